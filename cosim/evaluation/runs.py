@@ -10,9 +10,9 @@ import numpy as np
 
 from cosim.evaluation.simulate import simulate
 from cosim.plant import incidents
-from cosim.plant.feasible import check_strategy
-from cosim.plant.launch import own_files, own_vehicles
-from cosim.plant.settings import FILES, PRESSURES, settings
+from cosim.plant.launch import own_vehicles
+from cosim.plant.programmes import check_strategy
+from cosim.plant.settings import FILES, PRESSURES, own_files, settings
 from cosim.sumo import outputs
 from cosim.sumo.build import ensure_built
 from cosim.sumo.net import check_adjacency, load_city

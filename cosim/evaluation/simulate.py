@@ -4,7 +4,6 @@ import math
 import time
 from collections.abc import Callable, Collection, Mapping
 from contextlib import ExitStack
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -12,20 +11,18 @@ from jaxtyping import Bool
 
 from cosim.evaluation import estimation_errors
 from cosim.plant.max_pressure import FACTS as PRESSURE_FACTS
-from cosim.plant.observer import Observer
-from cosim.plant.plant import SumoPlant
-from cosim.plant.record import Record, settled
+from cosim.plant.plant import Observer, SumoPlant
+from cosim.plant.record import RECORD, settled
 from cosim.plant.settings import settings
 from cosim.sumo.arrays import EdgesOverTime, RegionCounts
 from cosim.sumo.net import City, Gateway, gateway_room_taken
-from cosim.sumo.outputs import check_whole
+from cosim.sumo.outputs import TripFacts, check_whole
 from cosim.sumo.session import Window
-from cosim.sumo.tripinfo import TripFacts
 from nmfd import closed_loop, metrics
 from nmfd.arrays import PerRegion
 from nmfd.controllers.strategy import Strategy
 from nmfd.model.scenario import Scenario, with_demand
-from nmfd.quantities import variables
+from nmfd.quantities import dataset_variables
 from nmfd.runs.files import atomic
 from nmfd.types import Result
 
@@ -97,7 +94,7 @@ def simulate(
         files = {kind: stack.enter_context(atomic(path)) for kind, path in (outputs or {}).items()}
         plant = SumoPlant(
             scenario,
-            overrides=settings(scenario).changed(**strategy.city),
+            settings=settings(scenario).changed(**strategy.city),
             outputs=files,
             planning=strategy.planning(scenario),
             observer=observer,
@@ -106,68 +103,63 @@ def simulate(
         stack.callback(plant.close)
         result = closed_loop.run(plant, controller, scenario, seed=seed, progress=progress)
         result = result.assign(controller=strategy.name, plant="sumo")
-        trips, sumo_time, leaks, trip_facts = plant.trips, plant.sumo_time, set(plant.leaks()), plant.trip_facts()
-        record = plant.record()
-        result = settled(result, record)
+        plant_facts, leaks, trip_facts = plant.facts(), set(plant.leaks()), plant.trip_facts()
+        result = settled(result.add(dataset_variables(RECORD, plant.record()), {}))
         backlog = result.backlog.sum(axis=(1, 2))
         facts = {
             "scenario": name,
             "scenario_folder": str(scenario.folder or ""),
             "demand": float(demand),
-            "trips": trips,
-            "departed_veh": int(record.departures.sum()),
+            **plant_facts,
+            "departed_veh": int(result.departures.sum()),
             "final_backlog_veh": int(backlog[-1]),
             "total_backlog_veh_s": float(scenario.step * backlog[:-1].sum()),
-            "teleports": int(record.teleports.sum()),
+            "teleports": int(result.teleports.sum()),
             **_trip_means(trip_facts),
-            "delay_gini": delay_gini(result, record, plant.time_loss()),
-            **queue_facts(record, plant.city),
+            "delay_gini": delay_gini(result, plant.time_loss()),
+            **queue_facts(result, plant.city),
             "notes": metrics.notes(result),
             "outside_training": strategy.outside_training(scenario, demand, policy),
-            "leaking_share": leaking_share(record, plant.city, leaks),
+            "leaking_share": leaking_share(result, plant.city, leaks),
             **_estimate_errors(scenario, result),
-            "sumo_time_s": sumo_time,
-            "overhead_share": 1.0 - sumo_time / result.wall_time,
+            "overhead_share": 1.0 - plant_facts["sumo_time_s"] / result.wall_time,
             "setup_time_s": time.perf_counter() - begin - result.wall_time,
-            "signals_left_alone": len(plant.other_signals),
-            "removed_veh": int(record.removals.sum() + record.given_up.sum()),
-            "removed_waiting_veh": int(record.given_up.sum()),
-            "jumps": int(record.jumps.sum()),
-            **plant.helped(),
-            **plant.pressure_facts(),
+            "removed_veh": int(result.removals.sum() + result.given_up.sum()),
+            "removed_waiting_veh": int(result.given_up.sum()),
+            "jumps": int(result.jumps.sum()),
         }
         check_whole(files)
-    return result.add(variables(Record, asdict(record)), facts)
+    return result.add({}, facts)
 
 
 def regional_outflow(record: Mapping[str, np.ndarray] | Result, step: float) -> RegionCounts:
     """Return trips that ended in every region and vehicles that left it (T, R) [veh/s].
 
-    record: arrays of cosim.plant.record.Record; step: control interval [s]
+    record: arrays of cosim.plant.record.RECORD; step: control interval [s]
     """
     return (record["arrivals"] + record["crossings"].sum(axis=(2, 3))) / step
 
 
-def delay_gini(result: Result, record: Record, time_loss: PerRegion) -> float:
+def delay_gini(result: Result, time_loss: PerRegion) -> float:
     """Return the Gini coefficient of the mean delays of regions of origin, weighted by their trips.
 
     The delay of a trip is its time loss on the road and its wait to enter. Unfinished trips count until the end.
     time_loss: SUMO's timeLoss of all trips that began in a region (R,) [s]
     """
-    begun = record.departures.sum(axis=(0, 2)) + result.backlog[-1].sum(axis=1)
-    trips = begun + record.given_up.sum(axis=(0, 2))
+    begun = result.departures.sum(axis=(0, 2)) + result.backlog[-1].sum(axis=1)
+    trips = begun + result.given_up.sum(axis=(0, 2))
     waiting = result.step * result.backlog[:-1].sum(axis=(0, 2))
     return metrics.gini((time_loss + waiting) / np.maximum(trips, 1.0), trips.astype(float))
 
 
-def queue_facts(record: Record, city: City) -> dict[str, float]:
+def queue_facts(result: Result, city: City) -> dict[str, float]:
     """Return queues on the edges before gateways, every edge once."""
     first: dict[str, int] = {}
     for n, gateway in enumerate(city.gateways):
         first.setdefault(gateway.from_edge, n)
     upstream = list(first.values())
-    queue, longest = record.gateway_queue[:, upstream], record.gateway_queue_max[:, upstream]
-    full = _gateway_full(record.edge_vehicles, city)[:, upstream]
+    queue, longest = result.gateway_queue[:, upstream], result.gateway_queue_max[:, upstream]
+    full = _gateway_full(result.edge_vehicles, city)[:, upstream]
     return {
         "gateway_queue_mean_veh": float(queue.mean()),
         "gateway_queue_max_veh": float(longest.max()),
@@ -175,9 +167,9 @@ def queue_facts(record: Record, city: City) -> dict[str, float]:
     }
 
 
-def leaking_share(record: Record, city: City, leaks: Collection[Gateway]) -> float:
+def leaking_share(result: Result, city: City, leaks: Collection[Gateway]) -> float:
     """Return the share of the boundary flow that passes gateways without a signal under control."""
-    flow = record.gateway_flow.sum(axis=0)
+    flow = result.gateway_flow.sum(axis=0)
     leaking = sum(passed for gateway, passed in zip(city.gateways, flow, strict=True) if gateway in leaks)
     return float(leaking / max(flow.sum(), 1))
 

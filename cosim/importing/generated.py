@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from cosim.importing.demand import Traffic
 from cosim.importing.streets import Streets
-from cosim.sumo.trips import CLASS_SPREAD, DRIVER_CLASSES, SHORT
+from cosim.sumo.trips import CLASS_SPREAD, DRIVER_CLASSES, SHORT_EDGE_M
 from nmfd.errors import InputError
 
 RAMP_UP_S, FLAT_S, RAMP_DOWN_S = 1800.0, 1800.0, 1800.0
@@ -70,7 +70,7 @@ class _Ends:
 
     def __init__(self, streets: Streets, random: np.random.Generator):
         self._random = random
-        good = streets.core & (streets.length >= SHORT)
+        good = streets.core & (streets.length >= SHORT_EDGE_M)
         self._edges = np.flatnonzero(good if good.sum() >= 4 else streets.core)
         weight = streets.lane_metres[self._edges]
         signalled = [n for n, signal in enumerate(streets.link_signals) if signal is not None]

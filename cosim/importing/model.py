@@ -168,7 +168,6 @@ def scenario_text(
         f"begin = {times['begin']}\n"
         f"step_length = {times['step-length']}\n"
         f"time_to_teleport = {times['time-to-teleport']}      # s; every table counts the teleports\n"
-        "departure_jitter = 10.0     # s, either way: seeds differ in it, beside SUMO's own randomness\n"
         "ways_return = true          # guided drivers may leave a region and come back, as main roads here do\n"
         + "".join(f"{key} = [{', '.join(map(quoted, values))}]\n" for key, values in lists.items())
         + ("mesoscopic = true           # SUMO's queue model: fast, without lanes\n" if mesoscopic else "")

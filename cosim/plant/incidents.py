@@ -4,10 +4,11 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
-from cosim.plant.perimeter import GREEN, YELLOW
+from cosim.plant.gates import DEFAULT_YELLOW_S
 from cosim.sumo.arrays import EdgeMask
 from cosim.sumo.net import City
 from cosim.sumo.session import Session
+from cosim.sumo.signals import GREEN
 from nmfd.errors import InputError
 from nmfd.faults import Fault
 
@@ -100,6 +101,6 @@ class Incidents:
         ends = [a in GREEN and b not in GREEN for a, b in zip(shown, target, strict=True)]
         if any(ends):
             session.set_signal_state(signal, "".join("y" if end else a for end, a in zip(ends, shown, strict=True)))
-            self._yellow_end[signal] = session.time + YELLOW
+            self._yellow_end[signal] = session.time + DEFAULT_YELLOW_S
         elif not alone:
             session.set_signal_state(signal, target)

@@ -1,75 +1,68 @@
 """Max-pressure control of signals (Varaiya, "Max pressure control of a network of signalized intersections", 2013).
 
-A movement from road l to road m has the weight w(l, m) = x(l, m) - sum_p r(m, p) x(m, p): the vehicles that want to
-make it, minus those that stand in the way behind it, by turning shares r. A stage (a green phase of the original
-programme) has the pressure sum c(l, m) max(w(l, m), 0) over its movements, c their saturation flows. The stage with
-the highest pressure gets the green, after the original yellow and all-red. Perimeter control rations the green of the
-gateway movements (cosim.plant.green_quota); one whose ration is spent exerts no pressure.
+A movement from road l to road m has the weight w(l, m) = x(l, m) - sum_p r(m, p) x(m, p): vehicles that want to make
+it, minus those in the way behind it, by turning shares r. A stage (a green phase of the original programme) has the
+pressure sum c(l, m) max(w(l, m), 0) over its movements, c their saturation flows. The stage with the highest pressure
+gets the green, after the original yellow and all-red. Perimeter control rations the green of the gateway movements
+(cosim.plant.gates.Ration); a movement whose ration is spent exerts no pressure.
 
-x counts vehicles per lane, as loops and cameras see them; on lanes that several movements share, and upstream of the
-turn lanes, they are shared out by r, from the demand's static routes. On streets that are closed to cars, whoever
-stands there, such as buses, presses for the stages that serve them.
+x counts vehicles per lane; on lanes that several movements share, and upstream of the turn lanes, r divides them, from
+the demand's static routes. Vehicles on streets closed to cars, such as buses, press for the stages that serve them. A
+shared lane counts for the stages that serve all of it; if there is none, for the others with the chance that its first
+vehicle is served, because that vehicle holds up all behind it.
 
-Who is first on a shared lane holds up all behind until the green is theirs: a stage that serves a part of a lane moves
-a few vehicles, whatever the queue. So a shared lane counts for the stages that serve all of it; where there is none,
-for the others in so far as the first vehicle is likely to be served.
-
-Which stage comes next is decided in one of two ways. Acyclic (Varaiya): the one with the highest pressure; a link that
-was red for MAX_RED while somebody waited there comes first. Cyclic (as Levin, Hu and Odell, "Max-pressure signal
-control with cyclical phase structure", 2020): the stages keep the order of the programme, stay while none has a higher
-pressure, and those that nobody waits for are left out. In both no green outlasts the maximum while others wait.
-A change costs the seconds of yellow and red on the way: the pressure of another stage counts for the share of green in
-these and the SOON seconds that follow. Without that it loses against fixed time in Bologna, whose ways are long.
+Acyclic (Varaiya): the next stage is the one with the highest pressure; a link that was red for MAX_RED_S while a
+vehicle waited there comes first. Cyclic (Levin, Hu and Odell, "Max-pressure signal control with cyclical phase
+structure", 2020): stages keep their order, stay while none has a higher pressure, and are left out without a vehicle.
+In both no green outlasts MAX_GREEN_S while others wait. A change costs yellow and red: the pressure of another stage
+counts for the share of green in these and the LOOKAHEAD_S that follow.
 """
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import lru_cache
 
 import numpy as np
 from scipy.sparse import csr_array
 
-from cosim.plant.green_quota import NEVER, Ration
-from cosim.plant.perimeter import yellow_time
+from cosim.plant.gates import MIN_GREEN_S, NEVER, Ration, yellow_time
 from cosim.sumo.net import City, gateway_movements
 from cosim.sumo.session import Phase, Session
 from cosim.sumo.signals import GREEN, Link, Signal, is_stage, lane_id
 from nmfd.arrays import PerPair
 
-LEVELS = "rgG"  # from nothing to the right of way
-FACTS = {  # columns of sumo.csv
+LEVELS = "rgG"  # from red to the right of way
+FACTS = {  # columns of the table of runs
     "signal_lanes": "lanes before signals under max-pressure",
     "split_lanes": "those that a stage serves in part",
     "never_whole_lanes": "those that no stage serves whole",
     "intergreen_share": "share of the time between two stages under max-pressure",
     "programmed_intergreen_share": "the same in the original programmes",
 }
-EVERY = 5.0  # s between two decisions: about two vehicles per lane
-SOON = 10.0  # s; about two minimum greens
-SHORT = 15.0  # m, two vehicles
-REACH = 100.0  # m before a signal within which vehicles count, wherever roads join and part there
-MAX_RED = 120.0  # s; about the longest cycle that is usual (Signal Timing Manual, 2nd edition, 2015)
-WHOLE = 1 - 1e-9  # of the vehicles of a lane: all of them
+DECISION_PERIOD_S = 5.0  # about two vehicles per lane
+LOOKAHEAD_S = 10.0  # about two minimum greens
+MAX_GREEN_S = 50.0  # netconvert's for actuated signals
+MAX_RED_S = 120.0  # about the longest usual cycle (Signal Timing Manual, 2nd edition, 2015)
+SHORT_ROAD_M = 15.0  # two vehicles
+REACH_M = 100.0  # before a signal within which vehicles count, wherever roads join and part there
+WHOLE = 1 - 1e-9  # share of the vehicles of a lane: all of them
 PERMISSIVE = 0.3  # saturation flow of a movement that must give way (g), as a share of a protected one
 
 
 class MaxPressure:
-    """Max-pressure at `signals`; call `play` before every simulation step."""
+    """Max-pressure at `signals`: `command` once per control interval, `play` before every simulation step."""
 
     def __init__(
         self,
         session: Session,
         city: City,
-        signals: list[Signal],
+        signals: Sequence[Signal],
         flows: Mapping[tuple[str, str], float],
         *,
-        min_green: float,
-        max_green: float,
         show: Callable[[str, str], None],
         cyclic: bool = False,
     ):
-        """flows: (edge, next edge) -> any measure of flow, for the turning shares; min_green, max_green: [s];
-        show(signal, state) puts a state on a signal; cyclic: whether stages keep their order."""
-        self._session, self._show, self._max_green, self._cyclic = session, show, max_green, cyclic
+        """flows: (edge, next edge) -> flow, any unit; show(signal, state): sets the state of a signal"""
+        self._session, self._show, self._cyclic = session, show, cyclic
         roads = Roads(city, signals, flows)
         self._lanes, self._weights, self._movements = roads.lanes, roads.weights, roads.movements
         self._gain, self._begins = roads.stages(signals)
@@ -77,40 +70,37 @@ class MaxPressure:
         self._shared, self._start = roads.shared(signals), session.time
         pairs = gateway_movements(city)
         self._programmed = float(np.mean([_intergreen(signal) for signal in signals])) if signals else 0.0
-        self._junctions = [
-            Junction(signal, session.time, pairs.get(signal.id), min_green=min_green) for signal in signals
-        ]
+        self._junctions = [Junction(signal, session.time, pairs.get(signal.id)) for signal in signals]
         self._approaches = [Approaches(signal, roads.watched, session.time) for signal in signals]
         self._rationed = [junction for junction in self._junctions if junction.rationed]
         self._next = session.time
         for junction in self._junctions:
             show(junction.signal, junction.state)
 
-    def command(self, share: PerPair, opened: Mapping[str, Collection[int]]) -> None:
-        """share: (R, R) [-], (u - u_min) / (u_max - u_min); opened: signal -> gateway links without a ration."""
+    def command(self, share: PerPair) -> None:
+        """Set the shares (R, R) [-], (u - u_min) / (u_max - u_min), of the cycles that begin from now on."""
         for junction in self._rationed:
-            junction.command(share, opened.get(junction.signal, ()))
+            junction.command(share)
 
     def green_time(self) -> dict[str, dict[int, float]]:
-        """Signal -> gateway link -> seconds of green shown so far."""
+        """Return signal -> gateway link -> green so far [s]."""
         now = self._session.time
         return {junction.signal: junction.green_time(now) for junction in self._rationed}
 
     def facts(self, now: float) -> dict[str, float]:
-        """FACTS: lanes before the signals, those of them that a stage serves in part, and those that none serves whole;
-        share of the time until `now` [s] between two stages, mean of the signals, and in the original programmes."""
+        """Return FACTS until `now` [s]."""
         lost = [junction.lost for junction in self._junctions]
         share = float(np.mean(lost)) / max(now - self._start, 1.0) if lost else 0.0
         return dict(zip(FACTS, (*self._shared, share, self._programmed), strict=True))
 
     def play(self, now: float) -> None:
-        """Show what holds from `now` [s] on."""
+        """Set all states from `now` [s] on."""
         for junction in self._junctions:
             if now >= junction.next_change - 1e-6:
                 self._show(junction.signal, junction.advance(now))
         if now < self._next - 1e-6:
             return
-        self._next = now + EVERY
+        self._next = now + DECISION_PERIOD_S
         count = self._session.lane_vehicles
         present = np.array([count(lane) for lane in self._lanes], dtype=float)
         pressure = self._pressure(present)
@@ -125,7 +115,7 @@ class MaxPressure:
     def _next_stage(
         self, junction: "Junction", pressure: np.ndarray, waiting: np.ndarray, approaches: "Approaches", now: float
     ) -> int:
-        """pressure: (n,) of the stages; waiting: (K,) bool, of the links; the present stage, if it may stay"""
+        """Return the next stage, or the present one. pressure: (n,) of the stages; waiting: (K,) bool, of the links"""
         own, called = junction.stage, approaches.serves @ waiting > 0
         in_turn = [n % len(pressure) for n in range(own + 1, own + len(pressure)) if called[n % len(pressure)]]
         if not in_turn:
@@ -134,9 +124,10 @@ class MaxPressure:
             overdue = approaches.serves @ (waiting * approaches.overdue(now))
             if overdue.any():
                 return int(np.argmax(overdue))
-        worth = {n: pressure[n] * SOON / (SOON + junction.loss(n)) for n in in_turn}
+        worth = {n: pressure[n] * LOOKAHEAD_S / (LOOKAHEAD_S + junction.loss(n)) for n in in_turn}
         best = max(in_turn, key=worth.__getitem__)
-        if worth[best] > pressure[own] or (now + EVERY > junction.stage_since + self._max_green + 1e-6):
+        too_long = now + DECISION_PERIOD_S > junction.stage_since + MAX_GREEN_S + 1e-6
+        if worth[best] > pressure[own] or too_long:
             return in_turn[0] if self._cyclic else best
         return own
 
@@ -149,56 +140,58 @@ class MaxPressure:
 
 
 class Junction:
-    """What one signal shows, second by second: a stage, or the way from one stage to the next."""
+    """The states of one signal, second by second: a stage, or the transition between two stages.
 
-    def __init__(
-        self, signal: Signal, now: float, gateways: Mapping[int, tuple[int, int]] | None = None, *, min_green: float
-    ):
-        """gateways: link index -> (i, h), of the links whose green is rationed; min_green: [s]"""
+    stages: their number; stage: the present or coming one; stage_since: time at which it begins [s]; lost: [s] between
+    stages so far; next_change: time of the next `advance` [s]
+    """
+
+    def __init__(self, signal: Signal, now: float, gateways: Mapping[int, tuple[int, int]] | None = None):
+        """gateways: link index -> (i, h), of links whose green is rationed"""
         self.signal, self._phases, self._numbers = signal.id, signal.phases, stages_of(signal)
         self.stages, self.stage = len(self._numbers), 0
         self._base = signal.phases[self._numbers[0]].state
-        self._green_since, self._min_green, self.stage_since = now, min_green, now
+        self._green_since, self.stage_since = now, now
         cycle = sum(phase.duration for phase in signal.phases)
         self._rations = {
-            link: Ration(pair, cycle=cycle, min_green=min_green, yellow=yellow_time(signal.phases, link), start=now)
+            link: Ration(pair, cycle=cycle, yellow=yellow_time(signal.phases, link), start=now)
             for link, pair in (gateways or {}).items()
         }
         self._movement = {link.index: (link.from_edge, link.to_edge) for link in signal.links}
         self._coming: list[tuple[float, str]] = []
-        self.lost = 0.0  # s between two stages so far
-        self._between: dict[tuple[int, int], list[Phase]] = {}  # stage, next stage -> what is shown between them
+        self.lost = 0.0
+        self._between: dict[tuple[int, int], list[Phase]] = {}  # stage, next stage -> phases between them
         self.state = self._base
         self.next_change = now if self._rations else NEVER  # until then, commands hold from the first second on
 
     @property
     def rationed(self) -> bool:
-        """Whether commands limit the green of a link here."""
+        """Return True if commands limit the green of a link here."""
         return bool(self._rations)
 
-    def command(self, share: PerPair, opened: Collection[int] = ()) -> None:
-        """(R, R) [-], as GatewaySignal.command in cosim.plant.perimeter."""
-        for link, ration in self._rations.items():
-            ration.command(1.0 if link in opened else float(share[ration.pair]))
+    def command(self, share: PerPair) -> None:
+        """Set the shares (R, R) [-] of the cycles that begin from now on."""
+        for ration in self._rations.values():
+            ration.command(float(share[ration.pair]))
 
     def exhausted(self) -> set[tuple[str, str]]:
-        """(edge, next edge) of the gateway movements that get no more green for now."""
+        """Return (edge, next edge) of the gateway movements without more green in this cycle."""
         return {self._movement[link] for link in self.exhausted_links()}
 
     def exhausted_links(self) -> list[int]:
-        """Of the gateway links, those that get no more green for now."""
+        """Return the gateway links without more green in this cycle."""
         return [link for link, ration in self._rations.items() if ration.exhausted]
 
     def green_time(self, now: float) -> dict[int, float]:
-        """Seconds of green that every gateway link has shown before `now` [s]."""
+        """Return the green of every gateway link before `now` [s]."""
         return {link: ration.green_time(now) for link, ration in self._rations.items()}
 
     def may_switch(self, now: float) -> bool:
-        """Whether the stage that is shown may be left at `now` [s]."""
-        return not self._coming and now >= self._green_since + self._min_green - 1e-6
+        """Return True if the stage may end at `now` [s]."""
+        return not self._coming and now >= self._green_since + MIN_GREEN_S - 1e-6
 
     def switch(self, stage: int, now: float) -> str:
-        """Leave the stage that is shown for another; the state from `now` on."""
+        """Leave the stage for another one; return the state from `now` on."""
         begin, self._coming = now, []
         for phase in self._way(stage):
             self._coming.append((begin, phase.state))
@@ -209,7 +202,7 @@ class Junction:
         return self.advance(now)
 
     def loss(self, stage: int) -> float:
-        """[s] between the stage that is shown and another one."""
+        """Return the time between the present stage and another one [s]."""
         return sum(phase.duration for phase in self._way(stage))
 
     def _way(self, stage: int) -> list[Phase]:
@@ -219,7 +212,7 @@ class Junction:
         return self._between[change]
 
     def advance(self, now: float) -> str:
-        """The state from `now` [s] on; call at every `next_change`."""
+        """Return the state from `now` [s] on; call at every `next_change`."""
         while self._coming and now >= self._coming[0][0] - 1e-6:
             self._base = self._coming.pop(0)[1]
         self.next_change = self._coming[0][0] if self._coming else NEVER
@@ -228,16 +221,16 @@ class Junction:
             lasting = all(state[link] in GREEN for _, state in self._coming)
             shown[link], again = ration.show(shown[link], now, lasting=lasting)
             self.next_change = min(self.next_change, again)
-            if ration.opened(now):  # in the middle of a stage, perhaps: it gets its minimum green, too
+            if ration.opened(now):  # perhaps in the middle of a stage: it gets its minimum green, too
                 self._green_since = max(self._green_since, now)
         self.state = "".join(shown)
         return self.state
 
 
 def stages_of(signal: Signal) -> tuple[int, ...]:
-    """The phases to choose from: stages of the programme that serve something no other one serves as well.
+    """Return the phases to choose from: stages that no other stage covers.
 
-    Programmes have the same phase twice, and phases in which a part of the green goes on until the last have passed.
+    Programmes have the same phase twice, and phases in which a part of the green goes on for the last vehicles.
     """
     level = {n: [LEVELS.index(light) for light in signal.phases[n].state] for n in signal.stages}
 
@@ -252,11 +245,11 @@ def stages_of(signal: Signal) -> tuple[int, ...]:
 
 
 def transition(phases: tuple[Phase, ...], source: int, target: int) -> list[Phase]:
-    """What is shown between two stages.
+    """Return the phases between two stages.
 
-    The original phases where the programme goes from one to the other; else yellow, as long as in the programme, and
-    red, as long as after `source` there, for the links that lose their green, or their right of way (G, then g). The
-    others stay as they are, and nothing that conflicts with them is green before the target stage.
+    The original ones if the programme goes from `source` to `target`; else yellow, as long as in the programme, and
+    red, as long as after `source`, for links that lose their green or their right of way (G, then g). The others stay
+    as they are, so that no conflicting movement is green before the target stage.
     """
     between, n = [], (source + 1) % len(phases)
     while phases[n].state == phases[source].state:
@@ -282,58 +275,57 @@ def transition(phases: tuple[Phase, ...], source: int, target: int) -> list[Phas
 
 
 def _intergreen(signal: Signal) -> float:
-    """Share of its cycle in which the original programme is between two stages."""
+    """Return the share of the cycle between two stages in the original programme."""
     durations = [(phase.duration, is_stage(phase.state)) for phase in signal.phases]
     between = sum(seconds for seconds, green in durations if not green)
     return between / max(sum(seconds for seconds, _ in durations), 1.0)
 
 
 class Approaches:
-    """Who waits before one signal, and since when it has been red for them.
+    """The links of one signal: whether vehicles wait, and since when it is red.
 
-    serves: (n, K) [0 or 1], whether a link is green in a stage; K links, by their index in the signal's states
+    serves: (n, K) [0 or 1], link k is green in stage n
     """
 
     def __init__(self, signal: Signal, watched: Callable[[Link], set[int]], now: float):
-        """watched: the lanes, by their number, whose vehicles may wait for a link"""
+        """watched: link -> numbers of the lanes whose vehicles may wait for it"""
         self.serves = np.array([_green(signal.phases[n].state) for n in stages_of(signal)], dtype=float)
         pairs = sorted({(link.index, lane) for link in (*signal.links, *signal.others) for lane in watched(link)})
         self._link, self._lane = np.array(pairs).T
         self._last_green = np.full(self.serves.shape[1], now)
 
     def observe(self, state: str, now: float) -> None:
-        """Take note of what the signal shows at `now` [s]."""
+        """Note the state at `now` [s]."""
         self._last_green[_green(state)] = now
 
     def waiting(self, present: np.ndarray, closed: Collection[int]) -> np.ndarray:
-        """(K,) bool: somebody is on a lane of the link; present: (L,) [veh]; nobody may wait for `closed` links"""
-        found = np.zeros(len(self._last_green), dtype=bool)
-        found[self._link[present[self._lane] > 0]] = True
-        found[list(closed)] = False
-        return found
+        """Return (K,) bool: a vehicle is on a lane of the link, which is not `closed`. present: (L,) [veh]"""
+        waits = np.zeros(len(self._last_green), dtype=bool)
+        waits[self._link[present[self._lane] > 0]] = True
+        waits[list(closed)] = False
+        return waits
 
     def overdue(self, now: float) -> np.ndarray:
-        """(K,) [s] of red, of those links where that is MAX_RED or more."""
+        """Return (K,) [s] of red, 0 below MAX_RED_S."""
         red = now - self._last_green
-        return red * (red >= MAX_RED - 1e-6)
+        return red * (red >= MAX_RED_S - 1e-6)
 
 
-@lru_cache(maxsize=4096)  # a city shows the same states all day long
+@lru_cache(maxsize=4096)  # a city shows the same states all day
 def _green(state: str) -> np.ndarray:
     """(K,) bool, not to be written to"""
     return np.isin(list(state), list(GREEN))
 
 
 class Roads:
-    """Vehicles by lane -> weights of the movements -> pressures of the stages, as two sparse matrices.
+    """Vehicles by lane -> weights of movements -> pressures of stages, as two sparse matrices.
 
-    lanes: (L,) names, of those for cars and of all others before the signals, such as bus lanes, which have no weight;
-    movements: (edge, next edge) at `signals` -> their number; weights: (M, L) [-], of these; roads
-    that end at none of the signals are full too
+    lanes: (L,) names, those for cars and all others before the signals, such as bus lanes, which have no weight
+    movements: (edge, next edge) at `signals` -> number; weights: (M, L) [-]
     """
 
     def __init__(self, city: City, signals: Iterable[Signal], flows: Mapping[tuple[str, str], float]):
-        """flows: (edge, next edge) -> any measure of flow, from which turning shares follow"""
+        """flows: (edge, next edge) -> flow, any unit, for the turning shares"""
         self._city, self._flows = city, flows
         self._before: dict[str, list[str]] = {edge: [] for edge in city.edges}
         for edge, after in city.successors.items():
@@ -362,10 +354,10 @@ class Roads:
         self.weights = _sparse(rows, len(self.lanes))
 
     def stages(self, signals: Iterable[Signal]) -> tuple[csr_array, list[int]]:
-        """(S, M) saturation flows [lanes] of the movements in the stages, and the number of each signal's first one.
+        """Return (S, M) saturation flows [lanes] of movements in stages, and the number of each signal's first stage.
 
-        A shared lane gives a stage that serves a part of it nothing where another stage serves all of it, and else its
-        share times the chance that the first vehicle there is served.
+        A shared lane gives a stage that serves a part of it nothing if another stage serves all of it, else its share
+        times the chance that its first vehicle is served.
         """
         rows: list[dict[int, float]] = []
         begins: list[int] = []
@@ -388,8 +380,7 @@ class Roads:
         return _sparse(rows, len(self.movements)), begins
 
     def shared(self, signals: Iterable[Signal]) -> tuple[int, int, int]:
-        """Lanes for cars before the signals; those of them that some stage serves in part; those that none serves
-        whole."""
+        """Return the numbers of lanes before signals, served in part by a stage, and served whole by none."""
         lanes: set[str] = set()
         split: set[str] = set()
         whole: set[str] = set()
@@ -401,7 +392,7 @@ class Roads:
         return len(lanes), len(split), len(split - whole)
 
     def _served(self, signal: Signal, state: str) -> dict[str, float]:
-        """Lane -> share of its vehicles that have green in `state`."""
+        """Return lane -> share of its vehicles that have green in `state`."""
         to: dict[str, set[str]] = {}
         for link in signal.links:
             if state[link.index] in GREEN and lane_id(link) in self._cars:
@@ -409,7 +400,7 @@ class Roads:
         return {lane: sum(self._lane_shares(lane)[edge] for edge in sorted(edges)) for lane, edges in to.items()}
 
     def _queue(self, edge: str, to: str, *, arriving: bool = False) -> dict[int, float]:
-        """Lane -> share of its vehicles that want to go from `edge` to `to`. arriving: also from beyond the road."""
+        """Return lane -> share of its vehicles from `edge` to `to`. arriving: also from beyond the road"""
         queue = {}
         share = self._shares(edge, self._targets(edge))[to]
         for lane in self._city.lane_ids[edge]:
@@ -426,8 +417,7 @@ class Roads:
         return queue
 
     def apart(self, signals: Iterable[Signal]) -> csr_array:
-        """(S, L) saturation flows [lanes] of the lanes in the stages, on streets that are closed to cars: what stands
-        there, such as buses, presses as it is, for no turning shares are known of it."""
+        """Return (S, L) saturation flows [lanes] of lanes in stages, on streets closed to cars."""
         rows = []
         for signal in signals:
             for number in stages_of(signal):
@@ -442,50 +432,51 @@ class Roads:
         return _sparse(rows, len(self.lanes))
 
     def watched(self, link: Link) -> set[int]:
-        """The numbers of the lanes on which somebody may wait for a link: its own, and those behind a piece of road
-        that is too short for a vehicle to be seen there."""
+        """Return the lanes (numbers) whose vehicles may wait for a link: its own, and those behind a short road."""
         own = {self.lane_number[lane_id(link)]}
-        if (link.from_edge, link.to_edge) in self.movements and self._city.length[link.from_edge] < SHORT:
+        if (link.from_edge, link.to_edge) in self.movements and self._city.length[link.from_edge] < SHORT_ROAD_M:
             own |= self._queue(link.from_edge, link.to_edge, arriving=True).keys()
         return own
 
     def _arriving(self, edge: str, length: float) -> dict[str, float]:
-        """Edges without a signal that lead to `edge`, as far as REACH -> share of their vehicles that take it; length:
-        [m] from the beginning of `edge` to the signal. Roads are cut into pieces shorter than their queues."""
-        found, todo = {edge: 1.0}, [(edge, length)]
+        """Return edge without a signal that leads to `edge`, within REACH_M -> share of its vehicles that take it.
+
+        Roads are cut into pieces shorter than their queues. length: from the beginning of `edge` to the signal [m]
+        """
+        shares, todo = {edge: 1.0}, [(edge, length)]
         for onward, there in todo:
-            for before in self._before[onward] if there < REACH else ():
-                if before not in self._links and before not in found:
-                    found[before] = found[onward] * self._shares(before, self._targets(before))[onward]
+            for before in self._before[onward] if there < REACH_M else ():
+                if before not in self._links and before not in shares:
+                    shares[before] = shares[onward] * self._shares(before, self._targets(before))[onward]
                     todo.append((before, there + self._city.length[before]))
-        del found[edge]
-        return found
+        del shares[edge]
+        return shares
 
     def _lane_shares(self, lane: str) -> dict[str, float]:
         edge = lane.rpartition("_")[0]
         return self._shares(edge, sorted({link.to_edge for link in self._links[edge] if lane_id(link) == lane}))
 
     def _targets(self, edge: str) -> list[str]:
-        """Where vehicles may go at the end of `edge`, signal or not."""
+        """Return the next edges of `edge`, with a signal or not."""
         if edge in self._links:
             return sorted({link.to_edge for link in self._links[edge]})
         return list(self._city.successors[edge])
 
     def _shares(self, edge: str, targets: list[str]) -> dict[str, float]:
-        """Turning shares among `targets`; equal ones where nobody was expected."""
+        """Return turning shares among `targets`, equal ones without flow."""
         flows = np.array([self._flows.get((edge, target), 0.0) for target in targets])
         total = flows.sum()
         return dict(zip(targets, flows / total if total else flows + 1.0 / max(len(targets), 1), strict=True))
 
     def _upstream(self, edge: str) -> str | None:
-        """The edge before, where a road only gets turn lanes there."""
+        """Return the edge before if the road only gets turn lanes here."""
         before = self._before[edge]
         if len(before) == 1 and len(self._city.successors[before[0]]) == 1 and before[0] not in self._links:
             return before[0]
         return None
 
     def _chain(self, edge: str) -> list[str]:
-        """The edges of a road from `edge` to the next signal or fork."""
+        """Return the edges of a road from `edge` to the next signal or fork."""
         chain = [edge]
         while chain[-1] not in self._links:
             after = self._city.successors[chain[-1]]

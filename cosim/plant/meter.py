@@ -1,9 +1,8 @@
-"""What the city is doing: the accumulations x_ij with an exact vehicle ledger, and every crossing of a boundary.
+"""The exact vehicle ledger of a run: accumulations x_ij, and every crossing of a boundary.
 
-Vehicles that have left are booked when `accumulation` counts, as SUMO's tripinfo tells it (cosim.sumo.tripinfo): as
-arrivals those that reached the last edge of their route, as it was in the end; as removed all others, whoever took them
-out. Where SUMO cannot be made to write its tripinfo at once (in the window), what it has not told of yet is taken for
-granted, an arrival for an arrival, and booked anew when it tells; `close_books` is the last word.
+SUMO's tripinfo says what became of vehicles that have left (cosim.sumo.outputs): an arrival at the last edge of the
+final route, else a removal. If SUMO cannot be made to write it at once (in its window), a vehicle that has left is
+booked as an arrival, and again when tripinfo has it; `close_books` has the last word.
 """
 
 from collections import Counter
@@ -16,18 +15,22 @@ import numpy as np
 from cosim.plant.metering import Metering
 from cosim.sumo.arrays import PerGateway
 from cosim.sumo.net import City
+from cosim.sumo.outputs import End, TripReader
 from cosim.sumo.session import REFUSALS, Session
-from cosim.sumo.tripinfo import End, TripReader
 from nmfd.arrays import PerPair
 from nmfd.ledger import LedgerError
 from nmfd.types import State
 
+POLL_PERIOD_S = 3.0  # longest time between two looks at the entry edges
+
 
 @dataclass
 class _Vehicle:
-    """origin, destination: regions; edge: the last edge of its route; announced: the region of its last Event (on a
-    junction it may be ahead of that), its origin before the first; free: guidance may reroute it; region: where it is
-    now, None before the departure."""
+    """A vehicle that SUMO has loaded.
+
+    origin, destination: regions; edge: last one of its route; announced: region of its last Event, which may be ahead
+    of `region` on a junction; free: guidance may reroute it; region: the present one, None before the departure
+    """
 
     origin: int
     destination: int
@@ -38,7 +41,7 @@ class _Vehicle:
 
     @property
     def here(self) -> int:
-        """The region, of one that has departed."""
+        """Return the region of a vehicle that has departed."""
         if self.region is None:
             raise RuntimeError(f"a vehicle bound for {self.edge} is on the road, but was never seen to depart")
         return self.region
@@ -46,7 +49,7 @@ class _Vehicle:
 
 @dataclass
 class _Gone:
-    """A vehicle that has left from `region`; guess: how it was booked as long as SUMO had not told."""
+    """A vehicle that has left from `region`; guess: how it is booked until tripinfo has it."""
 
     vehicle: _Vehicle
     region: int
@@ -55,8 +58,10 @@ class _Gone:
 
 @dataclass(frozen=True, kw_only=True)
 class Event:
-    """A vehicle is in a region for the first time since it was elsewhere. source: None at the departure; free: its
-    driver may choose another way (no public transport, no stops to make)."""
+    """A departure (source None), or the entry of a vehicle into another region.
+
+    edge: last one of its route; free: the driver may take another route (no public transport, no stops)
+    """
 
     vehicle: str
     source: int | None
@@ -73,15 +78,13 @@ class Meter:
     `accumulation` looks at every vehicle. A teleporting vehicle counts where it was last seen.
 
     Since the beginning [veh]:
-    departures (R, R); probe_departures (R, R), those of the vehicles `probes`
-    arrivals (R,), trips that were completed; removals (R, R) [i, j], vehicles that were taken out on their way, in i
-    given_up (R, R), trips that SUMO dropped before they began
-    crossings (R, R, R) [i, h, j] from i to h where a gateway leads there; jumps, the same where none does: by teleport,
-        by a street closed to cars, moved by another program, or past a region so fast that nobody saw it there
+    departures (R, R); probe_departures (R, R), of probes; arrivals (R,), completed trips
+    removals (R, R) [i, j], vehicles taken out in i on their way to j; given_up (R, R), trips dropped before they began
+    crossings (R, R, R) [i, h, j] from i to h by a gateway; jumps (R, R, R), without one: teleports, streets closed to
+        cars, vehicles moved by another program, or too fast to be seen in between
     redirected (R, R, R) [i, j, l], in i, bound for j and from now on for l
-    time_loss (R,) [s], lost on the road against driving freely, by the region where trips began; complete when the
-        books are closed
-    teleports, and entry_flow, (source region, first edge behind the boundary) -> vehicles seen there
+    time_loss (R,) [s], against driving freely, by region of origin; complete when the books are closed
+    teleports; entry_flow, (source region, first edge behind the boundary) -> vehicles
     """
 
     def __init__(
@@ -92,19 +95,19 @@ class Meter:
         trips: TripReader | None = None,
         metering: Metering | None = None,
     ):
-        """probes: vehicles that are counted apart, too; trips: what SUMO tells of those that have left, None to take
-        all that it calls arrived for arrivals; metering: who has trips wait, of whom SUMO does not know yet"""
+        """probes: vehicles that are also counted apart; trips: ends of trips, None if all are arrivals; metering: trips
+        that wait outside"""
         self._metering = metering
         self._session, self._city, self._probes, self._trips = session, city, probes, trips
         self._vehicles: dict[str, _Vehicle] = {}
-        self._gone: dict[str, list[_Gone]] = {}  # whose end SUMO has not told of: several where an id is used again
+        self._gone: dict[str, list[_Gone]] = {}  # not in tripinfo yet; several if an id is used again
         self._teleporting: set[str] = set()
         self._joined = {(g.source, g.target) for g in city.gateways}
         entries = sorted({g.to_edge for g in city.gateways})
         self._entries = {edge: city.region_of[edge] for edge in entries}
         # Polled often enough that no vehicle gets past the middle of an entry edge unseen.
         shortest = min((city.length[edge] / city.speed[edge] for edge in entries), default=2.0)
-        self._poll_every = max(1, int(min(0.5 * shortest, 3.0) / session.step_length))
+        self._poll_steps = max(1, int(min(0.5 * shortest, POLL_PERIOD_S) / session.step_length))
         self._steps = 0
         self._seen: dict[str, tuple[str, ...]] = dict.fromkeys(entries, ())
         self.teleports, regions = 0, city.regions
@@ -118,7 +121,7 @@ class Meter:
         self._alike = Counter((g.source, g.to_edge) for g in city.gateways)
 
     def state(self, step: int, time: float) -> State:
-        """What the city is in at `time` [s] since the start, when control step `step` begins. LedgerError."""
+        """Return the state at `time` [s] since the start, when control step `step` begins. Raises LedgerError."""
         accumulation, backlog = self.accumulation(step), self.backlog()
         return State(
             step=step,
@@ -130,43 +133,33 @@ class Meter:
         )
 
     def gateway_flow(self) -> PerGateway:
-        """(G,) [veh] over each gateway of the city since the beginning."""
+        """Return (G,) [veh] over each gateway since the beginning."""
         return np.array(
             [self.entry_flow[g.source, g.to_edge] / self._alike[g.source, g.to_edge] for g in self._city.gateways]
         )
 
     def observe(self) -> list[Event]:
-        """Account for the last simulation step; call after every one. Departures first, then entries."""
+        """Account for the last simulation step; return departures, then entries."""
         session, events = self._session, []
         arrived = list(session.arrived())
         for vehicle in session.loaded():
             try:
                 self._load(vehicle)
-            except REFUSALS:  # gone already, where SUMO found no way for it when it was due
+            except REFUSALS:  # gone already: SUMO found no route when it was due
                 self.given_up[0, 0] += 1
         for vehicle in session.started_teleport():
             self.teleports += 1
             self._teleporting.add(vehicle)
-        for vehicle in session.ended_teleport():
-            self._teleporting.discard(vehicle)
+        self._teleporting.difference_update(session.ended_teleport())
         for vehicle in session.departed():
             if vehicle in self._vehicles and self._vehicles[vehicle].region is not None:  # its id is used again
                 self._leave(vehicle)
                 if vehicle in arrived:
                     arrived.remove(vehicle)
             known = self._depart(vehicle)
-            events.append(
-                Event(
-                    vehicle=vehicle,
-                    source=None,
-                    region=known.origin,
-                    destination=known.destination,
-                    edge=known.edge,
-                    free=known.free,
-                )
-            )
+            events.append(_event(vehicle, known, None, known.origin))
         self._steps += 1
-        for edge, region in self._entries.items() if self._steps % self._poll_every == 0 else ():
+        for edge, region in self._entries.items() if self._steps % self._poll_steps == 0 else ():
             present = session.vehicles_on(edge)
             if present != self._seen[edge]:
                 for vehicle in set(present).difference(self._seen[edge]):
@@ -179,9 +172,12 @@ class Meter:
         return events
 
     def accumulation(self, step: int = 0) -> PerPair:
-        """x_ij (R, R) [veh]: every vehicle counted where it is now, on junctions too. LedgerError if the count differs
-        from departures minus arrivals and removed ones, in total or in any (i, j) as followed from crossing to
-        crossing, or if SUMO does not tell what became of a vehicle; it names the control step `step`."""
+        """Return x_ij (R, R) [veh], with every vehicle counted where it is now, on junctions too.
+
+        step: control step, for messages
+        Raises LedgerError if the count differs from departures minus arrivals and removals, in total or in any (i, j)
+        as followed from crossing to crossing, or if the end of a vehicle is unknown.
+        """
         counted = np.zeros_like(self._running)
         self.teleports = max(self.teleports, self._session.teleports())
         on_road = self._session.running()
@@ -195,7 +191,7 @@ class Meter:
             counted[region, known.destination] += 1
         away = self._teleporting.difference(on_road)
         if len(on_road) + len(away) < self._running.sum():
-            away |= self._held(on_road)
+            away |= self._off_road(on_road)
         for vehicle in away:
             known = self._vehicles[vehicle]
             counted[known.region, known.destination] += 1
@@ -212,8 +208,10 @@ class Meter:
         return counted.astype(float)
 
     def close_books(self) -> None:
-        """When the simulation has ended: what became of the last vehicles. LedgerError if SUMO's tripinfo does not tell
-        of every one, or sums up to something else."""
+        """Book the ends of the last vehicles after the simulation.
+
+        Raises LedgerError if tripinfo misses a vehicle, or its sums differ from the books.
+        """
         if self._trips is None:
             return
         self._settle(self._trips.finish(self._gone))
@@ -224,13 +222,47 @@ class Meter:
         if self._gone or (facts.completed, facts.removed) != booked:
             raise LedgerError(
                 f"vehicle ledger broken at the end: {booked[0]} completed trips and {booked[1]} removed vehicles were "
-                f"booked, but SUMO's tripinfo has {facts.completed} and {facts.removed}{self._untold()}"
+                f"booked, but SUMO's tripinfo has {facts.completed} and {facts.removed}{self._unknown_ends()}"
             )
 
-    def _held(self, on_road: Collection[str]) -> set[str]:
-        """The vehicles that the mesoscopic model has taken off a jammed road without a word, until there is room for
-        them further on: on their way, neither on the road nor teleporting, but still known to SUMO. Those that it does
-        not know any more have left; where SUMO may tell so later."""
+    def backlog(self) -> PerPair:
+        """Return (R, R) [veh] due to depart from i for j, but not inserted yet; book those that SUMO dropped."""
+        waiting, pending = self.held(), self._session.pending()
+        for vehicle in pending:
+            known = self._load(vehicle)
+            waiting[known.origin, known.destination] += 1
+        ahead = {vehicle for vehicle, known in self._vehicles.items() if known.region is None}.difference(pending)
+        for vehicle in ahead.difference(self._session.known()) if ahead else ():
+            self._leave(vehicle)
+        return waiting
+
+    def held(self) -> PerPair:
+        """Return (R, R) [veh] of the backlog: metered trips."""
+        return np.zeros(self._running.shape) if self._metering is None else self._metering.backlog()
+
+    def probes(self) -> PerPair:
+        """Return (R, R) [veh] of the accumulation when it was last counted: probes."""
+        counted = np.zeros(self._running.shape)
+        for vehicle in self._probes & self._vehicles.keys():
+            known = self._vehicles[vehicle]
+            if known.region is not None:
+                counted[known.region, known.destination] += 1
+        return counted
+
+    def probe_backlog(self) -> PerPair:
+        """Return (R, R) [veh] of the backlog: probes."""
+        waiting = np.zeros(self._running.shape)
+        for vehicle in self._probes.intersection(self._session.pending()):
+            known = self._load(vehicle)
+            waiting[known.origin, known.destination] += 1
+        return waiting
+
+    def _off_road(self, on_road: Collection[str]) -> set[str]:
+        """Return vehicles that the mesoscopic model holds off a jammed road until there is room.
+
+        They are on their way, neither on the road nor teleporting, but SUMO still has them. The others have left; SUMO
+        may say so later.
+        """
         under_way = {vehicle for vehicle, known in self._vehicles.items() if known.region is not None}
         lost = under_way.difference(on_road, self._teleporting)
         held = lost.intersection(self._session.known())
@@ -240,7 +272,7 @@ class Meter:
         return held
 
     def _settle(self, ends: Iterable[End]) -> None:
-        """Book the vehicles that SUMO tells of."""
+        """Book ends of trips."""
         for end in ends:
             if end.vehicle not in self._gone:  # removed by another program, which SUMO does not call arrived
                 if end.vehicle not in self._vehicles:
@@ -256,9 +288,9 @@ class Meter:
             self._book(gone, end)
 
     def _guess(self, step: int) -> None:
-        """Book those of whom SUMO has not told yet as what they seem to be. LedgerError if it would have told."""
+        """Book vehicles without an end as arrivals. Raises LedgerError if tripinfo was up to date."""
         if self._gone and self._trips is not None and self._trips.prompt:
-            raise LedgerError(f"vehicle ledger broken at control step {step}{self._untold()}")
+            raise LedgerError(f"vehicle ledger broken at control step {step}{self._unknown_ends()}")
         for vehicle, left in self._gone.items():
             for gone in left:
                 if gone.guess is None:
@@ -267,7 +299,7 @@ class Meter:
         if self._trips is None:
             self._gone.clear()
 
-    def _untold(self) -> str:
+    def _unknown_ends(self) -> str:
         if not self._gone:
             return ""
         return (
@@ -276,7 +308,7 @@ class Meter:
         )
 
     def _book(self, gone: _Gone, end: End, sign: int = 1) -> None:
-        """In the books of a vehicle that is in no region any more; sign: -1 to take it back."""
+        """Book the end of a vehicle; sign: -1 to take it back."""
         i, j = gone.region, gone.vehicle.destination
         if not end.reason and (to := self._city.region_of.get(end.edge, j)) != j:
             self.redirected[i, j, to] += sign
@@ -288,38 +320,6 @@ class Meter:
             self.removals[h, j] += sign
         else:
             self.arrivals[h] += sign
-
-    def backlog(self) -> PerPair:
-        """(R, R) [veh]: due to depart from i for j, but not inserted yet. Books those that SUMO has given up."""
-        waiting, pending = self.held(), self._session.pending()
-        for vehicle in pending:
-            known = self._load(vehicle)
-            waiting[known.origin, known.destination] += 1
-        ahead = {vehicle for vehicle, known in self._vehicles.items() if known.region is None}.difference(pending)
-        for vehicle in ahead.difference(self._session.known()) if ahead else ():
-            self._leave(vehicle)
-        return waiting
-
-    def held(self) -> PerPair:
-        """(R, R) [veh]: those of the backlog who are made to wait."""
-        return np.zeros(self._running.shape) if self._metering is None else self._metering.backlog()
-
-    def probes(self) -> PerPair:
-        """(R, R) [veh]: the probes among the accumulation, where it last counted them."""
-        counted = np.zeros(self._running.shape)
-        for vehicle in self._probes & self._vehicles.keys():
-            known = self._vehicles[vehicle]
-            if known.region is not None:
-                counted[known.region, known.destination] += 1
-        return counted
-
-    def probe_backlog(self) -> PerPair:
-        """(R, R) [veh]: the probes among the backlog."""
-        waiting = np.zeros(self._running.shape)
-        for vehicle in self._probes.intersection(self._session.pending()):
-            known = self._load(vehicle)
-            waiting[known.origin, known.destination] += 1
-        return waiting
 
     def _load(self, vehicle: str) -> _Vehicle:
         if vehicle not in self._vehicles:
@@ -335,7 +335,7 @@ class Meter:
         return self._vehicles[vehicle]
 
     def _depart(self, vehicle: str) -> _Vehicle:
-        """Where it is seen first, which its route need not begin with, bound for where it leads by now."""
+        """Book a departure where the vehicle is first seen, for where its route leads by now."""
         known = self._load(vehicle)
         with suppress(*REFUSALS):  # gone already
             self._follow(vehicle, known)
@@ -347,12 +347,12 @@ class Meter:
         return known
 
     def _under_way(self, vehicle: str) -> _Vehicle:
-        """One that is on the road, even if SUMO did not say that it departed: put there by another program."""
+        """Return a vehicle on the road, even if another program put it there without a departure."""
         known = self._vehicles.get(vehicle)
         return self._depart(vehicle) if known is None or known.region is None else known
 
     def _follow(self, vehicle: str, known: _Vehicle) -> None:
-        """Whoever has changed its route: to where does it lead?"""
+        """Book a change of the destination."""
         edge = self._session.route(vehicle)[-1]
         if edge == known.edge:
             return
@@ -363,7 +363,7 @@ class Meter:
             self._running[known.region, known.destination] += 1
 
     def _leave(self, vehicle: str, guess: End | None = None) -> None:
-        """It is not there any more; what became of it is booked when SUMO tells."""
+        """Take a vehicle out; its end is booked when tripinfo has it."""
         self._teleporting.discard(vehicle)
         known = self._vehicles.pop(vehicle)
         if known.region is None:  # given up before it departed
@@ -384,14 +384,7 @@ class Meter:
         self._cross(known, region)
         known.announced = region
         self.entry_flow[source, edge] += 1
-        return Event(
-            vehicle=vehicle,
-            source=source,
-            region=region,
-            destination=known.destination,
-            edge=known.edge,
-            free=known.free,
-        )
+        return _event(vehicle, known, source, region)
 
     def _cross(self, known: _Vehicle, region: int) -> None:
         if region != known.region:
@@ -400,3 +393,14 @@ class Meter:
             self._running[known.region, known.destination] -= 1
             self._running[region, known.destination] += 1
             known.region = region
+
+
+def _event(vehicle: str, known: _Vehicle, source: int | None, region: int) -> Event:
+    return Event(
+        vehicle=vehicle,
+        source=source,
+        region=region,
+        destination=known.destination,
+        edge=known.edge,
+        free=known.free,
+    )

@@ -1,4 +1,4 @@
-"""Which programme a signal of the city runs: its own, Webster's, an actuated one, or what max-pressure decides."""
+"""Signal programmes other than those of the network file: actuated ones, and plans by SUMO's own tools."""
 
 import hashlib
 import subprocess
@@ -11,73 +11,91 @@ from xml.sax.saxutils import quoteattr
 
 import sumo
 
-from cosim.plant.actuated import actuated_row
-from cosim.plant.settings import ACTUATED, FIXED, PRESSURES, WEBSTER, Settings
+from cosim.plant.settings import ACTUATED, FIXED, PRESSURES, Settings, check_lanes, own_files, settings
 from cosim.sumo.build import network_folder
 from cosim.sumo.net import City
 from cosim.sumo.signals import FIXED as FIXED_TIME
-from cosim.sumo.signals import HELD, Signal, read_signals, write_programmes
+from cosim.sumo.signals import HELD, Signal, read_signals
+from nmfd.controllers.strategy import Strategy
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
 from nmfd.runs import shipped
 from nmfd.runs.files import temporary_folder
 
+ACTUATED_MIN_GREEN_S, ACTUATED_MAX_GREEN_S = 5.0, 50.0  # netconvert's defaults
+
 
 @dataclass(frozen=True, kw_only=True)
 class CitySignals:
-    """simple: may run another programme; steered: of them, all but those that keep their own for perimeter control;
-    others: names of those left alone (cosim.sumo.signals, leave_signals)."""
+    """The signals of a city by what may be done with them.
+
+    simple: may run another programme; steered: of these, all but gateways that stay fixed-time; others: names of those
+        that keep their own programme
+    """
 
     simple: list[Signal]
     steered: list[Signal]
     others: list[str]
 
 
-def city_signals(city: City, chosen: Settings, additional: Sequence[Path]) -> CitySignals:
-    """additional: the city's own additional files. InputError where the chosen programme fits no signal."""
-    pressure = chosen.signals in PRESSURES
-    simple, others = read_signals(city, additional, HELD if pressure else (FIXED_TIME,))
-    left = {signal.id for signal in simple} & set(chosen.leave_signals)
+def check_strategy(strategy: Strategy, scenario: Scenario, city: City) -> None:
+    """Raise InputError, in a line that begins with the strategy, if it cannot run in this city."""
+    try:
+        chosen = settings(scenario).changed(**strategy.city)
+        check_lanes(scenario, chosen)
+        if chosen.signals != FIXED:
+            city_signals(city, scenario, chosen)
+    except InputError as error:
+        raise InputError(f"controller {strategy.name} cannot run here: {error}") from None
+
+
+def city_signals(city: City, scenario: Scenario, settings: Settings) -> CitySignals:
+    """Return the signals of the city. Raises InputError if the programme of `settings` fits none."""
+    pressure = settings.signals in PRESSURES
+    kinds = HELD if pressure else (FIXED_TIME,)
+    simple, others = read_signals(city, own_files(scenario, settings.additional), kinds)
+    left = {signal.id for signal in simple} & set(settings.leave_signals)
     simple, others = [signal for signal in simple if signal.id not in left], sorted({*others, *left})
-    if chosen.signals != FIXED and not simple:
+    if settings.signals != FIXED and not simple:
         raise InputError(
-            f"{city.net_file}: sumo.signals: {chosen.signals} needs {'' if pressure else 'fixed-time '}signals "
+            f"{city.net_file}: sumo.signals: {settings.signals} needs {'' if pressure else 'fixed-time '}signals "
             f"with several green phases, but none of the {len(others)} signals here is one; choose fixed"
         )
     kept = set()
-    if chosen.gateways_fixed and chosen.signals == ACTUATED:
+    if settings.gateways_fixed and settings.signals == ACTUATED:
         kept = {gateway.signal for gateway in city.gateways}
     return CitySignals(simple=simple, steered=[signal for signal in simple if signal.id not in kept], others=others)
 
 
-def write_signal_programmes(
-    folder: Path,
-    city: City,
-    scenario: Scenario,
-    chosen: Settings,
-    signals: CitySignals,
-    trips: Iterable[tuple[float, Sequence[str]]],
-) -> list[Path]:
-    """Additional files with which SUMO runs other programmes than those of the network file; none for fixed ones.
+def write_actuated(path: Path, signals: Iterable[Signal]) -> None:
+    """Write an additional file that makes fixed-time signals gap-based actuated ones of SUMO.
 
-    folder: of this run; trips: departure [s] and edges, for Webster's plan
+    A stage may last half as long again as in the fixed-time programme: in congestion all stages reach their limits, and
+    the shares of the green are those of the fixed-time programme.
     """
-    if chosen.signals == WEBSTER:
-        return optimised_plans(network_folder(scenario.network), city, signals.others, trips)
-    if chosen.signals == ACTUATED:
-        path = folder / "actuated.add.xml"
-        write_programmes(path, [actuated_row(signal) for signal in signals.steered])
-        return [path]
-    return []
+    rows = ["<additional>\n"]
+    for signal in signals:
+        rows.append(
+            f'  <tlLogic id={quoteattr(signal.id)} type="actuated" programID="plan" offset="{signal.offset:g}">\n'
+        )
+        for n, phase in enumerate(signal.phases):
+            fixed, limits = phase.duration, ""
+            low = min(ACTUATED_MIN_GREEN_S, fixed)
+            high = max(min(1.5 * fixed, ACTUATED_MAX_GREEN_S), ACTUATED_MIN_GREEN_S)
+            if n in signal.stages and low != high:
+                limits = f' minDur="{low:g}" maxDur="{high:g}"'
+            rows.append(f'    <phase duration="{fixed:g}"{limits} state="{phase.state}"/>\n')
+        rows.append("  </tlLogic>\n")
+    path.write_text("".join([*rows, "</additional>\n"]), encoding="utf-8")
 
 
 def optimised_plans(
-    network: Path, city: City, others: Sequence[str], trips: Iterable[tuple[float, Sequence[str]]]
+    scenario: Scenario, city: City, others: Sequence[str], trips: Iterable[tuple[float, Sequence[str]]]
 ) -> list[Path]:
     """Return fixed-time plans by SUMO's own tools: cycles by Webster's formula, then offsets for green waves.
 
-    network: its folder, in whose build folder plans are kept; others: signals that keep their programme; trips:
-    departure [s] and edges, sorted by departure
+    They are kept in the build folder of the network.
+    others: signals that keep their programme; trips: departure [s] and edges, sorted by departure
     Raises InputError if a tool fails.
     """
     rows = [
@@ -86,7 +104,7 @@ def optimised_plans(
     ]
     routes = "\n".join(["<routes>", *rows, "</routes>\n"]).encode()
     key = hashlib.sha256(routes + city.net_file.read_bytes() + metadata.version("eclipse-sumo").encode()).hexdigest()
-    folder = shipped.build_folder(network)
+    folder = shipped.build_folder(network_folder(scenario.network))
     cycles, offsets = (folder / f"webster-{key[:16]}-{kind}.add.xml" for kind in ("cycles", "offsets"))
     if cycles.is_file() and offsets.is_file():
         return [cycles, offsets]

@@ -1,6 +1,6 @@
-"""What a run in SUMO leaves behind, beside its trajectory."""
+"""The record of a run in SUMO per control interval, beside its states and controls."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -8,142 +8,93 @@ from cosim.plant.actuation import Actuation
 from cosim.plant.guidance import Guide
 from cosim.plant.meter import Meter
 from cosim.plant.sampling import StreetMeans
-from cosim.sumo.arrays import EdgesOverTime, GatewaysOverTime, PairCounts, RegionCounts, Series, TurnCounts
-from nmfd.quantities import quantity
+from nmfd.quantities import Quantity
 from nmfd.types import Result
 
 BOOKS = ("departures", "arrivals", "removals", "given_up", "crossings", "jumps", "redirected")  # of the meter
+_PAIRS = ("interval", "region", "destination")
+_TURNS = ("interval", "region", "next_region", "destination")
+_GATEWAYS = ("interval", "gateway")
+
+# Gateways that share the edge before them share its queue.
+RECORD: Mapping[str, Quantity] = {
+    "departures": Quantity(_PAIRS, "veh", "trips begun"),
+    "arrivals": Quantity(("interval", "destination"), "veh", "trips completed, on the last edge of their route"),
+    "removals": Quantity(_PAIRS, "veh", "vehicles taken out on their way"),
+    "given_up": Quantity(_PAIRS, "veh", "trips that SUMO dropped before they began"),
+    "crossings": Quantity(_TURNS, "veh", "vehicles that crossed a boundary"),
+    "jumps": Quantity(_TURNS, "veh", "vehicles that came into another region where no gateway leads there"),
+    "redirected": Quantity(
+        ("interval", "region", "destination", "next_region"),
+        "veh",
+        "vehicles whose route was changed to end in another region, the next, instead of destination",
+    ),
+    "production": Quantity(("interval", "region"), "veh m/s", "travel production, mean of samples"),
+    "mean_accumulation": Quantity(("interval", "region"), "veh", "vehicles inside, mean of the same samples"),
+    "edge_vehicles": Quantity(("interval", "edge"), "veh", "vehicles on the edge to 0.1 %, mean of the same samples"),
+    "gateway_green": Quantity(_GATEWAYS, "s", "green shown, mean of the gateway's links; NaN without a signal"),
+    "gateway_original_green": Quantity(_GATEWAYS, "s", "green in the original programme, mean of the gateway's links"),
+    "gateway_flow": Quantity(_GATEWAYS, "veh", "vehicles that crossed the boundary"),
+    "gateway_queue": Quantity(_GATEWAYS, "veh", "vehicles halting on the edge before it, mean of samples"),
+    "gateway_queue_max": Quantity(_GATEWAYS, "veh", "vehicles halting on the edge before it, largest of samples"),
+    "teleports": Quantity(("interval",), "1", "vehicles that SUMO took out of a jam"),
+    "guided": Quantity(_TURNS, "veh", "reroutes by route guidance"),
+}
 
 
-@dataclass(frozen=True, kw_only=True)
-class Record:
-    """What a closed-loop trajectory does not hold, per control interval k = 0 .. T-1.
+def settled(result: Result) -> Result:
+    """Return a result with a record whose last state, completed and removed trips follow from the closed books.
 
-    Gateways that share the edge before them share its queue.
+    SUMO may report the end of a trip late, or in the last step only (cosim.plant.meter).
     """
-
-    departures: PairCounts = quantity("interval", "region", "destination", unit="veh", text="trips begun")
-    arrivals: RegionCounts = quantity(
-        "interval", "destination", unit="veh", text="trips completed: on the last edge of their route"
-    )
-    removals: PairCounts = quantity(
-        "interval", "region", "destination", unit="veh", text="vehicles taken out on their way, whoever did it"
-    )
-    given_up: PairCounts = quantity(
-        "interval", "region", "destination", unit="veh", text="trips that SUMO dropped before they began"
-    )
-    crossings: TurnCounts = quantity(
-        "interval", "region", "next_region", "destination", unit="veh", text="vehicles that crossed a boundary"
-    )
-    jumps: TurnCounts = quantity(
-        "interval",
-        "region",
-        "next_region",
-        "destination",
-        unit="veh",
-        text="vehicles that came into another region where no gateway leads there",
-    )
-    redirected: TurnCounts = quantity(
-        "interval",
-        "region",
-        "destination",
-        "next_region",
-        unit="veh",
-        text="vehicles there whose route was changed to end in another region, the next, instead of destination",
-    )
-    production: RegionCounts = quantity("interval", "region", unit="veh m/s", text="travel production, mean of samples")
-    mean_accumulation: RegionCounts = quantity(
-        "interval", "region", unit="veh", text="vehicles inside, mean of the same samples"
-    )
-    edge_vehicles: EdgesOverTime = quantity(
-        "interval", "edge", unit="veh", text="vehicles on the edge to 0.1 %, mean of the same samples"
-    )
-    gateway_green: GatewaysOverTime = quantity(
-        "interval", "gateway", unit="s", text="green shown, mean of the gateway's links; NaN without a signal"
-    )
-    gateway_original_green: GatewaysOverTime = quantity(
-        "interval", "gateway", unit="s", text="green in the original programme, mean of the gateway's links"
-    )
-    gateway_flow: GatewaysOverTime = quantity(
-        "interval", "gateway", unit="veh", text="vehicles that crossed the boundary"
-    )
-    gateway_queue: GatewaysOverTime = quantity(
-        "interval", "gateway", unit="veh", text="vehicles halting on the edge before it, mean of samples"
-    )
-    gateway_queue_max: GatewaysOverTime = quantity(
-        "interval", "gateway", unit="veh", text="vehicles halting on the edge before it, largest of samples"
-    )
-    teleports: Series = quantity("interval", unit="1", text="vehicles that SUMO took out of a jam")
-    guided: TurnCounts = quantity(
-        "interval", "region", "next_region", "destination", unit="veh", text="reroutes by route guidance"
-    )
-
-
-def settled(trajectory: Result, record: Record) -> Result:
-    """What became of vehicles as the closed books have it, for where SUMO told late (cosim.plant.meter). Who was taken
-    out in the last step, too, is no longer there at the end."""
 
     def since_start(counts: np.ndarray) -> np.ndarray:
         return np.concatenate([np.zeros_like(counts[:1]), counts]).cumsum(axis=0).astype(float)
 
-    moved, redirected = (record.crossings + record.jumps).sum(axis=0), record.redirected.sum(axis=0)
-    inside = (record.departures - record.removals).sum(axis=0) - np.diag(record.arrivals.sum(axis=0))
+    moved, redirected = (result.crossings + result.jumps).sum(axis=0), result.redirected.sum(axis=0)
+    inside = (result.departures - result.removals).sum(axis=0) - np.diag(result.arrivals.sum(axis=0))
     inside = inside + moved.sum(axis=0) - moved.sum(axis=1) + redirected.sum(axis=1) - redirected.sum(axis=2)
-    return trajectory.assign(
-        accumulation=np.concatenate([trajectory.accumulation[:-1], inside[None].astype(float)]),
-        completed=since_start(record.arrivals.sum(axis=1)),
-        removed=since_start(record.removals + record.given_up),
+    return result.assign(
+        accumulation=np.concatenate([result.accumulation[:-1], inside[None].astype(float)]),
+        completed=since_start(result.arrivals.sum(axis=1)),
+        removed=since_start(result.removals + result.given_up),
     )
 
 
-def _small(counts: np.ndarray) -> np.ndarray:
-    """Whole numbers of one control interval in half the memory, which a record of days fills."""
-    return counts.astype(np.int32) if counts.dtype.kind == "i" else counts
-
-
 class Recorder:
-    """Adds up a record: `add` at the end of every control interval."""
+    """Rows of a record: `add` one at the end of every control interval."""
 
     def __init__(self, meter: Meter, guide: Guide, actuation: Actuation):
-        """What they have counted until now belongs to no interval."""
+        """Their counts so far belong to no interval."""
         self._meter, self._guide, self._actuation = meter, guide, actuation
         self._rows: list[dict[str, np.ndarray]] = []
         self._before = self._totals()
 
-    def add(self, streets: StreetMeans) -> None:
-        """streets: means of the interval that has just ended; all else is what was added since the last call"""
+    def add(self, streets: StreetMeans) -> dict[str, np.ndarray]:
+        """Add and return the row of the interval that has just ended. streets: its means"""
         totals = self._totals()
-        added = {key: _small(total - self._before[key]) for key, total in totals.items()}
-        self._rows.append(
-            {
-                **added,
-                "gateway_green": self._actuation.as_shown(added["gateway_green"]),
-                "gateway_original_green": self._actuation.original_green,
-                "production": streets.production,
-                "mean_accumulation": streets.accumulation,
-                "edge_vehicles": streets.vehicles.astype(np.float16),  # to 0.1 % and as small as an integer
-                "gateway_queue": streets.queue,
-                "gateway_queue_max": streets.queue_max,
-            }
-        )
+        added = {key: total - self._before[key] for key, total in totals.items()}
+        row = {
+            # Half the memory for counts, which fill the record of a long run.
+            **{key: a.astype(np.int32) if a.dtype.kind == "i" else a for key, a in added.items()},
+            "gateway_green": self._actuation.as_shown(added["gateway_green"]),
+            "gateway_original_green": self._actuation.original_green,
+            "production": streets.production,
+            "mean_accumulation": streets.accumulation,
+            "edge_vehicles": streets.vehicles.astype(np.float16),  # to 0.1 %, as small as an integer
+            "gateway_queue": streets.queue,
+            "gateway_queue_max": streets.queue_max,
+        }
+        self._rows.append(row)
         self._before = totals
+        return row
 
-    def repeat(self) -> None:
-        """Another interval in which everything stands and is shown as in the last one, and nothing was counted."""
-        counted = [key for key in self._before if key != "gateway_green"]
-        self._rows.append({**self._rows[-1], **{key: np.zeros_like(self._rows[-1][key]) for key in counted}})
-
-    @property
-    def last(self) -> dict[str, np.ndarray]:
-        """The fields of the record in the last control interval."""
-        return self._rows[-1]
-
-    def record(self) -> Record:
-        """Of all control intervals so far."""
-        return Record(**{key: np.stack([row[key] for row in self._rows]) for key in self._rows[0]})
+    def record(self) -> dict[str, np.ndarray]:
+        """Return the arrays of RECORD over all control intervals so far."""
+        return {key: np.stack([row[key] for row in self._rows]) for key in self._rows[0]}
 
     def close(self) -> None:
-        """The books were closed: what was booked at last belongs to the last interval."""
+        """Add to the last interval what was booked when the books were closed."""
         totals = {name: getattr(self._meter, name).copy() for name in BOOKS}
         for name in BOOKS if self._rows else ():
             self._rows[-1][name] = self._rows[-1][name] + totals[name] - self._before[name]

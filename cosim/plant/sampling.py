@@ -1,4 +1,4 @@
-"""What streets do, sampled every few seconds: vehicles, speeds and queues, and their means over a control interval."""
+"""Samples of the streets every few seconds: vehicles, speeds and queues, and their means over a control interval."""
 
 from dataclasses import dataclass
 
@@ -10,19 +10,18 @@ from cosim.sumo.net import City
 from cosim.sumo.session import Session
 from nmfd.arrays import PerRegion
 
-EVERY = 10.0  # s, between two samples
+SAMPLE_PERIOD_S = 10.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class StreetMeans:
     """Means over the samples of one control interval.
 
-    duration: [s], of the interval
-    vehicles: (E,) [veh], by the city's edges; speed: (E,) [m/s], that routing goes by (`Session.speeds`), NaN
-    where there were no vehicles, 0 on closed streets
+    duration: [s], of the interval; vehicles: (E,) [veh]
+    speed: (E,) [m/s], that routing goes by (`Session.speeds`); NaN without vehicles, 0 on closed streets
     accumulation: (R,) [veh]; production: (R,) [veh m/s]
     queue, queue_max: (G,) [veh] halting on the edge before a gateway, mean and largest
-    crossing: (I,) [veh] on the internal edges of `City.inside`; crossed: (I,) [veh/s], how many got over them
+    crossing: (I,) [veh] on the internal edges of `City.inside`; crossed: (I,) [veh/s] that got over them
     """
 
     duration: float
@@ -36,29 +35,18 @@ class StreetMeans:
     crossed: PerInside
 
 
-def samples_apart(seconds: float, session: Session, steps: int) -> int:
-    """Simulation steps from one sample to the next: at least one, at most the `steps` of a control interval."""
-    return min(max(1, round(seconds / session.step_length)), steps)
-
-
 class StreetSampler:
-    """The samples of one control interval: `sample` as often as they are due, `finish` at its end."""
+    """Sums over the samples of one control interval. last: vehicles (E,) and their mean speed (E,) [m/s] then"""
 
     def __init__(self, session: Session, city: City):
-        """Samples are of the city's normal edges, and of those before its gateways."""
         self._session, self._city = session, city
         self._number = {edge: n for n, edge in enumerate(city.edges)}
         self._region = np.array([city.region_of[edge] for edge in city.edges])
         self._inside = {edge: n for n, edge in enumerate(city.inside)}
         self._upstream = sorted({g.from_edge for g in city.gateways})  # gateways may share the edge before them
         self._upstream_of = np.array([self._upstream.index(g.from_edge) for g in city.gateways], dtype=int)
-        self._end = session.time
+        self._end, self.last = session.time, (np.zeros(len(city.edges)), np.zeros(len(city.edges)))
         self._begin()
-
-    @property
-    def last(self) -> tuple[PerEdge, PerEdge]:
-        """Vehicles (E,) [veh] and their mean speed (E,) [m/s] of the sample that was taken last."""
-        return self._last
 
     def _begin(self) -> None:
         # Sums over the samples: n, n v, and n times the speed that routing goes by.
@@ -68,25 +56,29 @@ class StreetSampler:
 
     def sample(self) -> None:
         """Take one sample."""
-        streets, crossed = self.travelled()
-        counts, speeds, routing = self._on(streets)
-        self._last = counts, speeds
+        streets, crossed = self._travelled()
+        session, edges = self._session, self._city.edges
+        counts, speeds, routing = np.zeros((3, len(edges)))
+        counts[streets] = [session.vehicle_count(edges[n]) for n in streets]
+        for n in np.flatnonzero(counts):
+            speeds[n], routing[n] = session.speeds(edges[n])
+        self.last = counts, speeds
         for edge in crossed:
-            if count := self._session.vehicle_count(edge):
-                n, (speed, _) = self._inside[edge], self._session.speeds(edge)
+            if count := session.vehicle_count(edge):
+                n, (speed, _) = self._inside[edge], session.speeds(edge)
                 self._crossing[n] += count
                 self._crossed[n] += count * speed / self._city.inside[edge]
         self._vehicles, self._metres = self._vehicles + counts, self._metres + counts * speeds
         self._routed += counts * routing
-        self._queues.append([self._session.halting(edge) for edge in self._upstream])
+        self._queues.append([session.halting(edge) for edge in self._upstream])
 
     def finish(self, closed: EdgeMask) -> StreetMeans:
-        """The means since the last call; new ones begin. closed: (E,) bool, streets on which nobody may drive"""
+        """Return the means since the last call. closed: (E,) bool, streets without traffic"""
         samples, vehicles, metres = len(self._queues), self._vehicles, self._metres
         queues = np.array(self._queues).reshape(samples, len(self._upstream))
         with np.errstate(invalid="ignore"):
             speed = self._routed / vehicles
-        speed[closed] = 0.0  # nobody is sent through a street because it is empty
+        speed[closed] = 0.0  # so that guidance does not take an empty street for a free one
         production, accumulation = (
             np.bincount(self._region, amount, self._city.regions) / samples for amount in (metres, vehicles)
         )
@@ -106,21 +98,8 @@ class StreetSampler:
             crossed=crossed,
         )
 
-    def present(self) -> tuple[PerEdge, PerEdge, PerEdge]:
-        """Vehicles (E,) [veh], their mean speed (E,) [m/s], and that which routing goes by, by edge, now."""
-        return self._on(self.travelled()[0])
-
-    def _on(self, travelled: list[int]) -> tuple[PerEdge, PerEdge, PerEdge]:
-        count, speeds_of, edges = self._session.vehicle_count, self._session.speeds, self._city.edges
-        counts, speeds, routing = np.zeros((3, len(edges)))
-        counts[travelled] = [count(edges[n]) for n in travelled]
-        for n in np.flatnonzero(counts):
-            speeds[n], routing[n] = speeds_of(edges[n])
-        return counts, speeds, routing
-
-    def travelled(self) -> tuple[list[int], list[str]]:
-        """Numbers of edges, and internal edges, among them all that have vehicles: a large city has more edges than
-        vehicles under way."""
+    def _travelled(self) -> tuple[list[int], list[str]]:
+        """Return edges (numbers) and internal edges that hold all vehicles: a large city has more edges than these."""
         vehicles = self._session.running()
         if 2 * len(vehicles) > len(self._city.edges):
             return list(range(len(self._city.edges))), list(self._inside)

@@ -9,8 +9,7 @@ from matplotlib.axes import Axes
 
 from cosim.importing import maps, quality
 from cosim.importing.streets import Streets, read_streets
-from cosim.plant.launch import own_files
-from cosim.plant.settings import settings
+from cosim.plant.settings import own_files, settings
 from cosim.sumo import net
 from cosim.sumo.build import ensure_built
 from nmfd.api import load_scenario

@@ -1,11 +1,14 @@
-"""SUMO's own output files of a run, on request: for tools that read them, beside what is recorded here."""
+"""SUMO's output files: tripinfo, read while SUMO writes it, and others on request."""
 
 import re
-from collections.abc import Iterable, Mapping
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable, Container, Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from xml.etree.ElementTree import Element
 from xml.sax.saxutils import quoteattr
 
-from cosim.sumo.xml_files import BROKEN, opened
+from cosim.sumo.xml_files import BROKEN, attribute, opened
 from nmfd.errors import InputError, RunFailed, did_you_mean
 from nmfd.runs.run_folder import run_name
 
@@ -16,19 +19,134 @@ KINDS = {
     "edgedata": "edgedata.xml",
     "emission": "emission.xml.gz",
 }
-ZIPPED = "emission"  # where the disk is full, SUMO ends the process that it runs in
-TAIL = 200  # bytes that are sure to hold the end tag of the root
+ZIPPED = "emission"  # on a full disk SUMO ends its process while it writes this one
+EMISSION_CLASS = "HBEFA4/PC_petrol_Euro-4"  # SUMO's default
+KG_PER_MG = 1e-6
+END_TAG_BYTES = 200  # these last bytes of a file hold the end tag of its root
+
+
+@dataclass(frozen=True, kw_only=True)
+class TripFacts:
+    """Sums over all trips that were due before the end of the simulation.
+
+    trips: their number; completed: at the last edge of their route; removed: taken out before; travel_time: on the road
+    [s]; departure_delay: between wanted and real departure [s]; time_loss: against driving freely [s]; co2, fuel: [kg]
+    of all vehicles on the road (EMISSION_CLASS)
+    Trips under way or not departed count with the time until the end.
+    """
+
+    trips: int = 0
+    completed: int = 0
+    removed: int = 0
+    travel_time: float = 0.0
+    departure_delay: float = 0.0
+    time_loss: float = 0.0
+    co2: float = 0.0
+    fuel: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class End:
+    """The end of a vehicle's trip.
+
+    edge: its last one, "" if unknown; reason: tripinfo's `vaporized` (calibrator, collision, teleport, traci ...), ""
+    at the end of its route; time_loss: against driving freely [s]
+    """
+
+    vehicle: str
+    edge: str = ""
+    reason: str = ""
+    time_loss: float = 0.0
+
+
+class TripReader:
+    """Reader of SUMO's tripinfo output while SUMO writes it.
+
+    facts: of all trips so far; prompt: the last reading had all that SUMO knew; under_way: vehicle -> time loss [s], of
+    those on the road at the end of the simulation
+    """
+
+    def __init__(self, path: Path, flush: Callable[[], bool] = lambda: False):
+        """flush: makes SUMO write what it buffers (about ten trips); False if it cannot"""
+        self._path, self._flush, self._offset = path, flush, 0
+        self._parser: ElementTree.XMLPullParser[Element] = ElementTree.XMLPullParser()
+        self.facts, self.prompt = TripFacts(), False
+        self.under_way: dict[str, float] = {}
+
+    def ends(self) -> list[End]:
+        """Return the trips that ended since the last call. Raises RunFailed for a broken file."""
+        self.prompt = self._flush()
+        return self._read(lambda vehicle: True)
+
+    def finish(self, gone: Container[str] = ()) -> list[End]:
+        """Return the last ends after the simulation; SUMO lists vehicles under way then, too, `gone` are none of these.
+
+        Raises RunFailed for a file that is not whole.
+        """
+        return self._read(gone.__contains__, last=True)
+
+    def _read(self, left: Callable[[str], bool], last: bool = False) -> list[End]:
+        """left: a vehicle of which SUMO says that it has not arrived has left, as after a teleport to its end."""
+        try:
+            with self._path.open("rb") as stream:
+                stream.seek(self._offset)
+                self._parser.feed(stream.read())
+                self._offset = stream.tell()
+            if last:
+                self._parser.close()
+            return self._ends(left)
+        except BROKEN as error:
+            raise unfinished(self._path, error) from None
+
+    def _ends(self, left: Callable[[str], bool]) -> list[End]:
+        ends = []
+        for event in self._parser.read_events():
+            element = event[-1]
+            if not isinstance(element, Element) or element.tag != "tripinfo":
+                continue
+            vehicle, reason = element.get("id", ""), element.get("vaporized", "")
+            departed, loss = float(attribute(element, "depart")) >= 0, _time_loss(element)
+            ended = float(attribute(element, "arrival")) >= 0 or (departed and left(vehicle))
+            self.facts = _added(self.facts, element, ended=ended, completed=ended and not reason)
+            if ended:
+                edge = element.get("arrivalLane", "").rpartition("_")[0]
+                ends.append(End(vehicle=vehicle, edge=edge, reason=reason, time_loss=loss))
+            elif departed:
+                self.under_way[vehicle] = loss
+            element.clear()
+        return ends
+
+
+def _time_loss(trip: Element) -> float:
+    return max(float(trip.get("timeLoss", 0.0)), 0.0)
+
+
+def _added(facts: TripFacts, trip: Element, *, ended: bool, completed: bool) -> TripFacts:
+    co2, fuel = facts.co2, facts.fuel
+    for emissions in trip.iter("emissions"):
+        co2 += KG_PER_MG * float(attribute(emissions, "CO2_abs"))
+        fuel += KG_PER_MG * float(attribute(emissions, "fuel_abs"))
+    return TripFacts(
+        trips=facts.trips + 1,
+        completed=facts.completed + completed,
+        removed=facts.removed + (ended and not completed),
+        travel_time=facts.travel_time + max(float(attribute(trip, "duration")), 0.0),
+        departure_delay=facts.departure_delay + float(attribute(trip, "departDelay")),
+        time_loss=facts.time_loss + _time_loss(trip),
+        co2=co2,
+        fuel=fuel,
+    )
 
 
 def parse(text: str) -> tuple[str, ...]:
-    """Kinds separated by commas. InputError for one that there is not."""
+    """Return kinds of outputs from a text with commas. Raises InputError."""
     kinds = tuple(dict.fromkeys(kind.strip() for kind in text.removesuffix(",").split(",")))
     check(kinds)
     return kinds
 
 
 def check(kinds: Iterable[str]) -> None:
-    """InputError for a kind that there is not."""
+    """Raise InputError for an unknown kind of output."""
     for kind in kinds:
         if kind not in KINDS:
             raise InputError(
@@ -38,27 +156,45 @@ def check(kinds: Iterable[str]) -> None:
 
 
 def paths(kinds: tuple[str, ...], folder: Path, controller: str, seed: int) -> tuple[tuple[str, Path], ...]:
-    """Kind and file in the run folder `folder`."""
+    """Return kind and file of the outputs in a run folder."""
     return tuple((kind, folder / f"{run_name(controller, seed)}.{KINDS[kind]}") for kind in kinds)
 
 
-def options(outputs: Mapping[str, Path]) -> tuple[str, ...]:
-    """Options of SUMO for `summary` and `emission`; tripinfo is written anyway (trip_facts)."""
-    return tuple(
-        part for kind in ("summary", "emission") if kind in outputs for part in (f"--{kind}-output", str(outputs[kind]))
+def options(trip_file: Path, outputs: Mapping[str, Path]) -> list[str]:
+    """Return the options with which SUMO writes `trip_file`, for `TripReader`, and `outputs`, kind -> file."""
+    more = [part for kind in ("summary", "emission") if kind in outputs for part in (kind, outputs[kind])]
+    return [
+        "--tripinfo-output",
+        str(trip_file),
+        "--tripinfo-output.write-unfinished",
+        "true",
+        "--tripinfo-output.write-undeparted",
+        "true",
+        "--device.emissions.probability",
+        "1",
+        *(f"--{part}-output" if isinstance(part, str) else str(part) for part in more),
+    ]
+
+
+def write_edge_data(path: Path, target: Path, period: float) -> None:
+    """Write an additional file that makes SUMO write means per edge over every `period` [s] to `target`."""
+    path.write_text(
+        f'<additional><edgeData id="edgedata" freq="{period:g}" excludeEmpty="true" '
+        f"file={quoteattr(str(target.resolve()))}/></additional>\n",
+        encoding="utf-8",
     )
 
 
 def check_whole(outputs: Mapping[str, Path]) -> None:
-    """RunFailed for a file that SUMO, which says nothing of a full disk, could not write to its end."""
+    """Raise RunFailed for a file that SUMO could not finish, of which it says nothing."""
     for path in outputs.values():
         end = b""
         try:
             with opened(path) as stream:
                 if path.suffix != ".gz":
-                    stream.seek(max(path.stat().st_size - TAIL, 0))
+                    stream.seek(max(path.stat().st_size - END_TAG_BYTES, 0))
                 while part := stream.read(1 << 20):
-                    end = (end + part)[-TAIL:]
+                    end = (end + part)[-END_TAG_BYTES:]
         except BROKEN as error:
             raise unfinished(path, error) from None
         if not re.search(rb"</[\w-]+>\s*$", end):
@@ -66,16 +202,6 @@ def check_whole(outputs: Mapping[str, Path]) -> None:
 
 
 def unfinished(path: Path, error: Exception | None = None) -> RunFailed:
-    """For a file of SUMO's that ends too early; error: how that was noticed"""
+    """Return the error of a file of SUMO's that ends too early."""
     noticed = "" if error is None else f" ({error})"
     return RunFailed(f"{path}: SUMO did not finish this file{noticed}: is the disk full?")
-
-
-def write_edge_data(path: Path, target: Path, every: float) -> Path:
-    """An additional file that makes SUMO write means per edge over every `every` [s] to `target`."""
-    path.write_text(
-        f'<additional><edgeData id="edgedata" freq="{every:g}" excludeEmpty="true" '
-        f"file={quoteattr(str(target.resolve()))}/></additional>\n",
-        encoding="utf-8",
-    )
-    return path

@@ -1,16 +1,18 @@
-"""The city's own vehicles, as its route file has them: read once, then varied by seed and by demand factor."""
+"""Recorded trips of a city: read from its route files once, then varied by seed and demand factor."""
 
 import math
 import xml.etree.ElementTree as ElementTree
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from cosim.sumo.arrays import PerTrip
 from cosim.sumo.net import City
-from cosim.sumo.trips import HeldTrips
+from cosim.sumo.trips import DRIVER_CLASSES, PEAK_S, PLANNING_SEEDS, HeldTrips, Ways, busiest
 from cosim.sumo.xml_files import attribute, read_xml
 from nmfd.errors import InputError
 from nmfd.runs import files
@@ -19,29 +21,12 @@ STREAM = 7102  # keeps these random numbers apart from others of the same seed
 MESOSCOPIC = ("--mesosim", "true", "--meso-junction-control", "true")  # options of SUMO
 # Vehicle classes that keep to their lines, or do not use the road as cars do.
 BOUND = frozenset(
-    {
-        "bus",
-        "coach",
-        "tram",
-        "rail",
-        "rail_urban",
-        "rail_electric",
-        "rail_fast",
-        "subway",
-        "cable_car",
-        "ship",
-        "aircraft",
-        "bicycle",
-        "pedestrian",
-        "scooter",
-        "wheelchair",
-        "container",
-        "drone",
-    }
+    "bus coach tram rail rail_urban rail_electric rail_fast subway cable_car ship aircraft bicycle pedestrian scooter "
+    "wheelchair container drone".split()
 )
 DrawnTrip = tuple[float, int, str]  # departure [s], number of the vehicle, id
-HELD = "held."  # names of routes that vehicles in the file have to themselves
-# Attributes of a vehicle -> arguments of libsumo.vehicle.add, whose defaults are those of the attributes.
+HELD = "held."  # prefix of the ids of routes that only one vehicle uses
+# Attribute of a vehicle -> argument of libsumo.vehicle.add, whose defaults are those of the attributes.
 ORDERED = {
     "type": "typeID",
     "departLane": "departLane",
@@ -55,17 +40,14 @@ ORDERED = {
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedTrips:
-    """N vehicles or trips. depart: (N,) [s]; elements: their XML, without anything that another one repeats."""
+    """N vehicles or trips. depart: (N,) [s], sorted; elements: their XML, with types and shared routes elsewhere."""
 
     depart: PerTrip
     elements: tuple[ElementTree.Element, ...]
 
 
 def read_recorded_trips(paths: Sequence[Path]) -> RecordedTrips:
-    """The `vehicle` and `trip` elements of SUMO route files. Raises InputError.
-
-    Every one must have a time as its depart; types and routes that several share belong to an additional file.
-    """
+    """Return the `vehicle` and `trip` elements of SUMO route files. Raises InputError."""
     elements = []
     for path in paths:
         root = read_xml(path)
@@ -81,7 +63,7 @@ def read_recorded_trips(paths: Sequence[Path]) -> RecordedTrips:
             )
         name = element.get("id")
         if not name or name in ids:
-            raise InputError(f"{path}: {element.tag} {n}: id: expected one that no other has, got {name!r} instead")
+            raise InputError(f"{path}: {element.tag} {n}: id: expected a unique one, got {name!r} instead")
         ids.add(name)
         try:
             departs[n] = float(element.attrib["depart"])
@@ -97,7 +79,7 @@ def read_recorded_trips(paths: Sequence[Path]) -> RecordedTrips:
 
 
 def check_edges(originals: RecordedTrips, city: City, where: str) -> None:
-    """InputError for a vehicle on an edge that the city does not have: SUMO would leave it out without a word."""
+    """Raise InputError for a vehicle on an unknown edge, which SUMO would drop silently."""
     for element in originals.elements:
         route = element.find("route")
         ends = [element.get(key) for key in ("from", "to") if element.get(key)]
@@ -111,64 +93,88 @@ def check_edges(originals: RecordedTrips, city: City, where: str) -> None:
 
 
 def read_routes(paths: Sequence[Path]) -> dict[str, tuple[str, ...]]:
-    """Name -> edges of the routes that additional files define for vehicles to share; of a distribution, its first."""
-    found: dict[str, tuple[str, ...]] = {}
+    """Return id -> edges of the shared routes in additional files; of a distribution, its first route."""
+    shared: dict[str, tuple[str, ...]] = {}
     for path in paths:
         root = read_xml(path)
         for route in root.iter("route"):
             name, edges = route.get("id"), route.get("edges")
             if name and edges:
-                found[name] = tuple(edges.split())
+                shared[name] = tuple(edges.split())
         for distribution in root.iter("routeDistribution"):
             routes = [tuple(edges.split()) for r in distribution.iter("route") if (edges := r.get("edges"))]
-            routes += [found[name] for name in distribution.get("routes", "").split() if name in found]
+            routes += [shared[name] for name in distribution.get("routes", "").split() if name in shared]
             if routes and (name := distribution.get("id")):
-                found[name] = routes[0]
-    return found
+                shared[name] = routes[0]
+    return shared
 
 
-def edges_of(element: ElementTree.Element, routes: Mapping[str, Sequence[str]]) -> tuple[Sequence[str], bool]:
-    """(the edges of a vehicle's route, True), or (those that it must pass, False)."""
+def edges_of(element: ElementTree.Element, shared: Mapping[str, Sequence[str]]) -> tuple[Sequence[str], bool]:
+    """Return (the edges of a vehicle's route, True), or (the edges that it must pass, False)."""
     route = element.find("route")
     if route is not None:
         return route.get("edges", "").split(), True
     if name := element.get("route"):
-        return routes.get(name, ()), True
+        return shared.get(name, ()), True
     return [edge for key in ("from", "via", "to") for edge in element.get(key, "").split()], False
 
 
-def draw(originals: RecordedTrips, *, seed: int, factor: float, jitter: float, begin: float) -> list[DrawnTrip]:
-    """(departure [s], number of the vehicle, its id) sorted by departure, for one run.
+def own_flows(
+    city: City, originals: RecordedTrips, shared: Mapping[str, Sequence[str]], factor: float
+) -> Mapping[tuple[str, str], float]:
+    """Return (edge, next edge) -> flow [veh/s] of recorded trips in their busiest quarter of an hour.
 
-    factor: the demand is multiplied by it. Vehicles are left out, or driven twice or more (ids with .1, .2 and so on),
-    by seeded choice; 1 is every vehicle once.
-    jitter: every departure is moved by up to this [s], either way, but not before `begin` [s].
+    Trips without a route take a fastest one. shared: `read_routes`; factor: multiplies the flows
+    """
+    peak = [edges_of(element, shared) for element in originals.elements[busiest(originals.depart, PEAK_S)]]
+    known = set(city.edges)
+    turns: Counter[tuple[str, str]] = Counter()
+    legs: list[tuple[str, str]] = []
+    for edges, driven in peak:
+        pairs = [pair for pair in pairwise(edges) if known.issuperset(pair)]
+        if driven:
+            turns.update(pairs)
+        else:
+            legs += [leg for leg in pairs if leg[0] != leg[1]]
+    if legs:
+        number = {edge: n for n, edge in enumerate(city.edges)}
+        random = np.random.default_rng(PLANNING_SEEDS[0])
+        begin, end = np.array([[number[edge] for edge in leg] for leg in legs]).T
+        for route in Ways(city, random).routes(begin, end, random.integers(DRIVER_CLASSES, size=len(legs))):
+            turns.update(pairwise(route))
+    return {turn: factor * count / PEAK_S for turn, count in turns.items()}
+
+
+def draw(originals: RecordedTrips, *, seed: int, factor: float, jitter: float, begin: float) -> list[DrawnTrip]:
+    """Return (departure [s], number of the vehicle, its id) of one run, sorted by departure.
+
+    factor: vehicles are left out, or drive several times (ids with .1, .2 ...), by seeded choice
+    jitter: departures are moved by up to this, either way, but not before `begin` [s]
     """
     rng = np.random.default_rng([seed, STREAM])
     count = len(originals.depart)
-    chosen = np.full(count, int(factor))
-    chosen[rng.permutation(count)[: round((factor - int(factor)) * count)]] += 1
-    shifts = rng.uniform(-jitter, jitter, size=(max(int(chosen.max(initial=0)), 1), count))
+    copies = np.full(count, int(factor))
+    copies[rng.permutation(count)[: round((factor - int(factor)) * count)]] += 1
+    shifts = rng.uniform(-jitter, jitter, size=(max(int(copies.max(initial=0)), 1), count))
     names = [attribute(element, "id") for element in originals.elements]
     taken = set(names)
     drawn = []
-    for n, times in enumerate(chosen):
-        name = names[n]
+    for n, times in enumerate(copies):
         for copy in range(times):
             depart = max(float(originals.depart[n] + shifts[copy, n]), min(begin, float(originals.depart[n])))
-            drawn.append((round(depart, 2), n, _copy(name, copy, taken) if copy else name))
+            drawn.append((round(depart, 2), n, _copy(names[n], copy, taken) if copy else names[n]))
     return sorted(drawn, key=lambda vehicle: vehicle[:2])
 
 
 def _copy(name: str, number: int, taken: set[str]) -> str:
-    """An id that no other vehicle has: the flow x has an x.1 of its own, and so may a vehicle x."""
-    while (found := f"{name}.{number}") in taken:
+    """Return an id for a copy that no other vehicle has."""
+    while (candidate := f"{name}.{number}") in taken:
         name += "."
-    return found
+    return candidate
 
 
 def write_recorded_trips(originals: RecordedTrips, drawn: Sequence[DrawnTrip], path: Path) -> None:
-    """Write the vehicles of one run to a SUMO route file. The same ones give the same bytes."""
+    """Write the vehicles of one run to a SUMO route file."""
     _write(path, [_departing(originals.elements[n], name, depart) for depart, n, name in drawn])
 
 
@@ -179,15 +185,16 @@ def write_held_trips(
     shared: Mapping[str, tuple[str, ...]],
     region_of: Mapping[str, int],
 ) -> HeldTrips:
-    """Those of one run that can be made to wait; their routes and all other vehicles are written to a SUMO route file.
+    """Return the metered trips of one run; write their routes and all other vehicles to a SUMO route file.
 
-    shared: `read_routes`; region_of: of edges. Who stops on the way, goes by way of certain edges, or has an attribute
-    that cannot be told to SUMO while it runs, is a vehicle of the file.
+    A vehicle with stops, via edges or attributes that libsumo.vehicle.add does not take is not metered.
+    shared: `read_routes`; region_of: edge -> region
     """
-    elements, written, held = [], set[int](), list[tuple[float, tuple[str, ...], dict[str, str]]]()
+    elements, written = [], set[int]()
+    trips: list[tuple[float, int, int, dict[str, str]]] = []
     for depart, n, name in drawn:
         element = originals.elements[n]
-        route = _waiting_route(element, shared)
+        route = _meterable_route(element, shared)
         if not route:
             elements.append(_departing(element, name, depart))
             continue
@@ -196,25 +203,24 @@ def write_held_trips(
             written.add(n)
             elements.append(ElementTree.Element("route", id=known, edges=" ".join(route)))
         order = {ORDERED[key]: value for key, value in element.attrib.items() if key in ORDERED}
-        held.append((depart, route, {"vehID": name, "routeID": known, **order}))
+        order = {"vehID": name, "routeID": known, **order}
+        trips.append((depart, region_of[route[0]], region_of[route[-1]], order))
     _write(path, elements)
     return HeldTrips(
-        depart=np.array([depart for depart, _, _ in held]),
-        origin=np.array([region_of[route[0]] for _, route, _ in held], dtype=int),
-        destination=np.array([region_of[route[-1]] for _, route, _ in held], dtype=int),
-        routes=tuple(route for _, route, _ in held),
-        orders=tuple(order for _, _, order in held),
+        depart=np.array([depart for depart, _, _, _ in trips]),
+        origin=np.array([origin for _, origin, _, _ in trips], dtype=int),
+        destination=np.array([destination for _, _, destination, _ in trips], dtype=int),
+        orders=tuple(order for _, _, _, order in trips),
     )
 
 
-def _waiting_route(element: ElementTree.Element, shared: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
-    """The edges of a vehicle that a program can let begin; none of one that it cannot. Between two edges that do not
-    meet SUMO looks for the way."""
+def _meterable_route(element: ElementTree.Element, shared: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
+    """Return the edges of a vehicle that can be metered, () of others; SUMO connects the two edges of a trip."""
     if not {"id", "depart", "route", "from", "to", "color", *ORDERED}.issuperset(element.attrib):
         return ()
-    brings = int(element.tag == "vehicle" and "route" not in element.attrib)  # a route of its own
-    if len(element) > brings or any(
-        one.tag != "route" or len(one) or not {"edges", "color"}.issuperset(one.attrib) for one in element
+    own = int(element.tag == "vehicle" and "route" not in element.attrib)  # a route of its own
+    if len(element) > own or any(
+        child.tag != "route" or len(child) or not {"edges", "color"}.issuperset(child.attrib) for child in element
     ):
         return ()
     edges, driven = edges_of(element, shared)

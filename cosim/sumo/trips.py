@@ -1,9 +1,9 @@
-"""Demand between regions -> individual trips with static routes."""
+"""Demand between regions to individual trips with static routes, and the turning flows of these."""
 
-import os
-import tempfile
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
@@ -20,15 +20,17 @@ STREAM = 7101  # keeps the random numbers of trips apart from others of the same
 DRIVER_CLASSES = 8  # groups of drivers who see different travel times
 CLASS_SPREAD = 0.15  # standard deviation of the logarithm of their travel times
 DEPARTING = {"departLane": "best", "departSpeed": "max", "departPos": "random_free"}  # attributes of every trip
-SHORT = 30.0  # m; no trip starts or ends on a shorter edge where its region has longer ones
+SHORT_EDGE_M = 30.0  # no trip starts or ends on a shorter edge if its region has longer ones
+POCKET_M = 80.0  # a longer edge is no turn pocket
+PLANNING_SEEDS = (778_001, 778_002, 778_003, 778_004)  # of trips that plans are made for, none of an evaluation
+PEAK_S = 900.0  # the Highway Capacity Manual designs for the busiest quarter of the peak hour
 
 
 @dataclass(frozen=True, kw_only=True)
 class Trips:
     """N trips, sorted by departure.
 
-    depart: (N,) [s]
-    origin, destination: (N,) regions
+    depart: (N,) [s]; origin, destination: (N,) regions
     routes: N tuples of edges, from an edge of the origin to an edge of the destination
     arrival: (N,) [m], position on the last edge at which the trip ends
     """
@@ -42,30 +44,25 @@ class Trips:
 
 @dataclass(frozen=True, kw_only=True)
 class HeldTrips:
-    """N trips that SUMO is not given beforehand, but one by one when they may begin, sorted by departure.
+    """N metered trips, which SUMO gets one by one when they may begin, sorted by departure.
 
-    depart: (N,) [s]
-    origin, destination: (N,) regions
-    routes: N tuples of edges
+    depart: (N,) [s]; origin, destination: (N,) regions
     orders: N sets of arguments of `Session.begin_trip`; each names a route that SUMO knows
     """
 
     depart: PerTrip
     origin: TripNumbers
     destination: TripNumbers
-    routes: tuple[tuple[str, ...], ...]
     orders: tuple[Mapping[str, str], ...]
 
 
 def held(trips: Trips) -> HeldTrips:
-    """Trips of `write_trips`, metered."""
+    """Return metered trips of `write_trips`."""
     orders = tuple(
         {"vehID": f"v{n}", "routeID": f"r{n}", "typeID": "car", "arrivalPos": f"{arrival:.1f}", **DEPARTING}
         for n, arrival in enumerate(trips.arrival)
     )
-    return HeldTrips(
-        depart=trips.depart, origin=trips.origin, destination=trips.destination, routes=trips.routes, orders=orders
-    )
+    return HeldTrips(depart=trips.depart, origin=trips.origin, destination=trips.destination, orders=orders)
 
 
 def write_trips(
@@ -73,36 +70,53 @@ def write_trips(
 ) -> Trips:
     """Write the trips of `demand` (T, R, R) [veh/s], intervals of `step` [s], to a SUMO route file.
 
-    The vehicles are v0, v1, ... by departure; the same seed gives the same bytes. metered: their routes r0, r1, ...
+    The vehicles are v0, v1, ... by departure; metered: only their routes r0, r1, ...
     """
     trips = make_trips(city, demand, step, seed)
     lines = ['<routes>\n  <vType id="car" sigma="0.2"/>\n']
     departing = " ".join(f'{key}="{value}"' for key, value in DEPARTING.items())
     for n, route in enumerate(trips.routes):
         edges = quoteattr(" ".join(route))
-        lines.append(
-            f'  <route id="r{n}" edges={edges}/>\n'
-            if metered
-            else (
+        if metered:
+            lines.append(f'  <route id="r{n}" edges={edges}/>\n')
+        else:
+            lines.append(
                 f'  <vehicle id="v{n}" type="car" depart="{trips.depart[n]:.2f}" {departing} '
                 f'arrivalPos="{trips.arrival[n]:.1f}"><route edges={edges}/></vehicle>\n'
             )
-        )
-    lines.append("</routes>\n")
-    path = Path(path)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    with os.fdopen(handle, "w", encoding="utf-8") as stream:
-        stream.writelines(lines)
-    os.replace(temporary, path)
+    path.write_text("".join([*lines, "</routes>\n"]), encoding="utf-8")
     return trips
 
 
+def turning_flows(city: City, demand: PairsOverTime, step: float) -> Mapping[tuple[str, str], float]:
+    """Return (edge, next edge) -> flow [veh/s] in the busiest quarter of an hour of `demand` (T, R, R) [veh/s].
+
+    Trips take static routes without delays; the mean of several planning seeds. Unused movements are missing.
+    """
+    window = min(PEAK_S, step * len(demand))
+    turns: Counter[tuple[str, str]] = Counter()
+    for seed in PLANNING_SEEDS:
+        trips = make_trips(city, demand, step, seed)
+        for route in trips.routes[busiest(trips.depart, window)]:
+            turns.update(pairwise(route))
+    return {turn: count / (window * len(PLANNING_SEEDS)) for turn, count in turns.items()}
+
+
+def busiest(depart: PerTrip, window: float) -> slice:
+    """Return the trips that depart in the busiest `window` [s]; depart: (N,) [s], sorted."""
+    if not len(depart):
+        return slice(0)
+    ends = np.searchsorted(depart, depart + window)
+    first = int(np.argmax(ends - np.arange(len(ends))))
+    return slice(first, int(ends[first]))
+
+
 def make_trips(city: City, demand: PairsOverTime, step: float, seed: int) -> Trips:
-    """Individual trips of `demand` (T, R, R) [veh/s], intervals of `step` [s].
+    """Return individual trips of `demand` (T, R, R) [veh/s], intervals of `step` [s].
 
     Every pair of regions gets its number of vehicles to within one, at the times at which its cumulated demand passes
-    whole numbers, shifted by a random phase. Edges are drawn by length times lanes. Each route is a shortest one in
-    free-flow time as one of `DRIVER_CLASSES` groups of drivers sees it. InputError where no way leads from i to j.
+    whole numbers, shifted by a random phase. Edges are drawn by length times lanes. Each route is the fastest one in
+    free flow as one of `DRIVER_CLASSES` groups of drivers sees it. Raises InputError if no way leads from i to j.
     """
     if demand.shape[1:] != (city.regions, city.regions):
         raise InputError(f"{city.net_file}: demand for {demand.shape[1]} regions, but the city has {city.regions}")
@@ -143,7 +157,7 @@ def make_trips(city: City, demand: PairsOverTime, step: float, seed: int) -> Tri
 def _departures(
     demand: PairsOverTime, step: float, rng: np.random.Generator
 ) -> tuple[PerTrip, TripNumbers, TripNumbers]:
-    """(times, origins, destinations), sorted by time, rounded to 0.01 s."""
+    """Return departures rounded to 0.01 s and sorted, origins and destinations."""
     clock = step * np.arange(len(demand) + 1)
     times, origins, destinations = [], [], []
     for i in range(demand.shape[1]):
@@ -164,10 +178,9 @@ def _departures(
 
 
 def _ends(city: City, region: int, *, departing: bool) -> tuple[list[str], np.ndarray]:
-    """The edges of a region where trips start (or end), and their cumulated weights.
+    """Return the edges of a region where trips start or end, and their cumulated weights.
 
-    Not where a trip would have to leave the region at once (or could only have come from outside), not on turn
-    pockets and short pieces: unless there is nothing else.
+    Edges from which a trip leaves the region at once, turn pockets and short pieces count only if nothing else is left.
     """
     edges = [edge for edge in city.edges if city.region_of[edge] == region]
     before = _predecessors(city)
@@ -175,11 +188,11 @@ def _ends(city: City, region: int, *, departing: bool) -> tuple[list[str], np.nd
     good = [
         edge
         for edge in edges
-        if _stays(city, edge, onward) and city.length[edge] >= SHORT and not _is_pocket(city, edge, before[edge])
+        if _stays(city, edge, onward) and city.length[edge] >= SHORT_EDGE_M and not _is_pocket(city, edge, before[edge])
     ]
-    chosen = good if len(good) >= 2 else edges
-    weights = np.cumsum([city.length[edge] * city.lanes[edge] for edge in chosen])
-    return chosen, weights / weights[-1]
+    ends = good if len(good) >= 2 else edges
+    weights = np.cumsum([city.length[edge] * city.lanes[edge] for edge in ends])
+    return ends, weights / weights[-1]
 
 
 def _predecessors(city: City) -> dict[str, list[str]]:
@@ -191,7 +204,7 @@ def _predecessors(city: City) -> dict[str, list[str]]:
 
 
 def _stays(city: City, edge: str, onward: Mapping[str, Sequence[str]]) -> bool:
-    """Whether some way on from the edge stays in its region; a dead end does not."""
+    """Return True if a way on from the edge stays in its region; a dead end does not."""
     seen = {edge}
     here = edge
     while len(onward[here]) == 1 and onward[here][0] not in seen:
@@ -203,10 +216,10 @@ def _stays(city: City, edge: str, onward: Mapping[str, Sequence[str]]) -> bool:
 
 
 def _is_pocket(city: City, edge: str, before: list[str]) -> bool:
-    """A short piece with more lanes at the end of a road."""
+    """Return True for a short piece with more lanes at the end of a road."""
     return (
         len(before) == 1
-        and city.length[edge] < 80.0
+        and city.length[edge] < POCKET_M
         and city.lanes[edge] > city.lanes[before[0]]
         and (city.successors[before[0]] == (edge,))
     )
@@ -218,10 +231,10 @@ def _draw(ends: tuple[list[str], np.ndarray], uniform: float) -> str:
 
 
 class Ways:
-    """Shortest paths over the edges as nodes: an arc costs the junction and the edge after it."""
+    """Fastest routes in free flow for several groups of drivers: a move costs the junction and the edge after it."""
 
     def __init__(self, city: City, rng: np.random.Generator):
-        """rng: draws how each group of drivers sees the travel times"""
+        """rng: draws the travel times that each group of drivers sees"""
         self.city = city
         number = {edge: n for n, edge in enumerate(city.edges)}
         arcs = [(number[a], number[b], city.turn_time[a, b]) for a, after in city.successors.items() for b in after]
@@ -231,8 +244,8 @@ class Ways:
         self._noise = np.exp(CLASS_SPREAD * rng.standard_normal((DRIVER_CLASSES, len(city.edges))))
 
     def routes(self, first: TripNumbers, last: TripNumbers, tastes: TripNumbers) -> list[tuple[str, ...]]:
-        """The route of every trip; empty where there is none."""
-        found: list[tuple[str, ...]] = [()] * len(first)
+        """Return the route of every trip, () if there is none."""
+        routes: list[tuple[str, ...]] = [()] * len(first)
         count = len(self.city.edges)
         for taste in range(DRIVER_CLASSES):
             cost = self._turn + (self._time * self._noise[taste])[self._to]
@@ -244,8 +257,8 @@ class Ways:
                     continue
                 _, before = dijkstra(graph, indices=chunk, return_predecessors=True)
                 for n in members[np.isin(first[members], chunk)]:
-                    found[n] = self._walk(before[np.searchsorted(chunk, first[n])], first[n], last[n])
-        return found
+                    routes[n] = self._walk(before[np.searchsorted(chunk, first[n])], first[n], last[n])
+        return routes
 
     def _walk(self, before: np.ndarray, first: int, last: int) -> tuple[str, ...]:
         way = [last]

@@ -98,15 +98,14 @@ CITY_WORDS: Mapping[str, tuple[str, Any, str]] = {
     "hold-back": ("actuation", "hold-back", "green taken from a gateway is red for all"),
     "redistribute": ("actuation", "redistribute", "green taken from a gateway goes to the other movements"),
     "estimate": ("measurement", "estimate", "the controller sees estimates from detectors and probe vehicles"),
-    "metering": ("metering", True, "trips wait outside while their region is full, or as the controller commands"),
+    "metering": ("metering", 1.2, "trips wait outside while their region is full, or as the controller commands"),
     "guided": ("guided", True, "drivers are guided by travel times"),
 }
 # Word-N -> key of [sumo], least N, largest N, unit, text.
 CITY_NUMBERS: Mapping[str, tuple[str, int, int, str, str]] = {
     "rerouting": ("rerouting", 1, 100, "percent", "N percent of the drivers reroute by themselves"),
     "compliance": ("compliance", 0, 100, "percent", "N percent of the drivers follow the guidance"),
-    "queue-override": ("queue_override", 1, 100, "percent", "a gateway opens while its road is N percent full"),
-    "metering": ("metering_level", 1, 1000, "percent", "metering at N percent of the critical accumulation"),
+    "metering": ("metering", 1, 1000, "percent", "metering at N percent of the critical accumulation"),
     "guidance-period": ("guidance_period", 1, 3600, "seconds", "drivers are guided again every N seconds"),
 }
 
@@ -269,8 +268,6 @@ def parse(controller: str | Controller, city: str = "") -> Strategy:
         if key in by_key:
             raise InputError(f"strategy {name!r}: {by_key[key]} and {word} exclude each other; omit one of them")
         by_key[key], settings[key] = word, value
-    if "metering_level" in settings:
-        settings["metering"] = True
     return Strategy(name=name, controller=kind, city=settings, words=tuple(words))
 
 

@@ -1,0 +1,330 @@
+"""Perimeter control to green: how commands limit the green of gateway links, signal by signal.
+
+With s = (u_ih - u_min) / (u_max - u_min), the share that is commanded, and m the minimum green, a gateway link i -> h
+keeps m + s (L - m) seconds
+
+- of every window of L seconds at a fixed-time signal (GatewaySignal), from its beginning,
+- of every cycle at a signal that SUMO times by detectors (ResponsiveSignal) or max-pressure runs (Ration): L is the
+  nominal green in a cycle, or the whole cycle.
+
+Then come the original yellow and red. Green is only taken away, so no two movements are green together that never
+were, and s = 1 is the original programme. The green that is taken stays red (hold-back), or phases without a gateway
+movement get it within an unchanged cycle and unchanged intergreens (redistribute).
+"""
+
+from bisect import bisect_right
+from collections.abc import Callable, Collection, Mapping, Sequence
+from itertools import accumulate
+
+import numpy as np
+
+from cosim.sumo.session import Phase, Programme, Session
+from cosim.sumo.signals import GREEN, is_stage
+from nmfd.arrays import PerPair
+
+MIN_GREEN_S = 5.0  # of a gateway link, and of every stage under max-pressure
+DEFAULT_YELLOW_S = 3.0  # where the original programme has none after a green
+NEVER = float("inf")
+
+
+class GatewaySignal:
+    """A fixed-time signal with gateway links.
+
+    signal, phases: of the original programme; next_change: time of the next `update` [s]
+    """
+
+    def __init__(
+        self,
+        programme: Programme,
+        movements: Mapping[int, tuple[int, int]],
+        *,
+        start: float,
+        redistribute: bool = False,
+    ):
+        """movements: link index -> (i, h); start: simulation time at which the programme was read [s]"""
+        self.signal, self.phases = programme.signal, programme.phases
+        self._states = [phase.state for phase in programme.phases]
+        self._original = [phase.duration for phase in programme.phases]
+        self._movements = {link: _Movement(pair) for link, pair in movements.items()}
+        self._redistribute, self._cycle = redistribute, programme.cycle
+        self._windows = {link: _windows(programme, link) for link in movements}
+        self._yellow = {link: yellow_time(programme.phases, link) for link in movements}
+        self._cycle_start = start - programme.position
+        self._ends = list(accumulate(self._original))
+        self._shown, self._since, self.next_change = "", start, start
+
+    def command(self, share: PerPair) -> None:
+        """Set the shares (R, R) [-] of the windows or cycles that begin from now on."""
+        for movement in self._movements.values():
+            movement.share = float(share[movement.pair])
+
+    def update(self, now: float) -> str:
+        """Return the state from `now` [s] on; call at every `next_change`."""
+        for link, movement in self._movements.items():
+            if self._shown and self._shown[link] in GREEN:
+                movement.green_time += now - self._since
+        while now >= self._cycle_start + self._cycle:
+            self._cycle_start += self._cycle
+            self._ends = list(accumulate(self._durations()))
+        phase = min(bisect_right(self._ends, now - self._cycle_start + 1e-6), len(self._ends) - 1)
+        base, changes = self._states[phase], [self._cycle_start + self._ends[phase]]
+        shown = list(base)
+        for link, movement in self._movements.items():
+            shown[link], change = self._filter(link, movement, base[link], phase, now)
+            changes.append(change)
+        self._shown, self._since, self.next_change = "".join(shown), now, min(changes)
+        return self._shown
+
+    def green_time(self) -> dict[int, float]:
+        """Return the green of every gateway link up to the last update [s]."""
+        return {link: movement.green_time for link, movement in self._movements.items()}
+
+    def _durations(self) -> list[float]:
+        """Return the phase durations of the cycle that begins; their sum is the original one."""
+        if not self._redistribute:
+            return self._original
+        shares: dict[int, float] = {}
+        for link, movement in self._movements.items():
+            for phase, state in enumerate(self._states):
+                if state[link] in GREEN and "y" not in state:
+                    shares[phase] = max(shares.get(phase, 0.0), movement.share)
+        takers = [phase for phase, state in enumerate(self._states) if phase not in shares and is_stage(state)]
+        if not takers:
+            return self._original
+        durations = list(self._original)
+        for phase, share in shares.items():
+            least = min(MIN_GREEN_S, durations[phase])
+            durations[phase] = least + float(round(share * (durations[phase] - least)))
+        freed = sum(self._original) - sum(durations)
+        weights = [self._original[phase] for phase in takers]
+        for phase, extra in zip(takers, _apportion(freed, weights), strict=True):
+            durations[phase] += extra
+        return durations
+
+    def _filter(self, link: int, movement: "_Movement", base: str, phase: int, now: float) -> tuple[str, float]:
+        """Return the light of a link instead of `base`, and the time of its next change [s]."""
+        full = self._windows[link].get(phase, 0.0)
+        always = full >= self._cycle  # a link without red: its window is the cycle
+        if base in GREEN:
+            if not movement.open or (always and now - movement.opened_at >= self._cycle - 1e-6):
+                movement.open, movement.cut_at = True, NEVER
+                if self._shown:  # the window during which control starts is left whole
+                    movement.opened_at, movement.cut_at = now, now + _kept(movement.share, full)
+            if now < movement.cut_at:
+                return base, movement.cut_at
+        else:
+            movement.open = False
+            if base != "y":
+                movement.cut_at = NEVER
+                return base, NEVER
+            if now < movement.cut_at:
+                return base, NEVER
+        red_at = movement.cut_at + self._yellow[link]
+        return ("y", red_at) if now < red_at else ("r", NEVER)
+
+
+class _Movement:
+    """State of a gateway link between two updates."""
+
+    def __init__(self, pair: tuple[int, int]):
+        self.pair, self.green_time, self.share = pair, 0.0, 1.0
+        self.open, self.opened_at, self.cut_at = False, -NEVER, NEVER
+
+
+def _kept(share: float, full: float) -> float:
+    """Return the green that is kept of a window of `full` seconds."""
+    least = min(MIN_GREEN_S, full)
+    return full if share >= 1.0 else least + round(share * (full - least))
+
+
+def _windows(programme: Programme, link: int) -> dict[int, float]:
+    """Return phase -> length [s] of the green window of a link that begins there; it may pass the cycle's end."""
+    phases = programme.phases
+    green = [phase.state[link] in GREEN for phase in phases]
+    if all(green):
+        return {0: programme.cycle}
+    starts = [n for n in range(len(phases)) if green[n] and not green[n - 1]]
+    return {n: _run_length(phases, n, link, GREEN) for n in starts}
+
+
+def yellow_time(phases: Sequence[Phase], link: int) -> float:
+    """Return the longest yellow after a green of a link [s]."""
+    starts = [n for n, phase in enumerate(phases) if phase.state[link] == "y" and phases[n - 1].state[link] in GREEN]
+    return max((_run_length(phases, n, link, "y") for n in starts), default=DEFAULT_YELLOW_S)
+
+
+def _run_length(phases: Sequence[Phase], first: int, link: int, lights: Collection[str]) -> float:
+    """Return how long a link shows one of `lights` from phase `first` on [s]."""
+    length, n = 0.0, first
+    while phases[n % len(phases)].state[link] in lights:
+        length, n = length + phases[n % len(phases)].duration, n + 1
+    return length
+
+
+def _apportion(total: float, weights: list[float]) -> list[float]:
+    """Share `total` whole seconds by weight, in whole seconds (largest remainders)."""
+    exact = np.array(weights) / sum(weights) * total
+    shares = np.floor(exact)
+    left = total - shares.sum()
+    for n in np.argsort(shares - exact, kind="stable")[: int(left)]:
+        shares[n] += 1.0
+    shares[0] += total - shares.sum()
+    return shares.tolist()
+
+
+class Ration:
+    """The green of one gateway link, limited per cycle; share 1 is no limit.
+
+    pair: (i, h), whose command it follows
+    """
+
+    def __init__(self, pair: tuple[int, int], *, cycle: float, yellow: float, start: float, full: float | None = None):
+        """start: time at which the first cycle begins [s]; full: green of share 1 in a cycle, the cycle if None [s]"""
+        self.pair, self._green_time = pair, 0.0
+        self._full = cycle if full is None else full
+        self._cycle, self._least, self._yellow = cycle, min(MIN_GREEN_S, self._full), yellow
+        self._share, self._budget, self._spent = 1.0, NEVER, 0.0
+        self._cycle_end = start
+        self._open, self._opened_at = False, -NEVER
+        self._light, self._since, self._yellow_until = "r", start, start
+
+    def command(self, share: float) -> None:
+        """Set the share [-] of the cycles that begin from now on."""
+        self._share = share
+
+    @property
+    def limited(self) -> bool:
+        """Return True if this cycle limits the green."""
+        return self._budget < NEVER
+
+    @property
+    def exhausted(self) -> bool:
+        """Return True if the link gets no more green in this cycle."""
+        return not self._open and self._budget - self._spent < self._least - 1e-6
+
+    def show(self, light: str, now: float, *, lasting: bool = True) -> tuple[str, float]:
+        """Return the light instead of `light` from `now` [s] on, and the time of the next call.
+
+        Call it also when `light` changes. lasting: a green lasts for the minimum green at least
+        """
+        if self._light in GREEN:
+            self._spent += now - self._since
+            self._green_time += now - self._since
+        self._since = now
+        while now >= self._cycle_end - 1e-6:
+            self._cycle_end += self._cycle
+            self._spent = 0.0
+            limit = self._least + self._share * (self._full - self._least)
+            self._budget = NEVER if self._share >= 1.0 else limit
+        self._light, again = self._filter(light, now, lasting)
+        return self._light, min(again, self._cycle_end)
+
+    def green_time(self, now: float) -> float:
+        """Return the green before `now` [s]."""
+        return self._green_time + (now - self._since if self._light in GREEN else 0.0)
+
+    def opened(self, now: float) -> bool:
+        """Return True if the link turned green just now."""
+        return self._open and self._opened_at >= now - 1e-6
+
+    def _filter(self, light: str, now: float, lasting: bool) -> tuple[str, float]:
+        left = self._budget - self._spent
+        if light in GREEN:
+            if self._open and left <= 1e-6:
+                self._open, self._yellow_until = False, now + self._yellow
+            elif not self._open and lasting and now >= self._yellow_until - 1e-6 and left >= self._least - 1e-6:
+                self._open, self._opened_at = True, now
+            if self._open:
+                return light, now + left
+        elif self._open:
+            self._open = light == "y"  # its yellow after this green
+            return light, NEVER
+        return ("y", self._yellow_until) if now < self._yellow_until - 1e-6 else ("r", NEVER)
+
+
+class ResponsiveSignal:
+    """A signal that SUMO times by detectors, with gateway links.
+
+    Its programme runs on underneath, and what is shown follows it one step behind. SUMO's own programme shows itself
+    as long as no green is taken away.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        programme: Programme,
+        movements: Mapping[int, tuple[int, int]],
+        *,
+        show: Callable[[str, str], None],
+        release: Callable[[str, str], None],
+    ):
+        """movements: link index -> (i, h); show(signal, state), release(signal, programme): see Incidents"""
+        self.signal, self.phases, self._programme = programme.signal, programme.phases, programme.id
+        self._session, self._show, self._release = session, show, release
+        phases, start = programme.phases, session.time
+        self._rations = {
+            link: Ration(
+                pair,
+                cycle=programme.cycle,
+                full=sum(p.duration for p in phases if p.state[link] in GREEN),
+                yellow=yellow_time(phases, link),
+                start=start,
+            )
+            for link, pair in movements.items()
+        }
+        self._always = {link for link in movements if all(phase.state[link] in GREEN for phase in phases)}
+        self._base, self._since, self._next, self._held, self._limited = "", start, start, False, False
+
+    def command(self, share: PerPair) -> None:
+        """Set the shares (R, R) [-] from the next cycle on."""
+        for ration in self._rations.values():
+            ration.command(float(share[ration.pair]))
+        self._limited = any(share[ration.pair] < 1.0 for ration in self._rations.values())
+        self._next = self._since
+
+    def play(self, now: float) -> None:
+        """Set the state from `now` [s] on, or leave the signal to SUMO."""
+        if self._held:
+            base = self._session.state_underneath(self.signal, self._programme)
+        else:
+            base = self._session.signal_state(self.signal)
+        if base == self._base and now < self._next - 1e-6:
+            return
+        before, self._base = self._base, base
+        if base != before:
+            self._since = now
+        shown = list(base)
+        self._next = NEVER
+        for link, ration in self._rations.items():
+            begun = not before or before[link] not in GREEN  # a window that begins lasts for SUMO's own minimum
+            light, again = ration.show(
+                "G" if not before and base[link] == "y" else base[link],  # a first yellow as that after a green
+                now,
+                lasting=begun or link in self._always,
+            )
+            self._next = min(self._next, again)
+            if light == "y" or base[link] in "Ggy":
+                shown[link] = light
+        if not before:
+            self._next = now
+        elif self._held or self._limited:
+            self._hold("".join(shown), now)
+
+    def green_time(self) -> dict[int, float]:
+        """Return the green of every gateway link so far [s]."""
+        return {link: ration.green_time(self._session.time) for link, ration in self._rations.items()}
+
+    def _hold(self, state: str, now: float) -> None:
+        """Show `state` from the first limit on, and give the signal back to SUMO after the last one.
+
+        It is given back in the midst of a stage: one that just began could end, one step behind SUMO, too early.
+        """
+        limited = self._limited or any(ration.limited for ration in self._rations.values())
+        again = NEVER if limited or state != self._base or not is_stage(state) else self._since + MIN_GREEN_S
+        self._held = now < again - 1e-6
+        if self._held:
+            self._show(self.signal, state)
+        else:
+            again = NEVER
+            self._release(self.signal, self._programme)
+        self._next = min(self._next, again)

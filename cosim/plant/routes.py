@@ -1,0 +1,308 @@
+"""Travel times along streets and over junctions, and searches for the fastest ways at these times.
+
+A few vehicles are on one street at a time, so recent minutes count together, the newest most: on a street by the mean
+speed, over a junction by Little's law, vehicles on it over vehicles that get over it per second. In the mesoscopic
+model, which has no junctions to wait on, the newest control interval counts half.
+"""
+
+import math
+from collections import OrderedDict
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components, dijkstra
+
+from cosim.plant.sampling import StreetMeans
+from cosim.sumo.arrays import EdgeMask, GatewayMask, MoveEnds, PerEdge, PerGateway, PerInside, PerMove
+from cosim.sumo.net import City
+
+MESO_SMOOTHING = 0.5  # weight of the newest control interval in the mesoscopic model
+WINDOW_S = 300.0  # after which an observation counts a third
+EMPTY_WEIGHT = 0.5  # of earlier observations after a control interval without vehicles
+PRIOR_VEH_S = 3.0  # at the speed limit, which count besides
+STANDING_M_S = 0.1  # lowest speed of a travel time
+FAR_S = 1e9  # longer than any way
+MOST_NODES = 20_000_000  # of the trees that are kept, of 4 to 12 bytes each
+FEWEST_TREES = 8  # that are kept, however large the city: one decision needs as many
+
+
+class TravelTimes:
+    """Travel times of one run.
+
+    first, second: (M,), numbers of the edges that each move joins; free: (E,) [s], in free flow; free_turns: (M,) [s]
+    edges: (E,) [s], present times along edges; turns: (M,) [s], of moves over junctions
+    """
+
+    first: MoveEnds
+    second: MoveEnds
+    free: PerEdge
+    free_turns: PerMove
+    edges: PerEdge
+    turns: PerMove
+
+    def __init__(self, city: City, *, lanes: bool = True):
+        """lanes: False in the mesoscopic model"""
+        self._lanes = lanes
+        number = {edge: n for n, edge in enumerate(city.edges)}
+        moves = [(e, f) for e, after in city.successors.items() for f in after]
+        self.first, self.second = np.array([(number[e], number[f]) for e, f in moves]).T
+        self._length = np.array([city.length[edge] for edge in city.edges])
+        self._limit = np.array([city.speed[edge] for edge in city.edges])
+        self.free, self.free_turns = self._length / self._limit, np.array([city.turn_time[move] for move in moves])
+        self.edges, self.turns = self.free.copy(), self.free_turns.copy()
+        inside = {edge: n for n, edge in enumerate(city.inside)}
+        self._longest = np.array(list(city.inside.values())) / STANDING_M_S
+        # Pairs of moves and internal edges that they lead over, which several moves may share.
+        over = [(n, inside[edge]) for n, move in enumerate(moves) for edge in city.over.get(move, ()) if edge in inside]
+        self._move, self._via = np.array(over, dtype=int).reshape(-1, 2).T
+        # Weighted sums: time [veh s] and distance [veh m] on edges, time and ways over [veh] on internal ones.
+        self._spent, self._driven = np.zeros((2, len(number)))
+        self._crossing, self._crossed = np.zeros((2, len(inside)))
+
+    def learn(self, seen: StreetMeans) -> None:
+        """Update the times from the means of a control interval."""
+        if not self._lanes:
+            now = np.where(np.isnan(seen.speed), self.free, self._length / np.maximum(seen.speed, STANDING_M_S))
+            self.edges = self.edges + MESO_SMOOTHING * (np.maximum(now, self.free) - self.edges)
+            return
+        kept, spent = math.exp(-seen.duration / WINDOW_S), seen.vehicles * seen.duration
+        used = spent > 0.0
+        kept_here = np.where(used, kept, min(kept, EMPTY_WEIGHT))
+        self._spent = kept_here * self._spent + spent
+        self._driven = kept_here * self._driven + spent * np.where(used, seen.speed, 0.0)
+        speed = (self._driven + PRIOR_VEH_S * self._limit) / (self._spent + PRIOR_VEH_S)
+        speed[seen.speed == 0.0] = 0.0  # closed, or all vehicles stand
+        self.edges = np.maximum(self._length / np.maximum(speed, STANDING_M_S), self.free)
+        self._crossing = kept * self._crossing + seen.crossing * seen.duration
+        self._crossed = kept * self._crossed + seen.crossed * seen.duration
+        self.turns = np.maximum(np.bincount(self._move, self._over()[self._via], len(self.turns)), self.free_turns)
+
+    def _over(self) -> PerInside:
+        """Return [s] over each internal edge, 0 without vehicles."""
+        standing = np.where(self._crossing > 0.0, self._longest, 0.0)
+        takes = np.divide(self._crossing, self._crossed, out=standing.copy(), where=self._crossed > 0.0)
+        return np.minimum(takes, self._longest)
+
+
+class Moves:
+    """Moves between allowed edges as a graph of these edges, from first[n] to second[n] or, reversed, back.
+
+    number: edge -> its node, -1 for edges that are not allowed
+    """
+
+    def __init__(self, first: MoveEnds, second: MoveEnds, *, allowed: EdgeMask, reverse: bool):
+        """first, second: (M,), numbers of edges; allowed: (E,)"""
+        self.edges = np.flatnonzero(allowed)
+        self.number = np.full(len(allowed), -1)
+        self.number[self.edges] = np.arange(len(self.edges))
+        rows, columns = (self.number[part] for part in ((second, first) if reverse else (first, second)))
+        kept = np.flatnonzero(allowed[first] & allowed[second])
+        kept = kept[np.lexsort((columns[kept], rows[kept]))]
+        self._kept, self._second, self._columns = kept, second[kept], columns[kept].astype(np.int32)
+        self._begins = np.searchsorted(rows[kept], np.arange(len(self.edges) + 1)).astype(np.int32)
+        self._ids = self.edges.tolist()
+
+    def costing(self, time: PerEdge, turns: PerMove, ahead: Float[np.ndarray, " nodes"] | None = None) -> csr_array:
+        """Return the graph with costs [s]: of a move (turns, (M,)) and of the edge that it leads to (time, (E,)).
+
+        ahead: (nodes,) [s]; costs are less by the time that a move comes nearer, so that a search from t finds cost +
+        ahead - ahead[t], and detours last (A*)
+        """
+        cost = np.maximum(time[self._second] + turns[self._kept], 1e-3)
+        if ahead is not None:
+            cost += ahead[self._columns] - np.repeat(ahead, np.diff(self._begins))
+        return csr_array((cost, self._columns, self._begins), shape=(len(self.edges),) * 2)
+
+    def leading_to(self, nodes: Int[np.ndarray, " G"]) -> Bool[np.ndarray, "nodes G"]:
+        """Return (all nodes, G) bool: each of `nodes` (G,) can be reached from it."""
+        moves = csr_array((np.ones(len(self._columns)), self._columns, self._begins), shape=(len(self.edges),) * 2)
+        # Nodes that lead to each other are reached from the same ones: in most cities nearly all.
+        _, part = connected_components(moves, connection="strong")
+        _, once, which = np.unique(part[nodes], return_index=True, return_inverse=True)
+        return np.isfinite(dijkstra(moves.T.tocsr(), indices=nodes[once], unweighted=True)).T[:, which]
+
+    def ahead(self, nodes: Int[np.ndarray, " G"], time: PerEdge, turns: PerMove) -> Float[np.ndarray, " nodes"]:
+        """Return (all nodes,) [s], just below the time to the nearest of `nodes` (G,), FAR_S if there is none."""
+        least = dijkstra(self.costing(time, turns).T.tocsr(), indices=nodes, min_only=True)
+        return np.where(np.isfinite(least), (1.0 - 1e-6) * least, FAR_S)  # below: no move may cost nothing
+
+    def path(self, before: Int[np.ndarray, " nodes"], first: int, last: int) -> list[int]:
+        """Return the edges from node `first` to node `last` by the predecessors of a search from `last`."""
+        way = [self._ids[first]]
+        while first != last:
+            first = before[first]
+            way.append(self._ids[first])
+        return way
+
+
+class Searches:
+    """Cache of search trees by owner and beginning, at most `most` nodes in all; the least recently used go first."""
+
+    def __init__(self, most: int = MOST_NODES):
+        self._most, self._nodes = most, 0
+        self._trees: OrderedDict[tuple[object, int], tuple[tuple, int]] = OrderedDict()
+
+    def get(self, owner: object, begin: int) -> tuple[Any, ...] | None:
+        """Return the tree of `owner` for `begin`, None if it is not there."""
+        if (entry := self._trees.get((owner, begin))) is None:
+            return None
+        self._trees.move_to_end((owner, begin))
+        return entry[0]
+
+    def put(self, owner: object, begin: int, tree: tuple, nodes: int) -> tuple[Any, ...]:
+        """Keep a tree in place of that before, and return it."""
+        _, before = self._trees.pop((owner, begin), (None, 0))
+        self._trees[owner, begin] = tree, nodes
+        self._nodes += nodes - before
+        while self._nodes > self._most and len(self._trees) > FEWEST_TREES:
+            _, (_, gone) = self._trees.popitem(last=False)
+            self._nodes -= gone
+        return tree
+
+
+class Trees:
+    """Fastest ways by `moves` from single edges, searched on demand and no further than needed."""
+
+    def __init__(self, moves: Moves, time: PerEdge, turns: PerMove, searches: Searches):
+        """time: (E,) [s]; turns: (M,) [s]"""
+        self.time, self.number = time, moves.number
+        self._moves, self._costs = moves, moves.costing(time, turns)
+        # Not this object itself: `searches` would hold it, and both would stay until the garbage is collected.
+        self._searches, self._owner = searches, object()
+
+    def costs(self, begin: int, most: float) -> Float[np.ndarray, " nodes"]:
+        """Return (nodes,) [s] from edge `begin`; more than `most` may be infinite."""
+        tree = self._searches.get(self._owner, begin)
+        if tree is None or tree[0] < most:
+            cost, before = dijkstra(self._costs, indices=self.number[begin], return_predecessors=True, limit=most)
+            tree = self._searches.put(self._owner, begin, (most, cost, before), len(cost))
+        return tree[1]
+
+    def back(self, begin: int, end: int) -> list[int]:
+        """Return the edges from `end` back to `begin`, after `costs` of `begin`."""
+        tree = self._searches.get(self._owner, begin)
+        assert tree is not None
+        return self._moves.path(tree[2], int(self.number[end]), int(self.number[begin]))
+
+
+class Home(Trees):
+    """Fastest ways to single edges, by reversed moves."""
+
+    def cost(self, here: int, target: int, most: float) -> float:
+        """Return [s] from the end of edge `here` to the end of edge `target`, infinite above `most`."""
+        cost = self.costs(target, most)[self.number[here]]
+        return float(cost) if cost <= most else np.inf
+
+    def route(self, here: int, target: int) -> list[int]:
+        """Return the edges from `here` to `target`, after `cost`."""
+        return self.back(target, here)
+
+
+class Ways:
+    """Fastest ways out of one region by each of its G gateways (first[g] -> second[g], into next_region[g]).
+
+    Gateways begins[n] to ends[n] - 1 lead into region neighbours[n]. Searches start where drivers are and where they
+    go, on demand and no further than needed. A way that comes back into the region before it leaves for good
+    (`returning`) has the same end, from the last gateway on.
+    """
+
+    def __init__(
+        self,
+        first: Int[np.ndarray, " G"],
+        second: Int[np.ndarray, " G"],
+        next_region: Int[np.ndarray, " G"],
+        *,
+        inside: Moves,
+        outside: Moves,
+        crossing: PerGateway,
+        leading: Bool[np.ndarray, "inside G"],
+        reached: Bool[np.ndarray, "nodes G"],
+        ahead: Float[np.ndarray, " nodes"],
+        time: PerEdge,
+        turns: PerMove,
+        searches: Searches,
+        everywhere: tuple[Trees, PerGateway, PerGateway] | None = None,
+    ):
+        """first, second, next_region: (G,), the last one rising
+        inside: moves in the region; outside: reversed moves elsewhere; crossing: (G,) [s], over each gateway
+        leading: (nodes of `inside`, G), first[g] can be reached; reached: (nodes of `outside`, G), from second[g]
+        ahead: (nodes of `outside`,) [s], to the nearest second[g] at times not above `time` (E,) and `turns` (M,) [s]
+        everywhere: ways by all moves, (G,) [s] over each gateway on these, and (G,) [s], not above the time from behind
+            the nearest gateway back to first[g]; None if no way may come back
+        """
+        self.time, self._inside, self._outside, self._ahead = time, inside, outside, ahead
+        self._leading, self._reached = leading, reached
+        self._gates, self._first, self._second = first, inside.number[first], outside.number[second]
+        self._entering, self._everywhere = crossing + time[second], None
+        if everywhere is not None:
+            trees, over, back = everywhere
+            self._everywhere = trees, trees.number[first], over + time[second], back
+        self.neighbours, self.begins = np.unique(next_region, return_index=True)
+        self.ends = np.append(self.begins[1:], len(next_region))
+        self._costs = inside.costing(time, turns), outside.costing(time, turns, ahead)
+        self._searches, self._from_here, self._to_there = searches, object(), object()
+
+    def cost(self, here: int, target: int, most: float) -> tuple[PerGateway, GatewayMask]:
+        """Return (G,) [s] from the end of `here` to the end of `target`, infinite above `most`; and (G,) bool, a way
+        exists."""
+        last = int(self._outside.number[target])
+        open_ways = self._leading[self._inside.number[here]] & self._reached[last]
+        within = max(most - self._ahead[last], 0.0)
+        tree = self._searches.get(self._from_here, here)
+        if tree is None or tree[0] < within:
+            cost, before = dijkstra(
+                self._costs[0], indices=self._inside.number[here], return_predecessors=True, limit=within
+            )
+            there = cost[self._first] + self._entering
+            tree = self._searches.put(
+                self._from_here, here, (within, there, float(there.min(initial=np.inf)), before), len(before)
+            )
+        _, there, nearest, _ = tree
+        if nearest == np.inf:
+            return there, open_ways
+        left = max(most - min(nearest, most) - self._ahead[last], 0.0)
+        onward = self._searches.get(self._to_there, target)
+        if onward is None or onward[0] < left:
+            cost, after = dijkstra(self._costs[1], indices=last, return_predecessors=True, limit=left)
+            onward = self._searches.put(
+                self._to_there, target, (left, cost[self._second] + self._ahead[last], after), len(after)
+            )
+        return there + onward[1], open_ways
+
+    def returning(self, here: int, target: int, most: float) -> tuple[float, int]:
+        """Return [s] of the fastest way of all, and its last gateway, after `cost`.
+
+        Infinite if it takes `most` or longer, or does not come back into the region.
+        """
+        there, onward = self._searches.get(self._from_here, here), self._searches.get(self._to_there, target)
+        if self._everywhere is None or there is None or onward is None:
+            return np.inf, 0
+        trees, gates, entering, back = self._everywhere
+        end = entering + onward[1]
+        # By then it has left, and come back, which alone takes too long for most gateways.
+        end[there[2] + back + end >= most] = np.inf
+        if (nearest := float(end.min(initial=np.inf))) == np.inf:
+            return np.inf, 0
+        cost = trees.costs(here, most - nearest)[gates] + end
+        gateway = int(cost.argmin())
+        return float(cost[gateway]), gateway
+
+    def route(self, here: int, gateway: int, target: int) -> list[int]:
+        """Return the edges from `here` to `target` through `gateway`, after `cost`."""
+        there = self._searches.get(self._from_here, here)
+        assert there is not None
+        to_gateway = self._inside.path(there[-1], int(self._first[gateway]), int(self._inside.number[here]))
+        return to_gateway[::-1] + self._onward(gateway, target)
+
+    def returning_route(self, here: int, gateway: int, target: int) -> list[int]:
+        """Return the edges of the way of `returning`."""
+        assert self._everywhere is not None
+        return self._everywhere[0].back(here, int(self._gates[gateway]))[::-1] + self._onward(gateway, target)
+
+    def _onward(self, gateway: int, target: int) -> list[int]:
+        """Return the edges from behind `gateway` to `target`."""
+        onward = self._searches.get(self._to_there, target)
+        assert onward is not None
+        return self._outside.path(onward[2], int(self._second[gateway]), int(self._outside.number[target]))
