@@ -5,8 +5,8 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from cosim.plant.settings import SumoTable
-from cosim.sumo.recipe import RecipeTable
+from cosim.plant.settings import Settings
+from cosim.sumo.build import RecipeTable
 from nmfd.controllers.strategy import CONTROLLERS
 from nmfd.model.planning import PlanningOptions
 from nmfd.model.regional_model import NetworkTable
@@ -14,7 +14,7 @@ from nmfd.model.scenario import ScenarioTable
 
 PAGE = Path(__file__).parents[1] / "scenarios" / "settings.md"
 FILES = (
-    ("scenario.toml", [ScenarioTable, ("sumo", SumoTable)]),
+    ("scenario.toml", [ScenarioTable, ("sumo", Settings)]),
     ("network.toml", [NetworkTable]),
     ("city.toml", [RecipeTable]),
 )

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from signal_rules import MIN_GREEN, PHASES, SINGLE, check, runs
 
-from cosim.plant.perimeter import YELLOW, GatewaySignal, GatewaySignals, _apportion, yellow_time
-from cosim.plant.settings import MODES
+from cosim.plant.gates import DEFAULT_YELLOW_S, GatewaySignal, _apportion, yellow_time
+from cosim.plant.settings import MODES, REDISTRIBUTE
 from cosim.sumo.session import Phase, Programme
 
 
@@ -17,7 +17,7 @@ def programme(phases, position=0.0):
 
 def play(phases, movements, mode, commands, *, position=0.0, interval=90):
     """The state of every second, under a new command (R, R) every `interval` seconds."""
-    signal = GatewaySignal(programme(phases, position), movements, min_green=MIN_GREEN, mode=mode, start=0.0)
+    signal = GatewaySignal(programme(phases, position), movements, start=0.0, redistribute=mode == REDISTRIBUTE)
     states, shown = [], ""
     for second in range(len(commands) * interval):
         if second % interval == 0:
@@ -66,28 +66,6 @@ def test_green_falls_from_the_original_to_the_minimum():
     assert (np.diff(green) >= 2).all()
 
 
-@pytest.mark.parametrize("mode", MODES)
-def test_an_opened_link_keeps_its_original_green(mode):
-    """The other gateway link of the signal is held all the same."""
-    signal = GatewaySignal(programme(SINGLE), {0: (0, 1), 1: (0, 1)}, min_green=MIN_GREEN, mode=mode, start=0.0)
-    signal.command(np.zeros((2, 2)), opened={0})
-    states = []
-    for second in range(180):
-        states.append(signal.update(float(second)))
-    check(states, SINGLE)
-    green = [sum(state[link] == "G" for state in states[90:]) for link in (0, 1)]
-    assert green[0] == 42
-    assert green[1] == MIN_GREEN if mode == "hold-back" else green[1] < 42
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_where_all_links_are_opened_the_original_programme_runs(mode):
-    signal = GatewaySignal(programme(PHASES), {0: (0, 1)}, min_green=MIN_GREEN, mode=mode, start=0.0)
-    signal.command(np.zeros((2, 2)), opened={0})
-    original = [state for state, duration in PHASES for _ in range(duration)]
-    assert [signal.update(float(second)) for second in range(270)] == 3 * original
-
-
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.7])
 def test_a_green_that_is_cut_has_the_yellow_of_the_programme_and_no_more(share):
     states = play(SINGLE, {0: (0, 1)}, "hold-back", [np.full((2, 2), share)] * 4)
@@ -105,14 +83,14 @@ def test_a_link_that_is_never_red_is_held_once_per_cycle(position):
 
 @pytest.mark.parametrize("mode", MODES)
 def test_before_any_command_the_original_programme_runs(mode):
-    signal = GatewaySignal(programme(SINGLE), {0: (0, 1)}, min_green=MIN_GREEN, mode=mode, start=0.0)
+    signal = GatewaySignal(programme(SINGLE), {0: (0, 1)}, start=0.0, redistribute=mode == REDISTRIBUTE)
     original = [state for state, duration in SINGLE for _ in range(duration)]
     assert [signal.update(float(second)) for second in range(270)] == 3 * original
 
 
 def test_a_time_just_before_the_end_of_the_cycle_is_in_its_last_phase():
     """Sums of simulation steps are off by some rounding."""
-    signal = GatewaySignal(programme(SINGLE), {0: (0, 1)}, min_green=MIN_GREEN, mode="hold-back", start=0.0)
+    signal = GatewaySignal(programme(SINGLE), {0: (0, 1)}, start=0.0)
     assert signal.update(90.0 - 1e-7) == "ry" and signal.update(90.0) == "Gr"
 
 
@@ -143,7 +121,7 @@ def test_every_window_of_a_link_keeps_its_minimum_green():
 
 
 def test_green_time_is_what_was_shown():
-    signal = GatewaySignal(programme(PHASES), {0: (0, 1)}, min_green=MIN_GREEN, mode="hold-back", start=0.0)
+    signal = GatewaySignal(programme(PHASES), {0: (0, 1)}, start=0.0)
     signal.command(np.full((2, 2), 0.5))
     green, shown = 0, ""
     for second in range(271):
@@ -155,7 +133,7 @@ def test_green_time_is_what_was_shown():
 
 def test_u_max_is_the_original_programme_to_the_fraction_of_a_second():
     phases = [("Gr", 42.4), ("yr", 3), ("rG", 41.6), ("ry", 3)]
-    signal = GatewaySignal(programme(phases), {0: (0, 1)}, min_green=MIN_GREEN, mode="hold-back", start=0.0)
+    signal = GatewaySignal(programme(phases), {0: (0, 1)}, start=0.0)
     signal.command(np.ones((2, 2)))
     while signal.next_change < 270.0:
         signal.update(signal.next_change)
@@ -183,33 +161,12 @@ def test_seconds_are_shared_out_whole_and_all(total, weights, shares):
     "states, expected",
     [
         ([("G", 30), ("y", 2), ("y", 3), ("r", 55)], 5),
-        ([("G", 30), ("r", 60)], YELLOW),
+        ([("G", 30), ("r", 60)], DEFAULT_YELLOW_S),
         ([("G", 30), ("y", 4)], 4),
         ([("g", 9), ("y", 3), ("r", 5), ("G", 9), ("y", 4), ("r", 5)], 4),
-        ([("y", 3), ("r", 9)], YELLOW),
+        ([("y", 3), ("r", 9)], DEFAULT_YELLOW_S),
         ([("y", 2), ("r", 9), ("G", 9), ("y", 3)], 5),
     ],
 )
 def test_the_longest_yellow_after_a_green(states, expected):
     assert yellow_time(programme(states).phases, 0) == expected
-
-
-def test_the_actuator_commands_all_signals_and_shows_what_is_due():
-    class Noted:
-        def __init__(self, name, next_change):
-            self.signal, self.next_change, self.commands = name, next_change, []
-
-        def command(self, share, opened):
-            self.commands.append((share.tolist(), tuple(opened)))
-
-        def update(self, now):
-            self.next_change = now + 10.0
-            return f"{self.signal} at {now:g}"
-
-    signals, shown = [Noted("a", 0.0), Noted("b", 5.0)], []
-    actuator = GatewaySignals(signals, lambda signal, state: shown.append((signal, state)))
-    actuator.command(np.full((1, 1), 0.25), {"b": [3]})
-    assert [signal.commands for signal in signals] == [[([[0.25]], ())], [([[0.25]], (3,))]]
-    for now in (0.0, 1.0, 5.0 - 1e-9, 9.0, 10.0):
-        actuator.play(now)
-    assert shown == [("a", "a at 0"), ("b", f"b at {5.0 - 1e-9:g}"), ("a", "a at 10")]

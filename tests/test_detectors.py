@@ -41,7 +41,7 @@ def city(scenario):
 
 
 def drive(scenario, **overrides):
-    plant = SumoPlant(scenario, overrides=Settings(**overrides))
+    plant = SumoPlant(scenario, settings=Settings(**overrides))
     try:
         return closed_loop.run(plant, PiGating(planning_model(scenario)), scenario, seed=3)
     finally:
@@ -83,7 +83,7 @@ def test_probes_are_a_share_of_the_vehicles():
 
 def test_all_links_and_all_probes_see_everything(scenario):
     """Loops on every link come close to the accumulations; probes are all vehicles."""
-    plant = SumoPlant(scenario, overrides=Settings(measurement="estimate", detector_share=1.0, probe_share=1.0))
+    plant = SumoPlant(scenario, settings=Settings(measurement="estimate", detector_share=1.0, probe_share=1.0))
     seen = []
     try:
         state, controller = plant.reset(3), PiGating(planning_model(scenario))
@@ -133,7 +133,7 @@ def test_estimating_changes_nothing_but_what_is_seen(scenario, run):
 
             return Controls(perimeter=run.perimeter[measurement.step], splits=None)
 
-    plant = SumoPlant(scenario, overrides=Settings())
+    plant = SumoPlant(scenario, settings=Settings())
     try:
         exact = closed_loop.run(plant, Again(), scenario, seed=3)
     finally:
@@ -155,7 +155,7 @@ def test_states_are_estimated_with_the_model_of_those_who_drive():
     for model, same in zip(models, (True, False), strict=True):
         plant = SumoPlant(
             scenario,
-            overrides=settings(scenario).changed(measurement="estimate"),
+            settings=settings(scenario).changed(measurement="estimate"),
             planning=replace(planning_model(scenario), network=model),
         )
         try:

@@ -61,7 +61,7 @@ def test_episodes_of_the_regional_model(tmp_path, count):
 
 
 def intervals(scenario, count):
-    plant = SumoPlant(scenario, overrides=settings(scenario))
+    plant = SumoPlant(scenario, settings=settings(scenario))
     network = scenario.network
     controls = Controls(perimeter=np.where(network.adjacency, 0.5, 0.0), splits=network.nominal_splits)
     plant.reset(0)

@@ -11,7 +11,7 @@ from cosim.evaluation import run_metrics
 from cosim.plant.plant import SumoPlant
 from cosim.plant.record import Record
 from cosim.sumo.net import edge_room
-from cosim.sumo.tripinfo import CLASS, read_trip_facts
+from cosim.sumo.outputs import CLASS, read_trip_facts
 from nmfd import metrics
 from nmfd.api import load_scenario
 from nmfd.types import Controls

@@ -9,7 +9,7 @@ import tiny
 import tiny_city
 from commands import call
 
-from cosim.plant.perimeter import YELLOW
+from cosim.plant.gates import DEFAULT_YELLOW_S
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
 from cosim.sumo.net import city_of
@@ -122,7 +122,7 @@ def city(tmp_path_factory):
 def in_sumo(city, *ordered, perimeter=None, watch=None, **changed):
     """The states and the record of a run with these faults; watch(plant) is called after the reset."""
     scenario = replace(city, faults=ordered)
-    plant = SumoPlant(scenario, overrides=settings(scenario).changed(**changed))
+    plant = SumoPlant(scenario, settings=settings(scenario).changed(**changed))
     opened = np.where(city.network.adjacency, city.network.u_max if perimeter is None else perimeter, 0.0)
     try:
         states = [plant.reset(0)]
@@ -176,7 +176,7 @@ def test_a_signal_that_does_not_obey_is_safe(city, signals, gateway):
 
     in_sumo(city, f"signal:{name}@3-6", perimeter=city.network.u_min, watch=watch, signals=signals)
     interval = round(city.step)
-    begin, end = 3 * interval + round(YELLOW), 6 * interval
+    begin, end = 3 * interval + round(DEFAULT_YELLOW_S), 6 * interval
     cycles = [[own[(n + k) % len(own)] for k in range(end - begin)] for n in range(len(own))]
     assert shown[begin:end] in cycles and shown[begin - interval : end - interval] not in cycles
     assert shown[-len(own) :] not in [cycle[: len(own)] for cycle in cycles]

@@ -15,7 +15,7 @@ from streets import FAR_FROM_THE_END, seen
 
 from cosim.plant.guidance import Guide, _Present, shifted
 from cosim.plant.meter import Event
-from cosim.plant.shortest_paths import FAR, FEWEST_KEPT, MOST_KEPT, Home, Moves, Searches, Trees, Ways
+from cosim.plant.routes import FAR_S, FEWEST_TREES, MOST_NODES, Home, Moves, Searches, Trees, Ways
 from cosim.sumo.net import City, Gateway
 
 EDGES, REGION = 40, np.repeat([0, 1, 2, 3], 10)
@@ -30,7 +30,7 @@ def city():
     return first, second, random.uniform(0.0, 3.0, len(pairs)), random.uniform(5.0, 60.0, EDGES)
 
 
-@pytest.fixture(params=[MOST_KEPT, 1])
+@pytest.fixture(params=[MOST_NODES, 1])
 def ways(city, request):
     """Out of region 0, with all trees kept or hardly any."""
     first, second, turn, time = city
@@ -141,10 +141,10 @@ def test_what_is_ahead_is_hardly_less_than_the_least_time(city):
     ahead = outside.ahead(outside.number[entry], time, turn)[outside.number[10:EDGES]]
     assert np.isfinite(exact).any() and (ahead <= exact).all()
     np.testing.assert_allclose(ahead[np.isfinite(exact)], exact[np.isfinite(exact)], rtol=1e-5)
-    assert (ahead[~np.isfinite(exact)] == FAR).all()
+    assert (ahead[~np.isfinite(exact)] == FAR_S).all()
 
 
-@pytest.mark.parametrize("kept", [MOST_KEPT, 1])
+@pytest.mark.parametrize("kept", [MOST_NODES, 1])
 def test_ways_home_are_the_fastest_up_to_a_limit(city, kept):
     first, second, turn, time = city
     exact = least(city, np.full(EDGES, True))
@@ -175,7 +175,7 @@ def test_of_the_trees_the_one_not_asked_for_longest_goes_first():
     assert searches.get(mine, 2) == (2,) and searches.get(mine, 0) == ("new",)
     searches.put(mine, 12, ("large",), 1000)
     left = [begin for begin in range(13) if searches.get(mine, begin)]
-    assert len(left) + bool(searches.get(others, 3)) == FEWEST_KEPT and left[-2:] == [11, 12]
+    assert len(left) + bool(searches.get(others, 3)) == FEWEST_TREES and left[-2:] == [11, 12]
 
 
 def test_trees_of_old_travel_times_go_at_once_and_do_not_wait_for_the_garbage_collector(city):

@@ -21,7 +21,7 @@ from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
 from cosim.sumo.net import load_city
 from cosim.sumo.recorded_trips import read_recorded_trips, read_routes
-from cosim.sumo.turning_flows import own_flows
+from cosim.sumo.recorded_trips import own_flows
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.model.planning import planning_model
@@ -189,7 +189,7 @@ def test_signals_that_are_left_alone(config, tmp_path):
 
 def test_mesoscopic_keeps_the_ledger(imported):
     scenario = replace(load_scenario(imported[0] / "scenarios" / "tiny"), steps=4)
-    plant = SumoPlant(scenario, overrides=settings(scenario).changed(mesoscopic=True))
+    plant = SumoPlant(scenario, settings=settings(scenario).changed(mesoscopic=True))
     try:
         plant.reset(0)
         for _ in range(scenario.steps):
@@ -203,7 +203,7 @@ def test_mesoscopic_keeps_the_ledger(imported):
 def test_mesoscopic_has_no_lanes(imported, key, value):
     scenario = load_scenario(imported[0] / "scenarios" / "tiny")
     with pytest.raises(InputError, match=f"sumo.{key}: {value} .* has no lanes"):
-        SumoPlant(scenario, overrides=settings(scenario).changed(mesoscopic=True, **{key: value}))
+        SumoPlant(scenario, settings=settings(scenario).changed(mesoscopic=True, **{key: value}))
 
 
 def test_options_and_includes_of_the_user_count(config, tmp_path):
@@ -271,7 +271,7 @@ def test_signal_plans_know_the_city_s_own_vehicles(imported):
     assert 2.0 * 75 / 900 <= flows["B1C1", "C1D1"] < 2.0 * 120 / 900  # the flow straight on, of trips
     assert all(b in city.successors[a] for a, b in flows)
     for plan in ("max-pressure", "webster", "actuated"):
-        plant = SumoPlant(scenario, overrides=settings(scenario).changed(signals=plan))
+        plant = SumoPlant(scenario, settings=settings(scenario).changed(signals=plan))
         try:
             plant.reset(0)
             for _ in range(2):

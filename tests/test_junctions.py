@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from cosim.plant.junctions import GAP, STOOD, Junctions
+from cosim.plant.stuck import GAP_M, JUNCTION_PATIENCE_S, Junctions
 
 LENGTH, EDGES = 5.0, (":x_1", ":x_2", ":x_10", ":y_1", "a", "b")
 
@@ -52,12 +52,12 @@ class Streets:
         ),  # one per lane
         ({"first": 130.0, "second": 20.0}, (50.0, 0.0), {"first": "a_0"}),  # who has just come is not asked
         ({"first": 130.0, "second": 130.0}, (50.0, 9.0), {}),  # one street behind is full: a real lock
-        ({"first": STOOD - 1.0}, (50.0, 50.0), {}),
+        ({"first": JUNCTION_PATIENCE_S - 1.0}, (50.0, 50.0), {}),
     ],
 )
 def test_vehicles_are_set_down_where_all_have_room(standing, room, expected):
     streets = Streets(standing, dict(zip(("a_0", "b_0"), room, strict=True)))
     junctions = Junctions(streets, SimpleNamespace(region_of=dict.fromkeys(EDGES, 0)))
     junctions.free()
-    assert streets.set_on == {vehicle: (lane, LENGTH + GAP) for vehicle, lane in expected.items()}
+    assert streets.set_on == {vehicle: (lane, LENGTH + GAP_M) for vehicle, lane in expected.items()}
     assert junctions.freed == len(expected)

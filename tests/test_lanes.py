@@ -7,7 +7,7 @@ import pytest
 import tiny_city
 
 from cosim.plant.guidance import Guide
-from cosim.plant.lanes import LEADER, NEAR, PATIENCE, Lanes
+from cosim.plant.stuck import LEADER_M, LEADER_PATIENCE_S, QUEUE_END_M, Lanes
 from cosim.plant.meter import Event
 from cosim.sumo.net import City
 from cosim.sumo.session import Session
@@ -124,7 +124,7 @@ def test_they_block_the_street_for_ever_without(session):
 def test_with_a_way_out_each_goes_on_where_the_lane_leads(session):
     lanes = Lanes(session)
     assert not any(lanes.way_out(vehicle, target) for vehicle, target in LEADERS.items())  # they have just come
-    assert not drive(session, int(PATIENCE) + 20)
+    assert not drive(session, int(LEADER_PATIENCE_S) + 20)
     ways = {vehicle: lanes.way_out(vehicle, target) for vehicle, target in LEADERS.items()}
     assert ways == {"left0": ["ab", "br", "rl", "le"], "right0": ["ab", "bl", "lr", "re"]}
     for vehicle, way in ways.items():
@@ -138,7 +138,7 @@ def test_with_a_way_out_each_goes_on_where_the_lane_leads(session):
 @pytest.mark.parametrize("session, late", [(-0.5, True), (100, False)], indirect=["session"])
 def test_near_the_end_of_a_lane_it_is_too_late_for_others(session, late):
     lanes = Lanes(session)
-    assert 0.5 < LEADER < NEAR < 200.0 - 12.0
+    assert 0.5 < LEADER_M < QUEUE_END_M < 200.0 - 12.0
     assert lanes.too_late("left0", ["ab", "bl", "le"]) is late
     assert not lanes.too_late("left0", ["ab", "br", "re"]) and not lanes.too_late("left0", ["ab"])
     assert not Lanes(session, 0.0).too_late("left0", ["ab", "bl", "le"])

@@ -9,7 +9,8 @@ import pytest
 import tiny_city
 from signal_rules import CROSS, MIN_GREEN, PHASES, SINGLE, check, signal
 
-from cosim.plant.max_pressure import EVERY, MAX_RED, PERMISSIVE, Junction, MaxPressure, Roads, stages_of, transition
+from cosim.plant import max_pressure
+from cosim.plant.max_pressure import MAX_RED_S, PERMISSIVE, Junction, MaxPressure, Roads, stages_of, transition
 from cosim.sumo.net import Gateway, load_city
 from cosim.sumo.session import Phase
 from cosim.sumo.signals import Link, read_signals
@@ -19,7 +20,7 @@ from cosim.sumo.signals import Link, read_signals
 def test_every_way_between_stages_is_safe(phases):
     """Random switching: yellow after green, the minimum green, nothing green together that never was."""
     random = np.random.default_rng(2)
-    junction, states = Junction(signal(phases), 0.0, min_green=MIN_GREEN), []
+    junction, states = Junction(signal(phases), 0.0), []
     for second in range(1500):
         if second >= junction.next_change:
             junction.advance(float(second))
@@ -64,7 +65,7 @@ def test_the_way_from_a_phase_that_comes_twice():
 def test_rationed_green(phases):
     """Random switching and commands: all is safe; no cycle has more green than its ration; u_max rations nothing."""
     random, links = np.random.default_rng(3), (0, 1)
-    junction = Junction(signal(phases), 0.0, {link: (0, 1) for link in links}, min_green=MIN_GREEN)
+    junction = Junction(signal(phases), 0.0, {link: (0, 1) for link in links})
     cycle, states, budgets = int(sum(d for _, d in phases)), [], []
     for second in range(40 * cycle):
         now = float(second)
@@ -85,15 +86,14 @@ def test_rationed_green(phases):
     assert junction.green_time(40.0 * cycle) == {link: green[:, n].sum() for n, link in enumerate(links)}
 
 
-@pytest.mark.parametrize("min_green", [2.0, 9.0])
-def test_the_minimum_green_is_that_of_the_settings(min_green):
-    """A stage lasts so long, and so much green has a gateway whose ration is the least."""
-    held = Junction(signal(CROSS), 0.0, {0: (0, 1)}, min_green=min_green)
+def test_the_minimum_green():
+    """Of a stage, and of a gateway whose ration is the least."""
+    held = Junction(signal(CROSS), 0.0, {0: (0, 1)})
     held.command(np.zeros((2, 2)))
-    assert held.may_switch(min_green) and not held.may_switch(min_green - 1.0)
+    assert held.may_switch(MIN_GREEN) and not held.may_switch(MIN_GREEN - 1.0)
     while held.next_change < 66.0:
         held.advance(held.next_change)
-    assert held.green_time(66.0) == {0: min_green}
+    assert held.green_time(66.0) == {0: MIN_GREEN}
 
 
 def link(index, start, end, lane=0):
@@ -158,10 +158,8 @@ def test_who_waits_behind_a_piece_too_short_to_be_seen_on_is_seen():
     town = SimpleNamespace(**{**vars(TOWN), "length": {**TOWN.length, "a": 5.0}})
     session = SimpleNamespace(time=0.0, lane_vehicles=lambda lane: {"x": 1.0, "c": 9.0}.get(lane[0], 0.0))
     shown = []
-    control = MaxPressure(
-        session, town, [CROSSING], FLOWS, min_green=5.0, max_green=40.0, show=lambda name, state: shown.append(state)
-    )
-    for _ in range(100):
+    control = MaxPressure(session, town, [CROSSING], FLOWS, show=lambda name, state: shown.append(state))
+    for _ in range(120):
         control.play(session.time)
         session.time += 1.0
     assert shown.count("rG") == 2 and shown.count("Gr") >= 2
@@ -218,7 +216,7 @@ def junctions():
         if name == "s":
             shown.append((session.time, name, state))
 
-    control = MaxPressure(session, TOWN, [CROSSING, END], FLOWS, min_green=12.0, max_green=50.0, show=show)
+    control = MaxPressure(session, TOWN, [CROSSING, END], FLOWS, show=show)
 
     def play(until):
         while session.time <= until:
@@ -229,7 +227,7 @@ def junctions():
     return control, vehicles, play
 
 
-def shown_by(crossing, vehicles, seconds, *, town=TOWN, **limits):
+def shown_by(crossing, vehicles, seconds, *, town=TOWN, **options):
     """(time, state) of all that max-pressure shows at one signal, with so many vehicles on every lane of an edge."""
     session = SimpleNamespace(time=0.0, lane_vehicles=lambda lane: vehicles.get(lane.partition("_")[0], 0.0))
     shown = []
@@ -238,9 +236,8 @@ def shown_by(crossing, vehicles, seconds, *, town=TOWN, **limits):
         town,
         [crossing],
         FLOWS,
-        min_green=5.0,
         show=lambda name, state: shown.append((session.time, state)),
-        **limits,
+        **options,
     )
     for _ in range(seconds):
         control.play(session.time)
@@ -253,11 +250,11 @@ def test_no_green_outlasts_the_maximum_while_others_wait(cyclic):
     """A single vehicle waits on c, a hundred on a; nobody anywhere else: then a keeps its green."""
 
     def greens(**vehicles):
-        shown = shown_by(CROSSING, vehicles, 200, max_green=40.0, cyclic=cyclic)
+        shown = shown_by(CROSSING, vehicles, 200, cyclic=cyclic)
         return [time for time, state in shown if state == "rG"]
 
     assert greens(a=100.0) == []
-    assert greens(a=100.0, c=1.0) == [43.0, 93.0, 143.0, 193.0]  # decided every 5 s: 40 s of green, 3 s; 37 s, 3 s
+    assert greens(a=100.0, c=1.0) == [53.0, 113.0, 173.0]  # decided every 5 s: 50 s of green, 3 s; 47 s, 3 s
 
 
 @pytest.mark.parametrize("cyclic, order", [(False, [2, 0, 2]), (True, [1, 2, 0])])
@@ -274,8 +271,6 @@ def test_stages_keep_their_order_if_cyclic(cyclic, order):
         town,
         [three],
         {},
-        min_green=5.0,
-        max_green=40.0,
         cyclic=cyclic,
         show=lambda name, state: shown.append(state),
     )
@@ -285,19 +280,21 @@ def test_stages_keep_their_order_if_cyclic(cyclic, order):
     assert [state.index("G") for state in shown if "G" in state][1:4] == order
 
 
-def test_who_waits_too_long_comes_first():
+def test_who_waits_too_long_comes_first(monkeypatch):
     """c has no pressure at all, as its road ahead is full; after 120 s of red its link gets the minimum green."""
+    monkeypatch.setattr(max_pressure, "MAX_GREEN_S", 500.0)
     town = SimpleNamespace(**{**vars(TOWN), "successors": {**AFTER, "d": ("e",)}})
-    shown = shown_by(CROSSING, {"a": 5.0, "c": 2.0, "d": 30.0}, 150, town=town, max_green=500.0)
-    assert [entry for entry in shown if entry[1] == "rG"] == [(MAX_RED + 3.0, "rG")]
-    assert shown[-1] == (MAX_RED + 13.0, "Gr")
+    shown = shown_by(CROSSING, {"a": 5.0, "c": 2.0, "d": 30.0}, 150, town=town)
+    assert [entry for entry in shown if entry[1] == "rG"] == [(MAX_RED_S + 3.0, "rG")]
+    assert shown[-1] == (MAX_RED_S + 13.0, "Gr")
 
 
-@pytest.mark.parametrize("buses, first", [(1.0, MAX_RED + 3.0), (9.0, 8.0)])
-def test_who_waits_on_a_street_that_is_closed_to_cars_gets_a_green(buses, first):
+@pytest.mark.parametrize("buses, first", [(1.0, MAX_RED_S + 3.0), (9.0, 8.0)])
+def test_who_waits_on_a_street_that_is_closed_to_cars_gets_a_green(buses, first, monkeypatch):
     """Buses on k are in no count of cars: they press by their number, and a single one does not wait for ever."""
+    monkeypatch.setattr(max_pressure, "MAX_GREEN_S", 500.0)
     crossing = replace(CROSSING, links=(link(0, "a", "b"),), others=(link(1, "k", "d"),))
-    shown = shown_by(crossing, {"a": 5.0, "k": buses}, 150, max_green=500.0)
+    shown = shown_by(crossing, {"a": 5.0, "k": buses}, 150)
     assert next(time for time, state in shown if state == "rG") == first
 
 
@@ -318,13 +315,12 @@ def test_streets_that_are_closed_to_cars_are_read_with_their_signals(tmp_path):
 
 
 def test_the_green_goes_where_the_pressure_is_after_the_minimum(junctions):
-    """Decided every EVERY seconds, so at 15 s; yellow for 3 s; and back in the same way."""
+    """Decided every 5 s; yellow for 3 s; and back in the same way."""
     _, vehicles, play = junctions
-    assert EVERY == 5.0
     vehicles["c"] = 3.0
-    assert play(30.0) == [(0.0, "s", "Gr"), (15.0, "s", "yr"), (18.0, "s", "rG")]
-    vehicles.update(c=0.0, a=1.0)  # since 18 s: until 30 s at least, and 30 s has passed
-    assert play(60.0)[3:] == [(35.0, "s", "ry"), (38.0, "s", "Gr")]
+    assert play(8.0) == [(0.0, "s", "Gr"), (5.0, "s", "yr"), (8.0, "s", "rG")]
+    vehicles.update(c=0.0, a=1.0)  # green since 8 s, until 13 s at least
+    assert play(60.0)[3:] == [(15.0, "s", "ry"), (18.0, "s", "Gr")]
 
 
 @pytest.mark.parametrize(
@@ -354,28 +350,21 @@ def test_a_spent_ration_exerts_no_pressure():
         **{**vars(TOWN), "gateways": (Gateway(source=0, target=1, from_edge="a", to_edge="b", signal="s", links=(0,)),)}
     )
     shown, session = [], SimpleNamespace(time=0.0, lane_vehicles=lambda lane: {"a": 50.0, "c": 1.0}.get(lane[0], 0.0))
-    control = MaxPressure(
-        session, town, [CROSSING], FLOWS, min_green=5.0, max_green=99.0, show=lambda name, state: shown.append(state)
-    )
-    control.command(np.full((2, 2), 5.0 / 61.0), {})  # 5 s, and so much of the other 61 s
+    control = MaxPressure(session, town, [CROSSING], FLOWS, show=lambda name, state: shown.append(state))
+    control.command(np.full((2, 2), 5.0 / 61.0))  # 5 s, and so much of the other 61 s
     assert control.green_time() == {"s": {0: 0.0}}
     for second in range(66):
         session.time = float(second)
         control.play(session.time)
     session.time = 66.0
     assert control.green_time()["s"][0] == pytest.approx(10.0, abs=1.0) and shown[-1] == "rG"
-    control.command(np.zeros((2, 2)), {"s": [0]})  # opened all the same
-    for second in range(66, 132):
-        session.time = float(second)
-        control.play(session.time)
-    assert shown[-1] == "Gr" and control.green_time()["s"][0] > 50.0
 
 
 def test_what_is_known_of_a_run():
     """Of five lanes one is served in part by a stage of t; CROSS is 6 s of 66 s between its stages, and so is t."""
     vehicles = {"a": 9.0, "c": 9.0}
     session = SimpleNamespace(time=0.0, lane_vehicles=lambda lane: vehicles.get(lane[0], 0.0))
-    control = MaxPressure(session, TOWN, [CROSSING, END], FLOWS, min_green=5.0, max_green=20.0, show=lambda *_: None)
+    control = MaxPressure(session, TOWN, [CROSSING, END], FLOWS, show=lambda *_: None)
     for _ in range(100):
         control.play(session.time)
         session.time += 1.0

@@ -303,7 +303,7 @@ def test_short_entries_are_polled_more_often(length, speed, every):
     session.clear()
     session.places["v"] = "b0"
     steps = next(n for n in range(2, 9) if meter.observe())
-    assert meter._poll_every == every and steps == max(every, 2)
+    assert meter._poll_steps == every and steps == max(every, 2)
 
 
 @pytest.mark.parametrize("length, every", [(100.0, 3), (40.0, 2), (20.0, 1)])
@@ -318,13 +318,13 @@ def test_entries_are_asked_no_more_often_than_that(length, every):
 def test_the_shortest_entry_decides():
     streets = city()
     streets = City(**{**vars(streets), "length": {**streets.length, "b0": 20.0, "a0": 900.0}})
-    assert Meter(Streets(), streets)._poll_every == 1
+    assert Meter(Streets(), streets)._poll_steps == 1
 
 
 def test_finer_steps_are_polled_as_often_in_time():
     session = Streets()
     session.step_length = 0.5
-    assert Meter(session, city())._poll_every == 6
+    assert Meter(session, city())._poll_steps == 6
 
 
 def test_a_city_without_boundaries_is_measured_too():

@@ -10,7 +10,7 @@ import pytest
 import tiny_city
 from commands import cosim, error_line
 
-from cosim.plant.metering import FILLING, KI, KP, Metering
+from cosim.plant.metering import FILLING_S, KI, KP, Metering
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
 from cosim.sumo.trips import Trips, held
@@ -63,13 +63,13 @@ def test_trips_begin_in_turn_at_the_rate_and_what_is_not_used_is_not_saved():
 
 def test_without_a_command_regions_are_held_at_their_level():
     meters, session, _ = metering([], [])
-    most, rates = CRITICAL / FILLING, []
+    most, rates = CRITICAL / FILLING_S, []
     for full in (0.5, 1.5, 1.5, 1.3):
         meters.command(None, full * CRITICAL)
         rates.append(meters._rate / CRITICAL * 90.0)
-    expected = [np.full(2, 90.0 / FILLING)]
+    expected = [np.full(2, 90.0 / FILLING_S)]
     for before, now in ((0.5, 1.5), (1.5, 1.5), (1.5, 1.3)):
-        expected.append(np.clip(expected[-1] + KP * (before - now) + KI * (1.2 - now), 0.0, 90.0 / FILLING))
+        expected.append(np.clip(expected[-1] + KP * (before - now) + KI * (1.2 - now), 0.0, 90.0 / FILLING_S))
     np.testing.assert_allclose(rates, expected)
     assert 0.0 < rates[1][0] < rates[0][0] and (meters._rate <= most).all()
 
@@ -97,7 +97,7 @@ def test_in_a_city_the_books_hold_and_waiting_counts():
     opened = Controls(perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=None, metering=np.full(7, 0.02))
     runs = []
     for chosen in (settings(scenario), settings(scenario).changed(metering=True)):
-        plant = SumoPlant(scenario, overrides=chosen)
+        plant = SumoPlant(scenario, settings=chosen)
         plant.reset(5)
         states = [plant.step(opened) for _ in range(3)]
         runs.append((states, plant.trip_facts(), plant.trips))
@@ -124,7 +124,7 @@ def ran(scenario, seed=5, **changes):
     network = scenario.network
     rate = changes.pop("rate", None)
     opened = Controls(perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=None, metering=rate)
-    plant = SumoPlant(scenario, overrides=settings(scenario).changed(**changes))
+    plant = SumoPlant(scenario, settings=settings(scenario).changed(**changes))
     plant.reset(seed)
     states, trips = [plant.step(opened) for _ in range(scenario.steps)], plant.trips
     facts = plant.trip_facts()

@@ -43,7 +43,7 @@ def plant_of(scenario):
     plants = []
 
     def make(**overrides):
-        plants.append(SumoPlant(scenario, overrides=Settings(**overrides)))
+        plants.append(SumoPlant(scenario, settings=Settings(**overrides)))
         return plants[-1]
 
     yield make

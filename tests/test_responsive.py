@@ -67,7 +67,7 @@ def opened(town):
 def drive(folder, gates, faults=(), **overrides):
     """A run under u = gates[k] in interval k: what every signal shows second by second, and more."""
     scenario = with_faults(replace(load_scenario(folder), steps=len(gates)), faults)
-    plant = SumoPlant(scenario, overrides=settings(scenario).changed(**overrides))
+    plant = SumoPlant(scenario, settings=settings(scenario).changed(**overrides))
     try:
         plant.reset(1)
         session, shown, step = plant.session, {}, plant.session.step

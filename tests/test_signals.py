@@ -17,7 +17,7 @@ from cosim.sumo.build import ensure_built
 from cosim.sumo.net import gateway_room_taken, load_city
 from cosim.sumo.signals import read_signals
 from cosim.sumo.trips import make_trips
-from cosim.sumo.turning_flows import turning_flows
+from cosim.sumo.trips import turning_flows
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.types import Controls
@@ -52,7 +52,7 @@ def plant_of(scenario):
     plants = []
 
     def make(**overrides):
-        plants.append(SumoPlant(scenario, overrides=Settings(**overrides)))
+        plants.append(SumoPlant(scenario, settings=Settings(**overrides)))
         return plants[-1]
 
     yield make
@@ -66,7 +66,7 @@ def driven(scenario):
 
     @cache
     def run(u, **overrides):
-        plant = SumoPlant(scenario, overrides=Settings(**overrides))
+        plant = SumoPlant(scenario, settings=Settings(**overrides))
         try:
             return *drive(plant, scenario, 4, u=u), plant.leaks()
         finally:
@@ -255,4 +255,4 @@ def test_the_same_drivers_reroute(scenario, plant_of):
 def test_a_city_without_fixed_signals(scenario, monkeypatch):
     monkeypatch.setattr("cosim.plant.programmes.read_signals", lambda *_: ([], ["c11"]))
     with pytest.raises(InputError, match="sumo.signals: webster needs fixed-time signals"):
-        SumoPlant(scenario, overrides=Settings(signals="webster"))
+        SumoPlant(scenario, settings=Settings(signals="webster"))

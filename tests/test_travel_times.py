@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from streets import seen
 
-from cosim.plant.travel_times import EMPTY, SLOWEST, UNSEEN, WINDOW, TravelTimes
+from cosim.plant.routes import EMPTY_WEIGHT, PRIOR_VEH_S, STANDING_M_S, WINDOW_S, TravelTimes
 from cosim.sumo.net import City
 
 NOBODY = math.nan
@@ -52,18 +52,18 @@ def test_at_first_everything_is_free(times):
 def test_many_count_more_than_few_and_nobody_is_faster_than_allowed(times):
     learn(times, 2.0, 2.0, 30.0, vehicles=(2.0, 0.01, 2.0), duration=60.0)
     for edge, spent in ((0, 120.0), (1, 0.6)):
-        assert times.edges[edge] == pytest.approx(100.0 / ((2.0 * spent + 10.0 * UNSEEN) / (spent + UNSEEN)))
+        assert times.edges[edge] == pytest.approx(100.0 / ((2.0 * spent + 10.0 * PRIOR_VEH_S) / (spent + PRIOR_VEH_S)))
     assert times.edges[2] == 10.0
 
 
 def test_the_newest_counts_most(times):
     learn(times, 2.0, 2.0, 2.0, duration=60.0)
     learn(times, 8.0, NOBODY, 8.0, vehicles=(1.0, 0.0, 1.0), duration=90.0)
-    kept = math.exp(-90.0 / WINDOW)
+    kept = math.exp(-90.0 / WINDOW_S)
     driven, spent = 240.0 * kept + 8.0 * 90.0, 120.0 * kept + 90.0
-    assert times.edges[0] == pytest.approx(100.0 * (spent + UNSEEN) / (driven + 10.0 * UNSEEN))
-    driven, spent = 240.0 * EMPTY, 120.0 * EMPTY  # an empty street is soon as good as free
-    assert times.edges[1] == pytest.approx(100.0 * (spent + UNSEEN) / (driven + 10.0 * UNSEEN))
+    assert times.edges[0] == pytest.approx(100.0 * (spent + PRIOR_VEH_S) / (driven + 10.0 * PRIOR_VEH_S))
+    driven, spent = 240.0 * EMPTY_WEIGHT, 120.0 * EMPTY_WEIGHT  # an empty street is soon as good as free
+    assert times.edges[1] == pytest.approx(100.0 * (spent + PRIOR_VEH_S) / (driven + 10.0 * PRIOR_VEH_S))
     for _ in range(12):
         learn(times, 8.0, NOBODY, 8.0, vehicles=(1.0, 0.0, 1.0))
     assert times.edges[1] == pytest.approx(10.0, rel=0.02) and times.edges[0] == pytest.approx(12.5, rel=0.1)
@@ -72,14 +72,14 @@ def test_the_newest_counts_most(times):
 def test_a_long_interval_leaves_less_of_an_empty_street(times):
     learn(times, 2.0, 2.0, 2.0, duration=60.0)
     learn(times, NOBODY, NOBODY, NOBODY, duration=900.0)
-    kept = math.exp(-900.0 / WINDOW)
-    assert times.edges[0] == pytest.approx(100.0 * (120.0 * kept + UNSEEN) / (240.0 * kept + 10.0 * UNSEEN))
+    kept = math.exp(-900.0 / WINDOW_S)
+    assert times.edges[0] == pytest.approx(100.0 * (120.0 * kept + PRIOR_VEH_S) / (240.0 * kept + 10.0 * PRIOR_VEH_S))
 
 
 def test_closed_and_standing_streets_are_so_at_once(times):
     learn(times, 8.0, 8.0, 8.0, vehicles=(50.0, 50.0, 50.0))
     learn(times, 0.0, NOBODY, 0.01, vehicles=(0.0, 0.0, 2e4))
-    assert times.edges[0] == times.edges[2] == 100.0 / SLOWEST
+    assert times.edges[0] == times.edges[2] == 100.0 / STANDING_M_S
     assert 12.0 < times.edges[1] < 13.0
     learn(times, NOBODY, NOBODY, NOBODY)
     assert times.edges[0] < 20.0  # open again
@@ -90,13 +90,13 @@ def test_turns_take_those_on_the_junction_by_those_who_get_over_it(times):
     learn(times, NOBODY, NOBODY, NOBODY, crossing=(1.5, 0.4), crossed=(0.1, 0.2), duration=90.0)
     assert times.turns.tolist() == pytest.approx([15.0 + 2.0, 15.0])
     learn(times, NOBODY, NOBODY, NOBODY, crossing=(0.5, 0.0), crossed=(0.5, 0.0), duration=60.0)
-    kept = math.exp(-60.0 / WINDOW)
+    kept = math.exp(-60.0 / WINDOW_S)
     takes = (1.5 * 90.0 * kept + 0.5 * 60.0) / (0.1 * 90.0 * kept + 0.5 * 60.0)
     assert times.turns.tolist() == pytest.approx([takes + 2.0, takes])
 
 
 def test_who_stands_on_a_junction_takes_as_long_as_at_the_slowest_speed(times):
     learn(times, NOBODY, NOBODY, NOBODY, crossing=(1.0, 1.0), crossed=(0.0, 1e-9))
-    assert times.turns.tolist() == pytest.approx([8.0 / SLOWEST + 4.0 / SLOWEST, 8.0 / SLOWEST])
+    assert times.turns.tolist() == pytest.approx([8.0 / STANDING_M_S + 4.0 / STANDING_M_S, 8.0 / STANDING_M_S])
     learn(times, NOBODY, NOBODY, NOBODY, crossing=(0.0, 0.0), crossed=(1e6, 1e6))
     assert np.allclose(times.turns, [2.0, 1.0])  # no faster than in free flow

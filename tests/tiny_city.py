@@ -102,7 +102,7 @@ def driven(scenario: Scenario, intervals: int, gates: float, **overrides) -> tup
     """(plant.trips, departures, arrivals, accumulation, backlog) of a run with all u at `gates`; in every interval the
     ledger is checked."""
     scenario = replace(scenario, steps=intervals)
-    plant = SumoPlant(scenario, overrides=settings(scenario).changed(**overrides))
+    plant = SumoPlant(scenario, settings=settings(scenario).changed(**overrides))
     try:
         plant.reset(0)
         for _ in range(intervals):

@@ -1,6 +1,7 @@
-"""Building a SUMO city: city.toml -> plain XML -> netconvert -> <network>/build/<name>.net.xml and regions.csv.
+"""The SUMO network of a city: given files, or built from a recipe by netconvert.
 
-Where nothing can be written beside the network, they are kept in the user's cache (nmfd.runs.shipped.build_folder).
+city.toml -> plain XML -> netconvert -> <network>/build/<name>.net.xml and regions.csv; in the user's cache if nothing
+can be written beside the network (nmfd.runs.shipped.build_folder).
 """
 
 import csv
@@ -11,17 +12,23 @@ import re
 import subprocess
 from dataclasses import dataclass
 from importlib import metadata
+from itertools import pairwise
 from pathlib import Path
+from typing import Annotated, Self
 from xml.sax.saxutils import quoteattr
 
 import sumo
+from pydantic import AfterValidator, Field, model_validator
 
-from cosim.sumo.recipe import CityTable, RecipeTable
 from nmfd.errors import InputError
 from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import config, shipped
+from nmfd.runs.config import Numbers, Problem, Region, Settings, Text, got, setting, whole
 from nmfd.runs.files import atomic, temporary_folder
 
+YELLOW_S, ALL_RED_S, LEFT_GREEN_S = 3, 0, 6  # of the signals; the last one of protected left turns
+LEAST_SPACING_M = 60.0  # of parallel streets
+JUNCTION_RADIUS_M = 10.0  # that netconvert cuts off a street
 # (lanes, movements, every movement has lanes of its own) -> lanes of each movement, numbered from the right
 LANES = {
     (4, "rsl", True): {"r": [0], "s": [1, 2], "l": [3]},
@@ -41,9 +48,82 @@ LANES = {
 }
 
 
+class CityTable(Settings):
+    """The table [sumo] of network.toml: a recipe, or SUMO's network and the region of every edge."""
+
+    recipe: Text | None = setting("file from which the city is built, relative to the network's folder", None)
+    net: Text | None = setting("instead: SUMO's network", None)
+    regions: Text | None = setting("with net: csv with the columns edge, region", None)
+
+    @model_validator(mode="after")
+    def _one_or_the_other(self) -> Self:
+        given = self.model_fields_set
+        if self.recipe is not None and len(given) > 1:
+            raise Problem("recipe", "a city has a recipe, or net and regions; remove one of them")
+        for key in ("net", "regions"):
+            if self.recipe is None and key not in given:
+                raise Problem(key, f'missing; add {key} = "...", or recipe = "city.toml"')
+        return self
+
+
+def _apart(lines: tuple[float, ...]) -> tuple[float, ...]:
+    if any(b - a < LEAST_SPACING_M for a, b in pairwise(lines)):
+        raise Problem("", got(f"rising numbers at least {LEAST_SPACING_M:g} m apart", list(lines)))
+    return lines
+
+
+Lines = Annotated[Numbers, Field(min_length=3, max_length=10), AfterValidator(_apart)]
+
+
+class Streets(Settings):
+    """Lines with streets in both directions, and junctions where they meet."""
+
+    x: Lines = setting("streets that run north-south; rising, at least 60 m apart", unit="m")
+    y: Lines = setting("streets that run east-west; rising, at least 60 m apart", unit="m")
+    speed: float = setting("speed limit", unit="m/s", gt=0.0)
+
+
+class CentreTable(Streets):
+    """The fine grid in the middle: one lane in each direction."""
+
+    region: Region = setting("region of the centre")
+    pocket: float = setting("length of the second lane before a signal", unit="m", ge=10.0)
+
+
+class OuterTable(Streets):
+    """The lattice of arterials around it: three lanes in each direction."""
+
+    regions: str = setting("region of every junction in lines, north at the top; a dot where the centre is")
+
+    @property
+    def picture(self) -> list[list[str]]:
+        """Return the words of every line that is not empty."""
+        return [line.split() for line in self.regions.splitlines() if line.strip()]
+
+    @model_validator(mode="after")
+    def _fits_the_lines(self) -> Self:
+        if [len(row) for row in self.picture] != [len(self.x)] * len(self.y):
+            raise Problem("regions", f"expected {len(self.y)} rows of {len(self.x)} regions or dots; correct it")
+        return self
+
+
+class SignalsTable(Settings):
+    """The fixed-time signals of all junctions."""
+
+    cycle: int = whole("cycle time", low=30, unit="s")
+
+
+class RecipeTable(Settings):
+    """A city with a fine grid in a wide lattice of arterials."""
+
+    centre: CentreTable = setting("the fine grid")
+    outer: OuterTable = setting("the lattice")
+    signals: SignalsTable = setting("of all junctions")
+
+
 @dataclass(frozen=True, kw_only=True)
 class SumoFiles:
-    """What a simulation needs of a city: the network and the region of every edge."""
+    """The files of a city: SUMO's network, and the region of every edge."""
 
     net_file: Path
     regions_csv: Path
@@ -51,7 +131,7 @@ class SumoFiles:
 
 @dataclass(frozen=True, kw_only=True)
 class Node:
-    """A junction at (x, y) [m]; `centre` tells the fine grid from the lattice around it."""
+    """A junction at (x, y) [m], of the fine grid (centre) or the lattice around it."""
 
     id: str
     x: float
@@ -62,7 +142,7 @@ class Node:
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """A city.toml that was read and checked, with its junctions and the streets between neighbours."""
+    """A checked city.toml with its junctions and the streets between neighbours."""
 
     table: RecipeTable
     nodes: dict[str, Node]
@@ -70,16 +150,16 @@ class Recipe:
 
 
 def network_folder(network: RegionalModel) -> Path:
-    """Where `network` was loaded from. Raises InputError for one that was not loaded."""
+    """Return the folder of `network`. Raises InputError for one that was not loaded from a file."""
     if network.folder is None:
         raise InputError(f"network {network.name}: was not loaded from a folder; load it with load_network")
     return network.folder
 
 
 def ensure_built(network: RegionalModel) -> SumoFiles:
-    """The SUMO files of `network`, built first if they are missing or the recipe has changed.
+    """Return the SUMO files of `network`, built first if they are missing or the recipe has changed.
 
-    Raises InputError if network.toml has no [sumo] table, a key of it or a file it names is wrong, or netconvert fails.
+    Raises InputError for a wrong [sumo] table of network.toml, a missing file, or an error of netconvert.
     """
     files = sources(network)
     if len(files) == 1:
@@ -92,8 +172,7 @@ def ensure_built(network: RegionalModel) -> SumoFiles:
 
 
 def sources(network: RegionalModel) -> tuple[Path, ...]:
-    """The files that say what the city of `network` is: a recipe, or a SUMO network and the regions of its edges, there
-    or not. Raises InputError as `ensure_built`."""
+    """Return the files that define the city: a recipe, or network and regions, which need not exist."""
     folder = network_folder(network)
     path = folder / "network.toml"
     content = config.read(path)
@@ -114,17 +193,13 @@ def _built(recipe_file: Path, network: RegionalModel) -> SumoFiles:
     stamp_file = folder / f"{network.name}.stamp"
     recipe = read_recipe(recipe_file, network.regions)
     stamp = _stamp(recipe_file)
-    if (
-        stamp_file.is_file()
-        and stamp_file.read_text(encoding="utf-8") == stamp
-        and files.net_file.is_file()
-        and (files.regions_csv.is_file())
-    ):
+    built = all(file.is_file() for file in (stamp_file, files.net_file, files.regions_csv))
+    if built and stamp_file.read_text(encoding="utf-8") == stamp:
         return files
     shipped.made(folder)
-    stamp_file.unlink(missing_ok=True)  # nothing here counts until it is written again
+    stamp_file.unlink(missing_ok=True)
     net, regions = build(recipe, str(recipe_file))
-    # the stamp comes last: whoever sees it finds the files that belong to it
+    # The stamp comes last: with it, all files are there.
     for file, content in ((files.net_file, net), (files.regions_csv, regions), (stamp_file, stamp.encode())):
         with atomic(file) as temporary:
             temporary.write_bytes(content)
@@ -132,13 +207,13 @@ def _built(recipe_file: Path, network: RegionalModel) -> SumoFiles:
 
 
 def _stamp(recipe_file: Path) -> str:
-    """Changes with the recipe, this file and SUMO's version."""
+    """Return a hash of the recipe, this file and SUMO's version."""
     content = recipe_file.read_bytes() + Path(__file__).read_bytes() + metadata.version("eclipse-sumo").encode()
     return hashlib.sha256(content).hexdigest()
 
 
 def read_recipe(path: Path, regions: int) -> Recipe:
-    """Read and check a city.toml (cosim.sumo.recipe). Raises InputError."""
+    """Read and check a city.toml. Raises InputError."""
     table = config.checked(RecipeTable, config.read(path), path)
     centre, outer = table.centre, table.outer
     if centre.region >= regions:
@@ -163,7 +238,7 @@ def read_recipe(path: Path, regions: int) -> Recipe:
 
 
 def _streets(nodes: dict[str, Node]) -> list[tuple[str, str]]:
-    """Both directions between neighbours on a line; lattice lines end or pass over into the centre's streets."""
+    """Return both directions between neighbours on a line; lines of the lattice may go on as streets of the centre."""
     streets = []
     for along, across in (("x", "y"), ("y", "x")):
         lines: dict[float, list[Node]] = {}
@@ -171,15 +246,15 @@ def _streets(nodes: dict[str, Node]) -> list[tuple[str, str]]:
             lines.setdefault(getattr(node, across), []).append(node)
         for line in lines.values():
             line.sort(key=lambda node: getattr(node, along))
-            for a, b in zip(line, line[1:], strict=False):
+            for a, b in pairwise(line):
                 streets += [(a.id, b.id), (b.id, a.id)]
     return streets
 
 
 def _movements(recipe: Recipe, start: str, end: str) -> dict[str, str]:
-    """{"r", "s" or "l": next node} at the end of a street, without turning back.
+    """Return {"r", "s" or "l": next node} at the end of a street, without turning back.
 
-    A radial into the centre is entered straight ahead only: no queue before the centre stands on the ring around it.
+    A radial into the centre is entered straight ahead only, so that no queue before it stands on the ring around it.
     """
     nodes = recipe.nodes
     heading = _heading(nodes[start], nodes[end])
@@ -199,7 +274,7 @@ def _heading(a: Node, b: Node) -> tuple[int, int]:
 
 
 def _plain_xml(recipe: Recipe) -> tuple[str, str, str, dict[str, int]]:
-    """nodes, edges and connections for netconvert, and the region of every edge."""
+    """Return nodes, edges and connections for netconvert, and the region of every edge."""
     nodes = recipe.nodes
     legs = {name: sum(a == name for a, _ in recipe.streets) for name in nodes}
     node_rows = [
@@ -215,8 +290,7 @@ def _plain_xml(recipe: Recipe) -> tuple[str, str, str, dict[str, int]]:
             if legs[b] > 2:
                 joint = f"{name}.j"
                 length = abs(end.x - start.x) + abs(end.y - start.y)
-                # netconvert cuts about 10 m off for the junction itself
-                share = 1.0 - (recipe.table.centre.pocket + 10.0) / length
+                share = 1.0 - (recipe.table.centre.pocket + JUNCTION_RADIUS_M) / length
                 node_rows.append(
                     _row(
                         "node",
@@ -250,20 +324,19 @@ def _file(tag: str, rows: list[str]) -> str:
 
 
 def _leads_in(recipe: Recipe, a: str, b: str) -> bool:
-    """A street of the lattice from whose end a radial leads into the centre."""
+    """Return True for a street of the lattice at whose end a radial leads into the centre."""
     outside = not recipe.nodes[a].centre and not recipe.nodes[b].centre
     return outside and any(recipe.nodes[to].centre for to in _movements(recipe, a, b).values())
 
 
 def _into(turn: str, lanes: int, target_lanes: int) -> list[range]:
-    """For each lane of a movement the lanes that it leads into.
+    """Return the lanes that each lane of a movement leads into.
 
-    A vehicle chooses the lane it needs next while it turns: in a queue it could not change lanes any more, and two
-    vehicles that each want the lane of the other would wait for ever.
+    A vehicle chooses its next lane while it turns: in a queue two vehicles that want each other's lane wait forever.
     """
     if turn == "s" or lanes > 1:
         cuts = [target_lanes * n // lanes for n in range(lanes + 1)]
-        return [range(a, b) for a, b in zip(cuts, cuts[1:], strict=False)]
+        return [range(a, b) for a, b in pairwise(cuts)]
     return [range(target_lanes)]
 
 
@@ -276,30 +349,25 @@ def _link(source: str, target: str, lane: int, into: int) -> str:
 
 
 def build(recipe: Recipe, where: str) -> tuple[bytes, bytes]:
-    """The bytes of net.xml and regions.csv; the same recipe gives the same bytes. InputError if netconvert fails."""
+    """Return the bytes of net.xml and regions.csv, the same ones for the same recipe.
+
+    Raises InputError if netconvert fails.
+    """
     *plain, region_of = _plain_xml(recipe)
-    signals = recipe.table.signals
     with temporary_folder() as folder:
-        options = []
+        options = {
+            "output-file": "net.xml",
+            "no-turnarounds": "true",
+            "tls.cycle.time": recipe.table.signals.cycle,
+            "tls.yellow.time": YELLOW_S,
+            "tls.allred.time": ALL_RED_S,
+            "tls.left-green.time": LEFT_GREEN_S,
+        }
         for kind, content in zip(("node", "edge", "connection"), plain, strict=True):
             (folder / f"{kind}.xml").write_text(content, encoding="utf-8")
-            options += [f"--{kind}-files", f"{kind}.xml"]
-        command = [
-            str(Path(sumo.SUMO_HOME) / "bin" / "netconvert"),
-            *options,
-            "--output-file",
-            "net.xml",
-            "--no-turnarounds",
-            "true",
-            "--tls.cycle.time",
-            str(signals.cycle),
-            "--tls.yellow.time",
-            str(signals.yellow),
-            "--tls.allred.time",
-            str(signals.all_red),
-            "--tls.left-green.time",
-            str(signals.left_green),
-        ]
+            options[f"{kind}-files"] = f"{kind}.xml"
+        program = str(Path(sumo.SUMO_HOME) / "bin" / "netconvert")
+        command = [program, *(part for key, value in options.items() for part in (f"--{key}", str(value)))]
         result = subprocess.run(
             command,
             cwd=folder,
@@ -316,5 +384,5 @@ def build(recipe: Recipe, where: str) -> tuple[bytes, bytes]:
     writer = csv.writer(table, lineterminator="\n")
     writer.writerow(["edge", "region"])
     writer.writerows(sorted(region_of.items()))
-    # the comment holds the date and the scratch folder
+    # The comment holds the date and the temporary folder.
     return re.sub(rb"<!--.*?-->\s*", b"", net, count=1, flags=re.DOTALL), table.getvalue().encode()
