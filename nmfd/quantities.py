@@ -5,7 +5,6 @@ a city gateway and edge, in the order of cosim.sumo.net.City.
 """
 
 from collections.abc import Mapping
-from dataclasses import field, fields
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,18 +35,3 @@ def dataset_variables(about: Mapping[str, Quantity], values: Mapping[str, Any]) 
 def _array(values: Any) -> np.ndarray:
     array = np.asarray(values)
     return array.astype(object) if array.dtype.kind == "U" else array  # as netCDF gives texts back
-
-
-def quantity(*dimensions: str, unit: str, text: str) -> Any:
-    """Return a dataclass field that holds an array with these named axes."""
-    return field(metadata={"quantity": Quantity(dimensions, unit, text)})
-
-
-def quantities(kind: type) -> dict[str, Quantity]:
-    """Return the quantities of a dataclass by the names of its fields."""
-    return {f.name: f.metadata["quantity"] for f in fields(kind) if "quantity" in f.metadata}
-
-
-def variables(kind: type, values: Mapping) -> dict[str, tuple]:
-    """Return the `values` of quantities of `kind` as xarray.Dataset takes them."""
-    return dataset_variables(quantities(kind), values)

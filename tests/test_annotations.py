@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 from jaxtyping import TypeCheckError
-from trajectories import record
 
 from cosim.evaluation.model_validation import held_up
-from cosim.plant.record import Record
 from nmfd.types import State
 
 pytestmark = pytest.mark.skipif("config.getoption('annotations') == 'off'", reason="--annotations=off")
@@ -31,8 +29,3 @@ def test_regions_are_as_many_everywhere_in_a_call():
     held_up(x, x, np.ones((3, 3), dtype=bool))
     with pytest.raises(TypeCheckError, match="adjacency"):
         held_up(x, x, np.ones((2, 2), dtype=bool))
-
-
-def test_a_record_has_one_number_of_intervals():
-    with pytest.raises(TypeCheckError, match="teleports"):
-        Record(**{**record(4, regions=2), "teleports": np.zeros(5)})

@@ -3,6 +3,7 @@
 import tomllib
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -93,7 +94,7 @@ def test_all_links_and_all_probes_see_everything(scenario):
         for _ in range(scenario.steps):
             before, state = state, plant.step(controller.act(plant.observe()))
         estimate = plant.observe()
-        crossings = plant.record().crossings[-1].sum(axis=2)
+        crossings = SimpleNamespace(**plant.record()).crossings[-1].sum(axis=2)
     finally:
         plant.close()
     assert (seen[-1].probes == state.accumulation).all()

@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -129,7 +130,7 @@ def in_sumo(city, *ordered, perimeter=None, watch=None, **changed):
         if watch:
             watch(plant)
         states += [plant.step(Controls(perimeter=opened, splits=None)) for _ in range(STEPS)]
-        return states, plant.record()
+        return states, SimpleNamespace(**plant.record())
     finally:
         plant.close()
 

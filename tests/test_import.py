@@ -6,6 +6,7 @@ import re
 import shutil
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -20,8 +21,7 @@ from cosim.importing.streets import graph, read_streets
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
 from cosim.sumo.net import load_city
-from cosim.sumo.recorded_trips import read_recorded_trips, read_routes
-from cosim.sumo.recorded_trips import own_flows
+from cosim.sumo.recorded_trips import own_flows, read_recorded_trips, read_routes
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.model.planning import planning_model
@@ -133,7 +133,7 @@ def test_scenario_drives_the_original_vehicles(imported, config):
             measurement = plant.step(
                 Controls(perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=network.nominal_splits)
             )
-        record, due = plant.record(), plant.trips
+        record, due = SimpleNamespace(**plant.record()), plant.trips
         # every car, and the buses: one, and one per 200 s in ten minutes
         assert due == (traffic.depart < 600.0 + scenario.steps * scenario.step - 10).sum() + 1 + 3
         assert record.departures.sum() == due - measurement.backlog.sum()
@@ -166,7 +166,7 @@ def test_networks_as_they_are(tmp_path):
             plant.reset(0)
             for _ in range(3):
                 plant.step(Controls(perimeter=np.where(scenario.network.adjacency, 0.1, 0.0), splits=None))
-            assert plant.record().departures.sum() > 0
+            assert SimpleNamespace(**plant.record()).departures.sum() > 0
         finally:
             plant.close()
 
@@ -194,7 +194,7 @@ def test_mesoscopic_keeps_the_ledger(imported):
         plant.reset(0)
         for _ in range(scenario.steps):
             plant.step(Controls(perimeter=np.where(scenario.network.adjacency, 0.5, 0.0), splits=None))
-        assert plant.record().crossings.sum() > 0
+        assert SimpleNamespace(**plant.record()).crossings.sum() > 0
     finally:
         plant.close()
 
@@ -276,7 +276,7 @@ def test_signal_plans_know_the_city_s_own_vehicles(imported):
             plant.reset(0)
             for _ in range(2):
                 plant.step(Controls(perimeter=np.where(scenario.network.adjacency, 0.9, 0.0), splits=None))
-            assert plant.record().departures.sum() > 0
+            assert SimpleNamespace(**plant.record()).departures.sum() > 0
         finally:
             plant.close()
 
@@ -347,7 +347,7 @@ def test_guidance_leaves_roads_that_are_closed_to_cars_alone(config, tmp_path):
         plant.reset(0)
         for _ in range(scenario.steps):
             plant.step(Controls(perimeter=np.where(network.adjacency, 0.9, 0.0), splits=network.nominal_splits))
-        assert plant.record().guided.sum() > 10
+        assert SimpleNamespace(**plant.record()).guided.sum() > 10
     finally:
         plant.close()
 

@@ -7,8 +7,8 @@ import pytest
 import tiny_city
 
 from cosim.plant.guidance import Guide
-from cosim.plant.stuck import LEADER_M, LEADER_PATIENCE_S, QUEUE_END_M, Lanes
 from cosim.plant.meter import Event
+from cosim.plant.stuck import LEADER_M, LEADER_PATIENCE_S, QUEUE_END_M, Lanes
 from cosim.sumo.net import City
 from cosim.sumo.session import Session
 

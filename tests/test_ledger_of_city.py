@@ -19,9 +19,9 @@ import tiny_city
 import cosim
 from cosim.plant.meter import Meter
 from cosim.sumo.net import load_city
+from cosim.sumo.outputs import TripReader, trip_options
 from cosim.sumo.recorded_trips import MESOSCOPIC
 from cosim.sumo.session import Session, _flush_all
-from cosim.sumo.outputs import TripReader, trip_options
 from nmfd import metrics
 from nmfd.ledger import LedgerError
 

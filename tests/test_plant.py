@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import libsumo
 import numpy as np
@@ -60,7 +61,7 @@ def drive(plant, scenario, *, seed=1, guidance=False, each_second=None):
         plant.session.step = lambda: (step(), each_second(plant.session))
     for _ in range(scenario.steps):
         measurements.append(plant.step(random_controls(scenario, random, guidance=guidance)))
-    return measurements, plant.record()
+    return measurements, SimpleNamespace(**plant.record())
 
 
 @pytest.mark.parametrize("actuation", ["hold-back", "redistribute"])
@@ -208,7 +209,7 @@ def sent_round(scenario, plant):
     plant.reset(1)
     for _ in range(scenario.steps):
         plant.step(Controls(perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=splits))
-    record = plant.record()
+    record = SimpleNamespace(**plant.record())
     return record.crossings.sum(axis=0)[2, :, 4], record.guided.sum(axis=0)[2, 0, 4]
 
 

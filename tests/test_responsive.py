@@ -85,7 +85,7 @@ def drive(folder, gates, faults=(), **overrides):
         return SimpleNamespace(
             shown=shown,
             plans=plans,
-            record=plant.record(),
+            record=SimpleNamespace(**plant.record()),
             leaks=plant.leaks(),
             gateways=plant.city.gateways,
             programmes={name: session.programme_id(name) for name in plans},

@@ -16,10 +16,10 @@ import xarray as xr
 from filelock import FileLock
 from trajectories import trajectory
 
-from cosim.plant.record import Record
+from cosim.plant.record import RECORD
 from nmfd import metrics
 from nmfd.errors import InputError, RunFailed
-from nmfd.quantities import quantities, variables
+from nmfd.quantities import dataset_variables
 from nmfd.runs import files
 from nmfd.runs import run_many as module
 from nmfd.runs.run_many import Run, raise_failures, read_manifest, run_many, run_name
@@ -48,14 +48,14 @@ def test_the_same_run_is_the_same_but_for_times():
 
 def test_xarray_opens_a_run_with_names_and_units(tmp_path):
     original, record = trajectory(), trajectories.record(4, regions=2)
-    original.add(variables(Record, record), {}).assign(estimated=True).write(tmp_path / "a.nc")
+    original.add(dataset_variables(RECORD, record), {}).assign(estimated=True).write(tmp_path / "a.nc")
     with xr.open_dataset(tmp_path / "a.nc") as data:
         assert dict(data.sizes) == {
             **{"time": 5, "interval": 4, "region": 2, "destination": 2, "next_region": 2},
             **{"gateway": 3, "edge": 5},
         }
         assert data.attrs["estimated"] == 1
-        assert set(data.data_vars) == {*VARIABLES, *quantities(Record)}
+        assert set(data.data_vars) == {*VARIABLES, *RECORD}
         for name, values in data.variables.items():
             assert values.attrs["long_name"] and ("units" in values.attrs or name == "note"), name
         assert list(data["status"].values) == [0, 0, 0, 3]  # a solver failure and a fallback

@@ -16,8 +16,7 @@ from cosim.plant.settings import Settings
 from cosim.sumo.build import ensure_built
 from cosim.sumo.net import gateway_room_taken, load_city
 from cosim.sumo.signals import read_signals
-from cosim.sumo.trips import make_trips
-from cosim.sumo.trips import turning_flows
+from cosim.sumo.trips import make_trips, turning_flows
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.types import Controls
@@ -90,7 +89,7 @@ def drive(plant, scenario, intervals, seed=1, u=0.9):
     network = scenario.network
     for _ in range(intervals):
         plant.step(Controls(perimeter=np.where(network.adjacency, u, 0.0), splits=None))
-    return shown, {s.id: s for s in plant.simple_signals}, plant.record()
+    return shown, {s.id: s for s in plant.simple_signals}, SimpleNamespace(**plant.record())
 
 
 def test_signals_of_the_city(city):

@@ -4,6 +4,7 @@ import gzip
 import subprocess
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import sumo
@@ -111,7 +112,7 @@ def driven(scenario: Scenario, intervals: int, gates: float, **overrides) -> tup
                     perimeter=np.where(scenario.network.adjacency, gates, 0.0), splits=scenario.network.nominal_splits
                 )
             )
-        record = plant.record()
+        record = SimpleNamespace(**plant.record())
         return (
             plant.trips,
             record.departures.sum(),

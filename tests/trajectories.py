@@ -4,22 +4,21 @@ import numpy as np
 from tiny import made
 
 from cosim.evaluation.simulate import FACTS, Task
-from cosim.plant.record import Record
-from nmfd.quantities import quantities, variables
+from cosim.plant.record import RECORD
+from nmfd.quantities import dataset_variables
 from nmfd.types import Result, Status
 
 
 def recorded(run: Result, arrays: dict[str, np.ndarray], facts: dict) -> Result:
     """`run` in a city, with the arrays of a Record and its facts."""
-    return run.add(variables(Record, arrays), facts)
+    return run.add(dataset_variables(RECORD, arrays), facts)
 
 
 def record(steps: int, *, regions: int, gateways: int = 3, edges: int = 5) -> dict[str, np.ndarray]:
     """The arrays of a Record, at random."""
     sizes, random = {"interval": steps, "gateway": gateways, "edge": edges}, np.random.default_rng(0)
     return {
-        name: random.random([sizes.get(axis, regions) for axis in about.dimensions])
-        for name, about in quantities(Record).items()
+        name: random.random([sizes.get(axis, regions) for axis in about.dimensions]) for name, about in RECORD.items()
     }
 
 
