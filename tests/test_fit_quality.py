@@ -117,27 +117,27 @@ FLOW = [[0, 300, 0], [100, 0, 100], [0, 300, 0]]
     [
         ((0.5, 0.9, 0.2), (10, 10, 10), 1.0, "No: no region is ever critical, region 1 comes nearest with 0.90"),
         ((0.5, 1.9, 0.2), (10, 10, 10), 0.0, "No: no gateway has a signal"),
-        ((0.5, 1.9, 0.2), (10, 600, 10), 1.0, "It may: region 1 becomes critical, and gateways could hold 50 %"),
+        ((0.5, 1.9, 0.2), (10, 600, 10), 1.0, "It may: region 1 becomes critical, and gateways could hold 50%"),
         (
             (0.5, 1.9, 0.2),
             (10, 5400, 10),
             1.0,
             "Hardly: regions become critical, but gateways could hold no more than 10",
         ),
-        ((0.5, 1.9, 0.2), (10, 600, 10), 0.06, "No: regions become critical, but gateways could hold no more than 3 %"),
+        ((0.5, 1.9, 0.2), (10, 600, 10), 0.06, "No: regions become critical, but gateways could hold no more than 3%"),
         (None, None, 1.0, "Unknown: nothing was simulated"),
     ],
 )
 def test_the_verdict_has_reasons_and_numbers(network, most, started, share, answer):
     most, started = (None if part is None else np.array(part, dtype=float) for part in (most, started))
     found = verdict(network, crossing(FLOW, share), most=most, started=started, where="in 2 runs")
-    assert found.answer.startswith(f"Can perimeter control help? {answer}"), found.answer
+    assert found.sentences[0].startswith(f"Can perimeter control help? {answer}"), found.sentences
     text = found.text()
-    assert f"{100 * share:.0f} % of the 800 crossings in 2 runs" in text or most is None
+    assert f"{share:.0%} of the 800 crossings in 2 runs" in text or most is None
     table = text.partition("\n\n")[2].splitlines()
-    assert table[-1].split()[:3] == ["all", "all", "800"] and len(table) == 2 + (crossing(FLOW, 1.0).gateways > 0).sum()
+    assert len(table) == 1 + (crossing(FLOW, 1.0).gateways > 0).sum()
 
 
 def test_nobody_crosses(network):
     found = verdict(network, crossing(np.zeros((3, 3)), 1.0), most=np.ones(3), started=np.ones(3), where="in 1 run")
-    assert "No: no vehicle crosses" in found.answer or "no gateway" in found.answer
+    assert "No: no vehicle crosses" in found.sentences[0]

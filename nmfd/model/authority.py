@@ -4,7 +4,6 @@ Control helps only if vehicles on their way into a region that becomes critical 
 is the share of all vehicles filling such a region, from elsewhere or starting there, that a gateway could hold.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +18,6 @@ NOTHING = 0.05  # or less: control does not help
 
 Counts = Real[np.ndarray, "R R"]
 FILE = "verdict.txt"
-COLUMNS = ("source", "target", "flow_veh", "controlled_veh", "controlled_share", "gateways", "controlled_gateways")
 NO_GATEWAY = (
     "no gateway has a signal that perimeter control can use, so that only route guidance can help here; other regions "
     "(cosim import --regions, or your own) may have signals between them"
@@ -45,36 +43,30 @@ class Boundaries:
         by_count = self.controllable / np.maximum(self.gateways, 1)
         return np.where(self.flow > 0, self.controlled / np.maximum(self.flow, 1e-9), by_count)
 
-    def rows(self) -> list[tuple]:
-        """Return a row of COLUMNS per boundary and direction, and one for all."""
-        parts = (self.flow, self.controlled, self.shares, self.gateways, self.controllable)
-        rows: list[tuple] = [
-            (int(i), int(h), *(_rounded(part[i, h]) for part in parts)) for i, h in np.argwhere(self.gateways > 0)
-        ]
-        flow, controlled = self.flow.sum(), self.controlled.sum()
-        total = (flow, controlled, controlled / flow if flow else np.nan, self.gateways.sum(), self.controllable.sum())
-        return [*rows, ("all", "all", *map(_rounded, total))]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """Answer in a sentence, and the numbers behind it."""
+    """Answer in the first of some sentences, and the numbers behind it."""
 
-    answer: str
-    details: tuple[str, ...]
+    sentences: tuple[str, ...]
     boundaries: Boundaries
-
-    @property
-    def sentences(self) -> tuple[str, ...]:
-        """Answer and details."""
-        return (self.answer, *self.details)
 
     def text(self) -> str:
         """Return the sentences and a table of the boundaries."""
-        names = ("from", "to", "flow [veh]", "controlled [veh]", "share", "gateways", "with signals")
-        rows = [(*row[:4], _percent(row[4]), *row[5:]) for row in self.boundaries.rows()]
-        table = text_table([dict(zip(names, row, strict=True)) for row in rows])
-        return "\n".join([*self.sentences, "", table]) + "\n"
+        each = self.boundaries
+        rows = [
+            {
+                "from": i,
+                "to": h,
+                "flow [veh]": f"{each.flow[i, h]:.0f}",
+                "controlled [veh]": f"{each.controlled[i, h]:.0f}",
+                "share": f"{each.shares[i, h]:.0%}",
+                "gateways": each.gateways[i, h],
+                "with signals": each.controllable[i, h],
+            }
+            for i, h in np.argwhere(each.gateways > 0)
+        ]
+        return "\n".join([*self.sentences, "", text_table(rows)]) + "\n"
 
 
 def verdict(
@@ -85,11 +77,14 @@ def verdict(
     most: (R,) [-], highest accumulation over the critical one, in any run; started: (R,) [veh], departures by region;
     both None without a simulation; where: the runs, such as "in 6 loading runs"
     """
-    flow, names = float(boundaries.flow.sum()), [_name(network, region) for region in range(network.regions)]
-    usable, gateways = int(boundaries.controllable.sum()), int(boundaries.gateways.sum())
-    share = _percent(float(boundaries.controlled.sum()) / max(flow, 1e-9))
-    passed = f"; {share} of the {flow:,.0f} crossings {where} passed one"
-    details = [f"Of {gateways} gateways {usable} have a signal that perimeter control can use{passed if flow else ''}."]
+    names = [
+        f"region {region}" if name == str(region) else f"{region} {name}"
+        for region, name in enumerate(network.region_names)
+    ]
+    flow, controlled = float(boundaries.flow.sum()), float(boundaries.controlled.sum())
+    passed = f"; {controlled / max(flow, 1e-9):.0%} of the {flow:,.0f} crossings {where} passed one" if flow else ""
+    usable, gateways = boundaries.controllable.sum(), boundaries.gateways.sum()
+    details = [f"Of {gateways} gateways {usable} have a signal that perimeter control can use{passed}."]
     if most is not None:
         ratios = ", ".join(f"{name} {ratio:.2f}" for name, ratio in zip(names, most, strict=True))
         details.append(f"Highest accumulation {where}, as a multiple of the critical one: {ratios}.")
@@ -99,7 +94,7 @@ def verdict(
         doubtful = ", ".join(name for name, doubts in zip(names, network.doubts, strict=True) if doubts)
         details.append(f"The fit is doubtful in {doubtful}: see its warnings.")
     answer = _answer(names, boundaries, most, started, details)
-    return Verdict(answer=f"Can perimeter control help? {answer}", details=tuple(details), boundaries=boundaries)
+    return Verdict(sentences=(f"Can perimeter control help? {answer}", *details), boundaries=boundaries)
 
 
 def _answer(
@@ -124,37 +119,13 @@ def _answer(
     for r in critical:
         details.append(
             f"{names[r]} becomes critical: {came[r]:,.0f} vehicles entered from other regions, "
-            f"{_percent(held[r] / max(came[r], 1.0))} of them past a signal under control, and {started[r]:,.0f} "
-            f"started in it; {_percent(holdable[r])} of all could be held."
+            f"{held[r] / max(came[r], 1.0):.0%} of them past a signal under control, and {started[r]:,.0f} started in "
+            f"it; {holdable[r]:.0%} of all could be held."
         )
     best = int(critical[np.argmax(holdable[critical])])
-    share = f"{_percent(holdable[best])} of what fills {names[best]}"
+    share = f"gateways could hold no more than {holdable[best]:.0%} of what fills {names[best]}"
     if holdable[best] <= NOTHING:
-        return f"No: regions become critical, but gateways could hold no more than {share}; try other regions."
+        return f"No: regions become critical, but {share}; try other regions."
     if holdable[best] < ENOUGH:
-        return f"Hardly: regions become critical, but gateways could hold no more than {share}."
-    return f"It may: {names[best]} becomes critical, and gateways could hold {share}."
-
-
-def joined(boundaries: Sequence[Boundaries]) -> Boundaries:
-    """Return the sum over several runs of one city."""
-    return Boundaries(
-        flow=np.sum([one.flow for one in boundaries], axis=0),
-        controlled=np.sum([one.controlled for one in boundaries], axis=0),
-        gateways=boundaries[0].gateways,
-        controllable=boundaries[0].controllable,
-    )
-
-
-def _name(network: RegionalModel, region: int) -> str:
-    name = network.region_names[region]
-    return f"region {region}" if name == str(region) else f"{region} {name}"
-
-
-def _percent(share: float) -> str:
-    return "-" if np.isnan(share) else f"{100.0 * share:.0f} %"
-
-
-def _rounded(value: float) -> float | int:
-    number = float(value)
-    return int(number) if number.is_integer() else round(number, 4)
+        return f"Hardly: regions become critical, but {share}."
+    return f"It may: {names[best]} becomes critical, and {share.replace('no more than ', '')}."
