@@ -28,7 +28,7 @@ def cloud(x, outflow):
 
 def doubts(network, samples, most=2.0, seeds=2):
     state = np.repeat(np.diag([most * mfd.critical for mfd in network.mfds])[None], 3, axis=0)
-    return [fit.doubts for fit in region_fits(network, samples, [state], seeds)]
+    return list(region_fits(network, samples, [state], seeds)["doubts"])
 
 
 def test_good_fits_have_no_warning_and_bad_ones_say_what_is_wrong(network):
@@ -60,7 +60,7 @@ def test_warnings_are_in_the_table_the_files_and_the_network(network, tmp_path):
     assert rows["doubts"].str.endswith("one seed").all() and rows["held_out_ahead_model_rmse_share"].isna().all()
     doubted = replace(
         network,
-        doubts=tuple(fit.doubts for fit in fits),
+        doubts=tuple(fits["doubts"]),
         placeholder=True,
         controllable=np.where(network.adjacency, 0.25, 0.0),
     )

@@ -82,7 +82,7 @@ def written(folder: Path, counts: pd.DataFrame, detectors: pd.DataFrame) -> dict
 
 def test_the_curve_that_made_the_tables_comes_back(tmp_path, made):
     found = nmfd.identify(**written(tmp_path, *made), trip_length=TRIP, out=tmp_path / "city")
-    for fit, curve in zip(found.fits, found.network.mfds, strict=True):
+    for fit, curve in zip(found.fits.itertuples(), found.network.mfds, strict=True):
         x = np.linspace(10.0, 840.0, 50)
         assert np.abs(curve.outflow(x) - CURVE.outflow(x)).max() < 0.01 * CURVE.capacity
         assert fit.r2 > 0.99 and fit.spread < 0.02 and fit.critical_veh == pytest.approx(CURVE.critical, rel=0.03)
@@ -118,7 +118,7 @@ def test_what_is_given_replaces_what_is_assumed(tmp_path, made):
     north, south = found.network.mfds
     assert north.critical == pytest.approx(4.0 * south.critical, rel=0.02)  # four times the streets
     assert north.capacity == pytest.approx(8.0 * south.capacity, rel=0.02)  # and trips half as long
-    assert found.fits[0].doubts == ("low coverage 25 %",) and found.fits[1].doubts == ("coverage unknown",)
+    assert list(found.fits["doubts"]) == [("low coverage 25 %",), ("coverage unknown",)]
 
 
 @pytest.mark.usefixtures("without_pictures")
@@ -139,7 +139,7 @@ def test_doubts_of_few_days_free_flow_and_loops_at_stop_lines(tmp_path):
     counts, detectors = tables(tmp_path, days=1, most=200.0)
     files = written(tmp_path, counts, detectors.assign(pos=0.01))
     found = nmfd.identify(**files, out=tmp_path / "city")
-    text = " ".join(found.fits[0].doubts)
+    text = " ".join(found.fits["doubts"][0])
     for doubt in (
         "no falling branch",
         "coverage unknown",

@@ -139,7 +139,7 @@ def identify(
     write_fits(out / "fit.csv", fits, errors)
     _write_samples(out / "samples.csv", samples)
     plots.draw_mfds(out / "mfd.png", model, samples)
-    model = replace(model, placeholder=False, doubts=tuple(fit.doubts for fit in fits))
+    model = replace(model, placeholder=False, doubts=tuple(fits["doubts"]))
     verdict = run_verdict(model, first)
     model = replace(model, controllable=verdict.boundaries.shares)
     target.mkdir(parents=True, exist_ok=True)

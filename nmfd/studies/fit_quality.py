@@ -1,7 +1,7 @@
 """Quality of the fit of each region, and doubts about it, as tables and files."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -34,78 +34,55 @@ MEANINGS = {  # beginning of a doubt -> meaning and remedy
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class RegionFit:
-    """Fit of the model of one region.
-
-    critical_veh, jam_veh, storage_veh, max_outflow_veh_s: of the model
-    r2, hysteresis: [-], NaN where unknown
-    spread: standard deviation of the samples around the curve, as a share of its maximum [-]
-    most_share: largest accumulation in any run, as a share of the critical one [-]
-    doubts: each begins with a key of MEANINGS
-    """
-
-    region: int
-    name: str
-    critical_veh: float
-    jam_veh: float
-    storage_veh: float
-    max_outflow_veh_s: float
-    samples: int
-    r2: float
-    spread: float
-    hysteresis: float
-    most_share: float
-    doubts: tuple[str, ...]
-
-
 def region_fits(
     network: RegionalModel,
     samples: Sequence[Mapping[str, Points]],
     accumulations: Sequence[StatesOverTime] = (),
     seeds: int = 2,
-) -> list[RegionFit]:
-    """Return the fit of each region.
+) -> pd.DataFrame:
+    """Return the fit of each region, a row each.
+
+    Columns: region, name; critical_veh, jam_veh, storage_veh, max_outflow_veh_s of the model; samples; r2; spread of
+    samples around the curve, as a share of its maximum; hysteresis [-]; most_share, the largest accumulation in any run
+    over the critical one [-]; doubts, each of which begins with a key of MEANINGS. NaN where unknown.
 
     samples: by region, label -> (n, 2) of accumulation [veh] and outflow [veh/s]; accumulations: (T+1, R, R) [veh] of
     each run; seeds: of the loading runs
     """
-    most = np.array([max((part[:, 0].max() for part in cloud.values() if len(part)), default=0.0) for cloud in samples])
+    most = [max((part[:, 0].max() for part in cloud.values() if len(part)), default=0.0) for cloud in samples]
     if len(accumulations):
         most = np.max([state.sum(axis=2).max(axis=0) for state in accumulations], axis=0)
-    return [_fit(network, region, cloud, float(most[region]), seeds) for region, cloud in enumerate(samples)]
-
-
-def _fit(network: RegionalModel, region: int, cloud: Mapping[str, Points], most: float, seeds: int) -> RegionFit:
-    curve, points = network.mfds[region], own_points(cloud)
-    residuals, r2, share = points[:, 1] - curve.outflow(points[:, 0]), float("nan"), most / curve.critical
-    if len(points) >= SAMPLES and points[:, 1].var() > 0:
-        r2 = float(1.0 - (residuals**2).mean() / points[:, 1].var())
-    doubts = []
-    if len(points) < SAMPLES:
-        doubts.append(f"{FEW} ({len(points)})")
-    elif not r2 >= EXPLAINED:  # NaN too
-        doubts.append(f"{POOR} {r2:.2f}")
-    if share < 1.0:
-        doubts.append(f"{SHORT} ({100 * share:.0f} % of critical)")
-    if np.isfinite(curve.jam) and curve.outflow(curve.jam) > (1.0 - FALL) * curve.capacity:
-        doubts.append(f"{ENDLESS} (jam {curve.jam:.0f}, critical {curve.critical:.0f} veh)")
-    if seeds < 2:
-        doubts.append(ALONE)
-    return RegionFit(
-        region=region,
-        name=network.region_names[region],
-        critical_veh=curve.critical,
-        jam_veh=curve.jam,
-        storage_veh=float("inf") if network.storage is None else float(network.storage[region]),
-        max_outflow_veh_s=curve.capacity,
-        samples=len(points),
-        r2=r2,
-        spread=float(np.sqrt((residuals**2).mean()) / curve.capacity) if len(points) else float("nan"),
-        hysteresis=hysteresis(cloud),
-        most_share=share,
-        doubts=tuple(doubts),
-    )
+    rows = []
+    for region, (curve, cloud) in enumerate(zip(network.mfds, samples, strict=True)):
+        points = own_points(cloud)
+        residuals, r2, share = points[:, 1] - curve.outflow(points[:, 0]), np.nan, most[region] / curve.critical
+        if len(points) >= SAMPLES and points[:, 1].var() > 0:
+            r2 = 1.0 - (residuals**2).mean() / points[:, 1].var()
+        doubts = {
+            f"{FEW} ({len(points)})": len(points) < SAMPLES,
+            f"{POOR} {r2:.2f}": len(points) >= SAMPLES and not r2 >= EXPLAINED,  # NaN too
+            f"{SHORT} ({100 * share:.0f} % of critical)": share < 1.0,
+            f"{ENDLESS} (jam {curve.jam:.0f}, critical {curve.critical:.0f} veh)": np.isfinite(curve.jam)
+            and curve.outflow(curve.jam) > (1.0 - FALL) * curve.capacity,
+            ALONE: seeds < 2,
+        }
+        rows.append(
+            {
+                "region": region,
+                "name": network.region_names[region],
+                "critical_veh": curve.critical,
+                "jam_veh": curve.jam,
+                "storage_veh": np.inf if network.storage is None else network.storage[region],
+                "max_outflow_veh_s": curve.capacity,
+                "samples": len(points),
+                "r2": r2,
+                "spread": np.sqrt((residuals**2).mean()) / curve.capacity if len(points) else np.nan,
+                "hysteresis": hysteresis(cloud),
+                "most_share": share,
+                "doubts": tuple(text for text, there in doubts.items() if there),
+            }
+        )
+    return pd.DataFrame(rows)
 
 
 def own_points(cloud: Mapping[str, Points]) -> Points:
@@ -135,7 +112,7 @@ def hysteresis(cloud: Mapping[str, Points]) -> float:
     return float((both[0] - both[1]).sum() / both.mean(axis=0).sum()) if both.size else float("nan")
 
 
-def fit_table(network: RegionalModel, fits: Sequence[RegionFit], known: Mapping[str, str] = MEANINGS) -> str:
+def fit_table(network: RegionalModel, fits: pd.DataFrame, known: Mapping[str, str] = MEANINGS) -> str:
     """Return the fits as text, followed by the meanings of the doubts."""
     table = text_table(
         [
@@ -152,10 +129,10 @@ def fit_table(network: RegionalModel, fits: Sequence[RegionFit], known: Mapping[
                 "most / critical": f"{fit.most_share:.2f}",
                 "WARNINGS": "; ".join(fit.doubts) or "none",
             }
-            for fit in fits
+            for fit in fits.itertuples(index=False)
         ]
     )
-    lines = meanings([doubt for fit in fits for doubt in fit.doubts], known)
+    lines = meanings([doubt for doubts in fits["doubts"] for doubt in doubts], known)
     return "\n".join([table, *wrapped("\n".join(lines))])
 
 
@@ -209,14 +186,11 @@ def prediction_table(network: RegionalModel, held_out: Sequence[Observed], schem
     )
 
 
-def write_fits(path: Path, fits: Sequence[RegionFit], held_out: Predictions | None) -> None:
+def write_fits(path: Path, fits: pd.DataFrame, held_out: Predictions | None) -> None:
     """Write fit.csv, a row per region; held_out: None without held-out runs."""
-    rows = []
-    for fit in fits:
-        row = asdict(fit) | {"doubts": "; ".join(fit.doubts)}
-        for part in ("model", "persistence"):
-            for n, when in enumerate(("next_interval", "ahead")):
-                share = float("nan") if held_out is None else float(getattr(held_out, part)[n, fit.region])
-                row[f"held_out_{when}_{part}_rmse_share"] = share
-        rows.append(row | {"ahead_s": float("nan") if held_out is None else held_out.ahead})
-    files.write_table(path, pd.DataFrame(rows), float_format="%.6g")
+    table = fits.assign(doubts=fits["doubts"].map("; ".join))
+    for part in ("model", "persistence"):
+        for n, when in enumerate(("next_interval", "ahead")):
+            table[f"held_out_{when}_{part}_rmse_share"] = getattr(held_out, part)[n] if held_out else np.nan
+    table["ahead_s"] = held_out.ahead if held_out else np.nan
+    files.write_table(path, table, float_format="%.6g")

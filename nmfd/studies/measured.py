@@ -54,12 +54,13 @@ class Identified:
     """Identified network and the data behind it.
 
     samples: by region, "loading" and "unloading" -> (n, 2) of accumulation [veh] and outflow [veh/s]
+    fits: a row per region (fit_quality.region_fits)
     intervals: a row per region, day and interval; text: report
     """
 
     network: RegionalModel
     samples: tuple[dict[str, Points], ...]
-    fits: tuple[fit_quality.RegionFit, ...]
+    fits: pd.DataFrame
     intervals: pd.DataFrame
     text: str
 
@@ -163,13 +164,13 @@ def identify(
             "neighbours, region,neighbour, with --adjacency"
         )
     days = rows["day"].nunique()
-    fits = tuple(
-        replace(fit, doubts=(*fit.doubts, *_doubts(stations[stations["region"] == fit.name], share, length, days)))
-        for fit, share, length in zip(
-            fit_quality.region_fits(network, samples), coverage, np.where(assumed, trip_km, np.nan), strict=True
-        )
-    )
-    network = replace(network, doubts=tuple(fit.doubts for fit in fits))
+    fits = fit_quality.region_fits(network, samples)
+    lengths = np.where(assumed, trip_km, np.nan)
+    fits["doubts"] = [
+        (*doubts, *_doubts(stations[stations["region"] == region], coverage[n], lengths[n], days))
+        for n, (region, doubts) in enumerate(zip(names, fits["doubts"], strict=True))
+    ]
+    network = replace(network, doubts=tuple(fits["doubts"]))
     share = "unknown" if np.isnan(coverage).all() else f"{np.nanmin(coverage):.0%} to {np.nanmax(coverage):.0%}"
     facts = (
         f"{len(rows):,} rows of {rows['detid'].nunique()} detectors on {days} days; left out: "
