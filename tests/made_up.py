@@ -1,5 +1,6 @@
 """Made-up runs on grid7_peak in real folders: nothing is simulated, everything is drawn from the seed."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -7,31 +8,45 @@ import pandas as pd
 import pytest
 import trajectories
 
-from cosim.evaluation import evaluate, experiment, statistics
-from cosim.evaluation.simulate import FACTS, Result, scenario_of
+from cosim.evaluation import evaluate, statistics
+from cosim.evaluation.simulate import FACTS
 from cosim.sumo.net import city_of
 from nmfd.api import load_scenario
-from nmfd.runs.run_folder import COLUMNS
+from nmfd.controllers.strategy import parse
+from nmfd.metrics import COUNTED, SUMMARY
+from nmfd.model.scenario import with_demand
+from nmfd.runs import run_many
+from nmfd.types import Result
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
 STEPS = 5
 SHARE = {"no-control": 1.0, "pi-gating": 0.8, "dpc-pcrg": 0.5}  # of the vehicles without control
 
 
-def result(task, city) -> Result:
-    scenario = scenario_of(task)
+def instead_of_sumo(patch, result) -> None:
+    """Let `result(scenario, strategy, seed=, demand=)` make every run of `run_many`: a Result, or why it failed."""
+
+    def outcomes(todo, *_):
+        for run in todo:
+            asked = {name: run.job.keywords[name] for name in ("seed", "demand")}
+            yield run, result(*run.job.args, **asked)
+
+    patch.setattr(run_many, "_outcomes", outcomes)
+
+
+def result(scenario, strategy, *, seed, demand, city) -> Result:
     network, steps = scenario.network, scenario.steps
-    regions, random = network.regions, np.random.default_rng([task.seed, len(task.controller)])
-    size = 40.0 * task.demand_factor * SHARE[task.controller]
+    regions, random = network.regions, np.random.default_rng([seed, len(strategy.name)])
+    size = 40.0 * demand * SHARE[strategy.name]
     shape = np.minimum(np.arange(steps + 1), steps - np.arange(steps + 1)) + 0.0
     accumulation = size * shape[:, None, None] * random.uniform(0.9, 1.1, (steps + 1, regions, regions))
-    acts, guides = task.controller != "no-control", "rg" in task.controller
+    acts, guides = strategy.name != "no-control", "rg" in strategy.name
     perimeter = random.uniform(0.3, 0.9, (steps, regions, regions)) if acts else np.full((steps, regions, regions), 0.9)
     crossings = random.integers(0, 9, (steps, regions, regions, regions)) * network.split_mask
     trajectory = trajectories.made(
-        controller=task.controller,
+        controller=strategy.name,
         plant="sumo",
-        seed=task.seed,
+        seed=seed,
         step=scenario.step,
         accumulation=accumulation,
         backlog=np.zeros_like(accumulation),
@@ -61,11 +76,12 @@ def result(task, city) -> Result:
         "guided": crossings * guides,
     }
     facts = {name: random.uniform(0.1, 100.0) for name in FACTS} | {
-        "controller": task.controller,
-        "seed": task.seed,
+        "scenario": scenario.name,
+        "scenario_folder": str(scenario.folder),
+        "demand": demand,
         "trips": 600,
         "outside_training": "",
-        "teleports": 3 * (task.controller == "pi-gating"),
+        "teleports": 3 * (strategy.name == "pi-gating"),
         "final_backlog_veh": 20,
     }
     return trajectories.recorded(trajectory, record, facts)
@@ -73,23 +89,16 @@ def result(task, city) -> Result:
 
 def folder(out: Path, *, controllers=tuple(SHARE), seeds=(2000, 2001), levels=(1.0,)) -> Path:
     """An evaluation whose runs are made up."""
-    scenario = load_scenario(SCENARIO)
-    city = city_of(scenario.network)
+    scenario = with_demand(load_scenario(SCENARIO), steps=STEPS)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            experiment, "outcomes", lambda function, todo, workers, **_: ((task, result(task, city)) for task in todo)
-        )
-        evaluate.evaluate(
-            evaluate.Evaluation(
-                scenario=SCENARIO, controllers=controllers, seeds=seeds, levels=levels, steps=STEPS, out=out
-            )
-        )
+        instead_of_sumo(patch, partial(result, city=city_of(scenario.network)))
+        evaluate.evaluate([(scenario, levels)], [parse(name) for name in controllers], seeds, out=out, progress=False)
     return out
 
 
 def rows_of(values: dict[tuple[float, str], dict[int, float]]) -> pd.DataFrame:
     """(level, controller) -> seed -> TTS; everything else is 1 or empty."""
-    blank = {name: 1.0 for name in (*COLUMNS, *FACTS)} | dict.fromkeys(("teleports", *statistics.COUNTED), 0)
+    blank = {name: 1.0 for name in (*SUMMARY, *FACTS)} | dict.fromkeys(("teleports", *COUNTED), 0)
     return pd.DataFrame(
         [
             blank | {"demand": level, "controller": name, "seed": seed, statistics.TTS: tts}

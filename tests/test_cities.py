@@ -13,10 +13,11 @@ import sumo
 from commands import cosim, good
 from tiny_city import driven
 
-from cosim.evaluation.simulate import Task, simulate
+from cosim.evaluation.simulate import simulate
 from cosim.importing.quality import pieces
 from cosim.importing.streets import read_streets
 from nmfd.api import load_scenario
+from nmfd.controllers.strategy import parse
 from nmfd.metrics import total_time_spent
 
 ROOT = Path(__file__).parents[1]
@@ -107,7 +108,7 @@ def test_max_pressure_takes_no_longer_than_fixed_time(tmp_path, name, level):
     assert result.exit_code == 0, result.output + str(result.exception)
     spent = {}
     for signals in ("no-control", "max-pressure", "max-pressure-cyclic"):
-        run = simulate(Task(scenario=tmp_path / "scenarios" / name, controller=signals, seed=1, demand_factor=level))
+        run = simulate(load_scenario(tmp_path / "scenarios" / name), parse(signals), seed=1, demand=level)
         spent[signals] = total_time_spent(run)
         assert run.completed[-1] == run.trips, signals
     assert max(spent, key=spent.get) == "no-control", spent

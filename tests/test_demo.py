@@ -1,13 +1,13 @@
 """cosim demo: what it says, which page it makes, and that its city locks without gates and flows with them."""
 
 import re
+from functools import partial
 
 import made_up
 import pytest
 from commands import cosim, good
 
 from cosim import api
-from cosim.evaluation import experiment
 from cosim.report import html
 from nmfd.api import load_scenario
 
@@ -18,14 +18,9 @@ def made(monkeypatch):
     scenario = load_scenario(made_up.SCENARIO)
     city = made_up.city_of(scenario.network)
     monkeypatch.setattr(api, "DEMO", made_up.SCENARIO)
-    monkeypatch.setattr(
-        experiment,
-        "outcomes",
-        lambda function, todo, workers, **_: ((task, made_up.result(task, city)) for task in todo),
-    )
+    made_up.instead_of_sumo(monkeypatch, partial(made_up.result, city=city))
     monkeypatch.setattr(html, "_pictures", lambda *_: [])
     monkeypatch.setattr(html, "_map", lambda *_: ("", "", ""))
-    monkeypatch.setattr(experiment, "draw_accumulations", lambda *_, **__: None)
 
 
 def test_report_and_page(made, tmp_path):

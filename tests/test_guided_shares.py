@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from streets import FAR_FROM_THE_END, seen
 
-from cosim.evaluation.simulate import drive
+from cosim.evaluation.simulate import simulate
 from cosim.plant import guidance
 from cosim.plant.guidance import Guide
 from cosim.plant.meter import Event
@@ -255,7 +255,7 @@ def test_guided_is_guidance_by_travel_times_wherever_the_controller_says_nothing
     scenario = replace(scenario, steps=1, demand=scenario.demand[15:16])
     own = scenario.network.nominal_splits
     by_hand, option, off = (
-        drive(scenario, parse(name), _Gate(splits), seed=1)
+        simulate(scenario, replace(parse(name), instance=_Gate(splits)), seed=1)
         for name, splits in (("pi-gating", own), ("pi-gating+guided", None), ("pi-gating", None))
     )
     assert option["guided"].sum() > 0 and off["guided"].sum() == 0

@@ -44,12 +44,10 @@ def rows():
 
 
 def test_statistics_pair_within_a_demand_level(rows):
-    table = statistics.statistics(rows, "pi-gating").set_index(["demand", "controller"])
+    table = statistics.statistics(rows).set_index(["demand", "controller"])
     assert table.loc[(1.0, "dpc-pc"), "change_percent"] == pytest.approx(-50.0 + 50.0 / 110.0)
     assert table.loc[(1.0, "dpc-pc"), "change_excludes_zero"] and not table.loc[(1.3, "dpc-pc"), "change_excludes_zero"]
-    assert table.loc[(1.0, "dpc-pc"), "change_to_reference_seeds"] == 1
     assert math.isnan(table.loc[(1.0, "no-control"), "change_percent"])
-    assert math.isnan(table.loc[(1.3, "dpc-pc"), "change_to_reference_percent"])
     assert (table["teleports"] == 0).all()
 
 
@@ -61,14 +59,28 @@ def test_pairs_hold_every_pair_in_both_directions(rows):
     assert there["excludes_zero"] and not pairs.loc[(1.0, "pi-gating", "dpc-pc"), "excludes_zero"]
 
 
-def test_tables_show_a_line_per_controller_and_the_teleports(rows, tmp_path):
-    table = statistics.write_tables(tmp_path, rows, "pi-gating")
-    text, page = statistics.text(table, "pi-gating"), (tmp_path / "evaluate.md").read_text()
-    assert "Demand times 1.3" in text and "against pi-gating" in text and "%*" in text
+def test_tables_show_a_line_per_controller_and_the_teleports(rows):
+    text, page = statistics.text(rows), statistics.markdown(rows)
+    assert "Demand times 1.3" in text and "%*" in text
     first = next(line for line in page.splitlines() if line.startswith("| dpc-pc"))
     assert first.rstrip("| ").endswith("| 0") and "-49.5 ± " in first
-    assert len(pd.read_csv(tmp_path / "runs.csv")) == len(rows)
-    assert len(pd.read_csv(tmp_path / "evaluate.csv")) == 5
+
+
+def test_the_frontier_counts_seeds_in_which_all_trips_are_completed():
+    rows = pd.DataFrame(
+        {
+            "demand": [1.0, 1.0, 1.5, 1.5, 2.0, 2.0],
+            "controller": "a",
+            "seed": [1, 2] * 3,
+            "completed_veh": [9, 9, 9, 8, 9, 9],
+            "trips": 9,
+            statistics.TTS: 1.0,
+        }
+    )
+    table = statistics.served(rows)
+    assert list(table["served_share"]) == [1.0, 0.5, 1.0] and statistics.highest(table) == {"a": 1.0}
+    assert table["served_share_low"][0] == pytest.approx(1.0 / (1.0 + 1.96**2 / 2), rel=1e-3)  # Wilson, both of two
+    assert table["served_share_high"][0] == pytest.approx(1.0)
 
 
 def test_numbers_stand_to_the_right_and_captions_are_wrapped():

@@ -10,8 +10,8 @@ import pytest
 import tiny_city
 from commands import call, good
 
-from cosim.evaluation.simulate import Task, scenario_of
 from cosim.sumo.net import city_of
+from nmfd.api import load_scenario
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 EVIL = "<script>alert(1)</script>"
@@ -160,7 +160,7 @@ def test_the_page_lives(scenario, browser, width):
             page.get_by_role("button", name=name, exact=True).click()
 
         page.wait_for_function(f"before => ({TEXT})() !== before", arg=page.evaluate(TEXT), timeout=20_000)
-        network = scenario_of(Task(scenario=scenario, controller="no-control", seed=3)).network
+        network = load_scenario(scenario).network
         assert page.evaluate(EDGES) == len(city_of(network).edges)
         press("Pause")
         page.get_by_role("button", name="Go on").wait_for()
@@ -175,11 +175,7 @@ def test_the_page_lives(scenario, browser, width):
         page.wait_for_function(f"before => ({TEXT})() !== before", arg=page.evaluate(TEXT), timeout=10_000)
         page.wait_for_timeout(1500)
         stepped = minutes()
-        assert (
-            before
-            < stepped
-            <= before + 2 * scenario_of(Task(scenario=scenario, controller="no-control", seed=3)).step / 60
-        )
+        assert before < stepped <= before + 2 * load_scenario(scenario).step / 60
         press("Faster")  # while it waits: at the end these buttons are off
         press("Close gate")
         press("Go on")

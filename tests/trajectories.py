@@ -3,7 +3,7 @@
 import numpy as np
 from tiny import made
 
-from cosim.evaluation.simulate import FACTS, Task
+from cosim.evaluation.simulate import FACTS
 from cosim.plant.record import RECORD
 from nmfd.quantities import dataset_variables
 from nmfd.types import Result, Status
@@ -41,25 +41,29 @@ def trajectory(controller="no-control", seed=0, steps=4):
     )
 
 
-def in_city(task: Task, tts: float, trips: int, completed: int) -> Result:
-    """A run of one interval in a city of seven regions; tts: its total time spent [veh s]."""
-    accumulation = np.zeros((2, 7, 7))
+def in_city(scenario, strategy, seed: int, demand: float, *, tts: float, trips: int, completed: int) -> Result:
+    """A run of one interval; tts: its total time spent [veh s]."""
+    regions = scenario.network.regions
+    accumulation = np.zeros((2, regions, regions))
     accumulation[0, 0, 0] = tts / 90.0
     run = made(
-        controller=task.controller,
+        controller=strategy.name,
         plant="sumo",
-        seed=task.seed,
+        seed=seed,
         step=90.0,
         accumulation=accumulation,
-        backlog=np.zeros((2, 7, 7)),
+        backlog=np.zeros((2, regions, regions)),
         completed=np.array([0.0, completed]),
-        perimeter=np.ones((1, 7, 7)),
-        splits=np.zeros((1, 7, 7, 7)),
+        perimeter=np.ones((1, regions, regions)),
+        splits=np.zeros((1, regions, regions, regions)),
         decision_time=np.zeros(1),
         wall_time=1.0,
     )
     facts = {name: 0 for name in FACTS} | {
         "outside_training": "",
         "trips": trips,
+        "scenario": scenario.name,
+        "scenario_folder": str(scenario.folder),
+        "demand": demand,
     }
-    return recorded(run, record(1, regions=7), facts)
+    return recorded(run, record(1, regions=regions), facts)

@@ -86,9 +86,9 @@ class Tuning:
                 else FloatDistribution(low, high, log=low > 0.0 and high / low > 10.0)
             )
         object.__setattr__(self, "space", space)
-        for end in (0, 1):
+        for end in ("low", "high"):
             try:
-                check_tables(self.tuned({name: bounds[end] for name, bounds in self.options.items()}))
+                check_tables(self.tuned({name: getattr(span, end) for name, span in space.items()}))
             except KeyError as error:
                 raise InputError(f"options: {error.args[0]}: the numbers before it need a range, too") from None
 
@@ -156,7 +156,8 @@ def tune(order: Tuning, *, workers: int = 1, scheduler: str | None = None, progr
         left = order.trials - sum(trial.state != TrialState.WAITING for trial in trials)
         if not running and left <= 0:
             return _write(order, study)
-        for _ in range(0 if running else min(left, generation if len(trials) > 1 else 1)):
+        begun = any(trial.state == TrialState.COMPLETE for trial in trials)
+        for _ in range(0 if running else min(left, generation if begun else 1)):
             number = len(study.get_trials(deepcopy=False))
             study.sampler = _sampler(order, number)
             study.ask(dict(order.space))
@@ -221,7 +222,7 @@ def _study(order: Tuning) -> optuna.Study:
 
 
 def _sampler(order: Tuning, number: int) -> CmaEsSampler:
-    """Return the sampler of one candidate: anew for each, so that a resumed search equals an uninterrupted one."""
+    """Return the sampler of one candidate: anew for each, so that a resumed generation is the same."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # x0 and sigma0 go in Optuna 6, without a successor yet
         return CmaEsSampler(
