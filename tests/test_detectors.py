@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from cosim.evaluation import estimation_errors
-from cosim.evaluation.simulate import Task, scenario_of, simulate
+from cosim.evaluation.simulate import simulate
 from cosim.plant.detectors import instruments, lay_out, probes
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import Settings, settings
@@ -145,14 +145,11 @@ def test_estimating_changes_nothing_but_what_is_seen(scenario, run):
 
 def test_states_are_estimated_with_the_model_of_those_who_drive():
     """`simulate` gives the plant the model with which the controller plans: another estimate of the same city."""
-    tasks = [
-        Task(scenario=SCENARIO, controller=name, seed=3, steps=INTERVALS)
-        for name in ("route-guidance+estimate", "route-guidance+estimate+max-pressure")
-    ]
-    models = [parse(task.controller).planning(scenario_of(task)).network for task in tasks]
+    strategies = [parse(name) for name in ("route-guidance+estimate", "route-guidance+estimate+max-pressure")]
+    scenario = load_scenario(SCENARIO, {"steps": INTERVALS})
+    models = [strategy.planning(scenario).network for strategy in strategies]
     assert [model.folder.name for model in models] == ["grid7_guided", "grid7_max_pressure"]
-    scenario = scenario_of(tasks[0])
-    found = simulate(tasks[0])
+    found = simulate(scenario, strategies[0], seed=3)
     for model, same in zip(models, (True, False), strict=True):
         plant = SumoPlant(
             scenario,

@@ -31,7 +31,7 @@ def rows() -> pd.DataFrame:
         "benchmark scenario --controllers no-control,pi-gating,mpc-pcrg --seeds 2 --out out",
         "robustness scenario --controllers pi-gating --scenarios 2 --out out",
         "show scenario --out out",
-        "bound scenario --controller bound-pc --iterations 1 --out plan.npz",
+        "bound scenario --controller bound-pc --out plan.npz",
     ],
 )
 def test_commands_without_demand(tmp_path, monkeypatch, command):

@@ -106,7 +106,9 @@ def _reasons(level: Level, network: RegionalModel, name: str, against: str, *, g
     if gains:
         after = load(network, runs)
         relief = f"{network.region_names[region]} is beyond its critical accumulation {after.beyond[region]:.0%} of the"
-        return acts + [f"{relief} time instead of {before.beyond[region]:.0%}"] * (before.beyond[region] > SMALL_SHARE)
+        return acts + [f"{relief} time instead of {before.beyond[region]:.0%}"] * int(
+            before.beyond[region] > SMALL_SHARE
+        )
     limits = []
     if not alone and _leaking(level) > LEAKING_SHARE:
         limits.append(f"{_leaking(level):.0%} of the boundary flow passes no signal under control")
