@@ -118,5 +118,5 @@ def test_the_same_seed_learns_the_same_and_the_file_keeps_it(scenario, learned, 
 
 def test_ipopt_knows_none(scenario, learned):
     planning = replace(planning_model(scenario, NAME), controller_options={NAME: {"solver": "ipopt"}})
-    with pytest.raises(InputError, match="ipopt knows no terminal cost"):
+    with pytest.raises(InputError, match="ipopt has no terminal cost"):
         EconomicMpc(planning, guidance=False, terminal=learned)

@@ -140,8 +140,8 @@ def settings(scenario: Scenario, strategy: "Strategy", steps: int | None = None)
     return setup if steps is None else setup.changed(steps=steps)
 
 
-def check(scenario: Scenario, strategy: "Strategy") -> None:
-    """Raise InputError if no gateway can be controlled or the MFDs are placeholders."""
+def check(scenario: Scenario, strategy: "Strategy") -> RegionalModel:
+    """Return the model to train on. Raise InputError without gateways, or for placeholder MFDs."""
     city, believed = scenario.network, strategy.planning(scenario).network
     file = city.name if city.folder is None else city.folder / "network.toml"
     if city.controllable is not None and not city.controllable.any():
@@ -154,6 +154,7 @@ def check(scenario: Scenario, strategy: "Strategy") -> None:
             f"are guesses from lanes and speed limits; run 'cosim identify {city.folder}' first, or set it to false "
             f"after putting in your own MFDs; --anyway trains {strategy.name} all the same"
         )
+    return believed
 
 
 def available(device: str) -> str:
