@@ -110,8 +110,8 @@ def identify(
 
     def load(stage: int, **options: object) -> list[Result]:
         named = progress and (lambda done, total, note: progress(done, total, f"loading runs {stage + 1} of 2; {note}"))
-        more = {"workers": workers, "scheduler": scheduler, "progress": named}
-        return _load(loaded, loading, loading.stages[stage], options, out, **more)
+        how = {"workers": workers, "scheduler": scheduler, "progress": named}
+        return _load(loaded, loading, loading.stages[stage], options, out, **how)
 
     first = load(0)
     network = static_model(loaded, first, guided=loading.guided)
@@ -229,18 +229,12 @@ def as_it_was(network: RegionalModel, model: RegionalModel, regions: Sequence[in
 
 def run_verdict(network: RegionalModel, results: Sequence[Result]) -> authority.Verdict:
     """Judge from runs with open gateways whether perimeter control can help."""
-    shape = (network.regions,) * 2
-    flow, controlled = np.zeros(shape), np.zeros(shape)
-    count, controllable = np.zeros(shape, dtype=int), np.zeros(shape, dtype=int)
+    gateways = []
     for n, gateway in enumerate(city_of(network).gateways):
-        pair = gateway.source, gateway.target
-        reached = not np.isnan(results[0]["gateway_original_green"][0, n])  # NaN without a signal under control
         passed = sum(float(result["gateway_flow"][:, n].sum()) for result in results)
-        count[pair] += 1
-        flow[pair] += passed
-        controllable[pair] += reached
-        controlled[pair] += passed * reached
-    boundaries = authority.Boundaries(flow=flow, controlled=controlled, gateways=count, controllable=controllable)
+        reached = not np.isnan(results[0]["gateway_original_green"][0, n])  # NaN without a signal under control
+        gateways.append((gateway.source, gateway.target, passed, reached))
+    boundaries = authority.Boundaries.of_gateways(network.regions, gateways)
     most = np.max([result.accumulation.sum(axis=2).max(axis=0) for result in results], axis=0) / network.critical
     started = np.sum([result["departures"].sum(axis=(0, 2)) for result in results], axis=0).astype(float)
     where = f"in {len(results)} loading run{'s' * (len(results) > 1)} under {results[0].controller}"

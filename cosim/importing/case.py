@@ -218,20 +218,13 @@ def parse_box(text: str) -> Box:
 def fetch_osm(box: Box, folder: Path) -> Path:
     """Fetch the streets within a box by SUMO's osmGet.py from a public server. Raises InputError."""
     where = ",".join(f"{value:g}" for value in box)
-    program = [sys.executable, str(Path(sumo.SUMO_HOME) / "tools" / "osmGet.py")]
-    road_types = '{"highway": ["."]}'
+    program = [sys.executable, str(Path(sumo.SUMO_HOME) / "tools" / "osmGet.py"), f"--bbox={where}"]
     options = ["--output-dir", str(folder), "--prefix", "osm", "--gzip", "--url", SERVERS, "--retries", "2"]
+    options += ["--road-types", '{"highway": ["."]}']
+    environment = os.environ | {"SUMO_HOME": sumo.SUMO_HOME}
+    kept = {"capture_output": True, "text": True, "errors": "replace", "stdin": subprocess.DEVNULL}
     try:
-        done = subprocess.run(
-            [*program, f"--bbox={where}", *options, "--road-types", road_types],
-            capture_output=True,
-            text=True,
-            errors="replace",
-            stdin=subprocess.DEVNULL,
-            timeout=SERVER_TIME_LIMIT_S,
-            check=False,
-            env=os.environ | {"SUMO_HOME": sumo.SUMO_HOME},
-        )
+        done = subprocess.run([*program, *options], timeout=SERVER_TIME_LIMIT_S, env=environment, **kept)
         reason = (done.stderr.strip().splitlines() or [f"status {done.returncode}"])[-1] if done.returncode else ""
     except subprocess.TimeoutExpired:
         reason = f"no answer in {SERVER_TIME_LIMIT_S:g} s"
@@ -263,15 +256,12 @@ def run_sumo(
     where: str,
     reached: Callable[[float], None] = lambda time: None,
 ) -> None:
-    """Run one of SUMO's programs.
+    """Run one of SUMO's programs. Raises InputError with the first error line of the program.
 
     Args:
         options: name without dashes -> value.
         where: file that an InputError names.
         reached: called with the times of SUMO's step log [s].
-
-    Raises:
-        InputError: with the first error line of the program.
     """
     arguments = [text for name, value in options.items() for text in (f"--{name}", str(value))]
     lines = []

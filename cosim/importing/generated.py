@@ -157,17 +157,7 @@ def _times(uniform: np.ndarray) -> np.ndarray:
 
 
 def _vehicle(n: int, depart: float, edges: Iterable[str]) -> Element:
-    vehicle = Element(
-        "vehicle",
-        {
-            "id": f"v{n}",
-            "type": "car",
-            "depart": f"{depart:.2f}",
-            "departLane": "best",
-            "departSpeed": "max",
-            "departPos": "random_free",
-            "arrivalPos": "random",
-        },
-    )
+    free = {"departLane": "best", "departSpeed": "max", "departPos": "random_free", "arrivalPos": "random"}
+    vehicle = Element("vehicle", {"id": f"v{n}", "type": "car", "depart": f"{depart:.2f}", **free})
     vehicle.append(Element("route", {"edges": " ".join(edges)}))
     return vehicle

@@ -25,7 +25,7 @@ def colour(region: int) -> str:
 
 
 def region_map(ax: Axes, streets: Streets, regions: EdgeNumbers, names: Sequence[str], places: Positions) -> Axes:
-    """Draw every street in the colour of its region, with a scale bar."""
+    """Draw every street in the colour of its region."""
     members = np.flatnonzero(streets.drivable)
     lines = LineCollection(
         [streets.shapes[n] for n in members],
@@ -41,13 +41,6 @@ def region_map(ax: Axes, streets: Streets, regions: EdgeNumbers, names: Sequence
         box = {"boxstyle": "round,pad=0.25", "facecolor": "white", "edgecolor": colour(region), "alpha": 0.85}
         title = f"{region} {names[region]}"
         ax.text(x, y, title, ha="center", va="center", fontsize="small", zorder=5, bbox=box)
-    left, right = ax.get_xlim()
-    length = 10.0 ** np.floor(np.log10(0.4 * (right - left)))
-    bottom = ax.get_ylim()[0]
-    ax.plot([left, left + length], [bottom, bottom], color="black", linewidth=2)
-    text = f"{length:g} m" if length < 1000 else f"{length / 1000:g} km"
-    middle = (left + length / 2, bottom)
-    ax.annotate(text, middle, xytext=(0, 3), textcoords="offset points", ha="center", fontsize="small")
     return ax
 
 
@@ -73,7 +66,7 @@ def rings_round(
         members: (E,) bool, the edges that count.
         blocks: share of the map's extent between streets that is still no hole.
     """
-    points, of = sampled(shapes, members)
+    points, of = _sampled(shapes, members)
     low, high = points.min(axis=0), points.max(axis=0)
     cell = max(float((high - low).max()) / CELLS, 1.0)
     # Beyond this distance a place belongs to no street; the map must end there, or rings stay open.
@@ -91,7 +84,7 @@ def rings_round(
     return outlines
 
 
-def sampled(shapes: Sequence[Points], members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _sampled(shapes: Sequence[Points], members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return points (n, 2) along the shapes of some edges, and the edge (n,) of each point."""
     points, of = [], []
     for n in np.flatnonzero(members):

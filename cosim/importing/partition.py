@@ -6,28 +6,23 @@ that much traffic joins without a controllable signal merge first.
 """
 
 from collections import Counter
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 from jaxtyping import Float, Int
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 from sklearn.cluster import AgglomerativeClustering
 
 from cosim.importing.baseline import Baseline
-from cosim.importing.maps import sampled
 from cosim.importing.regions import finish
 from cosim.importing.streets import Streets, graph
-from cosim.sumo.arrays import EdgeNumbers, PerEdge
+from cosim.sumo.arrays import EdgeNumbers
 from nmfd.errors import InputError
 
-CARRIAGEWAY_DISTANCE_M = 30.0  # between the carriageways of one road, at most
-OPPOSED_COSINE = -0.9  # of the angle between their directions, at most
-CARRIAGEWAY_SHARE = 0.02  # of the network: no block grows beyond this by joining carriageways
 SMOOTHING_ROUNDS = 2  # of averaging densities with the neighbours
 HIGHEST_DENSITY = 0.15  # veh/m of lane; denser counts as this dense
 UNSIGNALLED_SHARE = 0.3  # of the mean region, up to which streets merge over connections without a signal
@@ -37,7 +32,7 @@ MAX_EXTRA_CLUSTERS = 20  # beyond the requested number, among which enough large
 
 @dataclass(frozen=True, kw_only=True)
 class Blocks:
-    """B pieces of the main part of a network that no boundary divides: roads with all carriageways, roundabouts.
+    """B pieces of the main part of a network that no boundary divides: streets with both directions, roundabouts.
 
     of: (E,) block of an edge, -1 outside the main part
     weight: (B,) lane metres; core: (B,) those of edges of the strongly connected core
@@ -50,12 +45,6 @@ class Blocks:
     core: Float[np.ndarray, " B"]
     position: Float[np.ndarray, "B 2"]
     joins: csr_array
-
-    def mean(self, value: PerEdge, weight: PerEdge) -> Float[np.ndarray, " B"]:
-        """Return the weighted mean of a value over the edges of each block."""
-        inside = self.of >= 0
-        total = np.bincount(self.of[inside], (value * weight)[inside], len(self.weight))
-        return total / np.maximum(np.bincount(self.of[inside], weight[inside], len(self.weight)), 1e-9)
 
 
 def read_regions(streets: Streets, path: Path) -> EdgeNumbers:
@@ -99,7 +88,8 @@ def partition(
         raise InputError(f"--regions: expected at most {count}, the streets of {streets.path}, got {regions} instead")
     controllable = np.array([signal is not None and signal not in uncontrollable for signal in streets.link_signals])
     merged = _without_signals(streets, blocks, baseline.moves(), controllable, regions)
-    feature = features(blocks, blocks.mean(baseline.density(streets), streets.lane_metres))
+    inside, vehicles = blocks.of >= 0, baseline.density(streets) * streets.lane_metres
+    feature = features(blocks, np.bincount(blocks.of[inside], vehicles[inside], count) / blocks.weight)
     weight = np.bincount(merged, blocks.weight)
     feature = np.stack([np.bincount(merged, blocks.weight * axis) / weight for axis in feature.T], axis=1)[merged]
     labels = cluster(blocks, feature, regions)
@@ -134,24 +124,21 @@ def features(blocks: Blocks, density: Float[np.ndarray, " B"]) -> Float[np.ndarr
 
 def make_blocks(streets: Streets) -> Blocks:
     """Group the edges of the main part into blocks."""
-    size, inside = len(streets.edges), streets.main_part
+    inside, lanes = streets.main_part, streets.lane_metres
     rings = [(ring[0], n) for ring in streets.roundabouts for n in ring[1:]]
     pairs = np.array([*_opposite(streets), *rings], dtype=int).reshape(-1, 2)
     pairs = pairs[inside[pairs].all(axis=1)]
-    _, label = connected_components(graph(pairs, size), directed=False)
-    label = _merged(label, _beside(streets), streets.lane_metres, CARRIAGEWAY_SHARE * streets.lane_metres.sum())
-    _, number = np.unique(label[inside], return_inverse=True)
-    of = np.full(size, -1)
-    of[inside] = number
-    count, lanes = number.max() + 1, streets.lane_metres[inside]
-    weight = np.bincount(number, lanes, count)
-    middles = [np.bincount(number, axis * lanes, count) / weight for axis in streets.centre[inside].T]
-    ends = of[streets.links[inside[streets.links].all(axis=1)]]
-    ends = ends[ends[:, 0] != ends[:, 1]]
-    both = np.concatenate([ends, ends[:, ::-1]])
-    joins = coo_array((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(count, count)).tocsr()
+    _, label = connected_components(graph(pairs, len(streets.edges)), directed=False)
+    of = np.full(len(streets.edges), -1)
+    of[inside] = np.unique(label[inside], return_inverse=True)[1]
+    count = of.max() + 1
+    weight = np.bincount(of[inside], lanes[inside], count)
+    middles = [np.bincount(of[inside], (axis * lanes)[inside], count) / weight for axis in streets.centre.T]
+    ends = of[streets.links]
+    ends = ends[(ends >= 0).all(axis=1) & (ends[:, 0] != ends[:, 1])]
+    joins = graph(np.concatenate([ends, ends[:, ::-1]]), count)
     joins.sum_duplicates()
-    core = np.bincount(number, lanes * streets.core[inside], count)
+    core = np.bincount(of[inside], (lanes * streets.core)[inside], count)
     return Blocks(of=of, weight=weight, core=core, position=np.stack(middles, axis=1), joins=joins)
 
 
@@ -166,38 +153,13 @@ def _without_signals(
             flow[int(one), int(other)] += moves[int(a), int(b)]
     pairs = sorted(flow, key=lambda pair: (-flow[pair], pair))
     limit = UNSIGNALLED_SHARE * blocks.weight.sum() / regions
-    return np.unique(_merged(np.arange(len(blocks.weight)), pairs, blocks.weight, limit), return_inverse=True)[1]
-
-
-def _merged(label: np.ndarray, pairs: Iterable[tuple[int, int]], weight: np.ndarray, limit: float) -> np.ndarray:
-    """Merge the groups of each pair in order, unless the union weighs more than the limit."""
-    label, size = label.copy(), np.bincount(label, weight)
-    group: dict[int, list[int]] = {}
-    for n, name in enumerate(label):
-        group.setdefault(int(name), []).append(n)
-    for a, b in pairs:
-        one, other = int(label[a]), int(label[b])
+    label, size = np.arange(len(blocks.weight)), blocks.weight.copy()
+    for pair in pairs:
+        one, other = label[list(pair)]
         if one != other and size[one] + size[other] <= limit:
-            group[one] += group.pop(other)
-            label[group[one]] = one
+            label[label == other] = one
             size[one] += size[other]
-    return label
-
-
-def _beside(streets: Streets) -> np.ndarray:
-    """Return pairs of edges (n, 2): one, and another that runs the opposite way beside most of it."""
-    points, of = sampled(streets.shapes, streets.main_part)
-    first = np.searchsorted(of, of, side="left")
-    last = np.searchsorted(of, of, side="right") - 1
-    place = np.arange(len(of))
-    heading = points[np.minimum(place + 1, last)] - points[np.maximum(place - 1, first)]
-    heading /= np.maximum(np.hypot(*heading.T), 1e-9)[:, None]
-    pairs = cKDTree(points).query_pairs(CARRIAGEWAY_DISTANCE_M, output_type="ndarray")
-    pairs = pairs[(heading[pairs[:, 0]] * heading[pairs[:, 1]]).sum(axis=1) < OPPOSED_COSINE]
-    pairs = np.concatenate([pairs, pairs[:, ::-1]])
-    beside = np.unique(np.column_stack([pairs[:, 0], of[pairs[:, 1]]]), axis=0)  # every point once per other edge
-    edges, votes = np.unique(np.column_stack([of[beside[:, 0]], beside[:, 1]]), axis=0, return_counts=True)
-    return edges[votes > 0.5 * np.bincount(of)[edges[:, 0]]]
+    return np.unique(label, return_inverse=True)[1]
 
 
 def _opposite(streets: Streets) -> list[tuple[int, int]]:

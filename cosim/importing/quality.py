@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 from scipy.sparse.csgraph import connected_components
 
 from cosim.importing.baseline import INTERVAL_S, Baseline
@@ -71,7 +72,11 @@ def tables(
         for g in city.gateways
     ]
     density = np.zeros(len(regions)) if baseline is None else 1000.0 * baseline.density(streets)
-    signals = _signals(streets, regions, city)
+    approaches = [(signal, regions[streets.number[edge]]) for edge, signal in city.signals.items()]
+    main_region = (
+        pd.DataFrame(approaches, columns=["signal", "region"]).groupby("signal").agg(lambda part: part.mode()[0])
+    )
+    signals = np.bincount(main_region["region"].astype(int), minlength=len(names))
     rows = []
     for region, name in enumerate(names):
         own = [g for g in gateways if region in (g["source"], g["target"])]
@@ -137,17 +142,6 @@ def pieces(streets: Streets, members: EdgeMask) -> int:
     return int(connected_components(graph(numbers[links], int(members.sum())), directed=False)[0])
 
 
-def _signals(streets: Streets, regions: EdgeNumbers, city: City) -> np.ndarray:
-    """Count the signals (R,) by the region in which most of their approaches lie."""
-    votes: dict[str, Counter[int]] = {}
-    for edge, signal in city.signals.items():
-        votes.setdefault(signal, Counter())[int(regions[streets.number[edge]])] += 1
-    count = np.zeros(int(regions.max()) + 1, dtype=int)
-    for by_region in votes.values():
-        count[max(sorted(by_region), key=by_region.__getitem__)] += 1
-    return count
-
-
 def quality_table(found: Tables) -> str:
     """Return the quality of a partition as text."""
     return text_table(
@@ -174,16 +168,8 @@ def import_verdict(
     network: RegionalModel, gateways: Sequence[Mapping], regions: EdgeNumbers, baseline: Baseline
 ) -> Verdict:
     """Judge from the run without control whether perimeter control can help."""
-    shape = (network.regions,) * 2
-    flow, controlled = np.zeros(shape), np.zeros(shape)
-    count, controllable = np.zeros(shape, dtype=int), np.zeros(shape, dtype=int)
-    for row in gateways:
-        pair, reached = (row["source"], row["target"]), row["control"] == CONTROLLED
-        count[pair] += 1
-        flow[pair] += row["flow_veh"]
-        controllable[pair] += reached
-        controlled[pair] += row["flow_veh"] * reached
-    boundaries = Boundaries(flow=flow, controlled=controlled, gateways=count, controllable=controllable)
+    crossings = ((row["source"], row["target"], row["flow_veh"], row["control"] == CONTROLLED) for row in gateways)
+    boundaries = Boundaries.of_gateways(network.regions, crossings)
     inside = np.array([np.bincount(regions, row, network.regions) for row in baseline.presence]) / INTERVAL_S
     started = np.zeros(network.regions)
     for (way, _), vehicles in baseline.ways.items():

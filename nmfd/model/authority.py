@@ -4,6 +4,7 @@ Control helps only if vehicles on their way into a region that becomes critical 
 is the share of all vehicles filling such a region, from elsewhere or starting there, that a gateway could hold.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,6 +37,19 @@ class Boundaries:
     controlled: Counts
     gateways: Int[np.ndarray, "R R"]
     controllable: Int[np.ndarray, "R R"]
+
+    @classmethod
+    def of_gateways(cls, regions: int, gateways: Iterable[tuple[int, int, float, bool]]) -> "Boundaries":
+        """Sum over gateways: source, target, crossings [veh], with a signal under control."""
+        flow, controlled = np.zeros((2, regions, regions))
+        count, controllable = np.zeros((2, regions, regions), dtype=int)
+        for source, target, vehicles, reached in gateways:
+            pair = source, target
+            flow[pair] += vehicles
+            controlled[pair] += vehicles * reached
+            count[pair] += 1
+            controllable[pair] += reached
+        return cls(flow=flow, controlled=controlled, gateways=count, controllable=controllable)
 
     @property
     def shares(self) -> PerPair:
