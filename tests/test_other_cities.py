@@ -325,7 +325,7 @@ def test_speeds_and_coordinates(city):
     assert [vehicle.get("departSpeed") for vehicle in traffic.vehicles] == ["max", "random"]
     assert traffic.notes == {
         "fixed speeds at the departure, made the highest safe ones": 1,
-        "trips between zones, junctions or coordinates, left out: give them edges with duarouter": 1,
+        "trips between zones, junctions or coordinates, which duarouter would give edges, left out": 1,
     }
 
 

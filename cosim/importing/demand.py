@@ -70,18 +70,18 @@ class _Reader:
         self._classes: dict[str, str] = {"DEFAULT_BIKETYPE": "bicycle", "DEFAULT_PEDTYPE": "pedestrian"}
         self._routes: dict[str, list[str]] = {}
         self._notes: Counter[str] = Counter()
+        self._background: list[Element] = []
 
     def read(self) -> Traffic:
         drivers: list[tuple[Element, Path]] = []
         shared: list[Element] = []
-        background: list[Element] = []
         switched: set[str] = set()
         for path in (*self._case.additional, *self._case.routes):
             for element in map(_silent, read_xml(path)):
                 if element.tag in DRIVERS:
                     drivers.append((element, path))
                 elif element.tag in OTHERS:
-                    background.append(element)
+                    self._background.append(element)
                 elif element.tag not in DROPPED:
                     with _blamed(element, path):
                         self._learn(element)
@@ -95,13 +95,25 @@ class _Reader:
                 element.set("departSpeed", "max")
                 self._notes["fixed speeds at the departure, made the highest safe ones"] += 1
             if element.get("line") or self._classes.get(element.get("type", ""), "passenger") in BOUND:
-                background.append(element)
+                self._background.append(element)
                 self._notes[f"public transport and other classes left alone ({element.tag})"] += 1
             elif element.tag == "flow":
                 vehicles += [(single, path) for single in self._expand(element, path)]
             else:
                 vehicles.append((element, path))
-        return self._checked(vehicles, background, shared, switched)
+        kept = self._checked(vehicles)
+        if self._background:
+            self._notes["persons, containers and vehicles left alone, in all"] = len(self._background)
+        return Traffic(
+            vehicles=tuple(row[4] for row in kept),
+            depart=np.array([row[0] for row in kept], dtype=float),
+            origin=np.array([row[1] for row in kept], dtype=int),
+            destination=np.array([row[2] for row in kept], dtype=int),
+            background=tuple(sorted(self._background, key=_begin)),
+            shared=tuple(shared),
+            switched=tuple(sorted(switched)),
+            notes=dict(self._notes),
+        )
 
     def _learn(self, element: Element) -> None:
         """Store types and routes that vehicles refer to. Raises ValueError."""
@@ -140,33 +152,28 @@ class _Reader:
         begin = seconds(flow.get("begin", str(self._case.begin)), f"{where}: begin")
         end = seconds(text, f"{where}: end") if (text := flow.get("end")) else None
         stop = min(end if end is not None else self._case.end or begin + ENDLESS_FLOW_S, self._case.end or np.inf)
-        per_hour, period = flow.get("vehsPerHour") or flow.get("perHour"), flow.get("period")
+        per_hour, period = flow.get("vehsPerHour") or flow.get("perHour"), flow.get("period") or ""
         probability = flow.get("probability")
         try:
             number = int(text) if (text := flow.get("number")) else None
             if number == 0 or 0.0 in [float(rate) for rate in (per_hour, probability) if rate]:
                 return []
-            if match := re.fullmatch(r"exp\((.+)\)", period or ""):
+            if match := re.fullmatch(r"exp\((.+)\)", period):
                 rate = float(match[1])
                 gaps = self._random.exponential(1.0 / rate, size=number or int(3 * rate * (stop - begin) + 30))
                 times = begin + np.cumsum(gaps) - (gaps[0] if number else 0.0)
             elif probability:
-                seconds_of = np.arange(begin, stop)
-                times = seconds_of[self._random.random(len(seconds_of)) < float(probability)]
+                times = np.arange(begin, stop)
+                times = times[self._random.random(len(times)) < float(probability)]
             else:
                 if per_hour:
                     gap = 3600.0 / float(per_hour)
-                elif period:
-                    gap = float(period)
-                elif number is None:
-                    raise ValueError
                 else:
-                    gap = ((end if end is not None else stop) - begin) / number
+                    gap = float(period) if period else ((stop if end is None else end) - begin) / (number or 0)
                 times = begin + gap * np.arange(int(np.ceil((stop - begin) / gap - 1e-9)))
         except (ValueError, ZeroDivisionError):
-            raise InputError(
-                f"{where}: expected a number, period, vehsPerHour or probability above 0; correct it"
-            ) from None
+            remedy = "expected a number, period, vehsPerHour or probability above 0; correct it"
+            raise InputError(f"{where}: {remedy}") from None
         times = times[times < stop][:number]
         routed = flow.get("route") or any(flow.find(tag) is not None for tag in ("route", "routeDistribution"))
         tag = "vehicle" if routed else "trip"
@@ -179,72 +186,49 @@ class _Reader:
         self._notes["vehicles from flows"] += len(singles)
         return singles
 
-    def _checked(
-        self,
-        vehicles: Iterable[tuple[Element, Path]],
-        background: list[Element],
-        shared: Sequence[Element],
-        switched: Iterable[str],
-    ) -> Traffic:
-        """Keep vehicles that can drive from their first to their last edge within the simulation."""
-        number = self._streets.number
-        kept: list[Kept] = []
-        begin, end = self._case.begin, np.inf if self._case.end is None else self._case.end
-        names: set[str] = set()
+    def _checked(self, vehicles: Iterable[tuple[Element, Path]]) -> list[Kept]:
+        """Keep vehicles that can drive from their first to their last edge within the simulation, by departure."""
+        number, kept, names = self._streets.number, list[Kept](), set[str]()
+        begin, end = self._case.begin, self._case.end or np.inf
         for element, path in vehicles:
             try:
                 depart = begin if element.get("depart") == "begin" else seconds(element.get("depart", ""), "")
             except InputError:
-                background.append(element)
+                self._background.append(element)
                 self._notes["vehicles without a time of departure, left alone"] += 1
-                continue
-            if not begin <= depart < end:
-                self._notes["vehicles outside the simulated time, left out"] += 1
                 continue
             with _blamed(element, path):
                 edges, driven = self._edges(element)
-            if not edges and any(key in ZONES or key.endswith(("XY", "LonLat")) for key in element.keys()):
-                self._notes[
-                    "trips between zones, junctions or coordinates, left out: give them edges with duarouter"
-                ] += 1
-            elif not edges or any(edge not in number for edge in edges):
-                self._notes["vehicles with unknown edges or none, left out"] += 1
-            elif driven and not self._moves.issuperset(pairwise(map(number.get, edges))):
-                self._notes["vehicles on routes with gaps, left out"] += 1
-            elif self._is_car(element) and not self._open_to_cars([number[edge] for edge in edges], driven):
-                self._notes["cars on streets that are closed to cars, left out"] += 1
-            else:
-                name = element.get("id", "")
-                if not name or name in names:
-                    raise InputError(f"{path}: {element.tag}: id: expected one that no other vehicle has, got {name!r}")
-                names.add(name)
-                element.set("depart", f"{depart:.2f}")
-                kept.append((depart, number[edges[0]], number[edges[-1]], driven, element))
-        kept.sort(key=lambda row: row[0])
-        kept = self._reachable(kept)
-        background.sort(key=_begin)
-        if background:
-            self._notes["persons, containers and vehicles left alone, in all"] = len(background)
-        columns = (np.array([row[n] for row in kept], dtype=kind) for n, kind in ((0, float), (1, int), (2, int)))
-        depart, origin, destination = columns
-        return Traffic(
-            vehicles=tuple(row[4] for row in kept),
-            depart=depart,
-            origin=origin,
-            destination=destination,
-            background=tuple(background),
-            shared=tuple(shared),
-            switched=tuple(sorted(switched)),
-            notes=dict(self._notes),
-        )
+            if (reason := self._reason(element, depart, begin, end, edges, driven)) is not None:
+                self._notes[f"{reason}, left out"] += 1
+                continue
+            name = element.get("id", "")
+            if not name or name in names:
+                raise InputError(f"{path}: {element.tag}: id: expected one that no other vehicle has, got {name!r}")
+            names.add(name)
+            element.set("depart", f"{depart:.2f}")
+            kept.append((depart, number[edges[0]], number[edges[-1]], driven, element))
+        return self._reachable(sorted(kept, key=lambda row: row[0]))
+
+    def _reason(
+        self, element: Element, depart: float, begin: float, end: float, edges: Sequence[str], driven: bool
+    ) -> str | None:
+        """Return the reason why a vehicle is left out, None without any."""
+        number, streets = self._streets.number, self._streets
+        if not begin <= depart < end:
+            return "vehicles outside the simulated time"
+        if not edges and any(key in ZONES or key.endswith(("XY", "LonLat")) for key in element.keys()):
+            return "trips between zones, junctions or coordinates, which duarouter would give edges"
+        if not edges or any(edge not in number for edge in edges):
+            return "vehicles with unknown edges or none"
+        numbers = [number[edge] for edge in edges]
+        if driven and not self._moves.issuperset(pairwise(numbers)):
+            return "vehicles on routes with gaps"
+        closed = not streets.drivable[numbers].all() or (driven and not self._car_moves.issuperset(pairwise(numbers)))
+        return "cars on streets that are closed to cars" if closed and self._is_car(element) else None
 
     def _is_car(self, element: Element) -> bool:
         return self._classes.get(element.get("type", ""), "passenger") == "passenger"
-
-    def _open_to_cars(self, edges: Sequence[int], driven: bool) -> bool:
-        return bool(self._streets.drivable[list(edges)].all()) and (
-            not driven or self._car_moves.issuperset(pairwise(edges))
-        )
 
     def _edges(self, element: Element) -> tuple[list[str], bool]:
         """Return (edges of a vehicle's route, True), or (edges that a trip must pass, False)."""
