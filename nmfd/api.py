@@ -202,11 +202,10 @@ def train(
     strategy = parse(controller)
     chosen = training.settings(scenario, strategy, steps)
     file = _file(scenario, f"{controller}.pt", out)
-    if not anyway:
-        model = training.check(scenario, strategy)
-        for region, doubts in zip(model.region_names, model.doubts, strict=False):
-            if doubts:
-                print(f"nmfd: the model of region {region} is doubtful: {'; '.join(doubts)}", file=sys.stderr)
+    believed = strategy.planning(scenario).network
+    for region, doubts in zip(believed.region_names, believed.doubts, strict=False):
+        if doubts:
+            print(f"nmfd: the model of region {region} is doubtful: {'; '.join(doubts)}", file=sys.stderr)
     compiled = chosen.descend and chosen.steps >= training.WORTH_COMPILING and rollout.can_compile(device)
     try:
         with watched(controller, progress) as show:

@@ -45,7 +45,7 @@ def in_process(monkeypatch):
 
 def arrays(folder):
     """Return name -> result without times of every run in a folder."""
-    return {file.name: Result.read(file).without_times().data for file in folder.glob("*.nc")}
+    return {file.name: Result.read(file).without_times() for file in folder.glob("*.nc")}
 
 
 def same(left, right):

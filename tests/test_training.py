@@ -371,7 +371,7 @@ def test_the_model_that_a_controller_is_trained_on_must_be_measured(scenario):
     """Its own one, whatever the city's is; and somewhere something must be controllable."""
     own = replace(scenario.network, placeholder=True)
     city = replace(scenario, network=own)
-    with pytest.raises(InputError, match="placeholder: is true.*--anyway trains dpc-pc all the same"):
+    with pytest.raises(InputError, match="placeholder: is true.*anyway=True"):
         training.check(city, parse("dpc-pc"))
     training.check(scenario, parse("dpc-pc"))
     shut = replace(scenario.network, controllable=np.zeros_like(scenario.network.adjacency, dtype=float))
