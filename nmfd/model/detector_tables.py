@@ -51,8 +51,7 @@ def read_counts(path: Path, *, city: str | None = None, skip_bad: bool = False) 
     city: of several in the file; skip_bad: leave out rows with a missing or impossible number instead of raising
     InputError; rows marked as errors are always left out
     """
-    parts, left = [], {MARKED: 0, BAD: 0}
-    cities: set[str] = set()
+    parts, left, cities = [], {MARKED: 0, BAD: 0}, set[str]()
     for chunk in _chunks(path, COUNTS, ("error", "city", "region")):
         for name in ("day", "detid"):
             if chunk[name].isna().any():
@@ -70,24 +69,16 @@ def read_counts(path: Path, *, city: str | None = None, skip_bad: bool = False) 
             raise InputError(f"{path}: {problem}; correct it, or leave such rows out with --skip-bad")
         left[BAD] += len(chunk) - len(good)
         parts.append(good[[*COUNTS, *(["region"] if "region" in good else [])]])
-    if city is not None and city not in cities:
-        there = ", ".join(sorted(cities)) or "none: the file has no such column, so omit --city"
-        raise InputError(f"{path}: city: there is no {city!r}{did_you_mean(city, cities)}; choose from {there}")
-    if city is None and len(cities) > 1:
-        raise InputError(
-            f"{path}: city: holds {len(cities)} of them; choose one with --city: {', '.join(sorted(cities))}"
-        )
+    if (city is None and len(cities) > 1) or (city is not None and city not in cities):
+        hint = did_you_mean(city, cities) if city else ""
+        raise InputError(f"{path}: city: choose one of {', '.join(sorted(cities)) or 'none'} with --city{hint}")
     rows = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
     if len(rows) == 0 or left[BAD] > len(rows):
-        raise InputError(
-            f"{path}: {len(rows)} good rows, and left out: {omitted(left)}; is flow in veh/h per lane, and occ a share?"
-        )
-    doubled = rows.duplicated(["day", "interval", "detid"])
-    if doubled.any():
+        units = "is flow in veh/h per lane, and occ a share?"
+        raise InputError(f"{path}: {len(rows)} good rows, and left out: {omitted(left)}; {units}")
+    if (doubled := rows.duplicated(["day", "interval", "detid"])).any():
         day, interval, detid = rows.loc[doubled.idxmax(), ["day", "interval", "detid"]]
-        raise InputError(
-            f"{path}: detector {detid} has two rows of {day}, {interval:g} s ({doubled.sum()} such rows); keep one"
-        )
+        raise InputError(f"{path}: detector {detid} has two rows of {day}, {interval:g} s; keep one")
     times = np.unique(rows["interval"])
     if len(times) > 1 and np.diff(times).min() < LEAST_INTERVAL_S:
         raise InputError(
@@ -102,43 +93,35 @@ def read_detectors(
 ) -> pd.DataFrame:
     """Return region, lane_km, pos_km, x_m, y_m (NaN where unknown) by detid of all detectors in `counts`.
 
-    Detectors of one link share its length by station. Raises InputError.
+    Detectors of one link share its length by station. The last table with a column region counts. Raises InputError.
 
     path, regions: detectors.csv and regions.csv; where: file of `counts`; city: a citycode of detectors.csv
     """
     table = counts.drop_duplicates("detid").drop(columns=["day", "interval", "flow", "occ"])
-    detids, source = list(table["detid"]), where if "region" in table else path
+    detids = list(table["detid"])
     if path is not None:
         optional = ("lanes", "linkid", "pos", "long", "lat", "x", "y", "citycode", "region")
         more = pd.concat(_chunks(path, ("detid", "length"), optional))
         if city is not None and "citycode" in more:
             more = more[more["citycode"] == city]
-        if "region" in table and "region" in more:
-            raise InputError(f"{path}: has a column region, and so has {where}; remove one of the two")
         more = _unique(more[more["detid"].isin(detids)], "detid", path)
         used = ["length", *(["lanes"] if "lanes" in more and more["lanes"].notna().all() else [])]
         more, problem = _numbers(more, {name: DETECTOR_LIMITS[name] for name in used})
         if problem:
             raise InputError(f"{path}: {problem}; correct it")
-        table = more.merge(table, how="left") if "region" in table else more
+        table = table.drop(columns="region", errors="ignore") if "region" in more else table
+        table = more.merge(table, how="left")
     if regions is not None:
-        if "region" in table:
-            raise InputError(f"{regions}: {source} has a column region already; give one of the two")
-        table = table.merge(_unique(pd.concat(_chunks(regions, ("detid", "region"))), "detid", regions), how="left")
+        named = _unique(pd.concat(_chunks(regions, ("detid", "region"))), "detid", regions)
+        table = table.drop(columns="region", errors="ignore").merge(named, how="left")
+    where = regions or path or where
     if "region" not in table:
-        raise InputError(
-            f"{path or where}: has no column region; give it there, or a table detid,region with --regions"
-        )
+        raise InputError(f"{where}: has no column region; give it there, or a table detid,region with --regions")
     table = table.set_index("detid")
-    nowhere = table.index[table["region"].isna() | (table["region"].str.strip() == "")]
-    for missing, file, what in (
-        (set(detids) - set(table.index), path or where, "no row"),
-        (set(detids) & set(nowhere), regions or path or where, "no region"),
-    ):
-        if missing:
-            raise InputError(
-                f"{file}: detector {min(missing)}, which {where} counts, has {what} ({len(missing)} such); add it"
-            )
+    table = table[table["region"].notna() & (table["region"].str.strip() != "")]
+    if missing := set(detids) - set(table.index):
+        count = f"{len(missing)} such"
+        raise InputError(f"{where}: detector {min(missing)}, which has counts, has no row or region ({count}); add it")
     table = table.loc[detids]
     columns = {
         name: pd.to_numeric(table[name], errors="coerce") if name in table else np.nan

@@ -2,8 +2,7 @@
 
     python scenarios/large_grids/scaling.py --family hexagonal --load congested --regions 7,19,37 --out runs/scaling
 
-As in Tumu et al.: random MFDs around the benchmark's, random initial states, no demand, ten control intervals. Policies
-are untrained, because the time of a decision does not depend on their weights. Each case runs in a process of its own.
+As in Tumu et al.: random MFDs and initial states, no demand, untrained policies. Each case runs in its own process.
 """
 
 import argparse
@@ -11,6 +10,7 @@ import multiprocessing
 import resource  # noqa: TID251 (peak memory; POSIX only)
 import statistics
 import time
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +27,7 @@ from nmfd.model.regional_model import RegionalModel
 from nmfd.studies import plots
 from nmfd.tensors import one_thread
 
+BENCHMARK = 4.133e-11, -8.282e-7, 0.0042, 10_000.0  # a, b, c, jam
 SPREAD = 0.2  # each region's speed and size is drawn from 1 +- SPREAD times the benchmark's
 STEP_S, STEPS, TIME_LIMIT_S = 30.0, 10, 600.0
 GUIDES = {"dpc-pc": False, "dpc-pcrg": True, "mpc-pc": False, "mpc-pcrg": True, "dpc-pc-local": False}  # by controller
@@ -45,8 +46,7 @@ def network(family: str, regions: int, seed: int = 0) -> RegionalModel:
     """Return a network with random MFDs, "complete" or "hexagonal"."""
     random, where = np.random.default_rng([seed, regions]), lattice(regions)
     near = np.linalg.norm(where[:, None] - where, axis=2) < (np.inf if family == "complete" else 1.1)
-    a, b, c, jam = 4.133e-11, -8.282e-7, 0.0042, 10_000.0  # the benchmark's
-    factors = random.uniform(1.0 - SPREAD, 1.0 + SPREAD, (regions, 2))
+    (a, b, c, jam), factors = BENCHMARK, random.uniform(1.0 - SPREAD, 1.0 + SPREAD, (regions, 2))
     return RegionalModel(
         name=f"{family}-{regions}",
         region_names=tuple(map(str, range(regions))),
@@ -70,13 +70,13 @@ def initial_state(network: RegionalModel, load: str, seed: int = 0) -> np.ndarra
 def measure(family: str, load: str, regions: int, name: str) -> dict:
     """Return the row of one controller on one network, measured on one thread."""
     begin, city = time.perf_counter(), network(family, regions)
-    demand = np.zeros((STEPS, regions, regions))
-    planning = nmfd.PlanningModel(name=city.name, network=city, step=STEP_S, steps=STEPS, forecast=demand)
+    forecast = np.zeros((STEPS, regions, regions))
+    planning = nmfd.PlanningModel(name=city.name, network=city, step=STEP_S, steps=STEPS, forecast=forecast)
     torch.manual_seed(0)
+    small, sparse = Architecture(width=32, local=True), Architecture(guidance=GUIDES[name], sparse=True)
     if name.startswith("mpc"):
         controller = EconomicMpc(planning, guidance=GUIDES[name])
     else:
-        small, sparse = Architecture(width=32, local=True), Architecture(guidance=GUIDES[name], sparse=True)
         controller = DpcController(Policy(city, small if name.endswith("local") else sparse))
     controller.reset()
     row = dict(family=family, load=load, regions=regions, controller=name, set_up_s=time.perf_counter() - begin)
@@ -96,15 +96,12 @@ def measure(family: str, load: str, regions: int, name: str) -> dict:
 
 def draw(table: pd.DataFrame, path: Path) -> None:
     """Draw the time of a decision and the memory against the number of regions."""
-    figure = plots.figure(6.8, 6.4)
-    upper, lower = figure.subplots(2, 1, sharex=True)
-    for name, rows in table.groupby("controller", sort=False):
-        upper.loglog(rows["regions"], rows["median_s"], "o-", color=plots.colour(name), label=name)
-        lower.loglog(rows["regions"], rows["peak_memory_mib"], "o-", color=plots.colour(name))
-    upper.axhline(STEP_S, color="0.4", linestyle=":", label="control interval")
-    upper.set_ylabel("time of a decision [s]")
-    lower.set(xlabel="regions", ylabel="peak memory [MiB]")
-    plots.legend_below(figure, [upper])
+    figure, axes = plots.panels(2)
+    for ax, column, label in zip(axes, ("median_s", "peak_memory_mib"), ("decision [s]", "memory [MiB]"), strict=True):
+        for name, rows in table.groupby("controller", sort=False):
+            ax.loglog(rows["regions"], rows[column], "o-", color=plots.colour(name), label=name)
+        ax.set(xlabel="regions", ylabel=label)
+    plots.legend_below(figure, axes)
     plots.save(figure, path)
 
 
@@ -115,11 +112,10 @@ if __name__ == "__main__":
     parser.add_argument("--family", choices=["complete", "hexagonal"], default="complete")
     parser.add_argument("--load", choices=["published", "congested"], default="published")
     parser.add_argument("--out", type=Path, default=Path("runs/scaling"))
-    o = parser.parse_args()
+    o, table = parser.parse_args(), pd.DataFrame()
     o.out.mkdir(parents=True, exist_ok=True)
-    names, table = o.controllers.split(","), pd.DataFrame()
     with ProcessPool(max_workers=1, max_tasks=1, context=multiprocessing.get_context("spawn")) as pool:
-        for case in [(o.family, o.load, int(n), name) for name in names for n in o.regions.split(",")]:
+        for case in product([o.family], [o.load], map(int, o.regions.split(",")), o.controllers.split(",")):
             try:
                 row = pool.schedule(measure, args=case, timeout=TIME_LIMIT_S).result()
             except Exception as error:  # time limit, memory or crash: a row says so
