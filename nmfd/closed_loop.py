@@ -34,8 +34,7 @@ def run(
     """
     network = scenario.network
     opened = np.where(network.adjacency, network.u_max, 0.0)
-    supervised = faults.Supervised(controller, scenario.ordered_faults, opened)
-    supervised.reset(seed)
+    controller.reset(seed)
     sensors = _Sensors(scenario, seed)
     states, controls, decision_time = [plant.reset(seed)], [], []
     observed, problem = sensors.observe(states[-1], plant.observe())
@@ -44,9 +43,9 @@ def run(
     for k in range(scenario.steps):
         given = observed.copy()
         before = time.perf_counter()
-        command = supervised.act(given, problem)
+        command = controller.act(given)
         decision_time.append(time.perf_counter() - before)
-        command = _copied(command)
+        command = faults.checked(_copied(command), opened, problem)
         if decision_time[-1] > deadline:
             command = _with_status(command, Status.LATE, f"later than its deadline of {deadline:g} s")
         states.append(plant.step(command))
@@ -84,7 +83,7 @@ class _Sensors:
     """Sensors between the state and the controller: instruments or noise, and their faults."""
 
     def __init__(self, scenario: Scenario, seed: int):
-        self._faulty = faults.Sensors(scenario.ordered_faults, seed)
+        self._faulty = faults.Sensors(scenario.ordered_faults)
         self._std, self._random = scenario.measurement_std, noise_of(seed)
         self.estimated = False
 
@@ -92,7 +91,7 @@ class _Sensors:
         """Return the observation and its problem, "" if none. estimate: of the plant's own instruments."""
         noise = self._std * self._random.standard_normal(state.accumulation.shape)
         self.estimated = estimate is not None
-        return self._faulty.see(noisy(state, noise) if estimate is None else estimate, estimated=self.estimated)
+        return self._faulty.see(noisy(state, noise) if estimate is None else estimate)
 
 
 def noise_of(seed: int) -> np.random.Generator:

@@ -12,7 +12,7 @@ import numpy as np
 
 from nmfd.arrays import PerPair
 from nmfd.errors import InputError
-from nmfd.types import Controller, Controls, Observation, Status
+from nmfd.types import Controls, Observation, Status
 
 FORMS = "frozen, delayed:INTERVALS, missing:REGION, closed:EDGE or signal:SIGNAL, with @FROM-TO for some intervals only"
 FORM = re.compile(r"(frozen|(?:delayed|missing):\d{1,3}|(?:closed|signal):[^@]+)(?:@(\d{1,6})-(\d{1,6}))?")
@@ -22,7 +22,7 @@ FOREVER = 10**9
 
 @dataclass(frozen=True, kw_only=True)
 class Fault:
-    """One fault: its kind, its value as text, and the control intervals begin <= k < end in which it is active."""
+    """A fault: kind, value as text, and control intervals begin <= k < end in which it is active."""
 
     kind: str
     value: str = ""
@@ -54,13 +54,13 @@ def without_city(faults: Sequence[Fault], where: str) -> None:
 class Sensors:
     """Observations with sensor faults; missing entries keep their last value, 0 at the start."""
 
-    def __init__(self, faults: Sequence[Fault], seed: int = 0):
+    def __init__(self, faults: Sequence[Fault]):
         self._faults = [fault for fault in faults if fault.kind not in CITY]
         self._seen: list[Observation] = []
         self._frozen: dict[int, Observation] = {}
         self._last: np.ndarray | None = None
 
-    def see(self, observation: Observation, *, estimated: bool = False) -> tuple[Observation, str]:
+    def see(self, observation: Observation) -> tuple[Observation, str]:
         """Return the observation as it arrives, and a text that names the faults, "" if there are none."""
         problems, k = [], observation.step
         self._seen.append(observation)
@@ -87,29 +87,17 @@ class Sensors:
         return observation, f"measurement {', '.join(problems)}" if problems else ""
 
 
-class Supervised:
-    """A controller whose controls are checked: an open perimeter replaces those that are not finite."""
-
-    def __init__(self, controller: Controller, faults: Sequence[Fault], opened: PerPair):
-        """opened: (R, R) [-], the perimeter that is used instead"""
-        self.name, self._controller, self._opened = controller.name, controller, opened
-
-    def reset(self, seed: int = 0) -> None:
-        """Start a run."""
-        self._controller.reset(seed)
-
-    def act(self, observation: Observation, problem: str = "") -> Controls:
-        """Return the controls. problem: of the observation, for the status."""
-        controls = self._controller.act(observation)
-        arrays = (controls.perimeter, controls.splits, controls.prices, controls.metering)
-        if not all(np.isfinite(values).all() for values in arrays if values is not None):
-            controls = Controls(
-                perimeter=self._opened,
-                splits=None,
-                status=Status.SOLVER_FAILURE | Status.FALLBACK,
-                note="the controls were no numbers: perimeter opened",
-            )
-        if not problem:
-            return controls
-        note = "; ".join(filter(None, (problem, controls.note)))
-        return replace(controls, status=controls.status | Status.SENSOR_FAULT, note=note)
+def checked(controls: Controls, opened: PerPair, problem: str) -> Controls:
+    """Return controls with the problem of their observation; opened: (R, R) [-], in place of an infinite perimeter."""
+    arrays = (controls.perimeter, controls.splits, controls.prices, controls.metering)
+    if not all(np.isfinite(values).all() for values in arrays if values is not None):
+        controls = Controls(
+            perimeter=opened,
+            splits=None,
+            status=Status.SOLVER_FAILURE | Status.FALLBACK,
+            note="the controls were no numbers: perimeter opened",
+        )
+    if not problem:
+        return controls
+    note = "; ".join(filter(None, (problem, controls.note)))
+    return replace(controls, status=controls.status | Status.SENSOR_FAULT, note=note)

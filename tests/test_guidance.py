@@ -1,8 +1,6 @@
 """The searches of route guidance against all ways there are, in a small random city."""
 
-import gc
 import math
-import weakref
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -176,20 +174,6 @@ def test_of_the_trees_the_one_not_asked_for_longest_goes_first():
     searches.put(mine, 12, ("large",), 1000)
     left = [begin for begin in range(13) if searches.get(mine, begin)]
     assert len(left) + bool(searches.get(others, 3)) == FEWEST_TREES and left[-2:] == [11, 12]
-
-
-def test_trees_of_old_travel_times_go_at_once_and_do_not_wait_for_the_garbage_collector(city):
-    first, second, turn, time = city
-    moves, searches = Moves(first, second, allowed=np.full(EDGES, True), reverse=True), Searches()
-    home = Home(moves, time, turn, searches)
-    assert np.isfinite(home.cost(0, 5, np.inf)) and searches.get(home._owner, 5)
-    gone = weakref.ref(searches)
-    gc.disable()
-    try:
-        del searches, home
-        assert gone() is None
-    finally:
-        gc.enable()
 
 
 # A main road a m b t of 10 s each, of which m is in another region, and the side street s of `side` s from a to t.

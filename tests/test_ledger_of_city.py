@@ -19,7 +19,7 @@ import tiny_city
 import cosim
 from cosim.plant.meter import Meter
 from cosim.sumo.net import load_city
-from cosim.sumo.outputs import TripReader, trip_options
+from cosim.sumo.outputs import TripReader, options
 from cosim.sumo.recorded_trips import MESOSCOPIC
 from cosim.sumo.session import Session, _flush_all
 from nmfd import metrics
@@ -345,7 +345,7 @@ def run(folder: Path, city, case: Case, *, mesoscopic: bool, seed: int, prompt: 
         seed=seed,
         **case.session,
         options=(
-            *trip_options(out),
+            *options(out, {}),
             "--additional-files",
             str(folder / "more.add.xml"),
             "--ignore-junction-blocker",

@@ -56,11 +56,6 @@ def test_stages_that_serve_nothing_more_are_left_out(states, kept):
     assert list(stages_of(signal([(state, 5) for state in states.split()]))) == kept
 
 
-def test_the_way_from_a_phase_that_comes_twice():
-    phases = signal([("Gr", 9), ("Gr", 6), ("yr", 3), ("rr", 2), ("rG", 9), ("ry", 3)]).phases
-    assert [(p.state, p.duration) for p in transition(phases, 0, 4)] == [("yr", 3), ("rr", 2)]
-
-
 @pytest.mark.parametrize("phases", [PHASES, SINGLE, CROSS])
 def test_rationed_green(phases):
     """Random switching and commands: all is safe; no cycle has more green than its ration; u_max rations nothing."""
@@ -163,12 +158,6 @@ def test_who_waits_behind_a_piece_too_short_to_be_seen_on_is_seen():
         control.play(session.time)
         session.time += 1.0
     assert shown.count("rG") == 2 and shown.count("Gr") >= 2
-
-
-def test_without_expected_flows_all_turns_are_alike():
-    roads = Roads(TOWN, [CROSSING, END], {})
-    present = np.array([4.0 * (lane[0] == "b") for lane in roads.lanes])
-    assert (roads.weights @ present)[roads.movements["b", "f"]] == pytest.approx(0.5 * 4.0)
 
 
 def test_saturation_flows_by_hand():

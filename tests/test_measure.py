@@ -159,13 +159,6 @@ def test_a_region_that_is_first_seen_at_the_count(play):
     assert play.meter.crossings.sum() == 1 and dict(play.meter.entry_flow) == {(0, "b0"): 1}
 
 
-def test_an_unknown_edge_counts_where_the_vehicle_was(play):
-    play.session.routes = {"v": ("a0", "b0")}
-    play.step(new=["v"])
-    play.session.places["v"] = ":crossing"
-    assert (play.meter.accumulation() == x((0, 1))).all()
-
-
 def test_a_vehicle_that_arrives_unseen_has_crossed_too(play):
     play.session.routes = {"v": ("a0", "b0")}
     play.step(new=["v"])
@@ -198,25 +191,6 @@ def test_vehicles_that_the_mesoscopic_model_holds_stay_where_they_were(play):
     play.session.held = set()
     with pytest.raises(LedgerError, match="1 vehicles are in the city, but 2 departures"):
         play.meter.accumulation()
-
-
-def test_teleports_that_nobody_reported_count(play):
-    play.session.routes = {"v": ("a0", "b0")}
-    play.step(new=["v"])
-    play.session.jumped = 3
-    play.meter.accumulation()
-    assert play.meter.teleports == 3
-    play.session.jumped = 1
-    play.meter.accumulation()
-    assert play.meter.teleports == 3
-
-
-def test_a_teleporting_vehicle_enters_nothing(play):
-    play.session.routes = {"v": ("a0", "b0")}
-    play.step(new=["v"])
-    play.step(jumps=["v"])
-    play.session.places["v"] = "b0"  # on the edge already, but not yet ended
-    assert [event for _ in range(3) for event in play.step()] == []
 
 
 def test_who_waits_to_enter_is_backlog(play):
@@ -259,13 +233,6 @@ def test_back_into_a_region_is_an_entry_again(play):
     assert (play.meter.accumulation() == x((0, 0))).all()
 
 
-def test_staying_on_an_entry_is_no_second_entry(play):
-    play.session.routes = {"v": ("a0", "b0", "b1")}
-    play.step(new=["v"])
-    assert len([event for _ in range(12) for event in play.step(move={"v": "b0"})]) == 1
-    assert play.meter.entry_flow[0, "b0"] == 1
-
-
 def test_departures_come_before_entries_and_both_by_name(play):
     play.session.routes = {name: ("a0", "b0", "b1") for name in "wvut"}
     play.step(new=["w", "v"])
@@ -274,23 +241,10 @@ def test_departures_come_before_entries_and_both_by_name(play):
     assert [(event.vehicle, event.source) for event in found] == [("t", None), ("u", None), ("v", 0), ("w", 0)]
 
 
-def test_who_starts_on_an_entry_has_not_entered(play):
-    play.session.routes = {"v": ("b0", "b1")}
-    events = play.step(new=["v"]) + [event for _ in range(4) for event in play.step()]
-    assert [event.source for event in events] == [None]
-    assert not play.meter.entry_flow
-
-
 def test_public_transport_is_not_free(play):
     play.session.routes, play.session.bound = {"bus": ("a0", "b0")}, {"bus"}
     assert [event.free for event in play.step(new=["bus"])] == [False]
     assert [event.free for _ in range(3) for event in play.step(move={"bus": "b0"})] == [False]
-
-
-def test_routes_from_streets_without_a_region_count_as_region_0(play):
-    play.session.routes = {"v": ("somewhere", "b0"), "w": ("b0", "somewhere")}
-    play.step(new=["v", "w"])
-    assert (play.meter.departures == x((0, 1), (1, 0))).all()
 
 
 @pytest.mark.parametrize("length, speed, every", [(100.0, 10.0, 3), (20.0, 10.0, 1), (40.0, 10.0, 2), (10.0, 50.0, 1)])
@@ -304,36 +258,6 @@ def test_short_entries_are_polled_more_often(length, speed, every):
     session.places["v"] = "b0"
     steps = next(n for n in range(2, 9) if meter.observe())
     assert meter._poll_steps == every and steps == max(every, 2)
-
-
-@pytest.mark.parametrize("length, every", [(100.0, 3), (40.0, 2), (20.0, 1)])
-def test_entries_are_asked_no_more_often_than_that(length, every):
-    session, asked = Streets(), []
-    meter, session.vehicles_on = Meter(session, city(length)), lambda edge: asked.append(edge) or ()
-    for _ in range(12):
-        meter.observe()
-    assert len(asked) == 12 // every * 3  # three entries
-
-
-def test_the_shortest_entry_decides():
-    streets = city()
-    streets = City(**{**vars(streets), "length": {**streets.length, "b0": 20.0, "a0": 900.0}})
-    assert Meter(Streets(), streets)._poll_steps == 1
-
-
-def test_finer_steps_are_polled_as_often_in_time():
-    session = Streets()
-    session.step_length = 0.5
-    assert Meter(session, city())._poll_steps == 6
-
-
-def test_a_city_without_boundaries_is_measured_too():
-    session = Streets()
-    alone = city()
-    alone = City(**{**vars(alone), "gateways": ()})
-    meter, session.routes = Meter(session, alone), {"v": ("a0", "b0")}
-    session.new, session.places = ["v"], {"v": "a0"}
-    assert len(meter.observe()) == 1 and meter.accumulation().sum() == 1
 
 
 @pytest.mark.parametrize(
@@ -358,13 +282,3 @@ def test_the_ledger_names_step_and_numbers(play, break_it, numbers):
     break_it(play)
     with pytest.raises(LedgerError, match=f"vehicle ledger broken at control step 7, 1 s: .*{numbers}"):
         play.meter.accumulation(7)
-
-
-def test_the_state_is_all_that_was_counted(play):
-    play.session.routes = {"v": ("a0", "b0", "b1", "c0"), "w": ("b0", "b1"), "u": ("b0", "b1")}
-    play.step(new=["v", "u"], loads=["w"], waiting=["w"])
-    state = play.meter.state(3, 270.0)
-    assert (state.step, state.time, state.completed) == (3, 270.0, 0.0)
-    assert (state.accumulation == x((0, 2), (1, 1))).all() and (state.backlog == x((1, 1))).all()
-    play.step(gone=["u"])
-    assert play.meter.state(4, 360.0).completed == 1.0

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from signal_rules import MIN_GREEN, check
 
-from cosim.plant.guidance import Guide, shifted
+from cosim.plant.guidance import Guide
 from cosim.plant.plant import SumoPlant
 from cosim.plant.sampling import StreetSampler
 from cosim.plant.settings import Settings
@@ -128,13 +128,13 @@ def test_the_samples_are_those_of_every_edge(scenario, plant_of):
     sampler = StreetSampler(plant.session, plant.city)
 
     def compared():
-        counts, speeds, _ = sampler.present()
-        asked.append(len(sampler.travelled()[0]))
+        asked.append(len(sampler._travelled()[0]))
+        sampler.sample()
+        counts, speeds = sampler.last
         session, edges = plant.session, plant.city.edges
         assert counts.tolist() == [session.vehicle_count(edge) for edge in edges]
         there = [[libsumo.vehicle.getSpeed(one) for one in session.vehicles_on(edge)] for edge in edges]
         np.testing.assert_allclose(speeds, [np.mean(one) if one else 0.0 for one in there], atol=1e-9)
-        sampler.sample()
         means = sampler.finish(np.full(len(edges), False))
         routed = [
             libsumo.edge.getLastStepMeanSpeed(edge) if one else np.nan for edge, one in zip(edges, there, strict=True)
@@ -165,7 +165,7 @@ def test_ledger_notices_a_lost_vehicle(scenario, plant_of):
     plant = plant_of()
     plant.reset(1)
     plant.step(random_controls(scenario, np.random.default_rng(0)))
-    plant._sensing.meter.departures[0, 4] += 1
+    plant._meter.departures[0, 4] += 1
     message = r"control step 2, 180 s: \d+ vehicles are in the city, but \d+ departures minus \d+ arrivals"
     with pytest.raises(LedgerError, match=message):
         plant.step(random_controls(scenario, np.random.default_rng(0)))
@@ -179,24 +179,18 @@ def test_teleporting_vehicles_stay_in_the_ledger(scenario, plant_of):
     assert measurements[-1].accumulation.sum() == inside
 
 
-def test_guided_vehicles_go_where_theta_sends_them(scenario, plant_of):
+def test_guided_vehicles_go_where_theta_sends_them(scenario, plant_of, monkeypatch):
     """All vehicles in region 2 bound for 4 are sent through 0: with full compliance none leaves for 3 or 5, but for the
     few who depart just before the stop line of a lane that leads there."""
-    crossings, guided = sent_round(scenario, plant_of(most_detour=1e9))
+    monkeypatch.setitem(Guide.__init__.__kwdefaults__, "most_detour", 1e9)
+    crossings, guided = sent_round(scenario, plant_of())
     assert guided > 15
     assert crossings[0] >= 10 and crossings[0] > 0.8 * crossings.sum()
 
 
-def test_theta_shifts_what_drivers_wish():
-    wish, own = np.array([0.7, 0.3, 0.0]), np.array([0.2, 0.5, 0.3])
-    np.testing.assert_allclose(shifted(wish, own, own), wish)
-    np.testing.assert_allclose(shifted(wish, own, np.array([0.0, 0.0, 1.0])), [0.0, 0.0, 1.0])
-    np.testing.assert_allclose(shifted(wish, own, np.array([0.1, 0.5, 0.4])), [0.35, 0.3, 0.35])
-    np.testing.assert_allclose(shifted(wish, own, np.array([0.2, 0.8, 0.0])), wish)  # nobody wished what it lowers
-
-
-def test_nobody_follows_on_a_long_detour(scenario, plant_of):
-    crossings, guided = sent_round(scenario, plant_of(most_detour=30.0))
+def test_drivers_do_not_follow_on_a_long_detour(scenario, plant_of, monkeypatch):
+    monkeypatch.setitem(Guide.__init__.__kwdefaults__, "most_detour", 30.0)
+    crossings, guided = sent_round(scenario, plant_of())
     assert crossings[0] < 0.3 * crossings.sum()
 
 
@@ -231,10 +225,7 @@ def test_guided_vehicles_are_asked_again(scenario, plant_of):
     assert [m.accumulation.tolist() for m in first] == [m.accumulation.tolist() for m in second]
 
 
-@pytest.mark.parametrize(
-    "signals, late",
-    [("fixed", True), ("webster", True), ("actuated", True), ("max-pressure", False), ("max-pressure-cyclic", False)],
-)
+@pytest.mark.parametrize("signals, late", [("fixed", True), ("max-pressure", False)])
 def test_before_the_stop_line_nobody_is_sent_elsewhere_only_under_max_pressure(plant_of, monkeypatch, signals, late):
     told = {}
     monkeypatch.setattr(

@@ -14,7 +14,7 @@ from cosim.plant.max_pressure import Roads
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import Settings
 from cosim.sumo.build import ensure_built
-from cosim.sumo.net import gateway_room_taken, load_city
+from cosim.sumo.net import load_city
 from cosim.sumo.signals import read_signals
 from cosim.sumo.trips import make_trips, turning_flows
 from nmfd.api import load_scenario
@@ -22,15 +22,6 @@ from nmfd.errors import InputError
 from nmfd.types import Controls
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
-
-
-def street(**after):
-    """A city of roads of 200 m at 10 m/s; `after`: the edges that follow one."""
-    return SimpleNamespace(
-        length=dict.fromkeys("abcdefg", 200.0),
-        speed=dict.fromkeys("abcdefg", 10.0),
-        successors={edge: after.get(edge, ()) for edge in "abcdefg"},
-    )
 
 
 @pytest.fixture(scope="module")
@@ -156,20 +147,6 @@ def test_perimeter_control_over_max_pressure(driven):
     assert np.nanmean(green) < 0.3 * np.nanmean(seen["open"][1].gateway_green)
     flows = [seen[name][1].gateway_flow.sum() for name in ("open", "closed")]
     assert flows[1] < 0.6 * flows[0]
-
-
-@pytest.mark.parametrize("signals", ["fixed", pytest.param("max-pressure", marks=pytest.mark.slow)])
-def test_queue_override(city, driven, signals):
-    """Closed gateways open where the edge before them is full, in the next interval, and nowhere else."""
-    _, _, record, _ = driven(0.1, signals=signals, queue_override=0.3)
-    full = gateway_room_taken(record.edge_vehicles.astype(float), city) >= 0.3
-    green = record.gateway_green
-    assert full[:-1].any() and not full.all()
-    assert (green[1:][~full[:-1]] <= 2 * MIN_GREEN + 1.0).all()  # two windows in a cycle, at most
-    opened = green[1:][full[:-1]]
-    assert opened.mean() > 3.0 * green[1:][~full[:-1]].mean()
-    _, _, held, _ = driven(0.1, signals=signals)
-    assert held.gateway_flow.sum() < record.gateway_flow.sum()
 
 
 def test_max_pressure_is_safe(city, driven):

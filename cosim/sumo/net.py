@@ -1,4 +1,4 @@
-"""Partition of a SUMO network: edge -> region, and the gateways between regions."""
+"""A SUMO network cut into regions: edge -> region, and the gateways between regions."""
 
 import csv
 import math
@@ -22,12 +22,10 @@ JAM_SPACING = 7.5  # m of lane per standing vehicle
 
 @dataclass(frozen=True, kw_only=True)
 class Gateway:
-    """A boundary movement: from an edge in region `source` over a junction to an edge in region `target`.
+    """A boundary movement from an edge in region `source` over a junction to an edge in region `target`.
 
-    signal: the traffic light that controls it, or None where it leaks
-    links: its indices in the light's state string
-    lanes: of the edge it comes from, numbered as SUMO does
-    shared: those of them on which other vehicles go elsewhere, which a red of this movement holds too
+    signal: the one that controls it, None where it leaks; links: its indices in the signal's state
+    lanes: numbers of those that it comes from; shared: of these, lanes that other movements use, too
     """
 
     source: int
@@ -42,19 +40,14 @@ class Gateway:
 
 @dataclass(frozen=True, kw_only=True)
 class City:
-    """A SUMO network cut into regions 0 .. regions - 1; only what cars may use, but for region_of.
+    """A SUMO network cut into regions 0 .. regions - 1; only what cars may use, except in region_of.
 
-    edges: the normal edges, sorted
-    region_of: normal and junction-internal edge -> region; an internal edge has that of the edge it leads to, since
-        a vehicle on it has left the edge before. Edges closed to cars are there as far as their region was given
-    length [m], lanes, speed [m/s]: by normal edge
-    lane_ids: normal edge -> its lanes for cars
-    successors: normal edge -> the edges that follow, sorted
-    turn_time: (from_edge, to_edge) -> free-flow time on the junction between them [s], as far as where a turn waits
-    over: (from_edge, to_edge) -> the internal edges of this turn, in order; none where the net has none
-    inside: internal edge of a turn -> its length [m], sorted
-    gateways: sorted by source, target, from_edge, to_edge
-    signals: edge -> the signal at its end, as far as it has links for cars
+    edges: normal ones, sorted; length [m], lanes, speed [m/s], lane_ids: by these
+    region_of: normal and internal edge -> region; an internal edge has that of the edge that it leads to
+    successors: edge -> following edges, sorted
+    turn_time: (from_edge, to_edge) -> free-flow time on the junction [s], as far as where a turn waits
+    over: (from_edge, to_edge) -> internal edges of this turn, in order; inside: internal edge of a turn -> length [m]
+    gateways: sorted by source, target, from_edge, to_edge; signals: edge -> signal at its end
     """
 
     net_file: Path
@@ -75,6 +68,8 @@ class City:
 
 @dataclass(frozen=True)
 class _Connection:
+    """A link from lane to lane; via: lane on the junction; link: index in the signal's state."""
+
     source: str
     target: str
     via: str | None
@@ -85,7 +80,7 @@ class _Connection:
 
 
 def city_of(network: RegionalModel) -> City:
-    """The city that `network` is the model of, built first if need be; raises InputError as `load_city` does."""
+    """Return the city of `network`, built first if need be. Raises InputError."""
     files = ensure_built(network)
     return load_city(files.net_file, files.regions_csv, network.regions)
 
@@ -93,48 +88,41 @@ def city_of(network: RegionalModel) -> City:
 def load_city(net_file: Path, regions_csv: Path, regions: int) -> City:
     """Read a net.xml (or net.xml.gz) and the region of each of its edges.
 
-    Raises InputError for a missing or broken file, an edge that the network does not have, an edge without a region,
-    a region that is not in 0 .. regions - 1 and a region without edges.
+    Raises InputError for a broken file, an unknown edge, an edge without a region and a region without edges.
     """
     lanes_of, cars, internal, connections = _read_net(Path(net_file))
     given = _read_regions(Path(regions_csv), regions)
-    edges = tuple(sorted(lanes_of))
     for edge in given:
         if edge not in lanes_of and edge not in internal:
             raise InputError(f"{regions_csv}: edge {edge} is not in {net_file}; remove it or give the network it is of")
-    missing = [edge for edge in edges if lanes_of[edge] and edge not in given]
-    if missing:
+    edges = tuple(sorted(edge for edge, lanes in lanes_of.items() if lanes))
+    if missing := [edge for edge in edges if edge not in given]:
         raise InputError(
             f"{regions_csv}: edge {missing[0]} has no region ({len(missing)} such edges); add a line for every edge"
         )
-    edges = tuple(edge for edge in edges if lanes_of[edge])
-    empty = set(range(regions)) - {given[edge] for edge in edges}
-    if empty:
+    if empty := set(range(regions)) - {given[edge] for edge in edges}:
         raise InputError(
             f"{regions_csv}: region {min(empty)} has no edges; every region from 0 to {regions - 1} needs one"
         )
     links = [c for c in connections if (c.source, c.lane) in cars and (c.target, c.to_lane) in cars]
-    turns = sorted({(c.source, c.target) for c in links})
-    times = {(c.source, c.target): internal[c.via.rpartition("_")[0]][0] if c.via else 0.0 for c in links}
     over = _turns_over_junctions(links, connections)
     successors: dict[str, list[str]] = {edge: [] for edge in edges}
-    for source, target in turns:
+    for source, target in sorted({(c.source, c.target) for c in links}):
         successors[source].append(target)
     region_of = {edge: given[edge] for edge in edges}
-    gateways = _gateways(links, region_of)
-    region_of |= {edge: region for edge, region in given.items() if not edge.startswith(":")}
+    all_regions = region_of | {edge: region for edge, region in given.items() if not edge.startswith(":")}
     return City(
         net_file=Path(net_file),
         regions=regions,
-        region_of=region_of | _internal_regions(connections, region_of, internal),
+        region_of=all_regions | _internal_regions(connections, all_regions, internal),
         edges=edges,
         length={e: lanes_of[e][0][0] for e in edges},
         lanes={e: len(lanes_of[e]) for e in edges},
         lane_ids={e: tuple(lane for _, _, lane in lanes_of[e]) for e in edges},
         speed={e: max(speed for _, speed, _ in lanes_of[e]) for e in edges},
         successors={edge: tuple(after) for edge, after in successors.items()},
-        turn_time=times,
-        gateways=gateways,
+        turn_time={(c.source, c.target): internal[c.via.rpartition("_")[0]][0] if c.via else 0.0 for c in links},
+        gateways=_gateways(links, region_of),
         signals={c.source: c.signal for c in links if c.signal},
         over=over,
         inside={
@@ -146,25 +134,30 @@ def load_city(net_file: Path, regions_csv: Path, regions: int) -> City:
 
 
 def check_adjacency(city: City, network: RegionalModel) -> None:
-    """InputError unless the gateways join exactly the regions that network.toml calls adjacent, both ways."""
+    """Raise InputError unless the gateways join exactly the regions that network.toml calls adjacent."""
     where = f"{network.folder}/network.toml: regions"
     joined = np.zeros((city.regions, city.regions), dtype=bool)
     for gateway in city.gateways:
-        if not network.adjacency[gateway.source, gateway.target]:
+        i, h, ends = gateway.source, gateway.target, f"edge {gateway.from_edge} leads to {gateway.to_edge}"
+        if not (network.adjacency | network.adjacency.T)[i, h]:
             raise InputError(
-                f"{where}[{gateway.source}].adjacent: region {gateway.target} is missing, although edge "
-                f"{gateway.from_edge} leads to {gateway.to_edge}; add it, or move the edges to other regions"
+                f"{where}[{i}].adjacent: region {h} is missing, although {ends}; add it, or move the edges to other "
+                "regions"
             )
-        joined[gateway.source, gateway.target] = True
+        if not network.adjacency[i, h]:
+            raise InputError(
+                f"{where}[{i}].no_way_to: lists {h}, but {ends} there; remove it, or move the edges to other regions"
+            )
+        joined[i, h] = True
     for i, h in np.argwhere(network.adjacency & ~joined):
         raise InputError(
             f"{where}[{i}].adjacent: lists {h}, but no edge leads from region {i} to region {h} in {city.net_file}; "
-            "remove it, or change the regions of edges"
+            f"remove it, add no_way_to = [{h}], or change the regions of edges"
         )
 
 
 def edge_shapes(city: City) -> list[Points]:
-    """(n, 2) [m] for every edge of the city: its line on the map, midway between its outermost lanes."""
+    """Return (n, 2) [m] for every edge: its line on the map, midway between its outermost lanes."""
     shapes: dict[str, Points] = {}
     with opened(city.net_file) as stream:
         for _, element in ElementTree.iterparse(stream):
@@ -186,8 +179,8 @@ def _read_net(
 ) -> tuple[
     dict[str, list[tuple[float, float, str]]], set[tuple[str, int]], dict[str, tuple[float, float]], list[_Connection]
 ]:
-    """(edge -> [(length, speed, id) of each car lane], the car lanes, internal edge -> (free-flow time [s],
-    length [m]), links)."""
+    """Return edge -> (length, speed, id) of its car lanes; the car lanes; internal edge -> (free-flow time [s], length
+    [m]); and the connections."""
     cars: set[tuple[str, int]] = set()
     lanes_of: dict[str, list[tuple[float, float, str]]] = {}
     internal: dict[str, tuple[float, float]] = {}
@@ -196,22 +189,15 @@ def _read_net(
         with opened(path) as stream:
             for _, element in ElementTree.iterparse(stream):
                 if element.tag == "edge":
-                    lanes = [
-                        (size(lane, "length"), size(lane, "speed"), attribute(lane, "id"))
-                        for lane in element.iter("lane")
-                        if for_cars(lane)
-                    ]
+                    edge, open_lanes = attribute(element, "id"), [one for one in element.iter("lane") if for_cars(one)]
+                    lanes = [(size(one, "length"), size(one, "speed"), attribute(one, "id")) for one in open_lanes]
                     if element.get("function", "normal") in ("normal", "connector"):
-                        edge = attribute(element, "id")
                         lanes_of[edge] = lanes
-                        cars |= {
-                            (edge, int(attribute(lane, "index"))) for lane in element.iter("lane") if for_cars(lane)
-                        }
+                        cars |= {(edge, int(attribute(lane, "index"))) for lane in open_lanes}
                     else:
-                        internal[attribute(element, "id")] = max(
+                        internal[edge] = max(
                             ((length / speed, length) for length, speed, _ in lanes), default=(0.0, 0.0)
                         )
-                    element.clear()
                 elif element.tag == "connection":
                     connections.append(
                         _Connection(
@@ -224,8 +210,7 @@ def _read_net(
                             int(attribute(element, "toLane")),
                         )
                     )
-                    element.clear()
-                elif element.tag in ("junction", "tlLogic"):
+                if element.tag in ("edge", "connection", "junction", "tlLogic"):
                     element.clear()
         for connection in connections:
             if connection.via and connection.via.rpartition("_")[0] not in internal:
@@ -240,7 +225,7 @@ def _read_net(
 
 
 def size(lane: ElementTree.Element, name: str) -> float:
-    """The length [m] or speed [m/s] of a <lane>; ValueError unless it is above 0 and finite."""
+    """Return the length [m] or speed [m/s] of a <lane>. Raises ValueError unless it is above 0 and finite."""
     value = float(attribute(lane, name))
     if not 0.0 < value < math.inf:
         raise ValueError(f"lane {lane.get('id')}: {name}: expected a number above 0, got {value:g} instead")
@@ -248,7 +233,7 @@ def size(lane: ElementTree.Element, name: str) -> float:
 
 
 def for_cars(lane: ElementTree.Element) -> bool:
-    """Whether cars may use a <lane>."""
+    """Return True if cars may use a <lane>."""
     if (allowed := lane.get("allow")) is not None:
         return bool({"all", "passenger"} & set(allowed.split()))
     return not {"all", "passenger"} & set(lane.get("disallow", "").split())
@@ -258,21 +243,16 @@ def _read_regions(path: Path, regions: int) -> dict[str, int]:
     check_file(path, "give a table with the columns edge,region")
     try:
         with path.open(encoding="utf-8", newline="") as stream:
-            rows = list(csv.reader(stream))
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; give a table with the columns edge,region") from None
+            header, *rows = list(csv.reader(stream)) or [[]]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: cannot be read ({error}); give a table with the columns edge,region") from None
-    if not rows or rows[0] != ["edge", "region"]:
-        found = ",".join(rows[0]) if rows else "nothing"
-        raise InputError(f"{path}: line 1: expected edge,region, got {found} instead")
+    if header != ["edge", "region"]:
+        raise InputError(f"{path}: line 1: expected edge,region, got {','.join(header) or 'nothing'} instead")
     region_of: dict[str, int] = {}
-    for number, row in enumerate(rows[1:], start=2):
+    for number, row in enumerate(rows, start=2):
         if len(row) != 2 or not row[1].isdecimal() or len(row[1]) > 9 or int(row[1]) >= regions:
-            raise InputError(
-                f"{path}: line {number}: expected an edge and a region from 0 to {regions - 1}, got {','.join(row)} "
-                "instead"
-            )
+            expected = f"an edge and a region from 0 to {regions - 1}"
+            raise InputError(f"{path}: line {number}: expected {expected}, got {','.join(row)} instead")
         if row[0] in region_of:
             raise InputError(f"{path}: line {number}: edge {row[0]} appears twice; remove one of the lines")
         region_of[row[0]] = int(row[1])
@@ -282,8 +262,7 @@ def _read_regions(path: Path, regions: int) -> dict[str, int]:
 def _internal_regions(
     connections: Sequence[_Connection], region_of: Mapping[str, int], internal: Collection[str]
 ) -> dict[str, int]:
-    """Internal edge -> region of the edge it leads to; crossings and walking areas, without cars, that of any edge of
-    their junction."""
+    """Return internal edge -> region of the edge it leads to; without cars, that of any edge of the junction."""
     regions: dict[str, int] = {}
     of_junction: dict[str, int] = {}
     for connection in connections:
@@ -302,8 +281,10 @@ def _internal_regions(
 def _turns_over_junctions(
     links: Sequence[_Connection], connections: Sequence[_Connection]
 ) -> dict[tuple[str, str], tuple[str, ...]]:
-    """(from_edge, to_edge) -> the internal edges in between, of the last of several links: where a turn waits in the
-    middle of a junction, it goes over two."""
+    """Return (from_edge, to_edge) -> internal edges in between, of the last of several links.
+
+    A turn that waits in the middle of a junction goes over two.
+    """
     onward = {(c.source, c.lane): c.via for c in connections if c.source.startswith(":")}
     over: dict[tuple[str, str], tuple[str, ...]] = {}
     for link in links:
@@ -341,25 +322,24 @@ def _gateways(links: list[_Connection], region_of: dict[str, int]) -> tuple[Gate
 
 
 def gateway_movements(city: City) -> dict[str, dict[int, tuple[int, int]]]:
-    """Signal -> link index -> (i, h), of the links that lead over a boundary."""
+    """Return signal -> link index -> (i, h), of the links that lead over a boundary."""
     movements: dict[str, dict[int, tuple[int, int]]] = {}
     for gateway in city.gateways:
         if gateway.signal is not None:
-            movements.setdefault(gateway.signal, {}).update(
-                dict.fromkeys(gateway.links, (gateway.source, gateway.target))
-            )
+            pair = gateway.source, gateway.target
+            movements.setdefault(gateway.signal, {}).update(dict.fromkeys(gateway.links, pair))
     return movements
 
 
 def edge_room(city: City) -> PerEdge:
-    """(E,) [veh]: how many stand on each edge at JAM_SPACING."""
+    """Return (E,) [veh] that can stand on each edge at JAM_SPACING."""
     return np.array([max(city.lanes[edge] * city.length[edge] / JAM_SPACING, 1.0) for edge in city.edges])
 
 
 def gateway_room_taken(
     edge_vehicles: Float[np.ndarray, "*intervals E"], city: City
 ) -> Float[np.ndarray, "*intervals G"]:
-    """(..., G) [-]: the share of the room on the edge before each gateway that edge_vehicles (..., E) [veh] take."""
+    """Return (..., G) [-], the share of the room before each gateway that edge_vehicles (..., E) [veh] take."""
     index = {edge: n for n, edge in enumerate(city.edges)}
     before = [index[gateway.from_edge] for gateway in city.gateways]
     return edge_vehicles[..., before] / edge_room(city)[before]
