@@ -121,21 +121,6 @@ def model(scenario, runs):
     return made
 
 
-def test_the_search_begins_where_the_network_and_the_runs_say(scenario, runs):
-    """Free rates as they were, all exit rates 1, boundaries a fifth above the largest flow that was seen."""
-    begun = identification._Model(scenario.network, runs, 30.0, 1.0 / 30.0)
-    p = begun.parameters_of(1.0 - torch.eye(7))
-    largest = np.max([run.accumulation.sum(axis=2).max(axis=0) for run in runs], axis=0)
-    np.testing.assert_allclose(p.c.detach(), [mfd.c for mfd in scenario.network.mfds], rtol=1e-5)
-    np.testing.assert_allclose(p.exit_rates.detach(), 1.0)
-    np.testing.assert_allclose(p.jam.detach(), 0.7 * largest, rtol=1e-5)
-    np.testing.assert_allclose(p.storage.detach(), 2.0 * largest, rtol=1e-5)
-    np.testing.assert_allclose(
-        scenario.network.u_max * p.capacity.detach(), 1.2 * 60.0 / 30.0 * scenario.network.adjacency, rtol=1e-5
-    )
-    assert begun.penalty().item() == 0.0
-
-
 def test_any_free_numbers_are_a_valid_model(model):
     """q = c (1 - first y - second y^2) with y = x / jam, falling from c to a hundredth of it at the least."""
     p = model.parameters_of(1.0 - torch.eye(7))
@@ -162,19 +147,6 @@ def test_the_network_flows_as_the_free_numbers_do(scenario, runs, model):
         torch.testing.assert_close(mine, free.detach().double(), rtol=1e-4, atol=1e-6)
 
 
-def test_shares_are_errors_over_the_critical_accumulation(scenario, runs):
-    """Of a model with twice the free rate, 1 and 3 intervals ahead."""
-    network = replace(scenario.network, mfds=tuple(replace(m, c=2.0 * m.c) for m in scenario.network.mfds))
-    shares = identification.prediction_shares(network, runs, (1, 3), step=30.0)
-    for share, n in zip(shares, (1, 3), strict=True):
-        errors = identification.prediction_errors(network, runs, n, step=30.0)
-        assert errors.shape == (4 * (121 - n), 7)
-        np.testing.assert_allclose(
-            share * [m.critical for m in network.mfds], np.sqrt((errors**2).mean(axis=0)), rtol=1e-6
-        )
-    assert (shares[1] > shares[0]).all() and shares[0].min() > 0.0
-
-
 def test_that_nothing_changes_is_a_prediction_too(scenario, runs):
     """One vehicle more in every interval, and one run that is too short for two intervals."""
     growing = np.zeros((5, 7, 7))
@@ -198,12 +170,6 @@ def test_what_a_fit_makes_small(scenario, runs, by_origin):
     far = (2.0 - 0.5 * identification.OUTLIER) * 2.0  # two errors of twice the scale
     found = identification._misfit(p, [wrong, *rest], scale, scheme)
     assert found == pytest.approx(identification.BY_DESTINATION * far / 49 + (0.0 if by_origin else far / 7), rel=1e-3)
-
-
-def test_the_sign_of_a_prediction_error(scenario, runs):
-    """Predicted minus observed: who lets nobody out predicts too many vehicles."""
-    stuck = replace(scenario.network, mfds=tuple(Mfd(a=0.0, b=0.0, c=1e-9, jam=m.jam) for m in scenario.network.mfds))
-    assert identification.prediction_errors(stuck, runs, 5, step=30.0).mean() > 10.0
 
 
 @pytest.mark.parametrize("ahead, step, expected", [(600.0, 90.0, 7), (10.0, 90.0, 1), (90_000.0, 90.0, 120)])
