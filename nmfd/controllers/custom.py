@@ -84,9 +84,7 @@ def checked(controls: object, network: RegionalModel, name: str) -> Controls:
     splits = _numbers(controls.splits, np.zeros(allowed.shape), allowed.astype(float), f"{name}: act: splits")
     sums = splits.sum(axis=1)
     if (wrong := np.argwhere(allowed.any(axis=1) & (abs(sums - 1.0) > 100 * TOLERANCE))).size:
-        raise InputError(
-            f"{name}: act: splits: expected a sum of 1 over h, but not so for [i, j] = {wrong[0].tolist()}"
-        )
+        raise InputError(f"{name}: act: splits: expected a sum of 1 over h, not so for [i, j] = {wrong[0].tolist()}")
     return replace(controls, splits=splits / np.where(sums > 0, sums, 1.0)[:, None, :])
 
 

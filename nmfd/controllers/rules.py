@@ -25,7 +25,7 @@ class NoControl:
 
 
 class RouteGuidance(NoControl):
-    """Open perimeter with the nominal split ratios: in a city, guidance by travel times inside the regions only."""
+    """Open perimeter with nominal split ratios: guidance by travel times within regions."""
 
     name = "route-guidance"
 
@@ -69,7 +69,9 @@ class Gating(SetPoint):
 
 
 class PiGating:
-    """Incremental PI control of the accumulation n_p of every protected region p, at all its entries h -> p alike:
+    """Incremental PI control of the accumulation n_p of every protected region p.
+
+    All entries h -> p have the same opening:
 
         u_hp(k) = clip(u_hp(k-1) + kp (n_p(k-1) - n_p(k)) / n_cr + ki dt (n_set - n_p(k)) / n_cr,  u_min, u_max)
 
