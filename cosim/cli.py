@@ -7,7 +7,6 @@ from typing import Any
 import click
 
 import cosim
-import nmfd
 from nmfd.cli import (
     CONTROLLERS,
     COUNT,
@@ -16,6 +15,7 @@ from nmfd.cli import (
     POLICIES,
     SCENARIO,
     SEED,
+    VERSION,
     WORKERS,
     Commands,
     listed,
@@ -65,7 +65,7 @@ def parsed_ranges(
         "A city of your own": ("get", "import", "identify"),
     },
 )
-@click.version_option(nmfd.__version__)
+@VERSION
 def main() -> None:
     """Perimeter control in a SUMO city. Begin with `cosim demo`."""
 

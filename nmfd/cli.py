@@ -96,6 +96,18 @@ def parsed_policies(_ctx: click.Context, _param: click.Parameter, values: Sequen
     return policies
 
 
+def print_citation(ctx: click.Context, _param: click.Parameter, requested: bool) -> None:
+    """Print CITATION.cff with the version and exit, for --cite."""
+    if requested:
+        text = resources.files("nmfd").joinpath("CITATION.cff").read_text(encoding="utf-8")
+        click.echo(f"{text}version: {nmfd.__version__}")
+        ctx.exit()
+
+
+VERSION = combined(
+    click.version_option(nmfd.__version__),
+    click.option("--cite", is_flag=True, expose_value=False, callback=print_citation, help="Show CITATION.cff."),
+)
 SET = click.option(
     "--set",
     "settings",
@@ -142,7 +154,7 @@ def out_option(default: str, text: str = "Run folder; finished runs in it are ke
         "Networks from measured data": ("identify",),
     },
 )
-@click.version_option(nmfd.__version__)
+@VERSION
 def main() -> None:
     """Perimeter control and route guidance on the regional traffic model (NMFD).
 

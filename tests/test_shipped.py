@@ -10,7 +10,6 @@ import tiny
 from commands import cosim, error_line, good, nmfd
 
 from cosim.api import run as cosim_run
-from cosim.evaluation import results
 from cosim.sumo import build
 from cosim.sumo.build import ensure_built
 from nmfd import __version__
@@ -86,7 +85,7 @@ def test_a_path_goes_before_a_name(installed):
 def test_a_misspelt_name(installed, load, name, near):
     tiny.write(Path())
     Path("scenario").rename("mine")
-    with pytest.raises(InputError, match=f"{name}: no such folder .* did you mean {near}\\?; `nmfd list`"):
+    with pytest.raises(InputError, match=f"{name}: no such folder .* did you mean {near}\\?; `nmfd show`"):
         load(name)
 
 
@@ -110,9 +109,8 @@ def test_a_scenario_based_on_a_name_with_a_network_by_name(installed):
         ),
         ((nmfd, "bound", "economic_mpc", "--controller", "bound-pc"), "give --out FILE"),
         ((cosim, "identify", "grid7_peak"), "give another folder with --network"),
-        ((cosim, "identify", "grid7"), "give another folder with --network"),
     ],
-    ids=["train", "bound", "identify", "identify by network"],
+    ids=["train", "bound", "identify"],
 )
 def test_nothing_is_written_into_the_package(installed, command, remedy):
     program, *words = command
@@ -121,10 +119,8 @@ def test_nothing_is_written_into_the_package(installed, command, remedy):
 
 
 def test_a_missing_policy_is_trained_elsewhere(installed):
-    with pytest.raises(InputError, match="nmfd train grid7_peak --controller dpc-pc-robust --out dpc-pc-robust.pt"):
-        make_controller("dpc-pc-robust", load_scenario("grid7_peak"))
     scenario = load_scenario("economic_mpc")
-    assert make_controller("dpc-pc", scenario, policy=Path("economic_mpc/dpc-pc.pt"))  # as `nmfd list` calls it
+    assert make_controller("dpc-pc", scenario, policy=Path("economic_mpc/dpc-pc.pt"))  # as `nmfd show` calls it
 
 
 def test_cities_are_built_in_the_cache(installed, tmp_path, monkeypatch):
@@ -136,11 +132,6 @@ def test_cities_are_built_in_the_cache(installed, tmp_path, monkeypatch):
     monkeypatch.setenv(shipped.CACHE, str(tmp_path / "file"))
     with pytest.raises(InputError, match="COSIM_CACHE"):
         ensure_built(load_network("grid7"))
-
-
-def test_runs_find_their_scenario_again_by_its_name(installed, tmp_path):
-    manifest = {"sessions": [{"scenario_folder": "grid7_peak"}]}
-    assert results.scenario_folder(tmp_path, manifest) == installed / "scenarios" / "grid7_peak"
 
 
 def test_what_is_listed(installed):
