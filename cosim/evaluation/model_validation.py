@@ -22,7 +22,7 @@ from nmfd.model.identification import Observed
 from nmfd.model.plant import NmfdPlant
 from nmfd.model.scenario import Scenario
 from nmfd.runs import files, run_folder
-from nmfd.runs.tables import text_table
+from nmfd.runs.tables import text_columns, text_table
 from nmfd.studies import plots
 from nmfd.studies.fit_quality import SPILLBACK, predictions
 from nmfd.studies.traffic_states import model_outflow
@@ -34,6 +34,8 @@ OF_ONE_RUN = (
     "RMSE, bias: of the accumulation predicted for the whole run from its start [veh]; next interval: predicted from "
     "every recorded state; if nothing changed: RMSE of constant accumulation; bias > 0: the model holds too many"
 )
+HEADINGS = ["region", "name", "critical", "mean", "RMSE", "of critical", "if nothing changed", "bias"]
+HEADINGS += ["next interval RMSE", "of critical", "if nothing changed"]
 OF_ALL_RUNS = (
     "RMSE of the accumulation predicted from every recorded state under the recorded departures and controls, as a "
     "share of the region's critical accumulation, mean of the regions; if nothing changed: of constant accumulation; "
@@ -52,8 +54,9 @@ class Replay:
 
     def act(self, observation: Observation) -> Controls:
         """Return the recorded controls of this step."""
-        k = observation.step
-        return Controls(perimeter=self._result.perimeter[k], splits=self._result.splits[k])
+        return Controls(
+            perimeter=self._result.perimeter[observation.step], splits=self._result.splits[observation.step]
+        )
 
 
 def observed(result: Result) -> Observed:
@@ -124,25 +127,11 @@ def _rms(values: np.ndarray) -> float:
 
 def error_table(rows: pd.DataFrame) -> str:
     """Return the prediction errors of a run as text."""
-    return text_table(
-        [
-            {
-                "region": row["region"],
-                "name": row["name"],
-                "critical": f"{row['critical_veh']:.1f}",
-                "mean": f"{row['mean_veh']:.1f}",
-                "RMSE": f"{row['rmse_veh']:.1f}",
-                "of critical": f"{100 * row['rmse_share']:.1f} %",
-                "if nothing changed": f"{row['persistence_rmse_veh']:.1f}",
-                "bias": f"{row['bias_veh']:.1f}",
-                "next interval RMSE": f"{row['next_interval_rmse_veh']:.1f}",
-                "of critical ": f"{100 * row['next_interval_rmse_share']:.1f} %",
-                "if nothing changed ": f"{row['next_interval_persistence_rmse_veh']:.1f}",
-            }
-            for row in rows.to_dict("records")
-        ],
-        OF_ONE_RUN,
-    )
+    shown = {name: [str(cell) for cell in rows[name]] for name in rows}
+    for name in rows.columns[2:]:
+        percent = name.endswith("share")
+        shown[name] = [f"{100 * value:.1f} %" if percent else f"{value:.1f}" for value in rows[name]]
+    return text_columns(HEADINGS, zip(*shown.values(), strict=True), OF_ONE_RUN)
 
 
 def write_comparison(folder: Path, scenario: Scenario, result: Result) -> pd.DataFrame:

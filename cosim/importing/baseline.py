@@ -21,7 +21,7 @@ INTERVAL_S = 300.0  # of the densities
 PEAK_INTERVALS = 3  # in a row: those with the most vehicles count for the partition
 JITTER_S = 10.0  # of departures, in which seeds differ, as in the scenario that is written
 SILENT = {
-    "step-log.period": 10,
+    "no-step-log": "true",
     "no-warnings": "true",
     "ignore-route-errors": "true",
     "vehroute-output.exit-times": "true",
@@ -112,49 +112,33 @@ def averaged_runs(
     Raises:
         InputError: with SUMO's own words if it refuses.
     """
-    routes, background, additional = (
-        [folder / f for f in files[key]] for key in ("routes", "background", "additional")
-    )
     begin, end = float(times["begin"]), float(times["end"])
-    original = read_recorded_trips(routes)
+    background, additional = ([folder / name for name in files[key]] for key in ("background", "additional"))
+    original = read_recorded_trips([folder / name for name in files["routes"]])
     options: dict[str, object] = dict(times)
     # A vehicle with a new route by a rerouter makes SUMO fail when it writes the times of the edges it has left.
     if any(next(read_xml(path).iter("routeProbReroute"), None) is not None for path in additional):
         options["vehroute-output.exit-times"] = "false"
     runs = []
     for seed in range(seeds):
-
-        def reached(time: float, seed: int = seed) -> None:
-            share = (seed + min((time - begin) / (end - begin), 1.0)) / seeds
-            progress(f"simulating without control, {seed + 1} of {seeds}", share)
-
-        reached(begin)
+        progress(f"simulating without control, {seed + 1} of {seeds}", seed / seeds)
         with temporary_folder() as scratch:
             jitter = JITTER_S if seed else 0.0
-            own, ids = routes, [attribute(vehicle, "id") for vehicle in original.elements]
-            if factor != 1.0 or seed:
-                drawn = draw(original, seed=seed, factor=factor, jitter=jitter, begin=begin)
-                own, ids = [scratch / "vehicles.rou.xml"], [name for _, _, name in drawn]
-                write_recorded_trips(original, drawn, own[0])
+            drawn = draw(original, seed=seed, factor=factor, jitter=jitter, begin=begin)
+            write_recorded_trips(original, drawn, scratch / "vehicles.rou.xml")
             measure = scratch / "measure.add.xml"
             data = f'<edgeData id="all" freq="{INTERVAL_S:g}" file="edges.xml" excludeEmpty="true"/>'
             measure.write_text(f"<additional>{data}</additional>")
             options |= {
                 "net-file": file_list([streets.path]),
-                "route-files": file_list([*own, *background]),
+                "route-files": file_list([scratch / "vehicles.rou.xml", *background]),
                 "additional-files": file_list([*additional, measure]),
                 "seed": seed,
                 "vehroute-output": scratch / "ways.xml",
                 "statistic-output": scratch / "statistic.xml",
             }
-            run_sumo(
-                "sumo",
-                SILENT | options,
-                *(MESOSCOPIC if mesoscopic else ()),
-                where=str(streets.path),
-                reached=reached,
-            )
-            runs.append(_measured(scratch, streets, begin, end, set(ids)))
+            run_sumo("sumo", SILENT | options, *(MESOSCOPIC if mesoscopic else ()), where=str(streets.path))
+            runs.append(_measured(scratch, streets, begin, end, {name for _, _, name in drawn}))
     return replace(runs[0], presence=np.mean([run.presence for run in runs], axis=0))
 
 

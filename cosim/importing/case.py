@@ -6,7 +6,7 @@ import re
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -34,7 +34,6 @@ IDLE = re.compile(
     r"window|tracker|breakpoints|print|human|save|summary|tripinfo|vehroute|fcd|netstate|statistic|queue|emission|"
     r"device\.emissions|link|save-|load|osg|demo|game|language|registry|meso-).*"
 )
-STEP = re.compile(r"Step #([\d.]+)")
 # As SUMO's documentation recommends: sumo.dlr.de/docs/Networks/Import/OpenStreetMap.html. OpenStreetMap does not say
 # what signals show: they come out actuated.
 NETCONVERT = (
@@ -249,41 +248,14 @@ def _converted(osm: Path, folder: Path, left_hand: bool) -> Path:
     return net
 
 
-def run_sumo(
-    program: str,
-    options: Mapping[str, object],
-    *flags: str,
-    where: str,
-    reached: Callable[[float], None] = lambda time: None,
-) -> None:
-    """Run one of SUMO's programs. Raises InputError with the first error line of the program.
-
-    Args:
-        options: name without dashes -> value.
-        where: file that an InputError names.
-        reached: called with the times of SUMO's step log [s].
-    """
+def run_sumo(program: str, options: Mapping[str, object], *flags: str, where: str) -> None:
+    """Run one of SUMO's programs. Raises InputError with its first error line and the file `where`."""
     arguments = [text for name, value in options.items() for text in (f"--{name}", str(value))]
-    lines = []
-    with subprocess.Popen(
-        [str(Path(sumo.SUMO_HOME) / "bin" / program), *arguments, *flags],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    ) as process:
-        assert process.stdout is not None  # it is a pipe
-        try:
-            for line in process.stdout:  # universal newlines: the step log ends its lines with \r
-                if step := STEP.match(line):
-                    reached(float(step[1]))
-                else:
-                    lines.append(line)
-        except BaseException:
-            process.kill()
-            raise
-    if process.returncode:
-        errors = [line for line in lines if "rror" in line] or ["no reason given"]
-        raise InputError(f"{where}: {program} cannot run it: {' '.join(errors[0].split())}; correct the input")
+    command = [str(Path(sumo.SUMO_HOME) / "bin" / program), *arguments, *flags]
+    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace")
+    if done.returncode:
+        error = next((line for line in done.stdout.splitlines() if "rror" in line), "no reason given")
+        raise InputError(f"{where}: {program} cannot run it: {' '.join(error.split())}; correct the input")
 
 
 def _root(path: Path) -> ElementTree.Element:
