@@ -1,1 +1,1 @@
-"""Controllers behind one `act(measurement)`; `registry` finds them by name."""
+"""Controllers with `reset` and `act`; `strategy.parse` makes them by name."""

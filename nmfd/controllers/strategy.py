@@ -149,9 +149,8 @@ class Strategy:
         if self.controller.own:
             return str(getattr(custom.load(name), "name", name))
         split = {table: _split(table) for table in scenario.controller_options}
-        fitting = {table: words for table, (first, words) in split.items() if first == name}
-        fitting = {table: len(words) for table, words in fitting.items() if set(words) <= set(self.words)}
-        best = [table for table, count in fitting.items() if count and count == max(fitting.values())]
+        counts = {table: len(w) for table, (first, w) in split.items() if first == name and set(w) <= set(self.words)}
+        best = [table for table, count in counts.items() if count and count == max(counts.values())]
         if len(best) > 1:
             tables = " and ".join(f'[controllers."{table}"]' for table in best)
             raise InputError(

@@ -1,1 +1,1 @@
-"""Differentiable predictive control: policies, their training, and what watches over them."""
+"""Differentiable predictive control: policies, their files and training."""
