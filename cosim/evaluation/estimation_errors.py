@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from nmfd.model.regional_model import RegionalModel
-from nmfd.runs import files, run_folder
+from nmfd.runs import files
 from nmfd.runs.tables import text_columns
 from nmfd.studies import plots
 from nmfd.studies.traffic_states import OutflowOf
@@ -45,7 +45,7 @@ def write_errors(
     if estimated:
         files.write_table(folder / "estimation.csv", rows)
     for result in estimated:
-        path = folder / f"estimate-{run_folder.run_name(result.controller, result.seed)}.png"
+        path = folder / f"estimate-{files.run_name(result.controller, result.seed)}.png"
         if not path.exists():
             drawing, axes = plots.panels(network.regions)
             known = None if outflow is None else cache(outflow)

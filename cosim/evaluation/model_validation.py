@@ -21,7 +21,7 @@ from nmfd.model.dynamics import advance, parameters
 from nmfd.model.identification import Observed
 from nmfd.model.plant import NmfdPlant
 from nmfd.model.scenario import Scenario
-from nmfd.runs import files, run_folder
+from nmfd.runs import files
 from nmfd.runs.tables import text_columns, text_table
 from nmfd.studies import plots
 from nmfd.studies.fit_quality import SPILLBACK, predictions
@@ -138,7 +138,7 @@ def write_comparison(folder: Path, scenario: Scenario, result: Result) -> pd.Dat
     """Write compare-<run>.csv and two figures beside a run; return the rows of `errors`."""
     network, predicted = scenario.network, predict(scenario, result)
     rows = pd.DataFrame(errors(scenario, result, predicted))
-    name = run_folder.run_name(result.controller, result.seed)
+    name = files.run_name(result.controller, result.seed)
     files.write_table(folder / f"compare-{name}.csv", rows)
     drawing, axes = plots.panels(network.regions + 1)
     measured, model = regional_outflow(result, result.step), model_outflow(network)

@@ -10,7 +10,7 @@ from xml.sax.saxutils import quoteattr
 
 from cosim.sumo.xml_files import BROKEN, attribute, opened
 from nmfd.errors import InputError, RunFailed, did_you_mean
-from nmfd.runs.run_folder import run_name
+from nmfd.runs.files import run_name
 
 # Kind -> ending of its file. The emissions of every vehicle in every step are gigabytes, unless compressed.
 KINDS = {

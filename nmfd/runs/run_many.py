@@ -23,7 +23,7 @@ from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.parse import quote, unquote
+from urllib.parse import unquote
 
 from filelock import FileLock, Timeout
 from pebble import ProcessExpired, ProcessPool
@@ -31,6 +31,7 @@ from pebble import ProcessExpired, ProcessPool
 from nmfd import __version__
 from nmfd.errors import InputError, RunFailed, need
 from nmfd.metrics import summary
+from nmfd.runs.files import run_name as run_name
 from nmfd.runs.files import write_table, write_text
 from nmfd.runs.progress import Progress, watched
 from nmfd.types import Result
@@ -63,11 +64,6 @@ class Run:
     def file(self) -> str:
         """Return the path of its file below the folder of all runs."""
         return f"{self.folder}/{self.name}.nc" if self.folder else f"{self.name}.nc"
-
-
-def run_name(controller: str, seed: int) -> str:
-    """Return the stem of the file of a run; of a controller path/to/file.py:Class, too."""
-    return f"{quote(controller, safe='+,-._ ')}-{seed}"
 
 
 def run_many(
