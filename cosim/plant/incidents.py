@@ -16,10 +16,7 @@ CLOSED_SPEED_M_S = 0.001  # speed limit of a closed street: vehicles on it stand
 
 
 def check(faults: Sequence[Fault], city: City, where: str, others: Collection[str] = ()) -> None:
-    """Raise InputError for an edge or signal that the city does not have.
-
-    others: signals that are commanded, besides those with a gateway movement
-    """
+    """Raise InputError for an edge or signal that the city does not have; others: signals without a gateway."""
     signals = {gateway.signal for gateway in city.gateways} | {*others}
     for fault in faults:
         if fault.kind == "closed" and fault.value not in city.edges:
@@ -33,27 +30,27 @@ class Incidents:
 
     Call `begin` at the start of every control interval and `play` before every simulation step. A signal that stops or
     starts to obey shows yellow first where it loses a green.
+    refused: signals that did not take their states in this interval
     """
 
     def __init__(self, faults: Sequence[Fault], session: Session, city: City):
-        """faults: of the city, checked (`check`)"""
         self._faults, self._session, self._city = faults, session, city
         self._limits: dict[str, list[float]] = {}  # closed edge -> speed limits of its lanes before
         self._own = {fault.value: session.programme_id(fault.value) for fault in faults if fault.kind == "signal"}
         self._silent: set[str] = set()  # signals that do not obey
-        self._refused: set[str] = set()  # signals whose state SUMO refused in this interval
+        self._failed: set[str] = set()  # signals whose state SUMO refused in this interval
         self._commanded: dict[str, str] = {}  # signal -> last commanded state
         self._yellow_end: dict[str, float] = {}  # signal in transition -> end of its yellow [s]
 
     @property
     def closed(self) -> EdgeMask:
-        """(E,) bool, of the city's edges."""
+        """Return (E,) bool, the closed edges of the city."""
         return np.array([edge in self._limits for edge in self._city.edges], dtype=bool)
 
     @property
     def refused(self) -> set[str]:
-        """Signals that did not take their states in this interval."""
-        return self._refused | (self._silent & self._commanded.keys())
+        """Return the signals that did not take their states in this interval."""
+        return self._failed | (self._silent & self._commanded.keys())
 
     def begin(self, k: int) -> None:
         """Start the faults of control interval k, and end those that are over."""
@@ -63,7 +60,7 @@ class Incidents:
             self._limits[edge] = self._session.limit_speed(edge, [CLOSED_SPEED_M_S])
         for edge in self._limits.keys() - closed:
             self._session.limit_speed(edge, self._limits.pop(edge))
-        changed, self._silent, self._refused = sorted(silent ^ self._silent), silent, set()
+        changed, self._silent, self._failed = sorted(silent ^ self._silent), silent, set()
         for signal in changed:
             self._change(signal)
 
@@ -76,14 +73,13 @@ class Incidents:
     def show(self, signal: str, state: str) -> None:
         """Set the state of a signal, unless it does not obey."""
         self._commanded[signal] = state
-        obeys = signal not in self._silent and signal not in self._yellow_end
-        if obeys and not self._session.set_signal_state(signal, state):
-            self._refused.add(signal)
+        if self._obeys(signal) and not self._session.set_signal_state(signal, state):
+            self._failed.add(signal)
 
     def release(self, signal: str, programme: str) -> None:
         """Let a signal run its own programme again."""
         self._commanded.pop(signal, None)
-        if signal not in self._silent and signal not in self._yellow_end:
+        if self._obeys(signal):
             self._session.restart_programme(signal, programme)
 
     def problem(self) -> str:
@@ -91,16 +87,21 @@ class Incidents:
         streets = [f"edge {edge} closed" for edge in sorted(self._limits)]
         return ", ".join([*streets, *(f"signal {signal} took no programme" for signal in sorted(self.refused))])
 
+    def _obeys(self, signal: str) -> bool:
+        return signal not in self._silent and signal not in self._yellow_end
+
     def _change(self, signal: str) -> None:
-        """Switch between the signal's own programme and the commanded state, through yellow if a green ends."""
+        """Switch between own programme and commanded state, through yellow if a green ends."""
         session, shown = self._session, self._session.signal_state(signal)
-        alone = signal in self._silent or signal not in self._commanded
-        if alone:
+        target = None if signal in self._silent else self._commanded.get(signal)
+        if target is None:
             session.restart_programme(signal, self._own[signal])
-        target = session.signal_state(signal) if alone else self._commanded[signal]
-        ends = [a in GREEN and b not in GREEN for a, b in zip(shown, target, strict=True)]
+        ends = [
+            a in GREEN and b not in GREEN
+            for a, b in zip(shown, session.signal_state(signal) if target is None else target, strict=True)
+        ]
         if any(ends):
             session.set_signal_state(signal, "".join("y" if end else a for end, a in zip(ends, shown, strict=True)))
             self._yellow_end[signal] = session.time + DEFAULT_YELLOW_S
-        elif not alone:
+        elif target is not None:
             session.set_signal_state(signal, target)

@@ -140,11 +140,7 @@ class Launch:
         if self._originals is None:
             self._originals = own_vehicles(scenario, settings, self._city)
         drawn = draw(
-            self._originals,
-            seed=seed,
-            factor=scenario.demand_factor,
-            jitter=DEPARTURE_JITTER_S,
-            begin=settings.begin,
+            self._originals, seed=seed, factor=scenario.demand_factor, jitter=DEPARTURE_JITTER_S, begin=settings.begin
         )
         if metered:
             self.held = write_held_trips(self._originals, drawn, path, self._shared_routes, self._city.region_of)

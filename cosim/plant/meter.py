@@ -397,10 +397,5 @@ class Meter:
 
 def _event(vehicle: str, known: _Vehicle, source: int | None, region: int) -> Event:
     return Event(
-        vehicle=vehicle,
-        source=source,
-        region=region,
-        destination=known.destination,
-        edge=known.edge,
-        free=known.free,
+        vehicle=vehicle, source=source, region=region, destination=known.destination, edge=known.edge, free=known.free
     )

@@ -131,12 +131,7 @@ class Session:
 
     def _bind(self) -> None:
         """Bind SUMO's functions that need no translation; a Python call around them would cost as much as they do."""
-        simulation, vehicle, edge, lane = (
-            self._sumo.simulation,
-            self._sumo.vehicle,
-            self._sumo.edge,
-            self._sumo.lane,
-        )
+        simulation, vehicle, edge, lane = (self._sumo.simulation, self._sumo.vehicle, self._sumo.edge, self._sumo.lane)
         # Vehicles in the last step: read from files; inserted; ended as SUMO says, which tripinfo may deny, without
         # those that a program removed; taken off the road to be moved on; back on the road, or gone for good.
         self.loaded, self.departed = simulation.getLoadedIDList, simulation.getDepartedIDList
