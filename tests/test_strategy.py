@@ -45,8 +45,8 @@ def scenario(tmp_path):
         ),
         ("guided", "no-control", {"gateways_fixed": False, "guided": True}),
         ("dpc-pcrg+guidance-period-90", "dpc-pcrg", {"gateways_fixed": True, "guidance_period": 90.0}),
-        ("dpc-pc+metering", "dpc-pc", {"gateways_fixed": True, "metering": True}),
-        ("metering-120", "no-control", {"gateways_fixed": False, "metering": True, "metering_level": 1.2}),
+        ("dpc-pc+metering", "dpc-pc", {"gateways_fixed": True, "metering": 1.2}),
+        ("metering-120", "no-control", {"gateways_fixed": False, "metering": 1.2}),
         ("a.py:Gate", "a.py:Gate", {"gateways_fixed": True}),
         (
             "a+b/c d.py:Gate+actuated+rerouting-30",

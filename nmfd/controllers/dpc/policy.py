@@ -149,7 +149,7 @@ class DpcController:
     """Trained policy as a controller, "dpc-pc" or "dpc-pcrg"."""
 
     def __init__(self, policy: Policy):
-        self._policy = policy.eval()
+        self.policy = policy.eval()
         self.name = "dpc-pcrg" if policy.architecture.guidance else "dpc-pc"
         self._onward = policy.onward.numpy() if policy.architecture.listed else None
         self._u_max = self._full(policy.u_max * policy.adjacency.numpy())
@@ -159,7 +159,7 @@ class DpcController:
         self._memory: Memory | None = None
 
     def act(self, observation: Observation) -> Controls:
-        policy, accumulation = self._policy, observation.accumulation
+        policy, accumulation = self.policy, observation.accumulation
         with torch.inference_mode():
             # A local policy needs the sums only, and no copy.
             x = torch.from_numpy(accumulation if policy.architecture.local else accumulation.astype(np.float32))

@@ -146,13 +146,13 @@ def check(scenario: Scenario, strategy: "Strategy") -> RegionalModel:
     file = city.name if city.folder is None else city.folder / "network.toml"
     if city.controllable is not None and not city.controllable.any():
         raise InputError(
-            f"{file}: controllable: is 0 at every boundary: {NO_GATEWAY}; nmfd.train(..., anyway=True) trains all the same"
+            f"{file}: controllable: is 0 at every boundary: {NO_GATEWAY}; nmfd.train(..., anyway=True) trains it still"
         )
     if believed.placeholder:
         raise InputError(
             f"{file if believed.folder is None else believed.folder / 'network.toml'}: placeholder: is true: its MFDs "
             f"are guesses from lanes and speed limits; run 'cosim identify {city.folder}' first, or set it to false "
-            f"after putting in your own MFDs; nmfd.train(..., anyway=True) trains all the same"
+            "after putting in your own MFDs; nmfd.train(..., anyway=True) trains all the same"
         )
     return believed
 
