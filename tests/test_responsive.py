@@ -15,7 +15,6 @@ from signal_rules import MIN_GREEN, check
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
 from nmfd.api import load_scenario
-from nmfd.model.scenario import with_faults
 from nmfd.types import Controls
 
 CONFIG = """<configuration>
@@ -66,7 +65,7 @@ def opened(town):
 
 def drive(folder, gates, faults=(), **overrides):
     """A run under u = gates[k] in interval k: what every signal shows second by second, and more."""
-    scenario = with_faults(replace(load_scenario(folder), steps=len(gates)), faults)
+    scenario = replace(load_scenario(folder), steps=len(gates), faults=tuple(faults))
     plant = SumoPlant(scenario, settings=settings(scenario).changed(**overrides))
     try:
         plant.reset(1)

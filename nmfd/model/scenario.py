@@ -3,7 +3,7 @@
 import hashlib
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -111,13 +111,6 @@ class Scenario:
         """`faults`, parsed. Raises InputError."""
         where = "scenario.toml" if self.folder is None else self.folder / "scenario.toml"
         return tuple(parse(text, f"{where}: faults", self.network.regions) for text in self.faults)
-
-
-def with_faults(scenario: Scenario, texts: Sequence[str]) -> Scenario:
-    """Return `scenario` with more faults. Raises InputError."""
-    more = replace(scenario, faults=(*scenario.faults, *texts))
-    _ = more.ordered_faults
-    return more
 
 
 def with_demand(scenario: Scenario, *, steps: int | None = None, factor: float = 1.0) -> Scenario:
