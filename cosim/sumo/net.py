@@ -139,20 +139,16 @@ def check_adjacency(city: City, network: RegionalModel) -> None:
     joined = np.zeros((city.regions, city.regions), dtype=bool)
     for gateway in city.gateways:
         i, h, ends = gateway.source, gateway.target, f"edge {gateway.from_edge} leads to {gateway.to_edge}"
-        if not (network.adjacency | network.adjacency.T)[i, h]:
+        if not network.adjacency[i, h]:
             raise InputError(
                 f"{where}[{i}].adjacent: region {h} is missing, although {ends}; add it, or move the edges to other "
                 "regions"
-            )
-        if not network.adjacency[i, h]:
-            raise InputError(
-                f"{where}[{i}].no_way_to: lists {h}, but {ends} there; remove it, or move the edges to other regions"
             )
         joined[i, h] = True
     for i, h in np.argwhere(network.adjacency & ~joined):
         raise InputError(
             f"{where}[{i}].adjacent: lists {h}, but no edge leads from region {i} to region {h} in {city.net_file}; "
-            f"remove it, add no_way_to = [{h}], or change the regions of edges"
+            "remove it, or change the regions of edges"
         )
 
 
