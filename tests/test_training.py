@@ -19,30 +19,6 @@ from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError, RunFailed
 from nmfd.model.planning import planning_model
 
-# One value that is no default for every setting, and one beyond each end of what is allowed.
-CHOSEN = {
-    "steps": 3,
-    "learning_rate": 0.25,
-    "demand_low": 0.75,
-    "demand_high": 1.5,
-    "noise": 0.125,
-    "mfd_spread": 0.375,
-    "mfd_scale": 0.875,
-    "detour_cost": 20.0,
-    "from_no_control": True,
-    "local": True,
-}
-BEYOND = {
-    "steps": (0, 10**9),
-    "learning_rate": (0.0, 1.1),
-    "demand_low": (0.0, 1.1),
-    "demand_high": (0.9, 101.0),
-    "noise": (-0.1, 1e7),
-    "mfd_spread": (-0.1, 1.1),
-    "mfd_scale": (0.05, 1.1),
-    "detour_cost": (-0.1, 1e7),
-}
-
 
 @pytest.fixture
 def scenario(tmp_path):
@@ -57,23 +33,6 @@ def generator():
 def made(scenario, *, guidance=False):
     torch.manual_seed(0)
     return Policy(scenario.network, Architecture(width=8, guidance=guidance))
-
-
-def test_every_setting_is_taken_over(scenario):
-    wanted = replace(scenario, controller_options={"dpc-pc": CHOSEN})
-    assert training.settings(wanted, parse("dpc-pc")).model_dump() == {**training.Training().model_dump(), **CHOSEN}
-    assert training.settings(wanted, parse("dpc-pc"), steps=7).steps == 7
-    assert training.settings(wanted, parse("dpc-pc")).levels == (0.75, 1.5)
-    gate = replace(scenario, controller_options={"dpc-pc": {"from_gating": True}})
-    assert training.settings(gate, parse("dpc-pc")).from_gating
-    assert training.settings(scenario, parse("dpc-pc")) == training.Training()
-
-
-@pytest.mark.parametrize("key, value", [(key, value) for key, ends in BEYOND.items() for value in ends])
-def test_what_is_out_of_range_is_refused(scenario, key, value):
-    with pytest.raises(Exception, match=rf"dpc-pc\.{key}: ") as caught:
-        training.settings(replace(scenario, controller_options={"dpc-pc": {key: value}}), parse("dpc-pc"))
-    assert "\n" not in str(caught.value)
 
 
 def test_starts_without_a_spread_are_those_of_the_scenario(scenario, generator):
@@ -135,20 +94,6 @@ def test_noise_on_the_demand(scenario, generator):
     assert empty.min() == 0.0 and empty.max() > 0.0
 
 
-def test_models_are_drawn_around_the_nominal_one(scenario, generator):
-    """The accumulation axis by exp(0.2 n), the outflow by half of that, n cut at two deviations."""
-    rollout = Rollout(planning_model(scenario), dtype=torch.float64)
-    nominal = rollout.parameters
-    rollout.draw_model(8000, 0.2, generator, scale=0.5)
-    p = rollout.parameters
-    wide, high = torch.log(p.jam / nominal.jam / 0.5), torch.log(p.c / nominal.c)
-    for factor, most in ((wide, 0.4), (high, 0.2)):
-        assert factor.min().item() == pytest.approx(-most) and factor.max().item() == pytest.approx(most)
-        assert factor.mean().item() == pytest.approx(0.0, abs=0.01)
-    assert torch.corrcoef(torch.stack([wide[:, 0], wide[:, 1], high[:, 0]])).triu(1).abs().max() < 0.05
-    assert p.capacity is None and p.storage is None
-
-
 @pytest.mark.parametrize("rates", [None, 1.5], ids=["one rate", "exit rates"])
 def test_no_drawn_model_is_too_fast_for_the_step(scenario, generator, rates):
     """A free rate of 0.9 per integration step, half of the draws above it: all above 1 are cut down to 1."""
@@ -165,24 +110,6 @@ def test_no_drawn_model_is_too_fast_for_the_step(scenario, generator, rates):
     assert 0.2 < (drawn > 0.999).double().mean() < 0.6
 
 
-@pytest.mark.parametrize("rates", [1.0, 2.0])
-def test_half_of_the_moved_shares_are_diverted(scenario, rates):
-    """100 vehicles leave at 0.003 / s; own shares are all to 1, theta sends 0.4 of them elsewhere."""
-    network = replace(
-        scenario.network,
-        exit_rates=np.full((2, 2), rates),
-        mfds=tuple(replace(m, a=0.0, b=0.0, c=0.003) for m in scenario.network.mfds),
-    )
-    rollout = Rollout(planning_model(replace(scenario, network=network)), dtype=torch.float64)
-    x = torch.zeros(1, 2, 2, dtype=torch.float64)
-    x[0, 0, 1] = 100.0
-    own, theta = torch.zeros(2, 1, 2, 2, 2, dtype=torch.float64)
-    own[0, 0, 1, 1], theta[0, 0, 1, 1], theta[0, 0, 0, 1] = 1.0, 0.6, 0.4
-    rollout.nominal_splits = own[0]
-    diverted = rollout._diverted(x, theta)
-    assert diverted[0, 0, 1].item() == diverted.sum() == pytest.approx(0.4 * 0.003 * 100.0 * rates)
-
-
 def test_compilation_is_tried_out_where_there_is_a_compiler(monkeypatch):
     asked = []
     monkeypatch.setattr(rollout_module, "compiled_step", lambda step: lambda x: asked.append(step(x).tolist()))
@@ -194,27 +121,6 @@ def test_compilation_is_tried_out_where_there_is_a_compiler(monkeypatch):
     monkeypatch.setattr(shutil, "which", lambda name: name)
     monkeypatch.setattr(rollout_module, "compiled_step", lambda step: step / 0)
     assert not rollout_module.can_compile()
-
-
-def test_what_one_rollout_costs_does_not_depend_on_the_others(generator):
-    """With detours, each by itself; and the states are those of the step that is asked for."""
-    city = load_scenario("economic_mpc")
-    planning = planning_model(replace(city, steps=6, demand=city.demand[:6], measurement_std=0.0))
-    rollout = Rollout(planning, detour_cost=200.0)
-    policy = Policy(planning.network, Architecture(width=4, guidance=True)).requires_grad_(False)
-    x, demand = rollout.random_start(3, 0.5, 1.0, generator, (0.8, 1.2))
-    asked = []
-
-    def step(*arguments):
-        asked.append(arguments)
-        return rollout.step(*arguments)
-
-    def cost(chosen):
-        return rollout.total_time_spent(policy, x[chosen], demand[:, chosen], generator, step).tolist()
-
-    together = cost(slice(0, 3))
-    assert len(asked) == len(demand) - 1
-    assert len(set(together)) == 3 and together == pytest.approx([cost([n])[0] for n in range(3)])
 
 
 def test_the_total_time_spent_is_that_of_the_states(scenario, generator):
@@ -357,14 +263,6 @@ def test_what_cannot_be_trained_is_named(scenario):
         training.settings(scenario, parse("pi-gating"))
     with pytest.raises(InputError, match=r"'dpc-pc\+webster' needs a table .*dpc-pc\+webster"):
         training.settings(scenario, parse("dpc-pc+webster"))
-
-
-def test_a_wrong_setting_names_the_table_of_its_variant(scenario):
-    tables = {"dpc-pc": {"steps": 8}, "dpc-pc+webster": {"noise": -1.0}}
-    with pytest.raises(InputError, match=r"controllers\.dpc-pc\+webster\.noise: "):
-        training.settings(replace(scenario, controller_options=tables), parse("dpc-pc+webster"))
-    with pytest.raises(InputError, match=r"controllers\.dpc-pc\.steps: "):
-        training.settings(replace(scenario, controller_options={"dpc-pc": {"steps": 0}}), parse("dpc-pc"))
 
 
 def test_the_model_that_a_controller_is_trained_on_must_be_measured(scenario):
