@@ -274,9 +274,8 @@ def report(folders: Sequence[Path], *, seed: int | None = None, out: Path | None
 
     seed: of the runs on the map, the first of both if None
     """
-    with watched("report", None) as show:
-        runs = [results.read(folder) for folder in folders]
-        return html.write_page(out or folders[0] / "report.html", runs, seed=seed, progress=show)
+    runs = [results.read(folder) for folder in folders]
+    return html.write_page(out or folders[0] / "report.html", runs, seed=seed)
 
 
 def tune(

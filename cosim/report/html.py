@@ -39,32 +39,14 @@ LEVEL_PICTURES = {
 }
 
 
-def write_page(
-    path: Path,
-    runs: Sequence[Finished],
-    *,
-    seed: int | None = None,
-    progress: Callable[[int, int], None] | None = None,
-) -> Path:
-    """Write the page of the runs to `path`.
+def write_page(path: Path, runs: Sequence[Finished], *, seed: int | None = None) -> Path:
+    """Write the page of the runs to `path`; the first folder has its map with a slider.
 
-    Args:
-        path: the HTML file.
-        runs: folders of runs; the first one has its map with a slider.
-        seed: of the runs on the map; the first that both have if None.
-        progress: called with the demand levels done, and their number.
+    seed: of the runs on the map; the first that both have if None
 
     Raises:
         InputError: if there is no run with this seed.
     """
-    total, sections = sum(len(run.levels) for run in runs), []
-    for run in runs:
-        levels = []
-        for level in run.levels:
-            levels.append(_level(run, level))
-            if progress:
-                progress(sum(len(section["levels"]) for section in sections) + len(levels), total)
-        sections.append({**_run(run), "levels": levels})
     title, script, div = _map(runs[0], seed)
     environment = Environment(
         loader=PackageLoader("cosim.report", "."), autoescape=True, trim_blocks=True, undefined=StrictUndefined
@@ -73,7 +55,7 @@ def write_page(
         path,
         environment.get_template("report.html.j2").render(
             name=", ".join(dict.fromkeys(run.scenario.name for run in runs)),
-            runs=sections,
+            runs=[_run(run) for run in runs],
             map_title=title,
             map_div=div,
             scripts=[*Resources(mode="inline", components=["bokeh", "bokeh-widgets"]).js_raw, script],
@@ -104,11 +86,10 @@ def _map(run: Finished, seed: int | None) -> tuple[str, str, str]:
 
 
 def _run(run: Finished) -> dict:
-    """Return what the page shows of a folder before its levels."""
+    """Return what the page shows of a folder."""
     level, rows = run.level(None), run.rows
-    configuration = level.key
     heading, shown, name = card.card(level.rows)
-    minutes = configuration["steps"] * configuration["step_s"] / 60
+    minutes = level.key["steps"] * level.key["step_s"] / 60
     pictures = _pictures(partial(figures.draw_levels, rows=rows), LEVEL_PICTURES) if len(run.levels) > 1 else []
     return {
         "name": run.name,
@@ -118,6 +99,7 @@ def _run(run: Finished) -> dict:
         "intro": f"Scenario {run.scenario.name}, {minutes:.0f} min in SUMO; seeds {_seeds(rows)}. With the same seed "
         "every strategy has the same trips.",
         "pictures": pictures,
+        "levels": [_level(run, level) for level in run.levels],
         "manifest": json.dumps(
             {"runs": level.key, "controllers": level.controllers, "sessions": run.sessions}, indent=1
         ),

@@ -94,9 +94,10 @@ class Curves:
             legend = plot.legend[0]
             legend.update(location="top_left", background_fill_alpha=0.75, border_line_alpha=0.0)
             legend.update(label_text_font_size="11px", spacing=0, padding=2)
-        legend = self.gates.legend[0]  # values are at the top and at the bottom
-        legend.update(location="left", ncols=2, margin=0)
-        self.gates.add_layout(legend, "below")
+        for plot in (self.gates, self.plane):  # where values may be anywhere
+            legend = plot.legend[0]
+            legend.update(location="left", ncols=2, margin=0)
+            plot.add_layout(legend, "below")
         self.titles = [plot.title for plot in (self.region, self.plane, self.gates)]  # they name the region
         self.now = [_now(plot) for plot in over_time]
 

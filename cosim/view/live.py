@@ -230,8 +230,6 @@ def watch(
     """Run strategies side by side with a live page until they have ended and the page is closed.
 
     Args:
-        scenario: where they run.
-        strategies: one or two.
         seed, demand: see cosim.evaluation.simulate.simulate.
         port: of the page on this machine; 0 for a free one.
         browse: open the page in a browser.

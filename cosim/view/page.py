@@ -60,7 +60,7 @@ class Page:
         self.maps = [CityMap(picture, name) for name in names]
         self.loads = [Load(picture, f"{name}: load of the regions") for name in names]
         self.curves = Curves(picture, names)
-        self.numbers = Div(sizing_mode="stretch_width")
+        self.numbers = Div(sizing_mode="stretch_width", styles={"overflow-x": "auto"})
         ends = [region for gate in picture.gates for region in (gate.source, gate.target)]
         self.choose(max(range(picture.regions), key=ends.count))
         options = [(str(n), name if name == str(n) else f"{n} {name}") for n, name in enumerate(picture.region_names)]
@@ -152,6 +152,7 @@ def with_slider(picture: CityPicture, runs: Mapping[str, Sequence[Frame]]) -> La
         title="time [min]",
         name="time",
         sizing_mode="stretch_width",
+        styles={"flex": "1 1 240px"},
     )
     play = Toggle(label="Play", name="play", width=90, button_type="primary")
     callback = CustomJS(
@@ -200,19 +201,19 @@ def _wrapped(parts: Sequence[LayoutDOM], narrowest: int = NARROWEST) -> LayoutDO
 def numbers(names: Sequence[str], frames: Sequence[Frame | None], time: float) -> str:
     """Return the totals of the runs at a time [s], as an HTML table."""
     labels = ("inside [veh]", "waiting [veh]", "completed [veh]", "time spent [veh h]", "removed [veh]")
-    heads = "".join(f"<td style='color:{colours.FAINT};padding:0 14px'>{label}</td>" for label in labels)
+    heads = "".join(f"<td style='color:{colours.FAINT};padding:0 10px'>{label}</td>" for label in labels)
     lines = []
     for (colour, _), name, frame in zip(colours.RUNS, names, frames, strict=False):
         totals: list[float] = []
         if frame is not None:
             totals = [frame.accumulation.sum(), frame.waiting, frame.completed, frame.time_spent / HOUR, frame.removed]
-        cells = "".join(f"<td style='font-size:18px;padding:0 14px'>{value:,.0f}</td>" for value in totals)
+        cells = "".join(f"<td style='font-size:18px;padding:0 10px'>{value:,.0f}</td>" for value in totals)
         note = "" if frame is None else escape(frame.note[:200])
         lines.append(
             f"<tr><th style='color:{colour};text-align:left;font-size:15px'>{escape(name)}</th>{cells}"
             f"<td style='color:{colours.QUEUE}'>{note}</td></tr>"
         )
     return (
-        f"<table style='text-align:right'><tr><th style='font-size:20px;text-align:left'>{time / MINUTE:.1f} min</th>"
-        f"{heads}</tr>{''.join(lines)}</table>"
+        "<table style='text-align:right'><tr><th style='font-size:20px;text-align:left;white-space:nowrap'>"
+        f"{time / MINUTE:.1f} min</th>{heads}</tr>{''.join(lines)}</table>"
     )

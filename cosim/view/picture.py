@@ -165,14 +165,7 @@ def after(
     state: State,
     row: Mapping[str, np.ndarray],
 ) -> Frame:
-    """Return the frame at the end of a control interval.
-
-    Args:
-        spent: unfinished vehicles at its start (veh).
-        controls: the commands of the interval.
-        state: the state at its end.
-        row: one row of the record.
-    """
+    """Return the frame at the end of a control interval; spent: unfinished vehicles at its start [veh]."""
     with np.errstate(invalid="ignore", divide="ignore"):
         green = row["gateway_green"] / row["gateway_original_green"]
     flows = {name: row[name][None] for name in ("arrivals", "crossings")}
