@@ -185,7 +185,7 @@ def test_table_and_picture(scenario, run, tmp_path):
         ('measurement = "guess"', "sumo.measurement: should be 'exact' or 'estimate', got 'guess'"),
         ("detector_share = 1.2", r"sumo.detector_share: should be less than or equal to 1, got 1.2"),
         ("probe_share = -0.1", r"sumo.probe_share: should be greater than or equal to 0"),
-        ('measurement = "estimate"\ndetector_share = 0\nprobe_share = 0', "needs detectors or probes"),
+        ('measurement = "estimate"\ndetector_share = 0\nprobe_share = 0', "needs sumo.detector_share"),
     ],
 )
 def test_wrong_settings(scenario, lines, problem):

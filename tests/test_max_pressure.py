@@ -360,4 +360,4 @@ def test_what_is_known_of_a_run():
     facts = control.facts(session.time)
     assert (facts["signal_lanes"], facts["split_lanes"], facts["never_whole_lanes"]) == (4, 1, 0)
     assert facts["programmed_intergreen_share"] == pytest.approx(6.0 / 66.0)
-    assert facts["intergreen_share"] == pytest.approx(0.5 * 4 * 3.0 / 100.0)  # s changes four times, t never
+    assert facts["intergreen_share"] == pytest.approx(0.5 * 3.0 / 100.0)  # s changes once, t never

@@ -8,7 +8,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import tiny_city
-from commands import cosim, error_line
 
 from cosim.plant.metering import FILLING_S, KI, KP, Metering
 from cosim.plant.plant import SumoPlant
@@ -16,6 +15,7 @@ from cosim.plant.settings import settings
 from cosim.sumo.trips import Trips, held
 from cosim.sumo.xml_files import read_xml
 from nmfd.api import load_scenario
+from nmfd.errors import InputError
 from nmfd.model.plant import AcyclicPlant, NmfdPlant
 from nmfd.types import Controls
 
@@ -96,7 +96,7 @@ def test_in_a_city_the_books_hold_and_waiting_counts():
     network = scenario.network
     opened = Controls(perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=None, metering=np.full(7, 0.02))
     runs = []
-    for chosen in (settings(scenario), settings(scenario).changed(metering=True)):
+    for chosen in (settings(scenario), settings(scenario).changed(metering=1.2)):
         plant = SumoPlant(scenario, settings=chosen)
         plant.reset(5)
         states = [plant.step(opened) for _ in range(3)]
@@ -137,7 +137,7 @@ def test_a_citys_own_vehicles_wait_as_well(own):
     regions, step = scenario.network.regions, scenario.step
     (free, _, due), *metered = (
         ran(scenario),
-        *(ran(scenario, metering=True, rate=np.full(regions, rate)) for rate in (100.0, 0.0, 1.0 / step)),
+        *(ran(scenario, metering=1.2, rate=np.full(regions, rate)) for rate in (100.0, 0.0, 1.0 / step)),
     )
     (fast, _, again), (closed, _, _), (held_back, facts, count) = metered
     inside = [
@@ -153,13 +153,12 @@ def test_a_citys_own_vehicles_wait_as_well(own):
     assert facts.trips >= count
 
 
-def test_where_nobody_can_be_made_to_wait(own, tmp_path):
+def test_a_city_in_which_no_trip_can_wait(own):
     vehicles = next(own.glob("vehicles.rou.xml*"))
     root = read_xml(vehicles)
     for vehicle in root:
         vehicle.set("line", "7")
     with gzip.open(vehicles, "wb") as stream:
         ElementTree.ElementTree(root).write(stream)
-    line = error_line(cosim("run", own, "--controller", "no-control+metering", "--out", tmp_path / "out"))
-    assert "sumo.metering: none of the vehicles in sumo.routes can be made to wait" in line
-    assert not (tmp_path / "out").exists()
+    with pytest.raises(InputError, match="sumo.metering: none of the vehicles in sumo.routes can wait"):
+        ran(load_scenario(own), metering=1.2)

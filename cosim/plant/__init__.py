@@ -1,1 +1,1 @@
-"""The city as a plant, and what acts in it."""
+"""The city as a plant, with its actuation and measurement."""

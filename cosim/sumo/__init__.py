@@ -1,1 +1,1 @@
-"""What SUMO reads and writes; no control."""
+"""Files and sessions of SUMO; no control."""
