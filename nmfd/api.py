@@ -170,7 +170,6 @@ def robustness(
         parse_many(controllers, scenario, regional=True),
         sigmas,
         scenarios,
-        where="pairs",
         out=default_folder(scenario.name) if out is None else Path(out),
         workers=workers,
         progress=progress,

@@ -19,20 +19,20 @@ COUNTED = {
 
 # Attributes of a Result that are no column of a table of runs.
 NO_COLUMNS = {"step", "estimated", "wall_time", "key", "scenario_folder"}
-# Columns of a table of runs on any plant: type and meaning.
-SUMMARY: dict[str, tuple[type, str]] = {
-    "controller": (str, "the strategy"),
-    "seed": (int, "of trips, drivers and guidance"),
-    "plant": (str, "what was driven: a regional model, or the city in SUMO"),
-    "total_time_spent_veh_s": (float, "running, waiting to enter, and as long as it could be of those removed"),
-    "final_accumulation_veh": (float, "inside at the end"),
-    "max_accumulation_veh": (float, "inside at the end of an interval, the most"),
-    "completed_veh": (float, "trips that reached their end"),
-    "evaluation_time_s": (float, "wall time of all decisions"),
-    "control_step_ms_median": (float, "wall time of a decision"),
-    "control_step_ms_max": (float, "of the longest decision"),
-    **{column: (int, text) for column, (_, text) in COUNTED.items()},
-    "wall_time_s": (float, "wall time of the run"),
+# Columns of a table of runs on any plant, and their meaning.
+SUMMARY: dict[str, str] = {
+    "controller": "the strategy",
+    "seed": "of trips, drivers and guidance",
+    "plant": "what was driven: a regional model, or the city in SUMO",
+    "total_time_spent_veh_s": "running, waiting to enter, and as long as it could be of those removed",
+    "final_accumulation_veh": "inside at the end",
+    "max_accumulation_veh": "inside at the end of an interval, the most",
+    "completed_veh": "trips that reached their end",
+    "evaluation_time_s": "wall time of all decisions",
+    "control_step_ms_median": "wall time of a decision",
+    "control_step_ms_max": "of the longest decision",
+    **{column: text for column, (_, text) in COUNTED.items()},
+    "wall_time_s": "wall time of the run",
 }
 
 

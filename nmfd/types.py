@@ -5,13 +5,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Flag
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
 from nmfd.arrays import PerPair, PerRegion, PerTurn
 from nmfd.errors import InputError
-from nmfd.quantities import Quantity, dataset_variables
 
 if TYPE_CHECKING:
     import pandas
@@ -144,6 +143,22 @@ class Controller(Protocol):
         """Return the controls of the interval that begins now; `observation` is the controller's own copy."""
 
 
+class Quantity(NamedTuple):
+    """Named axes, unit ("" of texts) and meaning of a variable of a Result; attributes: more of them."""
+
+    dimensions: tuple[str, ...]
+    unit: str
+    text: str
+    attributes: Mapping[str, Any] = {}
+
+    def variable(self, values: Any) -> tuple:
+        """Return `values` as xarray.Dataset takes them: dimensions, array and attributes."""
+        array = np.asarray(values)
+        array = array.astype(object) if array.dtype.kind == "U" else array  # as netCDF returns texts
+        units = {"units": self.unit} if self.unit else {}
+        return self.dimensions, array, {"long_name": self.text, **units, **self.attributes}
+
+
 VARIABLES: dict[str, Quantity] = {
     "accumulation": Quantity(("time", "region", "destination"), "veh", "vehicles inside"),
     "backlog": Quantity(("time", "region", "destination"), "veh", "vehicles waiting to enter"),
@@ -208,7 +223,8 @@ class Result:
             "time": ("time", times, {"long_name": "time since the start", "units": "s"}),
             "interval": ("interval", times[:-1], {"long_name": "beginning of the interval", "units": "s"}),
         }
-        return cls(xarray.Dataset(dataset_variables(VARIABLES, arrays), coordinates, dict(attrs)))
+        variables = {name: about.variable(arrays[name]) for name, about in VARIABLES.items()}
+        return cls(xarray.Dataset(variables, coordinates, dict(attrs)))
 
     @classmethod
     def read(cls, path: Path | str) -> "Result":
@@ -283,8 +299,13 @@ class Result:
                 data.attrs[name] = value
         return Result(data)
 
-    def add(self, variables: Mapping[str, tuple], attrs: Mapping[str, Any]) -> "Result":
-        """Return the result with more variables (name -> dimensions, array, attributes) and attributes."""
+    def add(
+        self, attrs: Mapping[str, Any], about: Mapping[str, Quantity] | None = None, **arrays: np.ndarray
+    ) -> "Result":
+        """Return the result with more attributes, and the `arrays` that are described in `about`."""
+        variables = {
+            name: quantity.variable(arrays[name]) for name, quantity in (about or {}).items() if name in arrays
+        }
         return Result(self.data.assign(variables).assign_attrs(attrs))
 
     def without_times(self) -> "xarray.Dataset":

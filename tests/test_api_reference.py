@@ -20,7 +20,6 @@ MODULES = (  # in which public names are defined
     "nmfd.model.mfd",
     "nmfd.model.plant",
     "nmfd.model.regional_model",
-    "nmfd.runs.run_folder",
     "cosim.plant.settings",
     "nmfd.controllers.strategy",
     pytest.param("cosim.api", marks=pytest.mark.slow),

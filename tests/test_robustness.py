@@ -11,7 +11,7 @@ import torch
 from nmfd.api import load_scenario, robustness
 from nmfd.controllers.dpc import training
 from nmfd.model.planning import planning_model
-from nmfd.model.scenario import WHERE, perturbed, perturbed_entries
+from nmfd.model.scenario import pairs_with_demand, perturbed
 from nmfd.studies import robustness as study
 
 
@@ -25,26 +25,22 @@ def scenario(folder):
     return load_scenario(folder)
 
 
-@pytest.mark.parametrize("where", WHERE)
-def test_noise_has_the_declared_size_and_place(scenario, where):
+def test_noise_has_the_declared_size_and_place(scenario):
     long = replace(scenario, demand=np.tile(10.0 * np.sign(scenario.demand), (200, 1, 1)))
-    noisy = perturbed(long, 1.0, 0, where=where)
-    change, touched = noisy.demand - long.demand, perturbed_entries(long.demand, where)
-    assert (change[~touched] == 0.0).all() and noisy.demand.min() >= 0.0
+    noisy = perturbed(long, 1.0, 0)
+    change, pairs = noisy.demand - long.demand, pairs_with_demand(long.demand)
+    assert (change[:, ~pairs] == 0.0).all() and noisy.demand.min() >= 0.0
     assert change[long.demand > 0].std() == pytest.approx(1.0, rel=0.05)
-    added = noisy.demand[touched & (long.demand == 0)]
-    if where == "planned":
-        assert added.size == 0
-    else:  # half of a normal distribution
-        assert added.mean() == pytest.approx(1.0 / np.sqrt(2.0 * np.pi), rel=0.05)
+    added = noisy.demand[:, pairs][long.demand[:, pairs] == 0]
+    assert added.mean() == pytest.approx(1.0 / np.sqrt(2.0 * np.pi), rel=0.05)  # half of a normal distribution
 
 
 def test_noise_is_common_to_all_sigmas_and_follows_its_seed(scenario):
     high = replace(scenario, demand=scenario.demand + 100.0)
-    one, two = (perturbed(high, sigma, 3, where="all").demand - high.demand for sigma in (1.0, 2.0))
+    one, two = (perturbed(high, sigma, 3).demand - high.demand for sigma in (1.0, 2.0))
     np.testing.assert_allclose(two, 2.0 * one, atol=1e-10)
-    np.testing.assert_array_equal(perturbed(high, 0.0, 3, where="all").demand, high.demand)
-    assert not np.array_equal(perturbed(high, 1.0, 4, where="all").demand - high.demand, one)
+    np.testing.assert_array_equal(perturbed(high, 0.0, 3).demand, high.demand)
+    assert not np.array_equal(perturbed(high, 1.0, 4).demand - high.demand, one)
 
 
 def test_training_noise_is_that_of_the_evaluation(scenario):

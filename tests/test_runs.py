@@ -19,7 +19,6 @@ from trajectories import trajectory
 from cosim.plant.record import RECORD
 from nmfd import metrics
 from nmfd.errors import InputError, RunFailed
-from nmfd.quantities import dataset_variables
 from nmfd.runs import files
 from nmfd.runs import run_many as module
 from nmfd.runs.run_many import Run, raise_failures, read_manifest, run_many, run_name
@@ -48,7 +47,7 @@ def test_the_same_run_is_the_same_but_for_times():
 
 def test_xarray_opens_a_run_with_names_and_units(tmp_path):
     original, record = trajectory(), trajectories.record(4, regions=2)
-    original.add(dataset_variables(RECORD, record), {}).assign(estimated=True).write(tmp_path / "a.nc")
+    original.add({}, RECORD, **record).assign(estimated=True).write(tmp_path / "a.nc")
     with xr.open_dataset(tmp_path / "a.nc") as data:
         assert dict(data.sizes) == {
             **{"time": 5, "interval": 4, "region": 2, "destination": 2, "next_region": 2},

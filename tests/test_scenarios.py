@@ -81,10 +81,10 @@ def test_vehicles_at_the_start(base):
 
 def test_noise_on_the_demand_is_common_to_all_sigmas(base):
     scenario = load_scenario(base)
-    half, full = (perturbed(scenario, sigma, 3, where="planned").demand - scenario.demand for sigma in (0.001, 0.002))
+    half, full = (perturbed(scenario, sigma, 3).demand - scenario.demand for sigma in (0.001, 0.002))
     inside = scenario.demand > 0.1
     np.testing.assert_allclose(full[inside], 2.0 * half[inside], atol=1e-12)
-    assert (perturbed(scenario, 1.0, 3, where="all").demand >= 0.0).all()
+    assert (perturbed(scenario, 1.0, 3).demand >= 0.0).all()
 
 
 def test_a_network_is_written_as_it_is_read(tmp_path):

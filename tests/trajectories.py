@@ -5,13 +5,12 @@ from tiny import made
 
 from cosim.evaluation.simulate import FACTS
 from cosim.plant.record import RECORD
-from nmfd.quantities import dataset_variables
 from nmfd.types import Result, Status
 
 
 def recorded(run: Result, arrays: dict[str, np.ndarray], facts: dict) -> Result:
     """`run` in a city, with the arrays of a Record and its facts."""
-    return run.add(dataset_variables(RECORD, arrays), facts)
+    return run.add(facts, RECORD, **arrays)
 
 
 def record(steps: int, *, regions: int, gateways: int = 3, edges: int = 5) -> dict[str, np.ndarray]:

@@ -22,7 +22,6 @@ from nmfd import closed_loop, metrics
 from nmfd.arrays import PerRegion
 from nmfd.controllers.strategy import Strategy
 from nmfd.model.scenario import Scenario, with_demand
-from nmfd.quantities import dataset_variables
 from nmfd.runs.files import atomic
 from nmfd.types import Result
 
@@ -104,7 +103,7 @@ def simulate(
         result = closed_loop.run(plant, controller, scenario, seed=seed, progress=progress)
         result = result.assign(controller=strategy.name, plant="sumo")
         plant_facts, leaks, trip_facts = plant.facts(), set(plant.leaks()), plant.trip_facts()
-        result = settled(result.add(dataset_variables(RECORD, plant.record()), {}))
+        result = settled(result.add({}, RECORD, **plant.record()))
         backlog = result.backlog.sum(axis=(1, 2))
         facts = {
             "scenario": name,
@@ -129,7 +128,7 @@ def simulate(
             "jumps": int(result.jumps.sum()),
         }
         check_whole(files)
-    return result.add({}, facts)
+    return result.add(facts)
 
 
 def regional_outflow(record: Mapping[str, np.ndarray] | Result, step: float) -> RegionCounts:

@@ -8,8 +8,7 @@ from cosim.plant.actuation import Actuation
 from cosim.plant.guidance import Guide
 from cosim.plant.meter import Meter
 from cosim.plant.sampling import StreetMeans
-from nmfd.quantities import Quantity
-from nmfd.types import Result
+from nmfd.types import Quantity, Result
 
 BOOKS = ("departures", "arrivals", "removals", "given_up", "crossings", "jumps", "redirected")  # of the meter
 _PAIRS = ("interval", "region", "destination")

@@ -23,13 +23,6 @@ from nmfd.runs.config import Name, Numbers, Problem, Regions, Rows, Settings, Te
 LONGEST_STEP_S = 86_400.0
 MOST_STEPS = 10**6
 MOST_FLOW_VEH_S = 1e6
-# Entries d_ij(k) of the demand that noise perturbs. Clipping passes only the positive half of the noise where no demand
-# was planned, so that "pairs" and "all" add 0.4 sigma veh/s per pair, from start to end.
-WHERE = {
-    "planned": "pairs of regions with demand, while it lasts: about as many vehicles as planned",
-    "pairs": "pairs of regions with demand, all the time: more vehicles than planned",
-    "all": "every pair of regions, all the time: many times the planned vehicles",
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,22 +114,19 @@ def with_demand(scenario: Scenario, *, steps: int | None = None, factor: float =
     )
 
 
-def perturbed_entries(demand: PairsOverTime, where: str) -> Bool[np.ndarray, "T R R"]:
-    """Return the entries of `demand` (T, R, R) that `where`, a key of WHERE, perturbs."""
-    if where == "planned":
-        return demand > 0
-    if where == "pairs":
-        return np.broadcast_to((demand > 0).any(axis=0), demand.shape)
-    return np.ones(demand.shape, dtype=bool)
+def pairs_with_demand(demand: PairsOverTime) -> Bool[np.ndarray, "R R"]:
+    """Return the pairs of regions with demand (T, R, R) at any time: noise perturbs these, all the time."""
+    return (demand > 0).any(axis=0)
 
 
-def perturbed(scenario: Scenario, sigma: float, seed: int, *, where: str) -> Scenario:
+def perturbed(scenario: Scenario, sigma: float, seed: int) -> Scenario:
     """Return `scenario` with demand max(0, d_ij(k) + sigma n_ij(k)) [veh/s], n standard normal.
 
-    The same seed gives the same n for every sigma (common random numbers).
+    The same seed gives the same n for every sigma (common random numbers). Clipping passes only the positive half of
+    the noise while no demand is planned, which adds 0.4 sigma veh/s per pair.
     """
     noise = np.random.default_rng([seed, 0x64656D]).standard_normal(scenario.demand.shape)
-    noise *= perturbed_entries(scenario.demand, where)
+    noise *= pairs_with_demand(scenario.demand)
     return replace(scenario, demand=np.maximum(scenario.demand + sigma * noise, 0.0))
 
 

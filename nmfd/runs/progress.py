@@ -2,17 +2,8 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Protocol, runtime_checkable
 
 from tqdm.auto import tqdm
-
-
-@runtime_checkable
-class Show(Protocol):
-    """A function that takes what is done, what there is to do, and what is running."""
-
-    def __call__(self, done: int, total: int, note: str = "") -> None: ...
-
 
 Progress = Callable[..., None] | bool | None
 

@@ -5,7 +5,7 @@ import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from scipy.special import stdtrit
 
@@ -36,13 +36,6 @@ BOUND_CAPTION = (
 )
 
 
-class Noise(NamedTuple):
-    """Noise on the demand (nmfd.model.scenario), drawn from the seed of a run; sigma: its deviation (veh/s)."""
-
-    sigma: float
-    where: str
-
-
 def compared_with(controllers: Iterable[str]) -> str:
     """Return the controller that others are compared with: no control, or the first if that is not among them."""
     names = list(controllers)
@@ -56,17 +49,15 @@ def closed_loop_of(
     scenario: Scenario,
     plant: str,
     policy: Path | None = None,
-    noise: Noise | None = None,
+    sigma: float = 0.0,
 ) -> Result:
-    """Run the controller of `strategy`, which is made for `scenario`, in the scenario with `noise`."""
-    controller, actual = strategy.make(scenario, policy), with_noise(scenario, noise, seed)
+    """Run the controller of `strategy`, which is made for `scenario`, with noise on the demand.
+
+    sigma: standard deviation of the noise (veh/s), drawn from `seed`
+    """
+    controller, actual = strategy.make(scenario, policy), perturbed(scenario, sigma, seed) if sigma else scenario
     result = closed_loop.run(PLANTS[plant](actual), controller, actual, seed=seed)
     return result.assign(controller=strategy.name, plant=plant)
-
-
-def with_noise(scenario: Scenario, noise: Noise | None, seed: int) -> Scenario:
-    """Return `scenario` with the demand of the run of `seed`."""
-    return scenario if noise is None else perturbed(scenario, noise.sigma, seed, where=noise.where)
 
 
 def benchmark(

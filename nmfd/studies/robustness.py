@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING
 
 from nmfd.controllers.strategy import Strategy, parse
 from nmfd.metrics import percent_change, summary
-from nmfd.model.scenario import Scenario
+from nmfd.model.scenario import Scenario, perturbed
 from nmfd.runs.progress import Progress
 from nmfd.runs.run_many import Run, run_many, run_name
 from nmfd.runs.tables import text_columns
 from nmfd.studies import plots
-from nmfd.studies.benchmark import REFERENCE, Noise, closed_loop_of, interval, key_of, processes, with_noise
+from nmfd.studies.benchmark import REFERENCE, closed_loop_of, interval, key_of, processes
 from nmfd.types import Result
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ CAPTION = (
 
 
 def run_one(
-    strategy: Strategy, seed: int, *, scenario: Scenario, plant: str, noise: Noise, policy: Path | None = None
+    strategy: Strategy, seed: int, *, scenario: Scenario, plant: str, sigma: float, policy: Path | None = None
 ) -> Result:
     """Run one closed loop in perturbed demand; return its figures, without arrays.
 
@@ -40,9 +40,9 @@ def run_one(
     """
     import xarray
 
-    row = summary(closed_loop_of(strategy, seed, scenario=scenario, plant=plant, policy=policy, noise=noise))
-    actual = with_noise(scenario, noise, seed)
-    facts = {"sigma_veh_per_s": noise.sigma, "trips_veh": float(actual.step * actual.demand.sum())}
+    row = summary(closed_loop_of(strategy, seed, scenario=scenario, plant=plant, policy=policy, sigma=sigma))
+    actual = perturbed(scenario, sigma, seed)
+    facts = {"sigma_veh_per_s": sigma, "trips_veh": float(actual.step * actual.demand.sum())}
     return Result(xarray.Dataset(attrs=facts | {column: row[column] for column in KEPT}))
 
 
@@ -52,7 +52,6 @@ def robustness(
     sigmas: Sequence[float],
     scenarios: int,
     *,
-    where: str,
     out: Path,
     plant: str = "acyclic",
     policies: Mapping[str, Path] | None = None,
@@ -72,14 +71,14 @@ def robustness(
     runs = [
         Run(
             run_name(strategy.name, number),
-            {**key(strategy.name), "noise": [sigma, where]},
+            {**key(strategy.name), "sigma_veh_per_s": sigma},
             partial(
                 run_one,
                 strategy,
                 number,
                 scenario=scenario,
                 plant=plant,
-                noise=Noise(sigma, where),
+                sigma=sigma,
                 policy=policies.get(strategy.name),
             ),
             folder=f"sigma-{sigma:g}",

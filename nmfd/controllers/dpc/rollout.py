@@ -13,7 +13,7 @@ from jaxtyping import Float
 from nmfd.controllers.dpc.policy import Policy
 from nmfd.model import dynamics
 from nmfd.model.planning import PlanningModel
-from nmfd.model.scenario import perturbed_entries
+from nmfd.model.scenario import pairs_with_demand
 from nmfd.tensors import PerPair, PerTurn
 
 States = Float[torch.Tensor, "B R R"]
@@ -119,7 +119,7 @@ class Rollout:
         """
         if not noise:
             return demand
-        sigma = level[:, None, None] * noise * torch.tensor(perturbed_entries(self.planning.forecast, "pairs")[0])
+        sigma = level[:, None, None] * noise * torch.tensor(pairs_with_demand(self.planning.forecast))
         normal = torch.randn(demand.shape, generator=generator, dtype=self.dtype)
         return (demand + (normal * sigma).to(self.device)).clamp(min=0.0)
 
