@@ -109,7 +109,9 @@ def identify(
     more = [run for folder in loading.runs for run in finished(folder, loaded)]
 
     def load(stage: int, **options: object) -> list[Result]:
-        named = progress and (lambda done, total, note: progress(done, total, f"loading runs {stage + 1} of 2; {note}"))
+        named = progress and (
+            lambda done, total, note="": progress(done, total, f"loading runs {stage + 1} of 2; {note}")
+        )
         how = {"workers": workers, "scheduler": scheduler, "progress": named}
         return _load(loaded, loading, loading.stages[stage], options, out, **how)
 
@@ -120,7 +122,7 @@ def identify(
     scheme: dict = {"step": loaded.step, "substeps": loaded.substeps, "integrator": loaded.integrator}
 
     def fitted(runs: Sequence[Result], samples: Sequence[dict]) -> RegionalModel:
-        fitting = progress and (lambda done, total, note: progress(done, total, f"fitting, {note}"))
+        fitting = progress and (lambda done, total, note="": progress(done, total, f"fitting, {note}"))
         seen = [observed(run) for run in runs]
         model = identification.fit(network, seen, iterations=loading.iterations, progress=fitting, **scheme)
         return as_it_was(network, model, nearly_empty(samples))
