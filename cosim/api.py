@@ -399,6 +399,7 @@ def identify(
         raise InputError("--runs: fits one model; say which, by --with own or --with guided")
     report = []
     for guided in kinds or ["guided" in words]:
+        loaded = load_scenario(scenario, settings)  # the second model takes the split ratios of the first
         suffix = "-guided" if guided else ""
         folder = Path("runs") / f"{file_name(loaded.name)}-identify{suffix}" if out is None else out
         if out is not None and len(kinds) > 1 and guided:
