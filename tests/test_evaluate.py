@@ -123,7 +123,7 @@ def test_check_does_runs_again_and_names_what_differs(city, tmp_path, ran):
     "arguments, expected",
     [
         (("--controllers", "no-control,nobody"), "controller 'nobody' is unknown"),
-        (("--controllers", "no-control,no-control"), "no-control is there twice"),
+        (("--controllers", "no-control,no-control"), "no-control,no-control"),
         (("--controllers", "no-control", "--policy", "dpc-pc=x.pt"), "dpc-pc"),
     ],
 )

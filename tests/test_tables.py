@@ -66,23 +66,6 @@ def test_tables_show_a_line_per_controller_and_the_teleports(rows):
     assert first.rstrip("| ").endswith("| 0") and "-49.5 ± " in first
 
 
-def test_the_frontier_counts_seeds_in_which_all_trips_are_completed():
-    rows = pd.DataFrame(
-        {
-            "demand": [1.0, 1.0, 1.5, 1.5, 2.0, 2.0],
-            "controller": "a",
-            "seed": [1, 2] * 3,
-            "completed_veh": [9, 9, 9, 8, 9, 9],
-            "trips": 9,
-            statistics.TTS: 1.0,
-        }
-    )
-    table = statistics.served(rows)
-    assert list(table["served_share"]) == [1.0, 0.5, 1.0] and statistics.highest(table) == {"a": 1.0}
-    assert table["served_share_low"][0] == pytest.approx(1.0 / (1.0 + 1.96**2 / 2), rel=1e-3)  # Wilson, both of two
-    assert table["served_share_high"][0] == pytest.approx(1.0)
-
-
 def test_numbers_stand_to_the_right_and_captions_are_wrapped():
     rows = [
         {"controller": "no-control", "TTS": "1.50e8 ± 2e5", "change": ""},

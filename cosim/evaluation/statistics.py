@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from scipy.stats import binomtest
 
 from nmfd.metrics import COUNTED, percent_change
 from nmfd.runs.tables import markdown_table, text_table, wrapped
@@ -14,7 +13,6 @@ from nmfd.studies import benchmark
 from nmfd.studies.benchmark import REFERENCE, interval
 
 TTS = "total_time_spent_veh_s"
-SERVED_SHARE = 0.9  # of the seeds in which all trips are completed: the demand counts as served
 MEANS = (  # columns of runs.csv whose mean over seeds is shown
     "completed_veh",
     "removed_veh",
@@ -158,41 +156,6 @@ def pairs(rows: pd.DataFrame) -> pd.DataFrame:
                 }
             )
     return pd.DataFrame(out)
-
-
-def served(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the frontier: share of seeds in which all trips are completed, per demand level and controller.
-
-    Columns demand, controller, seeds, served_share with its 95 % Wilson interval (_low, _high), trips, mean and half
-    interval of TTS.
-    """
-    out = []
-    for (level, name), part in rows.groupby(["demand", "controller"], sort=False):
-        count = int((part["completed_veh"] >= part["trips"]).sum())
-        between = binomtest(count, len(part)).proportion_ci(method="wilson")
-        out.append(
-            {
-                "demand": level,
-                "controller": name,
-                "seeds": len(part),
-                "served_share": count / len(part),
-                "served_share_low": between.low,
-                "served_share_high": between.high,
-                "trips": float(part["trips"].mean()),
-                f"mean_{TTS}": float(part[TTS].mean()),
-                f"half_interval_{TTS}": interval(list(part[TTS])),
-            }
-        )
-    return pd.DataFrame(out)
-
-
-def highest(table: pd.DataFrame) -> dict[str, float]:
-    """Return controller -> demand up to which every level of `served` reaches SERVED_SHARE; 0 for none."""
-    result = {}
-    for name, part in table.sort_values("demand").groupby("controller", sort=False):
-        good = part["served_share"] >= SERVED_SHARE - 1e-9
-        result[str(name)] = float(part["demand"][good.cummin()].max()) if good.iloc[0] else 0.0
-    return result
 
 
 def shown(table: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
