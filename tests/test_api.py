@@ -104,7 +104,7 @@ def test_a_controller_and_a_plant_as_objects(tmp_path):
         (("pi-gating",), {"plant": "sumo"}, "plant 'sumo' is unknown; choose from nmfd, acyclic"),
         (("pi-gating",), {"steps": 0}, "steps: expected 1 or more"),
         ((Half(),), {"policy": "x.pt"}, "x.pt: controller half reads no policy"),
-        ((3,), {}, "got 3 without reset"),
+        ((3,), {}, "with reset and act, got 3"),
     ],
 )
 @pytest.mark.usefixtures("unchecked")

@@ -213,9 +213,9 @@ def test_guiding_controllers_find_the_model_of_guided_drivers(base, tmp_path):
     )
     jam = {
         name: planning_model(scenario, name).network.mfds[0].jam
-        for name in ("dpc-pcrg", "mpc-pcrg", "dpc-pcrg-robust", "dpc-pc", "bound-pcrg", "dpc-pcrg+max-pressure")
+        for name in ("dpc-pcrg", "mpc-pcrg", "dpc-pc", "bound-pcrg", "dpc-pcrg+max-pressure")
     }
-    assert list(jam.values()) == [800.0, 800.0, 800.0, 1000.0, 1000.0, 700.0]
+    assert list(jam.values()) == [800.0, 800.0, 1000.0, 1000.0, 700.0]
     (network / "guided" / "network.toml").write_text(tiny.row_network(3))
     with pytest.raises(InputError, match="guided/network.toml: network .* has other regions"):
         planning_model(scenario, "dpc-pcrg")
