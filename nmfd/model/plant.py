@@ -1,5 +1,7 @@
 """Regional plants: the NMFD and its acyclic variant, in float64 (nmfd.types.Plant)."""
 
+from typing import Any
+
 import numpy as np
 import torch
 
@@ -23,7 +25,7 @@ class NmfdPlant:
 
     def __init__(self, scenario: Scenario):
         self._scenario = scenario
-        self._scheme = {"integrator": scenario.integrator, "substeps": scenario.substeps}
+        self._scheme: dict[str, Any] = {"integrator": scenario.integrator, "substeps": scenario.substeps}
         self._build()
 
     def reset(self, seed: int) -> State:
@@ -81,9 +83,9 @@ class NmfdPlant:
 
     def _advance(self, demand: PerPair, perimeter: PerPair, splits: PerTurn) -> float:
         """Advance `_x` by one control interval; return the completed trips [veh]."""
-        controls = (torch.from_numpy(values) for values in (demand, perimeter, splits))
+        inflow, u, theta = (torch.from_numpy(values) for values in (demand, perimeter, splits))
         self._x, ended = dynamics.advance_counted(
-            self._parameters, self._x, *controls, self._scenario.step, **self._scheme
+            self._parameters, self._x, inflow, u, theta, self._scenario.step, **self._scheme
         )
         return float(ended)
 

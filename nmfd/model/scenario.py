@@ -7,11 +7,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Bool
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from nmfd.arrays import Intervals, PairsOverTime, PerPair
 from nmfd.errors import InputError
@@ -171,7 +171,7 @@ class ScenarioTable(Settings):
     forecast_error: float = setting(
         "standard deviation of the logarithm of forecast over demand", 0.0, unit="-", ge=0.0, le=2.0
     )
-    initial: Rows[Numbers] = setting(
+    initial: Annotated[tuple[Numbers, ...], Field(strict=False)] = setting(
         "vehicles at the start, regional model only: one row per region, by destination", (), unit="veh"
     )
     faults: Texts = setting("injected into every run: KIND[:VALUE][@FROM-TO]", ())
