@@ -198,14 +198,7 @@ def steps(monkeypatch):
 
 
 def test_the_learning_rate_falls_to_a_tenth_along_a_cosine(tmp_path, scenario, steps):
-    chosen = replace(
-        scenario,
-        controller_options={
-            "dpc-pc": {
-                "learning_rate": 0.5,
-            }
-        },
-    )
+    chosen = replace(scenario, controller_options={"dpc-pc": {"learning_rate": 0.5}})
     training.train(chosen, parse("dpc-pc"), seed=0, out=tmp_path / "p.pt", steps=4)
     expected = [0.5 * (0.1 + 0.45 * (1.0 + math.cos(math.pi * k / 4))) for k in range(4)]
     assert [rate for rate, _, _ in steps] == pytest.approx(expected)
@@ -227,12 +220,7 @@ def test_the_best_validation_is_kept(tmp_path, scenario, monkeypatch):
     monkeypatch.setattr(training, "VALIDATION_PERIOD", 2)
     monkeypatch.setattr(training, "validate", lambda *_: next(scores))
     out = training.train(
-        scenario,
-        parse("dpc-pc"),
-        seed=3,
-        out=tmp_path / "p.pt",
-        steps=5,
-        progress=lambda *note: notes.append(note),
+        scenario, parse("dpc-pc"), seed=3, out=tmp_path / "p.pt", steps=5, progress=lambda *note: notes.append(note)
     )
     assert notes == [
         (1, 5, "best inf veh s"),

@@ -32,21 +32,14 @@ class Ipopt:
         self._edges, self._turns = np.argwhere(network.adjacency), np.argwhere(network.split_mask & guidance)
         regions, p = network.regions, model.parameters(network)
         start, demand = ca.SX.sym("start", regions, regions), ca.SX.sym("demand", regions, regions * horizon)
+        scheme: dict = {"integrator": planning.integrator, "substeps": planning.substeps}
         variables, constraints, total, x = [], [], 0.0, start
         for k in range(horizon):
             u, theta = ca.SX.sym(f"u{k}", len(self._edges)), ca.SX.sym(f"theta{k}", len(self._turns))
             splits, sums = self._splits(theta)
             after = ca.SX.sym(f"x{k}", regions, regions)
-            moved = model.advance(
-                p,
-                UNIT * x,
-                demand[:, k * regions : (k + 1) * regions],
-                self._perimeter(u),
-                splits,
-                planning.step,
-                integrator=planning.integrator,
-                substeps=planning.substeps,
-            )
+            flows = demand[:, k * regions : (k + 1) * regions], self._perimeter(u), splits
+            moved = model.advance(p, UNIT * x, *flows, planning.step, **scheme)
             constraints += [*sums, ca.vec(ca.densify(moved) / UNIT - after)]
             total, x = total + ca.sum1(ca.vec(after)), after
             variables += [u, theta, ca.vec(after)]
@@ -54,17 +47,10 @@ class Ipopt:
         self._lower = np.tile([network.u_min] * edges + [0.0] * (turns + cells), horizon)
         self._upper = np.tile([network.u_max] * edges + [1.0] * turns + [np.inf] * cells, horizon)
         limits = {"max_iter": iterations} | ({} if seconds is None else {"max_wall_time": seconds})
-        self._solver = ca.nlpsol(
-            "mpc",
-            "ipopt",
-            {
-                "x": ca.vertcat(*variables),
-                "p": ca.vertcat(ca.vec(start), ca.vec(demand)),
-                "f": total,
-                "g": ca.vertcat(*constraints),
-            },
-            {"print_time": False, "ipopt": {"print_level": 0, "sb": "yes", **limits}},
-        )
+        problem = {"x": ca.vertcat(*variables), "f": total, "g": ca.vertcat(*constraints)}
+        problem["p"] = ca.vertcat(ca.vec(start), ca.vec(demand))
+        options = {"print_time": False, "ipopt": {"print_level": 0, "sb": "yes", **limits}}
+        self._solver = ca.nlpsol("mpc", "ipopt", problem, options)
 
     def solve(self, state: PerPair, demand: PairsOverTime) -> tuple[PairsOverTime, TurnsOverTime, str | None]:
         """Return u (-, (H, R, R)), theta (-, (H, R, R, R)), and the reason if IPOPT did not converge, else None.
@@ -72,26 +58,12 @@ class Ipopt:
         state: (veh, (R, R)); demand: (veh/s, (H, R, R))
         """
         network, regions, horizon = self._network, self._network.regions, self._horizon
-        guess = np.concatenate(
-            [
-                np.full(len(self._edges), network.u_max),
-                network.nominal_splits[tuple(self._turns.T)],
-                state.T.ravel() / UNIT,
-            ]
-        )
-        answer = (
-            self._solver(
-                x0=np.tile(guess, horizon),
-                p=np.concatenate([state.T.ravel() / UNIT, *(d.T.ravel() for d in demand)]),
-                lbx=self._lower,
-                ubx=self._upper,
-                lbg=0.0,
-                ubg=0.0,
-            )["x"]
-            .full()
-            .reshape(horizon, -1)
-        )
-        stats, edges, turns = self._solver.stats(), self._edges, self._turns
+        edges, turns, x = self._edges, self._turns, state.T.ravel() / UNIT
+        guess = np.concatenate([np.full(len(edges), network.u_max), network.nominal_splits[tuple(turns.T)], x])
+        given = np.concatenate([x, *(d.T.ravel() for d in demand)])
+        bounds = {"lbx": self._lower, "ubx": self._upper, "lbg": 0.0, "ubg": 0.0}
+        answer = self._solver(x0=np.tile(guess, horizon), p=given, **bounds)["x"].full().reshape(horizon, -1)
+        stats = self._solver.stats()
         perimeter, splits = np.zeros((horizon, regions, regions)), np.tile(network.nominal_splits, (horizon, 1, 1, 1))
         perimeter[:, edges[:, 0], edges[:, 1]] = answer[:, : len(edges)]
         splits[:, turns[:, 0], turns[:, 1], turns[:, 2]] = answer[:, len(edges) : len(edges) + len(turns)]
