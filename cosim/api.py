@@ -135,7 +135,7 @@ def run_controllers(
     rows = run_many(runs, out, workers=2)
     raise_failures(rows)
     finished = results.read(out)
-    there = [level.read(*name) for level in finished.levels for name in results.rows_of(level)]
+    there = [level.read(*name) for level in finished.levels for name in level.runs]
     draw_accumulations(out, loaded, there, outflow=lambda result: regional_outflow(result, result.step))
     errors = estimation_errors.write_errors(
         out, loaded.network, there, lambda result: regional_outflow(result, result.step)

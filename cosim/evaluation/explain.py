@@ -1,7 +1,7 @@
 """Why a controller gains or loses against the reference: one paragraph from the numbers of the runs."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,8 +21,7 @@ INTERGREEN_SHARE = 0.03  # more time between two stages than in the original pro
 WAIT_S = 1.0  # before a trip begins
 
 
-@dataclass(frozen=True, kw_only=True)
-class Load:
+class Load(NamedTuple):
     """Peak accumulation over critical, share of time beyond it, and share of vehicles that start inside (R,)."""
 
     peak: PerRegion
@@ -31,15 +30,12 @@ class Load:
 
 
 def load(network: RegionalModel, runs: Sequence[Result]) -> Load:
-    """Return the load of the regions in some runs."""
+    """Return the load of the regions, mean over runs."""
     states = [run.accumulation.sum(axis=2) / network.critical for run in runs]
     started = sum(run.departures.sum(axis=(0, 2)) for run in runs)
     entered = sum(run.crossings.sum(axis=(0, 1, 3)) for run in runs)
-    return Load(
-        peak=np.mean([state.max(axis=0) for state in states], axis=0),
-        beyond=np.mean([(state > 1.0).mean(axis=0) for state in states], axis=0),
-        inside=started / np.maximum(started + entered, 1),
-    )
+    peak, beyond = ([reduced(state) for state in states] for reduced in (lambda s: s.max(0), lambda s: (s > 1).mean(0)))
+    return Load(np.mean(peak, axis=0), np.mean(beyond, axis=0), started / np.maximum(started + entered, 1))
 
 
 def text(level: Level, finished: Finished) -> str:
@@ -51,92 +47,81 @@ def text(level: Level, finished: Finished) -> str:
 
 def city(level: Level, finished: Finished) -> str:
     """Return two sentences about the city under the reference."""
-    network, against = finished.scenario.network, statistics.compared_with(level.rows)
-    found = load(network, _runs(level, against))
-    hot = [
-        f"{network.region_names[r]} ({found.beyond[r]:.0%} of the time, up to {found.peak[r]:.1f} times)"
-        for r in np.flatnonzero(found.beyond > SMALL_SHARE)
-    ]
-    highest = int(np.argmax(found.peak))
-    state = (
-        f"these regions exceed their critical accumulation: {', '.join(hot)}"
-        if hot
-        else f"no region exceeds its critical accumulation; {network.region_names[highest]} is nearest, with "
-        f"{found.peak[highest]:.1f} times"
-    )
+    names, against = finished.scenario.network.region_names, statistics.compared_with(level.rows)
+    peak, beyond, _ = load(finished.scenario.network, _runs(level, against))
+    most = int(np.argmax(peak))
+    state = f"no region exceeds its critical accumulation; {names[most]} is nearest, with {peak[most]:.1f} times"
+    if hot := [
+        f"{names[r]} ({beyond[r]:.0%} of the time, up to {peak[r]:.1f} times)"
+        for r in np.flatnonzero(beyond > SMALL_SHARE)
+    ]:
+        state = f"these regions exceed their critical accumulation: {', '.join(hot)}"
     when = "Without control" if against == REFERENCE else f"Under {against}"
     return f"Signals under control see {1.0 - _leaking(level):.0%} of the boundary flow. {when} {state}."
 
 
 def paragraph(level: Level, finished: Finished, name: str) -> str:
     """Return how much `name` gains or loses against the reference, and why."""
-    rows, against = level.rows, statistics.compared_with(level.rows)
+    against = statistics.compared_with(level.rows)
     if name == against:
         return f"{name} is the reference."
-    pair = statistics.paired(
-        statistics.by_seed(rows, level.demand, name), statistics.by_seed(rows, level.demand, against)
-    )
-    if not pair.seeds or np.isnan(pair.percent):
-        return f"{name} has no seed in common with {against}, or {against} has no time spent: no comparison."
-    spread = f"± {pair.percent_half:.1f} % over {pair.seeds} seeds" if pair.seeds > 1 else "on one seed, no proof"
-    clear = pair.excludes_zero or pair.seeds == 1
-    verdict = "changes nothing" if pair.percent == 0 else "gains" if pair.percent < 0 else "loses"
-    if not clear and pair.percent:
+    values = [statistics.by_seed(level.rows, level.demand, each) for each in (name, against)]
+    pair = statistics.paired(*values)
+    if np.isnan(pair.percent):
+        return f"{name} has no seed in common with {against}, or no vehicle spent time: no comparison."
+    clear, gains = pair.excludes_zero or pair.seeds == 1, pair.percent < 0
+    verdict = "changes nothing" if not pair.percent else "gains" if gains else "loses"
+    if pair.percent and not clear:
         verdict = "shows no significant change"
-    reasons = _reasons(level, finished.scenario.network, name, against, gains=clear and pair.percent < 0)
+    spread = f"± {pair.percent_half:.1f} % over {pair.seeds} seeds" if pair.seeds > 1 else "on one seed, no proof"
+    reasons = _reasons(level, finished.scenario.network, name, against, gains=clear and gains)
     size = f"{pair.percent:+.1f} % total time spent against {against} {spread}"
     return f"{name} {verdict} ({size}){': ' if reasons else ''}{'; '.join(reasons)}."
 
 
 def _reasons(level: Level, network: RegionalModel, name: str, against: str, *, gains: bool) -> list[str]:
     """Return what the controller did, and what limits it if it does not gain."""
-    before, runs, rows = load(network, _runs(level, against)), _runs(level, name), level.rows
-    region, trips = int(np.argmax(before.beyond)), max(sum(run.departures.sum() for run in runs), 1)
+    before, runs, strategy = load(network, _runs(level, against)), _runs(level, name), parse(name)
+    trips, acts = max(sum(run.departures.sum() for run in runs), 1), strategy.controller.name != ALONE
     limit = network.u_max - OPEN_SHARE * (network.u_max - network.u_min)
     held = float(np.mean([(run.perimeter[:, network.adjacency] < limit).mean() for run in runs]))
     guided = sum(run.guided.sum() for run in runs) / trips
-    strategy = parse(name)
-    metered, alone = strategy.metered or level.key["sumo"].get("metering"), strategy.controller.name == ALONE
+    metered = strategy.metered or level.key["sumo"].get("metering", False)
     waited = sum(run.backlog[1:].sum() * run.step for run in runs) / trips if metered else 0.0
-    acts = [
-        *([f"it holds vehicles back in {held:.0%} of its commands"] if held >= SMALL_SHARE else []),
-        *([f"it guides {guided:.1f} times per trip"] if guided > 0 else []),
-        *([f"its trips wait {waited:.0f} s before they begin"] if waited >= WAIT_S else []),
-    ] or ["it never holds back and never guides"] * (not alone)
+    deeds = {
+        f"it holds vehicles back in {held:.0%} of its commands": held >= SMALL_SHARE,
+        f"it guides {guided:.1f} times per trip": guided > 0,
+        f"its trips wait {waited:.0f} s before they begin": waited >= WAIT_S,
+    }
+    done = [words for words, true in deeds.items() if true] or ["it never holds back and never guides"] * acts
+    critical, region = np.flatnonzero(before.beyond > SMALL_SHARE), int(np.argmax(before.beyond))
     if gains:
-        after = load(network, runs)
-        relief = f"{network.region_names[region]} is beyond its critical accumulation {after.beyond[region]:.0%} of the"
-        return acts + [f"{relief} time instead of {before.beyond[region]:.0%}"] * int(
-            before.beyond[region] > SMALL_SHARE
-        )
-    limits = []
-    if not alone and _leaking(level) > LEAKING_SHARE:
-        limits.append(f"{_leaking(level):.0%} of the boundary flow passes no signal under control")
-    critical = np.flatnonzero(before.beyond > SMALL_SHARE)
-    if not alone and not len(critical):
-        limits.append("no region is ever critical, so there is nothing to protect")
-    elif held >= SMALL_SHARE and (before.inside[critical] > 0.5).all():
-        limits.append("most vehicles in the critical regions start there, behind the gateways")
-    full = rows.groupby("controller")["gateway_full_share"].mean()
-    if held >= SMALL_SHARE and full[name] - full[against] > FULL_SHARE:
-        limits.append(
-            f"its queues fill the edges before gateways {full[name]:.0%} of the time, not {full[against]:.0%}"
-        )
-    mean = rows[rows["controller"] == name].mean(numeric_only=True)
-    if mean.get("split_lanes", 0) > 0:
-        limits.append(
-            f"{mean['split_lanes']:.0f} of {mean['signal_lanes']:.0f} lanes serve movements of several stages"
-        )
-    if mean.get("intergreen_share", 0) > mean.get("programmed_intergreen_share", 0) + INTERGREEN_SHARE:
-        limits.append(
-            f"its signals are between stages {mean['intergreen_share']:.0%} of the time, the original programmes "
-            f"{mean['programmed_intergreen_share']:.0%}"
-        )
-    return acts + limits
+        beyond = [f"{share:.0%}" for share in (load(network, runs).beyond[region], before.beyond[region])]
+        relief = f"{network.region_names[region]} is critical {beyond[0]} of the time instead of {beyond[1]}"
+        return done + [relief] * bool(len(critical))
+    mean = level.rows[level.rows["controller"] == name].mean(numeric_only=True)
+    full = level.rows.groupby("controller")["gateway_full_share"].mean()
+    split, between = (
+        mean.get("split_lanes", 0),
+        [mean.get(f"{kind}intergreen_share", 0.0) for kind in ("", "programmed_")],
+    )
+    leaking, holds = _leaking(level), held >= SMALL_SHARE
+    inside = len(critical) > 0 and bool((before.inside[critical] > 0.5).all())
+    blocks = holds and full[name] - full[against] > FULL_SHARE
+    slow = between[0] > between[1] + INTERGREEN_SHARE
+    limits = {
+        f"{leaking:.0%} of the boundary flow passes no signal under control": acts and leaking > LEAKING_SHARE,
+        "no region is ever critical, so there is nothing to protect": acts and not len(critical),
+        "most vehicles in the critical regions start there, behind the gateways": holds and inside,
+        f"its queues fill the edges before gateways {full[name]:.0%} of the time, not {full[against]:.0%}": blocks,
+        f"{split:.0f} of {mean.get('signal_lanes', 0):.0f} lanes serve movements of several stages": split > 0,
+        f"its signals are between stages {between[0]:.0%} of the time, the original programmes {between[1]:.0%}": slow,
+    }
+    return done + [words for words, true in limits.items() if true]
 
 
 def _runs(level: Level, name: str) -> list[Result]:
-    return [level.read(name, int(seed)) for seed in level.rows.loc[level.rows["controller"] == name, "seed"]]
+    return [level.read(*run) for run in level.runs if run[0] == name]
 
 
 def _leaking(level: Level) -> float:

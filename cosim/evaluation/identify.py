@@ -185,7 +185,7 @@ def finished(folder: Path, scenario: Scenario) -> list[Result]:
     if found.scenario.name != scenario.name:
         raise InputError(f"--runs: {folder}: holds runs of {found.scenario.name}, not of {scenario.name}")
     found.map()
-    return [level.read(*run) for level in found.levels for run in results.rows_of(level)]
+    return [level.read(*run) for level in found.levels for run in level.runs]
 
 
 def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool) -> RegionalModel:

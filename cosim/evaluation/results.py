@@ -11,18 +11,17 @@ from cosim.sumo.net import City, city_of
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
-from nmfd.runs import shipped
-from nmfd.runs.files import file_hash, read_table
+from nmfd.runs.files import file_hash
 from nmfd.runs.run_many import TABLE, read_manifest, run_name
 from nmfd.types import Result
 
 
 @dataclass(frozen=True, kw_only=True)
 class Level:
-    """Runs of one scenario at one demand level.
+    """Finished runs of one scenario at one demand level.
 
-    demand: multiple of the scenario's demand; folder: of the result files; rows: one per run; key: what all runs depend
-    on; controllers: name -> what only its runs depend on
+    demand: multiple of the scenario's demand; folder: of the result files; rows: one per run
+    key: what all runs depend on; controllers: name -> what only its runs depend on
     """
 
     demand: float
@@ -31,8 +30,13 @@ class Level:
     key: Mapping
     controllers: Mapping
 
+    @property
+    def runs(self) -> list[tuple[str, int]]:
+        """Controller and seed of every run."""
+        return list(zip(self.rows["controller"], map(int, self.rows["seed"]), strict=True))
+
     def read(self, controller: str, seed: int) -> Result:
-        """Return a finished run. Raises InputError."""
+        """Return a run. Raise InputError if it is missing."""
         return read_run(self.folder, controller, seed)
 
 
@@ -56,21 +60,16 @@ class Finished:
         return self.path.resolve().name
 
     def map(self) -> City:
-        """Return the city. Raises InputError if it has changed since the runs."""
+        """Return the city. Raise InputError if it has changed since the runs."""
         files = ensure_built(self.scenario.network)
         for key, file in (("net_file_hash", files.net_file), ("regions_hash", files.regions_csv)):
             if self.levels[0].key[key] != file_hash(file):
                 raise InputError(f"{self.path}: {file} has changed since the runs; run them again")
         return city_of(self.scenario.network)
 
-    def level(self, demand: float | None = None) -> Level:
-        """Return the level of `demand`, nearest to 1 if None. Raises InputError."""
-        if demand is None:
-            return min(self.levels, key=lambda level: abs(level.demand - 1.0))
-        for level in self.levels:
-            if abs(level.demand - demand) < 1e-9:
-                return level
-        raise InputError(f"{self.path}: has no runs at demand {demand:g}")
+    def level(self, demand: float = 1.0) -> Level:
+        """Return the level nearest to `demand`."""
+        return min(self.levels, key=lambda level: abs(level.demand - demand))
 
 
 def read(path: Path, scenario: str | None = None) -> Finished:
@@ -81,38 +80,28 @@ def read(path: Path, scenario: str | None = None) -> Finished:
     Raises:
         InputError: the folder holds no finished runs in SUMO
     """
-    if not (path / TABLE).is_file():
-        raise InputError(f"{path}: holds no finished runs; give a folder of `cosim run` or `cosim evaluate`")
-    manifest, rows = read_manifest(path), read_table(path / TABLE, {}, "run again")
-    rows = finished_rows(rows)
+    rows = finished_rows(pd.read_csv(path / TABLE)) if (path / TABLE).is_file() else pd.DataFrame()
     if rows.empty or "scenario" not in rows:
-        raise InputError(f"{path}: holds no finished runs in SUMO; finish one with `cosim run` or `cosim evaluate`")
+        raise InputError(f"{path}: holds no finished runs in SUMO; give a folder of `cosim run` or `cosim evaluate`")
+    manifest = read_manifest(path)
     rows = rows[rows["scenario"] == (scenario or rows["scenario"].iloc[0])]
-    levels = [
-        Level(
-            demand=float(demand),
-            folder=path / part["folder"].iloc[0],
-            rows=part.reset_index(drop=True),
-            key=manifest["folders"][part["folder"].iloc[0]]["key"],
-            controllers=manifest["folders"][part["folder"].iloc[0]]["controllers"],
-        )
-        for demand, part in rows.groupby("demand", sort=True)
-    ]
-    first = levels[0].read(rows_of(levels[0])[0][0], rows_of(levels[0])[0][1])
-    return Finished(
-        path=path,
-        levels=tuple(levels),
-        scenario=load_scenario(_scenario_folder(Path(first.scenario_folder), first.scenario, path)),
-        sessions=tuple(manifest["sessions"]),
-    )
+    levels = []
+    for demand, part in rows.groupby("demand", sort=True):
+        folder = part["folder"].iloc[0]
+        part = part.reset_index(drop=True)
+        levels.append(Level(demand=float(demand), folder=path / folder, rows=part, **manifest["folders"][folder]))
+    run = levels[0].read(*levels[0].runs[0])
+    place = Path(run.scenario_folder)
+    if not (place / "scenario.toml").is_file():
+        place = Path(run.scenario)  # a shipped one, on another machine
+    sessions = tuple(manifest["sessions"])
+    return Finished(path=path, levels=tuple(levels), scenario=load_scenario(place), sessions=sessions)
 
 
 def finished_rows(rows: pd.DataFrame) -> pd.DataFrame:
     """Return the rows of finished runs, controllers together, with a column folder."""
     rows = rows[rows["failure"].isna() | (rows["failure"] == "")].drop(columns="failure")
-    if "folder" not in rows:
-        rows.insert(0, "folder", "")
-    rows["folder"] = rows["folder"].fillna("")
+    rows["folder"] = rows["folder"].fillna("") if "folder" in rows else ""
     order = list(dict.fromkeys(rows["controller"]))
     return rows.sort_values(
         [name for name in ("scenario", "demand", "controller", "seed") if name in rows],
@@ -122,19 +111,6 @@ def finished_rows(rows: pd.DataFrame) -> pd.DataFrame:
     )
 
 
-def rows_of(level: Level) -> list[tuple[str, int]]:
-    """Return controller and seed of every run."""
-    return list(zip(level.rows["controller"], map(int, level.rows["seed"]), strict=True))
-
-
 def read_run(folder: Path, controller: str, seed: int) -> Result:
-    """Return a finished run. Raises InputError."""
+    """Return a finished run. Raise InputError if it is missing."""
     return Result.read(folder / f"{run_name(controller, seed)}.nc")
-
-
-def _scenario_folder(folder: Path, name: str, runs: Path) -> Path:
-    """Return where the scenario of `runs` is, shipped or in its folder. Raises InputError."""
-    for place in (folder, shipped.found(name, shipped.SCENARIO, beside=Path())):
-        if (place / "scenario.toml").is_file():
-            return place
-    raise InputError(f"{runs}: its scenario {folder} is not there any more")

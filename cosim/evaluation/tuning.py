@@ -76,15 +76,14 @@ class Tuning:
                     "options: expected KEY=LOW:HIGH with LOW below HIGH, such as kp=0.1:10 or set_point[0]=200:600, "
                     f"got {name}={low:g}:{high:g} instead"
                 )
-        space: dict[str, Range] = {}
-        for name, (low, high) in self.options.items():
-            declared = self.strategy.controller.options.model_fields.get(name)
-            whole = declared is not None and declared.annotation is int
-            space[name] = (
-                IntDistribution(math.ceil(low), math.floor(high))
-                if whole
-                else FloatDistribution(low, high, log=low > 0.0 and high / low > 10.0)
-            )
+        declared = self.strategy.controller.options.model_fields
+        whole = {name for name in self.options if name in declared and declared[name].annotation is int}
+        space: dict[str, Range] = {
+            name: IntDistribution(math.ceil(low), math.floor(high))
+            if name in whole
+            else FloatDistribution(low, high, log=low > 0.0 and high / low > 10.0)
+            for name, (low, high) in self.options.items()
+        }
         object.__setattr__(self, "space", space)
         for end in ("low", "high"):
             try:
@@ -180,12 +179,9 @@ def best(table: pd.DataFrame) -> pd.Series:
 def text(order: Tuning, table: pd.DataFrame) -> str:
     """Return the first and the best candidate as a table."""
     rows = {"first": table.iloc[0], f"best: {best(table)['candidate']:.0f}": best(table)}
+    columns = {option: option for option in order.options} | {SCORE: "score [veh s]"}
     lines = [
-        {
-            "candidate": name,
-            **{option: f"{row[option]:.4g}" for option in order.options},
-            "score [veh s]": f"{row[SCORE]:.4g}",
-        }
+        {"candidate": name, **{heading: f"{row[column]:.4g}" for column, heading in columns.items()}}
         for name, row in rows.items()
     ]
     return text_table(lines, "score: geometric mean of total time spent over all seeds and demand levels")

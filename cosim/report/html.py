@@ -68,7 +68,7 @@ def write_page(path: Path, runs: Sequence[Finished], *, seed: int | None = None)
 
 def _map(run: Finished, seed: int | None) -> tuple[str, str, str]:
     """Return title, script and HTML of the best run beside its reference, with a slider over their time."""
-    level = run.level(None)
+    level = run.level()
     against = statistics.compared_with(level.rows)
     names = [against, *(name for name in figures.ranked(level.rows) if name != against)][:2]
     seeds = [set(level.rows.loc[level.rows["controller"] == name, "seed"]) for name in names]
@@ -87,7 +87,7 @@ def _map(run: Finished, seed: int | None) -> tuple[str, str, str]:
 
 def _run(run: Finished) -> dict:
     """Return what the page shows of a folder."""
-    level, rows = run.level(None), run.rows
+    level, rows = run.level(), run.rows
     heading, shown, name = card.card(level.rows)
     minutes = level.key["steps"] * level.key["step_s"] / 60
     pictures = _pictures(partial(figures.draw_levels, rows=rows), LEVEL_PICTURES) if len(run.levels) > 1 else []
