@@ -239,16 +239,6 @@ def test_a_region_without_its_detector_is_predicted_on(broken):
     assert rmse((partial - truth)[:, 1:]) < 1.3 * rmse((whole - truth)[:, 1:])
 
 
-def test_reset_forgets():
-    estimator, crowd = Estimator(planning_model(SCENARIO), equipped()), Crowd(0, equipped())
-    observations = [crowd.step(k) for k in range(4)]
-    runs = []
-    for _ in range(2):
-        estimator.reset()
-        runs.append([estimator.step(OPEN, observation).tolist() for observation in observations])
-    assert runs[0] == runs[1]
-
-
 def test_bounded_moves_what_correlates():
     """Two cells of a region whose total is known: what one is raised by, the other loses."""
     covariance = np.array([[1.0, -1.0], [-1.0, 1.0]])
@@ -290,18 +280,6 @@ def test_the_noise_of_every_kind_of_reading():
     assert readings(equipped(probes=0.1), leaving=50.0)[2][4] < share  # they are others every time
 
 
-def test_probes_move_as_a_share_of_the_vehicles():
-    """What arrives, less what leaves, less the ends of trips: with a share of one, what dynamics changes."""
-    random = np.random.default_rng(1)
-    x = torch.from_numpy(random.uniform(0.0, 50.0, (1, REGIONS, REGIONS)))
-    controls = torch.from_numpy(OPEN.perimeter), torch.from_numpy(NETWORK.nominal_splits)
-    ends, transfers = dynamics.flows(dynamics.parameters(NETWORK), x, *controls)
-    change = estimation._moved(torch.ones_like(x), ends, transfers)
-    after = dynamics.euler(dynamics.parameters(NETWORK), x, torch.zeros_like(x), *controls, 1.0)
-    torch.testing.assert_close(change, after - x)
-    torch.testing.assert_close(estimation._moved(0.25 * torch.ones_like(x), ends, transfers), 0.25 * change)
-
-
 def test_a_detector_is_stuck_at_its_third_same_reading():
     """Two may be chance, and an empty street shows 0 for ever."""
     taken, model = [], Estimator(planning_model(SCENARIO), equipped())
@@ -315,18 +293,3 @@ def test_a_detector_is_stuck_at_its_third_same_reading():
         model.step(OPEN, replace(nothing(), accumulation=accumulation))
     assert [np.isnan(first) for first, _, _ in taken] == [False, False, True, True, False]
     assert [rest for _, *rest in taken] == [[0.0, 10.0 + k] for k in range(5)]
-
-
-def test_one_vehicle_changes_what_it_should():
-    """A turn leaves one cell for another; departures and ends of trips change one; each counts half in the mean."""
-    model = estimation._Model(planning_model(SCENARIO), equipped())
-    vehicle, probe = model._effects()
-    cells, turns = REGIONS**2, int(NETWORK.split_mask.sum())
-    place, half, crossing = np.split(vehicle, [cells, cells + REGIONS])
-    assert place[:, :turns].sum() == 0 and (np.abs(place[:, :turns]).sum(axis=0) == 2).all()
-    assert (place[:, turns : turns + REGIONS].sum(axis=0) == -1).all()
-    assert (place[:, turns + REGIONS :].sum(axis=0) == 1).all()
-    np.testing.assert_array_equal(half, 0.5 * place.reshape(REGIONS, REGIONS, -1).sum(axis=1))
-    assert (crossing[:, :turns].sum(axis=0) == 1).all() and not crossing[:, turns:].any()
-    np.testing.assert_array_equal(probe[:cells], place)
-    assert probe[cells:].sum() == cells and (probe[cells:, turns + REGIONS :] == np.eye(cells)).all()

@@ -1,15 +1,10 @@
 """Scenario and network files: settings, bases, errors, and models that controllers plan with."""
 
-import json
-import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import tiny
-from hypothesis import HealthCheck, given
-from hypothesis import settings as examples
-from hypothesis import strategies as st
 
 from nmfd.api import controller as make_controller
 from nmfd.api import load_scenario
@@ -142,53 +137,6 @@ def test_wrong_networks(tmp_path, old, new, message):
     folder = tiny.write(tmp_path, network=tiny.row_network().replace(old, new)).parent / "network"
     with pytest.raises(InputError, match=f"network.toml: {message}|network.toml: .*{message}"):
         load_network(folder)
-
-
-VALUES = st.recursive(
-    st.one_of(st.booleans(), st.integers(), st.floats(), st.text(max_size=12), st.sampled_from(["../network", "", -1])),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
-    max_leaves=5,
-)
-KEYS = ("name", "network", "step", "steps", "integrator", "substeps", "protected", "demand_factor", "demand_file")
-MORE = ("base", "initial", "faults", "controllers", "sumo", "forecast_error", "measurement_std", "unknown")
-
-
-def toml(value) -> str:
-    """A value as TOML writes it."""
-    match value:
-        case bool():
-            return str(value).lower()
-        case float() if not math.isfinite(value):
-            return "nan" if value != value else "inf" if value > 0 else "-inf"
-        case str():
-            return json.dumps(value).replace("\x7f", "\\u007f")
-        case list():
-            return f"[{', '.join(map(toml, value))}]"
-        case dict():
-            return f"{{ {', '.join(f'{json.dumps(key)} = {toml(item)}' for key, item in value.items())} }}"
-    return repr(value)
-
-
-@examples(
-    max_examples=100,
-    derandomize=True,
-    deadline=None,
-    database=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
-)
-@given(key=st.sampled_from(KEYS + MORE), value=VALUES)
-def test_any_value_is_read_or_refused_in_one_line(tmp_path, key, value):
-    if not (tmp_path / "network").exists():
-        tiny.write(tmp_path)
-    (tmp_path / "other").mkdir(exist_ok=True)
-    text = "\n".join(line for line in tiny.SCENARIO.splitlines() if not line.startswith(f"{key} ="))
-    (tmp_path / "other" / "scenario.toml").write_bytes(f"{key} = {toml(value)}\n{text}".encode("utf-8", "replace"))
-    try:
-        scenario = load_scenario(tmp_path / "other")
-    except InputError as error:
-        assert "\n" not in str(error)
-    else:
-        assert scenario.demand.shape == (scenario.steps, 2, 2) and (scenario.demand >= 0).all()
 
 
 def test_a_controller_plans_with_the_model_that_it_names(base, tmp_path):
