@@ -1,7 +1,8 @@
 """Types that plants, controllers and the closed loop exchange, and the result of a run."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from enum import Flag
 from pathlib import Path
@@ -159,6 +160,12 @@ class Quantity(NamedTuple):
         return self.dimensions, array, {"long_name": self.text, **units, **self.attributes}
 
 
+def _apart(function: Callable, *arguments: Any, **options: Any) -> Any:
+    """Call `function` in a thread, which Ctrl-C does not interrupt: else xarray would keep its lock for ever."""
+    with ThreadPoolExecutor(1) as thread:
+        return thread.submit(function, *arguments, **options).result()
+
+
 VARIABLES: dict[str, Quantity] = {
     "accumulation": Quantity(("time", "region", "destination"), "veh", "vehicles inside"),
     "backlog": Quantity(("time", "region", "destination"), "veh", "vehicles waiting to enter"),
@@ -236,7 +243,7 @@ class Result:
         import xarray
 
         try:
-            data = xarray.load_dataset(path, engine="netcdf4", decode_times=False, mask_and_scale=False)
+            data = _apart(xarray.load_dataset, path, engine="netcdf4", decode_times=False, mask_and_scale=False)
         except FileNotFoundError:
             raise InputError(f"{path}: no such run") from None
         except (OSError, RuntimeError, ValueError, KeyError, AttributeError, TypeError) as error:
@@ -263,7 +270,7 @@ class Result:
         path = Path(path)
         temporary = path.with_name(f".{path.stem}-{os.getpid()}.tmp")
         try:
-            data.to_netcdf(temporary, engine="netcdf4", encoding=encoding)
+            _apart(data.to_netcdf, temporary, engine="netcdf4", encoding=encoding)
             os.replace(temporary, path)
         except RuntimeError as error:  # netCDF hides the reason of the system
             raise InputError(f"{path}: cannot be written ({error}); is the disk full?") from None

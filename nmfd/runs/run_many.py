@@ -315,34 +315,32 @@ def provenance() -> dict:
         "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
         "commit": commit,
         "dirty": dirty,
-        "versions": dict(_versions()),
+        "versions": _versions(),
     }
 
 
 @cache
-def _versions() -> tuple[tuple[str, str], ...]:
+def _versions() -> dict[str, str]:
     versions = {"python": platform.python_version(), "perimeter-cosim": __version__}
     for package in PACKAGES:
         with suppress(metadata.PackageNotFoundError):
             versions[package] = metadata.version(package)
-    return tuple(versions.items())
+    return versions
 
 
 @cache
 def _checkout() -> tuple[str | None, bool | None]:
     """Return the commit of this package, and whether files differ from it, at the first call."""
-    here = Path(__file__).resolve()
     # an installed copy may lie inside another checkout: the commit counts only if this file is tracked
-    tracked = _git(here.parent, "ls-files", "--error-unmatch", here.name) is not None
-    commit = _git(here.parent, "rev-parse", "HEAD") if tracked else None
-    changes = _git(here.parent, "status", "--porcelain", "--untracked-files=no") if commit else None
-    return commit, None if changes is None else bool(changes)
+    if _git("ls-files", "--error-unmatch", Path(__file__).name) is None:
+        return None, None
+    return _git("rev-parse", "HEAD"), bool(_git("status", "--porcelain", "--untracked-files=no"))
 
 
-def _git(folder: Path, *arguments: str) -> str | None:
+def _git(*arguments: str) -> str | None:
+    folder = Path(__file__).resolve().parent
     try:
         command = ["git", "--no-optional-locks", "-C", str(folder), *arguments]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=10)
-    except (OSError, subprocess.TimeoutExpired):
+        return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
         return None
-    return done.stdout.strip() if done.returncode == 0 else None
