@@ -8,7 +8,6 @@ from pydantic import BaseModel
 from cosim.plant.settings import Settings
 from cosim.sumo.build import RecipeTable
 from nmfd.controllers.strategy import CONTROLLERS
-from nmfd.model.planning import PlanningOptions
 from nmfd.model.regional_model import NetworkTable
 from nmfd.model.scenario import ScenarioTable
 
@@ -32,7 +31,6 @@ def page() -> str:
             name, kind = table if isinstance(table, tuple) else ("", table)
             lines += section(kind, name)
         if file == "scenario.toml":
-            lines += section(PlanningOptions, "controllers.NAME")
             for kind, names in options.items():
                 lines += section(kind, ", ".join(f"controllers.{name}" for name in names))
     return "\n".join(lines) + "\n"

@@ -23,16 +23,6 @@ GUIDED = "guided"  # subfolder of a network with the model of the same city with
 GUIDING = ("mpc-pcrg", "dpc-pcrg")  # prefixes of the controllers that plan with it
 
 
-class PlanningOptions(Settings):
-    """Options of every controller, beside its own."""
-
-    model: Text | None = setting(
-        "folder or shipped name of the regional model to plan with; by default that of the scenario's network or, for "
-        "controllers that guide routes, the one in its folder guided",
-        None,
-    )
-
-
 @dataclass(frozen=True, kw_only=True)
 class PlanningModel:
     """Regional model, forecast and options that a controller, filter or supervisor has before a run.
@@ -76,7 +66,13 @@ class PlanningModel:
 
 
 class Options(Settings):
-    """Options of a controller; this class declares none."""
+    """Options of every controller."""
+
+    model: Text | None = setting(
+        "folder or shipped name of the regional model to plan with; by default that of the scenario's network or, for "
+        "controllers that guide routes, the one in its folder guided",
+        None,
+    )
 
     def misfit(self, planning: PlanningModel) -> Problem | None:
         """Return what does not fit the planning model, or None."""
@@ -111,7 +107,7 @@ def planning_model(scenario: Scenario, controller: str = "", table: str = "") ->
     merged = {**tables.get(controller, {}), **tables.get(table, {})}
     if "model" in merged and scenario.folder is not None:
         where, prefix = scenario.folder / "scenario.toml", f"controllers.{table}."
-        model = config.checked(PlanningOptions, {"model": merged.pop("model")}, where, prefix).model
+        model = config.checked(Options, {"model": merged.pop("model")}, where, prefix).model
         assert model is not None  # TOML has no null
         network = other_model(scenario, scenario.folder / model, f"{where}: {prefix}model")
     elif controller.startswith(GUIDING) and (folder := guided_model(scenario.network)) is not None:
