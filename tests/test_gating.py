@@ -8,6 +8,7 @@ import pytest
 
 from nmfd.api import load_scenario
 from nmfd.closed_loop import run
+from nmfd.controllers.excitation import Probing
 from nmfd.controllers.rules import PiGating
 from nmfd.errors import InputError
 from nmfd.metrics import summary
@@ -129,3 +130,11 @@ def test_the_set_point_by_a_share_of_the_maximum_outflow():
         (point,) = PiGating(planning_model(with_options(outflow_share=share))).set_point
         assert point <= mfd.critical and mfd.outflow(point) == pytest.approx(share * mfd.capacity, rel=1e-3)
     assert PiGating(planning_model(with_options(outflow_share=0.5, set_point=[3000.0]))).set_point == [3000.0]
+
+
+def test_probing_moves_around_the_set_point_that_identification_gives():
+    options = {"probing-pc": {"set_point": [2000.0]}}
+    probing = Probing(planning_model(replace(SCENARIO, controller_options=options)), guidance=False)
+    probing.reset(1)
+    gates = [probing.act(seen(2000.0, k)).perimeter for k in range(20)]
+    assert len({u.tobytes() for u in gates}) > 1 and probing._gating.critical == [2000.0]

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from nmfd.controllers.rules import PiGating
-from nmfd.model.planning import PlanningModel
+from nmfd.controllers.rules import PiGating, SetPoint
+from nmfd.model.planning import PlanningModel, options
 from nmfd.types import Controls, Observation
 
 HOLD_INTERVALS = (3, 9)  # control intervals between two draws, from and to
@@ -19,14 +19,20 @@ class Probing:
 
     Random controls alone would lock the city early in every run. Gating alone moves all gateways of a region together.
     With guidance, theta lies between the nominal split ratios and a random point of the simplex. All is drawn again
-    every few control intervals, from the seed of the run. The set points vary around the critical accumulation.
+    every few control intervals, from the seed of the run. The set points vary around the option set_point, or else the
+    critical accumulation.
     """
 
     def __init__(self, planning: PlanningModel, *, guidance: bool):
+        """Raise InputError for a wrong option."""
         self.name = "probing-pcrg" if guidance else "probing-pc"
         self._network, self._guidance, self._gating = planning.network, guidance, None
-        if planning.protected:
-            self._gating = PiGating(replace(planning, controller_options={}))
+        middle = options(SetPoint, planning, self.name).set_point
+        middle = middle or tuple(planning.network.mfds[region].critical for region in planning.protected)
+        if middle:
+            gating = replace(planning, controller_options={PiGating.name: {"set_point": list(middle)}})
+            self._gating = PiGating(gating)
+            self._gating.critical = np.array(middle)
         self._open = np.where(planning.network.adjacency, planning.network.u_max, 0.0)
         self.reset()
 

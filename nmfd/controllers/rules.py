@@ -34,16 +34,28 @@ class RouteGuidance(NoControl):
         self._controls = Controls(perimeter=self._controls.perimeter, splits=planning.network.nominal_splits)
 
 
-class Gating(Options):
+class SetPoint(Options):
+    """Options of controllers that hold the accumulation of protected regions; cosim identify sets it for probing."""
+
+    set_point: PositiveNumbers | None = setting(
+        "accumulation to hold in each protected region; derived from the MFD by default", None, unit="veh"
+    )
+
+    def misfit(self, planning: PlanningModel) -> Problem | None:
+        """Return a wrong number of set points as a problem."""
+        count = len(planning.protected)
+        if not count or self.set_point is None or len(self.set_point) == count:
+            return None
+        return Problem("set_point", got(f"a list of {count} numbers", list(self.set_point)))
+
+
+class Gating(SetPoint):
     """Options of PI gating.
 
     The default gains are moderate ones: on the benchmark kp from 0 to 5 and ki from 0.01 to 0.1 differ by less than 2 %
     in total time spent. They are relative to the critical accumulation, so that they carry over to other cities.
     """
 
-    set_point: PositiveNumbers | None = setting(
-        "accumulation to hold in each protected region; derived from the MFD by default", None, unit="veh"
-    )
     outflow_share: float = setting(
         "share of the MFD's maximum that defines the set point: the smallest accumulation with this outflow; 1 is the "
         "critical accumulation, less leaves a margin",
@@ -54,13 +66,6 @@ class Gating(Options):
     )
     kp: float = setting("proportional gain, per relative error", 1.0, unit="-", ge=0.0)
     ki: float = setting("integral gain, per relative error", 0.01, unit="1/s", gt=0.0)
-
-    def misfit(self, planning: PlanningModel) -> Problem | None:
-        """Return a wrong number of set points as a problem."""
-        count = len(planning.protected)
-        if not count or self.set_point is None or len(self.set_point) == count:
-            return None
-        return Problem("set_point", got(f"a list of {count} numbers", list(self.set_point)))
 
 
 class PiGating:

@@ -19,7 +19,7 @@ from nmfd.controllers import custom, open_loop
 from nmfd.controllers.dpc import policy_file, training
 from nmfd.controllers.excitation import Probing
 from nmfd.controllers.mpc import controller as mpc
-from nmfd.controllers.rules import Gating, Greedy, NoControl, PiGating, RouteGuidance
+from nmfd.controllers.rules import Gating, Greedy, NoControl, PiGating, RouteGuidance, SetPoint
 from nmfd.errors import InputError, did_you_mean
 from nmfd.model.planning import (
     Options,
@@ -82,7 +82,7 @@ CONTROLLERS: Mapping[str, ControllerType] = {
         ControllerType(name="greedy", text="bang-bang control by the more congested of two regions", make=Greedy),
         *_pair("mpc-{}", "economic MPC", mpc.EconomicMpc, options=mpc.Mpc),
         *_pair("mpc-{}-terminal", "economic MPC with terminal cost", mpc.load, reads=VALUE, options=mpc.Mpc),
-        *_pair("probing-{}", "random excitation for cosim identify", Probing),
+        *_pair("probing-{}", "random excitation for cosim identify", Probing, options=SetPoint),
         *_pair("dpc-{}", "trained policy", policy_file.load, reads=POLICY, options=training.Training),
         *_pair("bound-{}", "best plan with all demand known (nmfd bound)", open_loop.read, reads=PLAN),
     )
