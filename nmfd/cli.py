@@ -1,6 +1,8 @@
 """Command line `nmfd`: it parses options and calls nmfd.api; cosim.cli takes the shared options from here."""
 
 import shlex
+import signal
+import threading
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from importlib import resources
@@ -34,7 +36,9 @@ class Commands(click.Group):
                 formatter.write_dl(rows)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run a command; exit with 2 after a user error, 1 after failed runs, 130 after Ctrl-C."""
+        """Run a command; exit with 2 after a user error, 1 after failed runs, 130 after Ctrl-C or SIGTERM."""
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt as stop:

@@ -38,7 +38,11 @@ def stopped(program, *arguments, out, by):
     return process.returncode, said
 
 
-@pytest.mark.parametrize("by, status", [(signal.SIGINT, 130), (signal.SIGKILL, -9)], ids=["Ctrl-C", "kill"])
+@pytest.mark.parametrize(
+    "by, status",
+    [(signal.SIGINT, 130), (signal.SIGTERM, 130), (signal.SIGKILL, -9)],
+    ids=["Ctrl-C", "SIGTERM", "kill -9"],
+)
 def test_a_stopped_benchmark_continues(tmp_path, by, status):
     scenario = tiny.write(tmp_path)
     command = ("benchmark", scenario, "--controllers", "no-control,pi-gating", "--seeds", 20)
