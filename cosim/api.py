@@ -8,13 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from cosim.evaluation import (
-    estimation_errors,
-    model_validation,
-    results,
-    statistics,
-    tuning,
-)
+from cosim.evaluation import estimation_errors, model_validation, results, statistics, tuning
 from cosim.evaluation import evaluate as evaluation
 from cosim.evaluation import identify as identification
 from cosim.evaluation.runs import runs_of
@@ -23,6 +17,7 @@ from cosim.importing import get as cities
 from cosim.importing import importer
 from cosim.importing.case import parse_box, seconds
 from cosim.report import card, figures, html
+from cosim.sumo.arrays import RegionCounts
 from cosim.sumo.outputs import check
 from cosim.sumo.session import LOST, Window
 from cosim.view import live
@@ -64,7 +59,7 @@ def run(
     sumo_output: files of SUMO's own outputs: {"tripinfo": "trips.xml"}, also summary, edgedata, emission
     progress: None for a bar, False for none, or a function of done and total control intervals
 
-    The result has the arrays of cosim.plant.record.Record, and the facts of cosim.evaluation.simulate as attributes.
+    The result has the arrays of cosim.plant.record.RECORD, and the facts of cosim.evaluation.simulate as attributes.
 
         >>> result = cosim.run("grid7_peak", "pi-gating+rerouting-30", seed=3, steps=2)
         >>> result.accumulation.shape, result.crossings.shape
@@ -136,10 +131,8 @@ def run_controllers(
     raise_failures(rows)
     finished = results.read(out)
     there = [level.read(*name) for level in finished.levels for name in level.runs]
-    draw_accumulations(out, loaded, there, outflow=lambda result: regional_outflow(result, result.step))
-    errors = estimation_errors.write_errors(
-        out, loaded.network, there, lambda result: regional_outflow(result, result.step)
-    )
+    draw_accumulations(out, loaded, there, outflow=_outflow)
+    errors = estimation_errors.write_errors(out, loaded.network, there, _outflow)
     lines = [statistics.text(finished.rows), *([estimation_errors.error_table(errors)] if len(errors) else [])]
     return "\n".join([*lines, f"Written to {out}"])
 
@@ -420,6 +413,10 @@ def identify(
         target = os.path.normpath(loading.target(loaded) / "network.toml")
         report += [text, f"Written to {target}; samples and figures to {folder}"]
     return "\n".join(report)
+
+
+def _outflow(result: Result) -> RegionCounts:
+    return regional_outflow(result, result.step)
 
 
 def _say(line: str) -> None:

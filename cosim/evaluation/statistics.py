@@ -13,22 +13,6 @@ from nmfd.studies import benchmark
 from nmfd.studies.benchmark import REFERENCE, interval
 
 TTS = "total_time_spent_veh_s"
-MEANS = (  # columns of runs.csv whose mean over seeds is shown
-    "completed_veh",
-    "removed_veh",
-    "trips",
-    "final_backlog_veh",
-    "total_backlog_veh_s",
-    "mean_trip_time_s",
-    "mean_departure_delay_s",
-    "co2_kg",
-    "fuel_kg",
-    "gateway_queue_mean_veh",
-    "gateway_full_share",
-    "control_step_ms_median",
-    "overhead_share",
-    "wall_time_s",
-)
 COLUMNS = {  # heading without unit -> meaning
     "TTS": "total time spent, running and waiting to enter, mean over seeds ± 95 % interval",
     "change": "of TTS against no-control, or the controller in the heading, paired by seed, mean of the percentages ± "
@@ -116,6 +100,7 @@ def statistics(rows: pd.DataFrame) -> pd.DataFrame:
             pair = paired(by_seed(rows, level, name), by_seed(rows, level, against) if name != against else {})
             out.append(
                 {
+                    **part.mean(numeric_only=True),
                     "demand": level,
                     "controller": name,
                     "against": against,
@@ -126,7 +111,6 @@ def statistics(rows: pd.DataFrame) -> pd.DataFrame:
                     "change_half_interval_percent": pair.percent_half,
                     "change_excludes_zero": pair.excludes_zero if pair.seeds else None,
                     "change_seeds": pair.seeds,
-                    **{column: part[column].mean() for column in MEANS},
                     "teleports": int(part["teleports"].sum()),
                     "gateway_queue_max_veh": part["gateway_queue_max_veh"].max(),
                     "control_step_ms_max": part["control_step_ms_max"].max(),

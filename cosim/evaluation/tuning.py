@@ -42,7 +42,6 @@ from nmfd.runs.run_many import TABLE, raise_failures, run_many
 from nmfd.runs.tables import text_table
 
 OPTION = re.compile(r"([a-z_]\w*)(?:\[([0-9])\])?")  # KEY, or KEY[N] for one number of a list
-LARGEST_DIMENSION = 20  # options: with more, CMA-ES needs more runs than a city allows
 INITIAL_DEVIATION = 0.25  # standard deviation of the first generation, as a share of every range
 SCORE = "score_veh_s"
 Range = FloatDistribution | IntDistribution
@@ -68,8 +67,6 @@ class Tuning:
 
     def __post_init__(self) -> None:
         """Check the options. Raise InputError."""
-        if not 0 < len(self.options) <= LARGEST_DIMENSION:
-            raise InputError(f"options: expected 1 to {LARGEST_DIMENSION} ranges, got {len(self.options)} instead")
         for name, (low, high) in self.options.items():
             if not (OPTION.fullmatch(name) and -math.inf < low < high < math.inf):
                 raise InputError(
@@ -163,7 +160,8 @@ def tune(order: Tuning, *, workers: int = 1, scheduler: str | None = None, progr
         running = [trial for trial in study.get_trials(deepcopy=False) if trial.state == TrialState.RUNNING]
         rows = _run(order, running, city, workers, scheduler, progress)
         for trial in running:
-            score = _score(list(_totals(order, rows, trial.number).values()))
+            totals = np.maximum(list(_totals(order, rows, trial.number).values()), 1.0)  # a city may be empty
+            score = float(np.exp(np.log(totals).mean()))
             failed = math.isnan(score)
             study.tell(trial.number, None if failed else score, state=TrialState.FAIL if failed else None)
         table = _write(order, study)
@@ -271,11 +269,6 @@ def _totals(order: Tuning, rows: pd.DataFrame, number: int) -> dict[str, float]:
         for level in order.levels
         for seed in order.seeds
     }
-
-
-def _score(totals: Sequence[float]) -> float:
-    """Return the geometric mean [veh s], NaN if a run is missing; a city may be empty."""
-    return float(np.exp(np.log(np.maximum(totals, 1.0)).mean()))
 
 
 def _write(order: Tuning, study: optuna.Study) -> pd.DataFrame:
