@@ -2,6 +2,7 @@
 
 import multiprocessing
 import queue
+import socket
 import threading
 import time
 from dataclasses import replace
@@ -175,6 +176,18 @@ def test_a_process_that_dies_is_an_error(scenario, strategy):
         assert show.over and isinstance(show.runs[0].error, RunFailed)
     finally:
         show.close()
+
+
+def test_watching_ends_when_the_runs_have_ended_and_nobody_looks(scenario, strategy, monkeypatch):
+    monkeypatch.setattr(live, "OPENING_S", 0.0)
+    lines = []
+    [run] = live.watch(scenario, [strategy], seed=3, tell=lines.append)
+    assert run.row["completed_veh"] > 0 and lines[0].startswith("Watch it at http://localhost:")
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        with pytest.raises(InputError, match="choose another"):
+            live.watch(scenario, [strategy], seed=3, port=taken.getsockname()[1], tell=lines.append)
 
 
 def test_wrong_ways_to_watch(scenario):

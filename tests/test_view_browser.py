@@ -78,10 +78,10 @@ def test_the_report(report, width):
 
 
 @pytest.mark.parametrize("width", [1400, 390])
-def test_the_live_page(scenario, width):
-    command = [sys.executable, "-m", "cosim", "watch", str(scenario), "--controller", "no-control"]
-    command += ["--against", "no-control+guided", "--seed", "3"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+def test_the_live_page(width):
+    """Two runs that take minutes, so that they are under way when the browser has started."""
+    command = [sys.executable, "-m", "cosim", "watch", "grid7_peak", "--controller", "no-control"]
+    process = subprocess.Popen([*command, "--against", "pi-gating"], stderr=subprocess.PIPE, text=True)
     try:
         address = re.search(r"http://localhost:\d+/", process.stderr.readline())[0]
         with opened(address, address, width) as page:
@@ -92,22 +92,23 @@ def test_the_live_page(scenario, width):
             def press(name):
                 page.get_by_role("button", name=name, exact=True).click()
 
-            page.locator("select").first.select_option("slow")
-            page.wait_for_function(f"before => ({NUMBERS})() !== before", arg=page.evaluate(NUMBERS), timeout=20_000)
+            def wait_for_other_numbers():
+                shown = page.evaluate(NUMBERS)
+                page.wait_for_function(f"before => ({NUMBERS})() !== before", arg=shown, timeout=20_000)
+
+            wait_for_other_numbers()
             press("Pause")
             page.get_by_role("button", name="Go on").wait_for()
-            page.wait_for_timeout(1500)
+            page.wait_for_timeout(3000)
             before = minutes()
-            page.wait_for_timeout(1500)
+            page.wait_for_timeout(2000)
             assert minutes() == before
             page.locator("select").last.select_option(index=1)
             page.wait_for_function(f"() => ({PLANE})().startsWith('Region 1')", timeout=10_000)
+            page.locator("select").first.select_option("slow")
             press("Go on")
-            page.locator("select").first.select_option("as fast as possible")
-            page.get_by_role("button", name="Finished").wait_for(timeout=60_000)
+            wait_for_other_numbers()
             assert minutes() > before
-        outcome, errors = process.communicate(timeout=60)
-        assert process.returncode == 0 and outcome.count("total time spent") == 2, errors
     finally:
-        process.kill()
+        process.terminate()
         process.wait()
