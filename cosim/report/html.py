@@ -88,6 +88,7 @@ def _map(run: Finished, seed: int | None) -> tuple[str, str, str]:
 def _run(run: Finished) -> dict:
     """Return what the page shows of a folder."""
     level, rows = run.level(), run.rows
+    seeds = ", ".join(map(str, sorted(set(rows["seed"]))))
     heading, shown, name = card.card(level.rows)
     minutes = level.key["steps"] * level.key["step_s"] / 60
     pictures = _pictures(partial(figures.draw_levels, rows=rows), LEVEL_PICTURES) if len(run.levels) > 1 else []
@@ -96,8 +97,8 @@ def _run(run: Finished) -> dict:
         "heading": heading + (f", demand times {level.demand:g}" if len(run.levels) > 1 else ""),
         "figures": shown,
         "why": explain.paragraph(level, run, name),
-        "intro": f"Scenario {run.scenario.name}, {minutes:.0f} min in SUMO; seeds {_seeds(rows)}. With the same seed "
-        "every strategy has the same trips.",
+        "intro": f"Scenario {run.scenario.name}, {minutes:.0f} min in SUMO; seeds {seeds}. With the same seed every "
+        "strategy has the same trips.",
         "pictures": pictures,
         "levels": [_level(run, level) for level in run.levels],
         "manifest": json.dumps(
@@ -143,7 +144,3 @@ def _pictures(draw: Callable[[Path], None], captions: dict[str, str]) -> list[tu
 def _html(frame: pd.DataFrame) -> str:
     """Return a table as HTML with escaped text."""
     return frame.to_html(index=False, border=0, na_rep="–", float_format="{:.7g}".format)
-
-
-def _seeds(rows: pd.DataFrame) -> str:
-    return ", ".join(map(str, sorted(set(rows["seed"]))))

@@ -3,6 +3,7 @@
 import logging
 import multiprocessing
 import queue
+import signal
 import time
 import webbrowser
 from collections.abc import Callable, Mapping, Sequence
@@ -122,6 +123,7 @@ class Show:
 
 def run(n: int, job: Callable[..., Result], scenario: Scenario, messages: Any, limit: Any, delay: Any) -> None:
     """Do a job as number n, and send its picture, frames, and summary or error."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the server ends the runs
     try:
         result = job(observer=Reporter(n, scenario, messages, limit, delay))
         messages.put((n, summary(result)))
@@ -171,11 +173,13 @@ class Reporter:
         """Return when the run may go on from a time [s]."""
         time.sleep(self._delay.value * (now - self._time))
         self._time = now
-        parent = multiprocessing.parent_process()
-        while now >= self._limit.value:
+        parent, held = multiprocessing.parent_process(), True
+        while held:
             if parent is not None and not parent.is_alive():
+                self._messages.cancel_join_thread()  # nobody reads them
                 raise RunFailed("the page was closed")
-            time.sleep(HOLD_PERIOD_S)
+            if held := now >= self._limit.value:
+                time.sleep(HOLD_PERIOD_S)
 
 
 class Viewer:
