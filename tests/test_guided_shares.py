@@ -255,8 +255,8 @@ def test_guided_is_guidance_by_travel_times_wherever_the_controller_says_nothing
     scenario = replace(scenario, steps=1, demand=scenario.demand[15:16])
     own = scenario.network.nominal_splits
     by_hand, option, off = (
-        simulate(scenario, replace(parse(name), instance=_Gate(splits)), seed=1)
-        for name, splits in (("pi-gating", own), ("pi-gating+guided", None), ("pi-gating", None))
+        simulate(scenario, parse(_Gate(splits), city), seed=1)
+        for city, splits in (("", own), ("guided", None), ("", None))
     )
     assert option["guided"].sum() > 0 and off["guided"].sum() == 0
     assert option.without_times().equals(by_hand.without_times())
