@@ -55,6 +55,8 @@ def runs_of(
         "demand_hash": hashlib.sha256(flows.tobytes()).hexdigest()[:16],
     }
     policies = policies or {}
+    for strategy in strategies:
+        strategy.make(scenario, policies.get(strategy.name))  # reports mistakes before the first run
     if sumo_output:
         shared["sumo_output"] = list(sumo_output)
     keys = {s.name: {**shared, "controller": s.fingerprint(scenario, policies.get(s.name))} for s in strategies}
