@@ -12,12 +12,11 @@ from cosim.evaluation import estimation_errors, model_validation, results, stati
 from cosim.evaluation import evaluate as evaluation
 from cosim.evaluation import identify as identification
 from cosim.evaluation.runs import runs_of
-from cosim.evaluation.simulate import regional_outflow, simulate
+from cosim.evaluation.simulate import simulate
 from cosim.importing import get as cities
 from cosim.importing import importer
 from cosim.importing.case import parse_box, seconds
 from cosim.report import card, figures, html
-from cosim.sumo.arrays import RegionCounts
 from cosim.sumo.outputs import check
 from cosim.sumo.session import LOST, Window
 from cosim.view import live
@@ -131,8 +130,8 @@ def run_controllers(
     raise_failures(rows)
     finished = results.read(out)
     there = [level.read(*name) for level in finished.levels for name in level.runs]
-    draw_accumulations(out, loaded, there, outflow=_outflow)
-    errors = estimation_errors.write_errors(out, loaded.network, there, _outflow)
+    draw_accumulations(out, loaded, there)
+    errors = estimation_errors.write_errors(out, loaded.network, there)
     lines = [statistics.text(finished.rows), *([estimation_errors.error_table(errors)] if len(errors) else [])]
     return "\n".join([*lines, f"Written to {out}"])
 
@@ -413,10 +412,6 @@ def identify(
         target = os.path.normpath(loading.target(loaded) / "network.toml")
         report += [text, f"Written to {target}; samples and figures to {folder}"]
     return "\n".join(report)
-
-
-def _outflow(result: Result) -> RegionCounts:
-    return regional_outflow(result, result.step)
 
 
 def _say(line: str) -> None:

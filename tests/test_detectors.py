@@ -22,7 +22,6 @@ from nmfd.controllers.rules import PiGating
 from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
 from nmfd.model.planning import planning_model
-from nmfd.studies import plots
 from nmfd.types import Observation
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
@@ -173,9 +172,6 @@ def test_table_and_picture(scenario, run, tmp_path):
     assert len(pd.read_csv(tmp_path / "estimation.csv")) == len(rows) == 8
     shown = estimation_errors.error_table(rows)
     assert "x_ij RMSE" in shown and "mean of the regions" in shown
-    ax = plots.region_estimate(plots.figure(4.0, 3.0).subplots(), scenario.network, 3, run)
-    lines = [line.get_ydata() for line in ax.get_lines()]
-    np.testing.assert_allclose(lines, [run.accumulation[:, 3].sum(axis=1), run.observed[:, 3].sum(axis=1)])
     assert estimation_errors.write_errors(tmp_path / "none", scenario.network, [run.assign(estimated=False)]).empty
 
 

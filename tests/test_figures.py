@@ -22,12 +22,6 @@ def test_one_seed_is_shown_and_all_are_shaded(ax):
     assert len(ax.collections) == 1
 
 
-def test_strategies_get_colours_of_their_own():
-    names = ["no-control", "max-pressure", *(f"dpc-pc+rerouting-{n}" for n in range(10, 90, 10))]
-    colours = plots.colours(names)
-    assert len({colours[name] for name in names}) == len(names) and colours["no-control"] == plots.colour("no-control")
-
-
 def test_demand_figure_has_the_levels_as_ticks(ax):
     points = {"dpc-pc": {0.8: (0.9, 0.1), 1.3: (0.5, np.nan)}, "pi-gating": {0.8: (0.7, 0.1)}}
     assert figures.over_levels(ax, points, "ratio [-]").get_ylabel() == "ratio [-]"

@@ -46,9 +46,9 @@ def runs_of(scenario, *, plants=("nmfd",), controllers=("no-control",), seeds=(0
 
 
 def test_every_controller_has_its_own_colour():
-    assert set(plots.CONTROLLER_COLOURS) == set(CONTROLLERS)
-    assert len(set(plots.CONTROLLER_COLOURS.values())) == len(CONTROLLERS)
-    assert plots.colour("mine") == plots.colour("mine") in plots.OTHER_COLOURS
+    names = [*CONTROLLERS, "max-pressure", *(f"dpc-pc+rerouting-{n}" for n in range(10, 90, 10))]
+    colours = plots.colours(names)
+    assert len({colours[name] for name in names}) == len(names)
 
 
 def test_total_accumulation_counts_the_backlog(ax, scenario):
@@ -61,7 +61,7 @@ def test_total_accumulation_counts_the_backlog(ax, scenario):
 def test_seeds_share_one_curve_and_controllers_do_not(ax, scenario):
     plots.total_accumulation(ax, runs_of(scenario, controllers=("no-control", "dpc-pc"), seeds=(0, 1)))
     assert [line.get_label() for line in ax.lines] == ["no-control", "dpc-pc"]
-    assert [line.get_color() for line in ax.lines] == [plots.colour("no-control"), plots.colour("dpc-pc")]
+    assert [line.get_color() for line in ax.lines] == [plots.COLOURS["no-control"], plots.COLOURS["dpc-pc"]]
 
 
 def test_plants_differ_in_line_style(ax, scenario):

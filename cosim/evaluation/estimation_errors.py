@@ -1,7 +1,6 @@
 """Errors of estimated states: tables and figures of runs with measurement = "estimate"."""
 
 from collections.abc import Sequence
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,6 @@ from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import files
 from nmfd.runs.tables import text_columns
 from nmfd.studies import plots
-from nmfd.studies.traffic_states import OutflowOf
 from nmfd.types import Result
 
 CAPTION = (
@@ -36,9 +34,7 @@ def errors(network: RegionalModel, result: Result) -> list[dict]:
     return [{"controller": result.controller, "seed": result.seed, **row} for row in rows]
 
 
-def write_errors(
-    folder: Path, network: RegionalModel, results: Sequence[Result], outflow: OutflowOf | None = None
-) -> pd.DataFrame:
+def write_errors(folder: Path, network: RegionalModel, results: Sequence[Result]) -> pd.DataFrame:
     """Write estimation.csv and a figure per run that was controlled on estimates; nothing without such a run."""
     estimated = [result for result in results if result.estimated]
     rows = pd.DataFrame([row for result in estimated for row in errors(network, result)])
@@ -48,9 +44,9 @@ def write_errors(
         path = folder / f"estimate-{files.run_name(result.controller, result.seed)}.png"
         if not path.exists():
             drawing, axes = plots.panels(network.regions)
-            known = None if outflow is None else cache(outflow)
+            estimate = result.assign(accumulation=result.observed, plant="estimate")
             for region, ax in enumerate(axes):
-                plots.region_estimate(ax, network, region, result, known)
+                plots.region_accumulation(ax, network, region, [result, estimate])
             plots.legend_below(drawing, axes)
             plots.save(drawing, path)
     return rows

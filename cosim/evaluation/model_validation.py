@@ -3,7 +3,6 @@
 import os
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +24,6 @@ from nmfd.runs import files
 from nmfd.runs.tables import text_columns, text_table
 from nmfd.studies import plots
 from nmfd.studies.fit_quality import SPILLBACK, predictions
-from nmfd.studies.traffic_states import model_outflow
 from nmfd.types import Controls, Observation, Result
 
 COLLAPSED_SHARE = 0.7  # of the largest outflow so far, below which a denser region is collapsed
@@ -141,10 +139,8 @@ def write_comparison(folder: Path, scenario: Scenario, result: Result) -> pd.Dat
     name = files.run_name(result.controller, result.seed)
     files.write_table(folder / f"compare-{name}.csv", rows)
     drawing, axes = plots.panels(network.regions + 1)
-    measured, model = regional_outflow(result, result.step), model_outflow(network)
-    outflow = cache(lambda run: measured if run.plant == "sumo" else model(run))
     for region, ax in enumerate(axes[:-1]):
-        plots.region_accumulation(ax, network, region, [result, predicted], outflow=outflow)
+        plots.region_accumulation(ax, network, region, [result, predicted])
     plots.total_accumulation(axes[-1], [result.assign(backlog=np.zeros_like(result.backlog)), predicted])
     axes[-1].set_title("all regions", fontsize="medium")
     plots.legend_below(drawing, axes, columns=4)

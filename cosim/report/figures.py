@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 
 from cosim.evaluation import model_validation, statistics
 from cosim.evaluation.results import Finished
-from cosim.evaluation.simulate import regional_outflow
 from cosim.sumo.arrays import Series
 from cosim.sumo.net import City
 from nmfd.model.regional_model import RegionalModel
@@ -115,7 +114,7 @@ def draw_level(out: Path, scenario: Scenario, city: City, rows: pd.DataFrame, re
     runs = [read(row.controller, row.seed) for row in rows.itertuples()]
     shaded = ", shaded: all seeds" if rows["seed"].nunique() > 1 else ""
     title = f"seed {seed}{shaded}; {note}"
-    draw_accumulations(out, scenario, runs, seed=seed, title=title, outflow=lambda run: regional_outflow(run, run.step))
+    draw_accumulations(out, scenario, runs, seed=seed, title=title)
     best_first = {run.controller: run for run in runs if run.seed == seed}
     best_first = {name: best_first[name] for name in ranked(rows) if name in best_first}
     against = statistics.compared_with(rows)

@@ -23,9 +23,7 @@ from nmfd.runs import files
 
 PICTURES = {  # file -> caption
     "total_accumulation": "Vehicles in the network, with those that wait to enter, over time.",
-    "region_accumulation": "Vehicles in each region over time. The strips show its traffic state: light below the "
-    "critical accumulation, green within 10 % of the largest outflow, red with less outflow than possible, hatched "
-    "with hardly any.",
+    "region_accumulation": "Vehicles in each region over time, and the critical accumulation of the regional model.",
     "mfd": "Macroscopic fundamental diagram of each region. Dots: control intervals; line: the regional model; "
     "hatched: beyond all dots.",
     "perimeter": "Perimeter control: commanded u of the boundaries that were closed most, green shown and flow, as "

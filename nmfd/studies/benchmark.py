@@ -3,7 +3,7 @@
 import math
 import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,7 +18,6 @@ from nmfd.runs.progress import Progress
 from nmfd.runs.run_many import Run, run_many, run_name
 from nmfd.runs.tables import text_table
 from nmfd.studies import plots
-from nmfd.studies.traffic_states import OutflowOf, model_outflow
 from nmfd.types import Plant, Result
 
 if TYPE_CHECKING:
@@ -91,7 +90,8 @@ def benchmark(
     done = rows[rows["failure"] == ""]
     names = [run_name(name, seed) for name, seed in zip(done["controller"], done["seed"], strict=True)]
     if names:
-        draw(out, scenario, [Result.read(out / f"{name}.nc") for name in names])
+        draw_accumulations(out, scenario, [Result.read(out / f"{name}.nc") for name in names])
+        draw_scenario(out, scenario)
     return rows
 
 
@@ -171,12 +171,6 @@ def _scientific(value: float, digits: int = 4) -> str:
     return f"{mantissa}e{int(exponent)}" if value else "0"
 
 
-def draw(folder: Path, scenario: Scenario, trajectories: Sequence[Result]) -> None:
-    """The paper's figures of `trajectories` and of their scenario, as png files in `folder`."""
-    draw_accumulations(folder, scenario, trajectories)
-    draw_scenario(folder, scenario)
-
-
 def draw_accumulations(
     folder: Path,
     scenario: Scenario,
@@ -184,50 +178,39 @@ def draw_accumulations(
     *,
     seed: int | None = None,
     title: str | None = None,
-    outflow: OutflowOf | None = None,
 ) -> None:
-    """Total and regional accumulation over time, as png files in `folder`.
+    """Draw total and regional accumulation over time, as png files in `folder`.
 
-    seed: shown instead of the mean over seeds; title: above both pictures; outflow: what left every region of a run,
-    where it was measured; else that of the regional model, of runs on it.
+    seed: shown instead of the mean over seeds; title: above both pictures
     """
+    network = scenario.network
     drawing = plots.figure(8.0, 4.6)
     ax = plots.total_accumulation(drawing.subplots(), trajectories, seed)
     drawing.suptitle(title, fontsize="medium")
     plots.legend_below(drawing, [ax], columns=6)
     plots.save(drawing, folder / "total_accumulation.png")
-    network = scenario.network
-    outflow = cache(outflow or model_outflow(network))
     drawing, axes = plots.panels(network.regions)
     for region, ax in enumerate(axes):
-        plots.region_accumulation(ax, network, region, trajectories, seed, outflow)
+        plots.region_accumulation(ax, network, region, trajectories, seed)
     drawing.suptitle(title, fontsize="medium")
     plots.legend_below(drawing, axes, columns=3)
     plots.save(drawing, folder / "region_accumulation.png")
 
 
 def draw_scenario(folder: Path, scenario: Scenario) -> list[Path]:
-    """Spawn matrix, region map and MFDs of `scenario`, as png files in `folder`."""
-    network = scenario.network
-    drawing = plots.figure(11.0, 4.8)
-    left, right = drawing.subplots(1, 2)
+    """Draw spawn matrix, region map and MFDs of `scenario`; return the png files in `folder`."""
+    demand = plots.figure(11.0, 4.8)
+    left, right = demand.subplots(1, 2)
     plots.spawn_matrix(left, scenario)
     plots.demand(right, scenario)
-    plots.legend_below(drawing, [right])
-    files = [plots.save(drawing, folder / "spawn_matrix.png")]
-    drawing = plots.figure(5.5, 5.0)
-    plots.region_map(drawing.subplots(), network)
-    files.append(plots.save(drawing, folder / "region_map.png"))
-    kinds: dict = {}
-    for region, mfd in enumerate(network.mfds):
-        kinds.setdefault(mfd, []).append(region)
-    drawing, axes = plots.panels(len(kinds))
-    for ax, (mfd, regions) in zip(axes, kinds.items(), strict=True):
-        plots.mfd(ax, mfd)
-        ax.set_title("region " + ", ".join(map(str, regions)) if len(kinds) > 1 else "every region", fontsize="medium")
-    plots.legend_below(drawing, axes)
-    files.append(plots.save(drawing, folder / "mfd.png"))
-    return files
+    plots.legend_below(demand, [right])
+    regions = plots.figure(5.5, 5.0)
+    plots.region_map(regions.subplots(), scenario.network)
+    return [
+        plots.save(demand, folder / "spawn_matrix.png"),
+        plots.save(regions, folder / "region_map.png"),
+        plots.draw_mfds(folder / "mfd.png", scenario.network),
+    ]
 
 
 def interval(values: Sequence[float]) -> float:

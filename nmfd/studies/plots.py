@@ -1,7 +1,7 @@
 """Figures of networks, scenarios and runs; each function draws into an `ax` and returns it, without pyplot."""
 
-import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +17,10 @@ from nmfd.model.mfd import Mfd
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs.files import atomic
-from nmfd.studies.traffic_states import LOOKS, OutflowOf, RegionalOutflow, draw_strips, states
 from nmfd.types import Result
 
 # Colours distinct for colour-blind readers.
-CONTROLLER_COLOURS = {
+COLOURS = {
     "no-control": "#333333",
     "pi-gating": "#e69f00",
     "mpc-pc": "#56b4e9",
@@ -36,8 +35,6 @@ CONTROLLER_COLOURS = {
     "greedy": "#2e8b57",
     "mpc-pc-terminal": "#7fd1c7",
     "mpc-pcrg-terminal": "#00695c",
-}
-CITY_COLOURS = {  # strategies without a regional controller
     "webster": "#00838f",
     "actuated": "#7e57c2",
     "max-pressure": "#009e73",
@@ -48,21 +45,13 @@ OTHER_COLOURS = ("#17becf", "#5254a3", "#843c39", "#66c2a5", "#bc80bd", "#1b5e20
 PLANT_LABELS = {"nmfd": "regional model", "acyclic": "acyclic model", "sumo": "SUMO", "estimate": "estimate"}
 LINE_STYLES = ("-", "--", ":", "-.")
 CRITICAL, UNSEEN = "critical accumulation of the model", "beyond all samples: a guess"
-LAST = (CRITICAL, UNSEEN, *(look[0] for look in LOOKS.values()))  # labels at the end of legends
+LAST = CRITICAL, UNSEEN  # labels at the end of legends
 
 
-def colour(controller: str) -> str:
-    """Return the colour of a controller; unknown names get one of OTHER_COLOURS by their hash."""
-    other = OTHER_COLOURS[zlib.crc32(controller.encode()) % len(OTHER_COLOURS)]
-    return (CONTROLLER_COLOURS | CITY_COLOURS).get(controller, other)
-
-
-def colours(controllers: Sequence[str]) -> dict[str, str]:
+def colours(controllers: Iterable[str]) -> dict[str, str]:
     """Return the colour of each controller; unknown names get distinct ones of OTHER_COLOURS if possible."""
-    known = CONTROLLER_COLOURS | CITY_COLOURS
-    unknown = [name for name in dict.fromkeys(controllers) if name not in known]
-    others = OTHER_COLOURS * (1 + len(unknown) // len(OTHER_COLOURS))
-    return {**known, **dict(zip(unknown, others, strict=False))}
+    unknown = [name for name in dict.fromkeys(controllers) if name not in COLOURS]
+    return COLOURS | dict(zip(unknown, cycle(OTHER_COLOURS), strict=False))
 
 
 def figure(width: float, height: float) -> Figure:
@@ -112,62 +101,21 @@ def total_accumulation(ax: Axes, trajectories: Sequence[Result], seed: int | Non
 
 
 def region_accumulation(
-    ax: Axes,
-    network: RegionalModel,
-    region: int,
-    trajectories: Sequence[Result],
-    seed: int | None = None,
-    outflow: OutflowOf | None = None,
+    ax: Axes, network: RegionalModel, region: int, trajectories: Sequence[Result], seed: int | None = None
 ) -> Axes:
-    """Draw the accumulation of one region over time; above, a strip per curve with its traffic states.
+    """Draw the accumulation of one region over time; seed: shown instead of the mean over seeds.
 
-    Results of several plants share the controller's colour and differ in line style; the marks of their strips are
-    hollow for all but the first plant.
-
-    seed: shown instead of the mean over seeds; strips show it or the first seed
-    outflow: of each region of a run, (T, R) [veh/s], or None for no strip
+    Results of several plants share the controller's colour and differ in line style.
     """
-    curve = network.mfds[region]
+    critical = network.mfds[region].critical
     style = dict(color="0.35", linewidth=1.0, linestyle=":", zorder=1)
-    ax.hlines(curve.critical, 0.0, 1.0, transform=ax.get_yaxis_transform(), label=CRITICAL, **style)
+    ax.hlines(critical, 0.0, 1.0, transform=ax.get_yaxis_transform(), label=CRITICAL, **style)
     _curves(ax, trajectories, lambda t: t.accumulation[:, region].sum(axis=1), seed)
-    first: dict[tuple[str, str], Result] = {}
-    for t in sorted(trajectories, key=lambda t: t.seed != seed):  # stable
-        first.setdefault((t.controller, t.plant), t)
-    known = [(t, out) for t in first.values() if (out := outflow(t) if outflow else None) is not None]
-    below, tones = 1.0, colours([t.controller for t in trajectories])
-    if known:
-        below = draw_strips(
-            ax,
-            [time_axis(ax, t.step * np.arange(len(t.accumulation))) for t, _ in known],
-            states(
-                curve,
-                known[0][0].step,
-                [t.accumulation[:, region].sum(axis=1) for t, _ in known],
-                [out[:, region] for _, out in known],
-            ),
-            [tones[t.controller] for t, _ in known],
-            [t.plant != trajectories[0].plant for t, _ in known],
-        )
     ax.set_ylabel("accumulation [veh]")
     highest = max((t.accumulation[:, region].sum(axis=1).max() for t in trajectories), default=0.0)
-    top = 1.06 * max(highest, 1.25 * curve.critical)
-    ax.set_ylim(0.0, top / below)
-    ax.set_yticks([tick for tick in ax.get_yticks() if 0.0 <= tick <= top])
+    ax.set_ylim(0.0, 1.06 * max(highest, 1.25 * critical))
     ax.set_title(region_title(network, region), fontsize="medium")
     return ax
-
-
-def region_estimate(
-    ax: Axes, network: RegionalModel, region: int, trajectory: Result, outflow: OutflowOf | None = None
-) -> Axes:
-    """Draw the accumulation of one region over time, and its observed estimate."""
-    estimate = trajectory.assign(accumulation=trajectory.observed, plant="estimate")
-
-    def measured(t: Result) -> RegionalOutflow | None:
-        return outflow(t) if outflow and t.plant != "estimate" else None
-
-    return region_accumulation(ax, network, region, [trajectory, estimate], outflow=measured)
 
 
 def mfd(ax: Axes, mfd: Mfd, samples: Mapping[str, np.ndarray] | None = None) -> Axes:
@@ -184,10 +132,8 @@ def mfd(ax: Axes, mfd: Mfd, samples: Mapping[str, np.ndarray] | None = None) -> 
             largest, max(right, largest), facecolor="none", edgecolor="0.75", hatch="///", linewidth=0, label=UNSEEN
         )
     ax.axvline(mfd.critical, color="0.35", linewidth=1.0, linestyle=":", label=CRITICAL, zorder=1)
-    known = CONTROLLER_COLOURS | CITY_COLOURS
     for (label, cloud), tone in zip(clouds.items(), _tones(len(clouds)), strict=True):
-        tone = known.get(label, tone)
-        ax.scatter(cloud[:, 0], cloud[:, 1], s=7, color=tone, alpha=0.6, linewidths=0, label=label)
+        ax.scatter(cloud[:, 0], cloud[:, 1], s=7, color=COLOURS.get(label, tone), alpha=0.6, linewidths=0, label=label)
     grid = np.linspace(0.0, right, 1001)
     ax.plot(grid, mfd.outflow(grid), color="black", linewidth=1.8, label="MFD")
     if not clouds:
@@ -203,49 +149,16 @@ def mfd(ax: Axes, mfd: Mfd, samples: Mapping[str, np.ndarray] | None = None) -> 
     return ax
 
 
-def draw_mfds(path: Path, network: RegionalModel, samples: Sequence[Mapping[str, np.ndarray]]) -> None:
-    """Draw the MFD of each region over its outflow samples, as one file."""
-    drawing, axes = panels(network.regions)
-    for region, ax in enumerate(axes):
-        mfd(ax, network.mfds[region], samples[region])
-        ax.set_title(region_title(network, region), fontsize="medium")
+def draw_mfds(path: Path, network: RegionalModel, samples: Sequence[Mapping[str, np.ndarray]] | None = None) -> Path:
+    """Draw the MFD of each region over its outflow samples, as one file; equal MFDs without samples once."""
+    shown = range(network.regions) if samples or len(set(network.mfds)) > 1 else [0]
+    drawing, axes = panels(len(shown))
+    for region, ax in zip(shown, axes, strict=True):
+        mfd(ax, network.mfds[region], samples[region] if samples else None)
+        title = region_title(network, region) if len(shown) == network.regions else "every region"
+        ax.set_title(title, fontsize="medium")
     legend_below(drawing, axes)
-    save(drawing, path)
-
-
-def improvement(ax: Axes, gains: Mapping[str, Mapping[float, tuple[float, float]]]) -> Axes:
-    """Draw the improvement over no control [%] against sigma of the demand noise [veh/s], with 95 % intervals.
-
-    gains: controller -> sigma -> mean and half interval (nmfd.studies.robustness.improvements)
-    """
-    ax.axhline(0.0, color=CONTROLLER_COLOURS["no-control"], linewidth=1.0)
-    for number, (controller, points) in enumerate(gains.items()):
-        mean, half = np.array(list(points.values())).reshape(-1, 2).T
-        ax.errorbar(
-            list(points),
-            mean,
-            np.nan_to_num(half),
-            color=colour(controller),
-            linewidth=1.6,
-            capsize=3,
-            marker="o^sDv"[number % 5],
-            markersize=4,
-            label=controller,
-        )
-    ax.set_ylabel("total time spent saved\nagainst no-control [%]")
-    ax.spines[["top", "right"]].set_visible(False)
-    return ax
-
-
-def trips(ax: Axes, counts: Mapping[float, float]) -> Axes:
-    """Draw the trips of the scenario against sigma of the demand noise [veh/s]."""
-    ax.plot(list(counts), list(counts.values()), color=CONTROLLER_COLOURS["no-control"], marker="o", markersize=4)
-    ax.set_ylim(bottom=0.0)
-    ax.set_xlabel("standard deviation of the noise on the demand [veh/s]")
-    ax.set_ylabel("trips [veh]")
-    ax.yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
-    ax.spines[["top", "right"]].set_visible(False)
-    return ax
+    return save(drawing, path)
 
 
 def region_map(ax: Axes, network: RegionalModel) -> Axes:

@@ -5,10 +5,12 @@ perturbed demand; its improvement is over no control in the same perturbed scena
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from nmfd.controllers.strategy import Strategy, parse
 from nmfd.metrics import percent_change, summary
@@ -23,6 +25,7 @@ from nmfd.types import Result
 if TYPE_CHECKING:
     import pandas as pd
 
+PLANT = "acyclic"
 SIGMAS_VEH_S = (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0)  # of the noise on the demand
 KEPT = ("controller", "seed", "plant", "total_time_spent_veh_s", "final_accumulation_veh", "fallbacks")
 CAPTION = (
@@ -31,18 +34,16 @@ CAPTION = (
 )
 
 
-def run_one(
-    strategy: Strategy, seed: int, *, scenario: Scenario, plant: str, sigma: float, policy: Path | None = None
-) -> Result:
+def run_one(strategy: Strategy, seed: int, *, scenario: Scenario, sigma: float) -> Result:
     """Run one closed loop in perturbed demand; return its figures, without arrays.
 
     seed: number of the draw of the noise on demand and measurements
     """
     import xarray
 
-    row = summary(closed_loop_of(strategy, seed, scenario=scenario, plant=plant, policy=policy, sigma=sigma))
-    actual = perturbed(scenario, sigma, seed)
-    facts = {"sigma_veh_per_s": sigma, "trips_veh": float(actual.step * actual.demand.sum())}
+    row = summary(closed_loop_of(strategy, seed, scenario=scenario, plant=PLANT, sigma=sigma))
+    trips = scenario.step * float(perturbed(scenario, sigma, seed).demand.sum())
+    facts = {"sigma_veh_per_s": sigma, "trips_veh": trips}
     return Result(xarray.Dataset(attrs=facts | {column: row[column] for column in KEPT}))
 
 
@@ -53,8 +54,6 @@ def robustness(
     scenarios: int,
     *,
     out: Path,
-    plant: str = "acyclic",
-    policies: Mapping[str, Path] | None = None,
     workers: int = 1,
     progress: Progress = None,
 ) -> "pd.DataFrame":
@@ -65,22 +64,13 @@ def robustness(
     Raises:
         InputError: a controller cannot be made
     """
-    policies, others = policies or {}, [strategy for strategy in strategies if strategy.name != REFERENCE]
-    strategies = [parse(REFERENCE), *others]
-    key = key_of(scenario, strategies, plant, policies)
+    strategies = [parse(REFERENCE), *(strategy for strategy in strategies if strategy.name != REFERENCE)]
+    key = key_of(scenario, strategies, PLANT, {})
     runs = [
         Run(
             run_name(strategy.name, number),
             {**key(strategy.name), "sigma_veh_per_s": sigma},
-            partial(
-                run_one,
-                strategy,
-                number,
-                scenario=scenario,
-                plant=plant,
-                sigma=sigma,
-                policy=policies.get(strategy.name),
-            ),
+            partial(run_one, strategy, number, scenario=scenario, sigma=sigma),
             folder=f"sigma-{sigma:g}",
         )
         for sigma in sigmas
@@ -110,15 +100,27 @@ def trips(rows: "pd.DataFrame") -> dict[float, float]:
     return rows.groupby("sigma_veh_per_s")["trips_veh"].mean().to_dict()
 
 
-def draw(folder: Path, rows: "pd.DataFrame") -> Path:
+def draw(folder: Path, rows: "pd.DataFrame") -> None:
     """Draw improvement and trips over sigma as robustness.png in `folder`."""
     drawing = plots.figure(8.0, 6.4)
     upper, lower = drawing.subplots(2, 1, sharex=True, height_ratios=(3, 1))
-    plots.improvement(upper, {name: improvements(rows, name) for name in _compared(rows)})
-    plots.trips(lower, trips(rows))
+    upper.axhline(0.0, color=plots.COLOURS[REFERENCE], linewidth=1.0)
+    names = _compared(rows)
+    colours = plots.colours(names)
+    for number, name in enumerate(names):
+        gains = improvements(rows, name)
+        mean, half = np.array(list(gains.values())).reshape(-1, 2).T
+        style = dict(marker="o^sDv"[number % 5], markersize=4, capsize=3, linewidth=1.6, color=colours[name])
+        upper.errorbar(list(gains), mean, np.nan_to_num(half), label=name, **style)
+    count = trips(rows)
+    lower.plot(list(count), list(count.values()), color=plots.COLOURS[REFERENCE], marker="o", markersize=4)
+    upper.set_ylabel("total time spent saved\nagainst no-control [%]")
+    lower.set(xlabel="standard deviation of the noise on the demand [veh/s]", ylabel="trips [veh]", ylim=(0.0, None))
+    for ax in (upper, lower):
+        ax.spines[["top", "right"]].set_visible(False)
     drawing.align_ylabels()
     plots.legend_below(drawing, [upper], columns=4)
-    return plots.save(drawing, folder / "robustness.png")
+    plots.save(drawing, folder / "robustness.png")
 
 
 def improvement_table(rows: "pd.DataFrame") -> str:
@@ -127,15 +129,7 @@ def improvement_table(rows: "pd.DataFrame") -> str:
     lines = [["trips", *(f"{total:,.0f}" for total in count.values())]]
     for name in _compared(rows):
         gains = improvements(rows, name)
-        lines.append(
-            [
-                name,
-                *(
-                    "{:.1f} ± {:.1f}".format(*gains.get(s, (math.nan, math.nan))).replace("nan ± nan", "-")
-                    for s in count
-                ),
-            ]
-        )
+        lines.append([name, *("{:.1f} ± {:.1f}".format(*gains[s]) if s in gains else "-" for s in count)])
     return text_columns(["sigma", *(f"{sigma:g}" for sigma in count)], lines, CAPTION)
 
 

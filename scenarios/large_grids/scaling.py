@@ -99,7 +99,7 @@ def draw(table: pd.DataFrame, path: Path) -> None:
     figure, axes = plots.panels(2)
     for ax, column, label in zip(axes, ("median_s", "peak_memory_mib"), ("decision [s]", "memory [MiB]"), strict=True):
         for name, rows in table.groupby("controller", sort=False):
-            ax.loglog(rows["regions"], rows[column], "o-", color=plots.colour(name), label=name)
+            ax.loglog(rows["regions"], rows[column], "o-", color=plots.COLOURS[name], label=name)
         ax.set(xlabel="regions", ylabel=label)
     plots.legend_below(figure, axes)
     plots.save(figure, path)
