@@ -1,6 +1,7 @@
 """Signal programmes other than those of the network file: actuated ones, and plans by SUMO's own tools."""
 
 import hashlib
+import re
 import subprocess
 import sys
 from collections.abc import Iterable, Sequence
@@ -20,7 +21,7 @@ from nmfd.controllers.strategy import Strategy
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
 from nmfd.runs import shipped
-from nmfd.runs.files import temporary_folder
+from nmfd.runs.files import temporary_folder, write_text
 
 ACTUATED_MIN_GREEN_S, ACTUATED_MAX_GREEN_S = 5.0, 50.0  # netconvert's defaults
 
@@ -105,23 +106,26 @@ def optimised_plans(
     routes = "\n".join(["<routes>", *rows, "</routes>\n"]).encode()
     key = hashlib.sha256(routes + city.net_file.read_bytes() + metadata.version("eclipse-sumo").encode()).hexdigest()
     folder = shipped.build_folder(network_folder(scenario.network))
-    cycles, offsets = (folder / f"webster-{key[:16]}-{kind}.add.xml" for kind in ("cycles", "offsets"))
+    cycles, offsets = (folder / f"plan-{key[:16]}-{kind}.add.xml" for kind in ("cycles", "offsets"))
     if cycles.is_file() and offsets.is_file():
         return [cycles, offsets]
     shipped.made(folder)
     unified = ("-u", "-y", "3", "-p", "webster", "--skip", ",".join(others))
     with temporary_folder() as scratch:
         (scratch / "routes.xml").write_bytes(routes)
-        for tool, target, options in (
-            ("tlsCycleAdaptation.py", cycles, unified),
-            ("tlsCoordinator.py", offsets, ("-a", str(cycles))),
+        for tool, output, options in (
+            ("tlsCycleAdaptation.py", "cycles.xml", unified),
+            ("tlsCoordinator.py", "offsets.xml", ("-a", "cycles.xml")),
         ):
             program = Path(sumo.SUMO_HOME) / "tools" / tool
-            command = [sys.executable, str(program), "-n", str(city.net_file), "-r", "routes.xml", *options]
-            result = subprocess.run(
-                [*command, "-o", str(target)], cwd=scratch, capture_output=True, text=True, check=False
-            )
+            command = [sys.executable, str(program), "-n", str(city.net_file), "-r", "routes.xml", "-o", output]
+            result = subprocess.run([*command, *options], cwd=scratch, capture_output=True, text=True, check=False)
             if result.returncode:
                 words = (result.stderr.strip() or "no message").splitlines()[-1]
                 raise InputError(f"{city.net_file}: {tool} cannot plan its signals ({words}); choose other signals")
+        for output, file in (("cycles.xml", cycles), ("offsets.xml", offsets)):
+            text = (scratch / output).read_text(encoding="utf-8")
+            # Whole seconds: perimeter control follows programmes second by second.
+            text = re.sub(r'offset="([^"]+)"', lambda m: f'offset="{round(float(m[1]))}"', text)
+            write_text(file, text)
     return [cycles, offsets]
