@@ -52,7 +52,6 @@ def check(folder: Path, name: str, intervals: int) -> None:
         ("cross", None),
         ("grid6", None),
         ("corridor", None),
-        ("A10KW", None),
         ("DRT", "names no vehicles for the streets of cars"),
         ("ramp", "no two regions can be made"),
         ("rail", "has no edge that cars may use"),

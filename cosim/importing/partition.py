@@ -98,14 +98,15 @@ def partition(
 
 def cluster(blocks: Blocks, feature: Float[np.ndarray, "B F"], regions: int) -> Int[np.ndarray, " B"]:
     """Return the cluster of every block; -1 in clusters that are too small for a region."""
-    least = SMALLEST_SHARE * blocks.core.sum() / regions
-    best, large_of_best = np.zeros(len(feature), dtype=int), 0
+    size = blocks.core if np.count_nonzero(blocks.core) >= regions else blocks.weight
+    least = SMALLEST_SHARE * size.sum() / regions
+    best, most = np.zeros(len(feature), dtype=int), 0
     for count in range(regions, min(regions + MAX_EXTRA_CLUSTERS, len(feature)) + 1):
         labels = AgglomerativeClustering(n_clusters=count, connectivity=blocks.joins).fit_predict(feature)
-        large = np.bincount(labels, blocks.core) >= least
-        if large_of_best < large.sum() <= regions:
-            best, large_of_best = np.where(large[labels], labels, -1), large.sum()
-        if large_of_best == regions:
+        large = np.bincount(labels, size) >= least
+        if most < large.sum() <= regions:
+            best, most = np.where(large[labels], labels, -1), large.sum()
+        if most == regions:
             break
     return best
 
