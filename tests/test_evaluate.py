@@ -133,7 +133,9 @@ def test_command_line_errors(arguments, expected):
 
 @pytest.mark.slow
 def test_a_small_evaluation_in_sumo(city, tmp_path):
-    change(city / "scenario.toml", r"outflow_share = [\d.]+", "set_point = [20.0]")
+    file = city / "scenario.toml"
+    file.write_text(re.sub(r"ramp_up = [\d.]+", "ramp_up = 60.0", file.read_text()))
+    change(file, r"outflow_share = [\d.]+", "set_point = [20.0]")
     out = tmp_path / "out"
     arguments = ("evaluate", city, "--controllers", "no-control,pi-gating", "--seeds", 1, "--steps", 3, "--out", out)
     said = good(cosim(*arguments))
