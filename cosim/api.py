@@ -177,7 +177,7 @@ def watch(
             return "The window was closed before the end."
     else:
         runs = live.watch(loaded, strategies, seed=seed, demand=demand, port=port, browse=_has_screen(), tell=_say)
-        rows = {run.name: run.row for run in runs}
+        rows = {run.name: run.row for run in runs if run.row is not None}
     return "\n".join(
         f"{name}, seed {seed}: total time spent {row['total_time_spent_veh_s']:.4g} veh s, "
         f"{row['completed_veh']:,.0f} trips completed"
@@ -343,7 +343,7 @@ def import_city(
             parse_box(source) if isinstance(source, str) else source,
             out,
             scenario,
-            regions=number or Path(regions),
+            regions=number or Path(str(regions)),
             left_hand=left_hand,
             routes=tuple(routes),
             peak=demand is not None,

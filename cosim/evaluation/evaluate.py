@@ -40,7 +40,7 @@ class Suite(TypedDict):
 
 def read_suite(
     file: Path, settings: Mapping[str, Any] | None = None
-) -> tuple[list[tuple[Scenario, list[float]]], list[int]]:
+) -> tuple[list[tuple[Scenario, Sequence[float]]], Sequence[int]]:
     """Read the scenarios with their demand levels, and the seeds, of a suite.
 
     Scenarios are shipped names, or folders seen from that of the file.

@@ -18,7 +18,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import optuna
@@ -44,7 +44,7 @@ from nmfd.runs.tables import text_table
 OPTION = re.compile(r"([a-z_]\w*)(?:\[([0-9])\])?")  # KEY, or KEY[N] for one number of a list
 INITIAL_DEVIATION = 0.25  # standard deviation of the first generation, as a share of every range
 SCORE = "score_veh_s"
-Range = FloatDistribution | IntDistribution
+Range: TypeAlias = FloatDistribution | IntDistribution
 
 
 @dataclass(frozen=True, kw_only=True)
