@@ -6,7 +6,6 @@ import tiny
 from nmfd.api import load_scenario
 from nmfd.controllers.strategy import CONTROLLERS, parse
 from nmfd.errors import InputError, did_you_mean
-from nmfd.model.regional_model import load_network
 
 
 def problem(call, *arguments) -> str:
@@ -30,16 +29,6 @@ def problem(call, *arguments) -> str:
 )
 def test_names(call, arguments, hint):
     assert f"did you mean {hint}?" in problem(call, *arguments)
-
-
-@pytest.mark.parametrize(
-    "load, name", [(load_scenario, "scenario"), (load_network, "network")], ids=["scenario", "network"]
-)
-def test_folders(tmp_path, load, name):
-    tiny.write(tmp_path)
-    (tmp_path / f"{name}s").mkdir()  # nearer, but holds nothing
-    text = problem(load, tmp_path / f"{name}x")
-    assert text.startswith(f"{tmp_path}/{name}x/{name}.toml: no such file; did you mean {name}?")
 
 
 @pytest.mark.parametrize(
