@@ -37,7 +37,7 @@ def result(scenario):
     for k in range(scenario.steps):
         u = random.uniform(network.u_min, network.u_max, 7)[:, None] * network.adjacency  # one u per region, see below
         completions, transfers = dynamics.flows(p, x, torch.from_numpy(u), splits)
-        x = dynamics.euler(p, x, torch.from_numpy(scenario.demand[k]), torch.from_numpy(u), splits, scenario.step)
+        x = dynamics.advance(p, x, torch.from_numpy(scenario.demand[k]), torch.from_numpy(u), splits, scenario.step)
         states.append(x.numpy())
         perimeter.append(u)
         crossings.append(scenario.step * transfers.numpy())

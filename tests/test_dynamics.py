@@ -44,7 +44,7 @@ def one_region(mfd):
 
 
 @KINDS
-@pytest.mark.parametrize("integrator", dynamics.INTEGRATORS)
+@pytest.mark.parametrize("integrator", dynamics.SCHEMES)
 def test_no_vehicle_is_negative_or_lost_inside(integrator, network):
     """Without trips that end, the vehicles only move: their number grows by the demand exactly."""
     p = dynamics.parameters(network)
@@ -64,19 +64,9 @@ def test_no_vehicle_is_negative_or_lost_inside(integrator, network):
 def test_vehicles_leave_as_their_trips_end():
     x, demand, perimeter, splits = random_tensors(2, filling=25_000.0, batch=(40,))
     completions, _ = dynamics.flows(PARAMETERS, x, perimeter, splits)
-    after = dynamics.euler(PARAMETERS, x, demand, perimeter, splits, STEP)
+    after = dynamics.advance(PARAMETERS, x, demand, perimeter, splits, STEP)
     expected = x.sum((-2, -1)) + STEP * (demand.sum((-2, -1)) - completions.sum(-1))
     torch.testing.assert_close(after.sum((-2, -1)), expected, rtol=0.0, atol=1e-9)
-
-
-def test_one_euler_step_is_the_default():
-    x, demand, perimeter, splits = random_tensors(9, filling=6000.0)
-    expected = dynamics.euler(PARAMETERS, x, demand, perimeter, splits, STEP)
-    for after in (
-        dynamics.advance(PARAMETERS, x, demand, perimeter, splits, STEP),
-        dynamics.advance_counted(PARAMETERS, x, demand, perimeter, splits, STEP)[0],
-    ):
-        torch.testing.assert_close(after, expected, rtol=1e-13, atol=1e-10)
 
 
 @KINDS
@@ -125,7 +115,7 @@ def test_order_of_convergence(integrator, order):
 
 @KINDS
 @pytest.mark.parametrize("filling", [3000.0, 30_000.0], ids=["free", "jammed"])
-@pytest.mark.parametrize("integrator", dynamics.INTEGRATORS)
+@pytest.mark.parametrize("integrator", dynamics.SCHEMES)
 def test_gradients_against_finite_differences(integrator, filling, network):
     """In vehicles by the thousand, so that one step of differences suits states and controls."""
     x, demand, perimeter, splits = random_tensors(5, filling=filling)
@@ -139,7 +129,7 @@ def test_gradients_against_finite_differences(integrator, filling, network):
 
 @KINDS
 @pytest.mark.parametrize("substeps", [1, 3])
-@pytest.mark.parametrize("integrator", dynamics.INTEGRATORS)
+@pytest.mark.parametrize("integrator", dynamics.SCHEMES)
 def test_torch_and_casadi_agree(integrator, substeps, network):
     """Over a rollout into the jam and beyond, with new controls in every interval."""
     random = np.random.default_rng(6)

@@ -83,7 +83,8 @@ def test_every_action_is_admissible_and_reaches_the_bounds(hexagon, guidance):
     interface, network = rl.Interface(hexagon.network, guidance=guidance), hexagon.network
     random = np.random.default_rng(0)
     for action in (random.uniform(-1.3, 1.3, interface.action_size), np.ones(interface.action_size)):
-        perimeter, splits = interface.perimeter(action), interface.splits(action)
+        controls = interface.controls(action)
+        perimeter, splits = controls.perimeter, controls.splits
         assert (perimeter[~network.adjacency] == 0).all()
         assert perimeter[network.adjacency].min() >= network.u_min
         assert perimeter[network.adjacency].max() <= network.u_max
@@ -92,16 +93,6 @@ def test_every_action_is_admissible_and_reaches_the_bounds(hexagon, guidance):
             np.testing.assert_allclose(splits.sum(axis=1)[network.split_mask.any(axis=1)], 1.0)
     assert (perimeter[network.adjacency] == network.u_max).all()
     assert guidance or splits is None
-
-
-def test_metering_closes_all_entries_of_a_region_alike(hexagon):
-    interface, network = rl.Interface(hexagon.network, metering=True), hexagon.network
-    assert interface.action_size == network.regions
-    action = np.ones(7)
-    action[3] = -1.0
-    perimeter = interface.perimeter(action)
-    assert (perimeter[network.adjacency[:, 3], 3] == network.u_min).all()
-    assert (perimeter[network.adjacency & (np.arange(7) != 3)] == network.u_max).all()
 
 
 class Constant:

@@ -17,6 +17,7 @@ Shapes: `...` is any batch. x (..., R, R) [veh], [i, j] in region i bound for j;
 perimeter (..., R, R) [-], [i, h]; splits (..., R, R, R) [-], [i, h, j].
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -121,21 +122,20 @@ def derivative(p: Parameters, x: PerPair, demand: PerPair, perimeter: PerPair, s
     return demand - torch.diag_embed(completions) - transfers.sum(-2) + transfers.sum(-3)
 
 
-def euler(p: Parameters, x: PerPair, demand: PerPair, perimeter: PerPair, splits: PerTurn, step: float) -> PerPair:
-    """Return x after `step` [s] by forward Euler; x stays >= 0 if step * q <= 1 and demand >= 0."""
-    return x + step * derivative(p, x, demand, perimeter, splits)
+def integrated(slope: Callable[[Any], Any], x: Any, step: float, integrator: str) -> Any:
+    """Return x after `step` [s] of dx/dt = slope(x), by forward Euler or the classical Runge-Kutta scheme.
 
-
-def rk4(p: Parameters, x: PerPair, demand: PerPair, perimeter: PerPair, splits: PerTurn, step: float) -> PerPair:
-    """Return x after `step` [s] by the classical fourth-order Runge-Kutta scheme."""
-    k1 = derivative(p, x, demand, perimeter, splits)
-    k2 = derivative(p, x + 0.5 * step * k1, demand, perimeter, splits)
-    k3 = derivative(p, x + 0.5 * step * k2, demand, perimeter, splits)
-    k4 = derivative(p, x + step * k3, demand, perimeter, splits)
+    With Euler x stays >= 0 if step * q <= 1 and demand >= 0.
+    """
+    k1 = slope(x)
+    if integrator == "euler":
+        return x + step * k1
+    k2 = slope(x + 0.5 * step * k1)
+    k3 = slope(x + 0.5 * step * k2)
+    k4 = slope(x + step * k3)
     return x + step / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
 
 
-INTEGRATORS = {"euler": euler, "rk4": rk4}
 # Weights of the slopes, and the point of each slope in steps along the previous one.
 SCHEMES = {"euler": ((1.0,), (0.0,)), "rk4": ((1 / 6, 1 / 3, 1 / 3, 1 / 6), (0.0, 0.5, 0.5, 1.0))}
 
@@ -153,7 +153,7 @@ def advance(
 ) -> PerPair:
     """Return x after one control interval of `step` [s], in `substeps` equal steps under constant inputs."""
     for _ in range(substeps):
-        x = INTEGRATORS[integrator](p, x, demand, perimeter, splits, step / substeps)
+        x = integrated(lambda x: derivative(p, x, demand, perimeter, splits), x, step / substeps, integrator)
     return x
 
 

@@ -13,6 +13,7 @@ import casadi as ca
 import numpy as np
 
 from nmfd.arrays import PerTurn
+from nmfd.model.dynamics import integrated
 from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, RegionalModel
 
 Matrix: TypeAlias = ca.SX | ca.MX | ca.DM
@@ -100,23 +101,6 @@ def derivative(p: Parameters, x: Matrix, demand: Matrix, perimeter: Matrix, spli
     return demand - ca.diag(completions) - leaving + entering
 
 
-def euler(p: Parameters, x: Matrix, demand: Matrix, perimeter: Matrix, splits: Turns, step: float) -> Matrix:
-    """Return x after `step` [s] by forward Euler."""
-    return x + step * derivative(p, x, demand, perimeter, splits)
-
-
-def rk4(p: Parameters, x: Matrix, demand: Matrix, perimeter: Matrix, splits: Turns, step: float) -> Matrix:
-    """Return x after `step` [s] by the classical fourth-order Runge-Kutta scheme."""
-    k1 = derivative(p, x, demand, perimeter, splits)
-    k2 = derivative(p, x + 0.5 * step * k1, demand, perimeter, splits)
-    k3 = derivative(p, x + 0.5 * step * k2, demand, perimeter, splits)
-    k4 = derivative(p, x + step * k3, demand, perimeter, splits)
-    return x + step / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
-
-
-INTEGRATORS = {"euler": euler, "rk4": rk4}
-
-
 def advance(
     p: Parameters,
     x: Matrix,
@@ -130,5 +114,5 @@ def advance(
 ) -> Matrix:
     """Return x after one control interval of `step` [s], in `substeps` equal steps under constant inputs."""
     for _ in range(substeps):
-        x = INTEGRATORS[integrator](p, x, demand, perimeter, splits, step / substeps)
+        x = integrated(lambda x: derivative(p, x, demand, perimeter, splits), x, step / substeps, integrator)
     return x

@@ -10,7 +10,7 @@ from gymnasium.spaces import Box
 from jaxtyping import Float
 from pettingzoo import ParallelEnv
 
-from nmfd.arrays import PerPair, PerRegion, PerTurn
+from nmfd.arrays import PerPair, PerRegion
 from nmfd.closed_loop import noise_of, noisy
 from nmfd.model.plant import NmfdPlant
 from nmfd.model.regional_model import RegionalModel
@@ -29,28 +29,18 @@ class Interface:
     Observation (float32): x_ij and the backlog of these regions and, unless they are all, the accumulation of every
     region; each divided by the region's critical accumulation.
 
-    Action in [-1, 1]: u_ih of each boundary out of these regions, from u_min to u_max, or with `metering` one value for
-    all entries of a region h; with `guidance` also a logit for each next region h of theta_ihj where there is a choice.
-    Every action is admissible.
+    Action in [-1, 1]: u_ih of each boundary out of these regions, from u_min to u_max; with `guidance` also a logit for
+    each next region h of theta_ihj where there is a choice. Every action is admissible.
     """
 
-    def __init__(
-        self,
-        network: RegionalModel,
-        *,
-        guidance: bool = False,
-        metering: bool = False,
-        regions: Sequence[int] | None = None,
-    ):
+    def __init__(self, network: RegionalModel, *, guidance: bool = False, regions: Sequence[int] | None = None):
         self._network, self._all = network, regions is None
         self._own = np.arange(network.regions) if regions is None else np.array(regions)
         own = np.isin(np.arange(network.regions), self._own)
         self._boundaries = np.nonzero(network.adjacency & own[:, None])
         choice = network.split_mask & (network.split_mask.sum(axis=1, keepdims=True) > 1) & own[:, None, None]
         self._turns = np.nonzero(choice) if guidance else None
-        entered, gate = np.unique(self._boundaries[1], return_inverse=True)
-        self._gate = gate if metering else np.arange(len(gate))  # index into the action of each boundary
-        self._gates = len(entered) if metering else len(gate)
+        self._gates = len(self._boundaries[0])
         self.action_size = self._gates + (0 if self._turns is None else len(self._turns[0]))
         self.observation_size = len(self._own) * (network.regions + 1) + (0 if self._all else network.regions)
         self._open = np.where(network.adjacency, network.u_max, 0.0)
@@ -60,13 +50,9 @@ class Interface:
     def vector(self, accumulation: PerPair, backlog: PerPair) -> Vector:
         """Return the observation (observation_size,) of accumulation and backlog (R, R) [veh]."""
         critical = self._network.critical
-        parts = [
-            (accumulation / critical[:, None])[self._own].ravel(),
-            (backlog.sum(axis=1) / critical)[self._own],
-        ]
-        if not self._all:
-            parts.append(accumulation.sum(axis=1) / critical)
-        return np.concatenate(parts, dtype=np.float32)
+        own = (accumulation / critical[:, None])[self._own].ravel(), (backlog.sum(axis=1) / critical)[self._own]
+        other = () if self._all else (accumulation.sum(axis=1) / critical,)
+        return np.concatenate([*own, *other], dtype=np.float32)
 
     def observed(self, observation: Observation) -> Vector:
         """Return the observation (observation_size,) of what a controller receives."""
@@ -84,26 +70,18 @@ class Interface:
         """Vectors (action_size,) in [-1, 1]."""
         return Box(-1.0, 1.0, (self.action_size,), np.float32)
 
-    def perimeter(self, action: Vector) -> PerPair:
-        """Return u (R, R) [-] of an action; u_max at the boundaries of other regions."""
-        low, high = self._network.u_min, self._network.u_max
-        share = 0.5 * (np.clip(np.asarray(action, dtype=float)[: self._gates], -1.0, 1.0) + 1.0)
-        perimeter = self._open.copy()
-        perimeter[self._boundaries] = low + (high - low) * share[self._gate]
-        return perimeter
-
-    def splits(self, action: Vector) -> PerTurn | None:
-        """Return theta (R, R, R) [-] of an action, 0 in other regions; None without guidance."""
-        if self._turns is None:
-            return None
-        weight = np.zeros_like(self._fixed)
-        weight[self._turns] = np.exp(LOGIT_SCALE * np.clip(np.asarray(action, dtype=float)[self._gates :], -1.0, 1.0))
-        sums = weight.sum(axis=1, keepdims=True)
-        return self._fixed + weight / np.where(sums > 0, sums, 1.0)
-
     def controls(self, action: Vector) -> Controls:
-        """Return the controls of an action."""
-        return Controls(perimeter=self.perimeter(action), splits=self.splits(action))
+        """Return the controls of an action: u_max at the boundaries and theta = 0 in the other regions."""
+        low, high = self._network.u_min, self._network.u_max
+        action = np.clip(np.asarray(action, dtype=float), -1.0, 1.0)
+        perimeter = self._open.copy()
+        perimeter[self._boundaries] = low + (high - low) * 0.5 * (action[: self._gates] + 1.0)
+        if self._turns is None:
+            return Controls(perimeter=perimeter, splits=None)
+        weight = np.zeros_like(self._fixed)
+        weight[self._turns] = np.exp(LOGIT_SCALE * action[self._gates :])
+        sums = weight.sum(axis=1, keepdims=True)
+        return Controls(perimeter=perimeter, splits=self._fixed + weight / np.where(sums > 0, sums, 1.0))
 
 
 class RegionalEnv(gymnasium.Env):
@@ -117,7 +95,7 @@ class RegionalEnv(gymnasium.Env):
     accumulations): total time spent = - sum of rewards * unit * scenario.step. `info` holds time_s,
     total_time_spent_veh_s and completed_veh. A seed gives the closed loop of nmfd.run with the same seed.
 
-    scenario: or its folder; plant: the NMFD if None, closed with the environment; guidance, metering: see Interface
+    scenario: or its folder; plant: the NMFD if None, closed with the environment; guidance: see Interface
     """
 
     metadata: dict[str, Any] = {"render_modes": []}
@@ -128,11 +106,10 @@ class RegionalEnv(gymnasium.Env):
         plant: Plant | None = None,
         *,
         guidance: bool = False,
-        metering: bool = False,
     ):
         self.scenario = scenario if isinstance(scenario, Scenario) else read_scenario(scenario)
         self.plant = NmfdPlant(self.scenario) if plant is None else plant
-        self.interface = Interface(self.scenario.network, guidance=guidance, metering=metering)
+        self.interface = Interface(self.scenario.network, guidance=guidance)
         self.unit = sum(mfd.critical for mfd in self.scenario.network.mfds)
         self.observation_space = self.interface.observation_space(self.scenario)
         self.action_space = self.interface.action_space
@@ -195,7 +172,7 @@ class RegionsEnv(ParallelEnv):
         guidance: bool = False,
         cooperative: bool = True,
     ):
-        self._env, self._cooperative = RegionalEnv(scenario, plant), cooperative
+        self._env, self._cooperative, self._guidance = RegionalEnv(scenario, plant), cooperative, guidance
         loaded = self._env.scenario
         self.possible_agents = [f"region_{region}" for region in range(loaded.network.regions)]
         self.agents: list[str] = []
@@ -220,17 +197,14 @@ class RegionsEnv(ParallelEnv):
     def step(self, actions: dict) -> tuple[dict, dict, dict, dict, dict]:
         """Advance by one control interval; the region of an agent without an action is open."""
         network = self._env.scenario.network
-        perimeter, splits, guided = (
-            np.where(network.adjacency, network.u_max, 0.0),
-            network.nominal_splits.copy(),
-            False,
-        )
+        perimeter, splits = np.where(network.adjacency, network.u_max, 0.0), network.nominal_splits.copy()
         for agent, action in actions.items():
             region, controls = self.possible_agents.index(agent), self.interfaces[agent].controls(action)
             perimeter[region] = controls.perimeter[region]
             if controls.splits is not None:
-                splits[region], guided = controls.splits[region], True
-        self._seen, vehicles, over = self._env.advance(Controls(perimeter=perimeter, splits=splits if guided else None))
+                splits[region] = controls.splits[region]
+        theta = splits if self._guidance else None
+        self._seen, vehicles, over = self._env.advance(Controls(perimeter=perimeter, splits=theta))
         amounts = np.full(len(vehicles), vehicles.sum()) if self._cooperative else vehicles
         agents, rewards = self.agents, (-amounts / self._env.unit).tolist()
         result = (
