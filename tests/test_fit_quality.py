@@ -8,12 +8,11 @@ import pytest
 import tiny
 
 from cosim.evaluation import model_validation
-from nmfd.model import identification
 from nmfd.model.authority import Boundaries, verdict
 from nmfd.model.identification import Observed
 from nmfd.model.mfd import Mfd
 from nmfd.model.regional_model import load_network, network_toml
-from nmfd.studies.fit_quality import MEANINGS, fit_table, prediction_table, region_fits, write_fits
+from nmfd.studies.fit_quality import MEANINGS, fit_table, prediction_table, predictions, region_fits, write_fits
 
 
 @pytest.fixture
@@ -55,9 +54,9 @@ def test_warnings_are_in_the_table_the_files_and_the_network(network, tmp_path):
     assert "WARNINGS" in table.splitlines()[0] and table.count("few samples (1); not reached (0 % of critical)") == 3
     for kind in ("few samples", "not reached", "one seed"):
         assert f"WARNING, {kind}: " in table and kind in MEANINGS
-    write_fits(tmp_path / "fit.csv", fits, None)
+    write_fits(tmp_path / "fit.csv", fits)
     rows = pd.read_csv(tmp_path / "fit.csv")
-    assert rows["doubts"].str.endswith("one seed").all() and rows["held_out_ahead_model_rmse_share"].isna().all()
+    assert rows["doubts"].str.endswith("one seed").all()
     doubted = replace(
         network,
         doubts=tuple(fits["doubts"]),
@@ -87,9 +86,11 @@ def test_persistence_is_what_it_says(network):
     state = np.zeros((9, 3, 3))
     state[:, 0, 0] = 10.0 * np.arange(9)
     run, critical = observed(network, state), network.mfds[0].critical
-    shares = identification.persistence_shares(network, [run, run], (1, 4))
-    assert shares[:, 0] * critical == pytest.approx([10.0, 40.0]) and (shares[:, 1:] == 0.0).all()
-    table = prediction_table(network, [run], {"step": 30.0, "substeps": 1, "integrator": "euler"})
+    errors = predictions(network, [run, run], {"step": 225.0, "substeps": 8, "integrator": "euler"})
+    assert (errors["ahead_s"] == 900.0).all()
+    shares = errors[["next_interval_persistence_rmse_share", "ahead_persistence_rmse_share"]].to_numpy()
+    assert shares[0] * critical == pytest.approx([10.0, 40.0]) and (shares[1:] == 0.0).all()
+    table = prediction_table(network, errors, 225.0)
     assert table.splitlines()[0].count("unchanged") == 2
     assert f"{100 * shares[0, 0]:.1f} %" in table.splitlines()[1]
 

@@ -147,17 +147,6 @@ def test_the_network_flows_as_the_free_numbers_do(scenario, runs, model):
         torch.testing.assert_close(mine, free.detach().double(), rtol=1e-4, atol=1e-6)
 
 
-def test_that_nothing_changes_is_a_prediction_too(scenario, runs):
-    """One vehicle more in every interval, and one run that is too short for two intervals."""
-    growing = np.zeros((5, 7, 7))
-    growing[:, 2, 4] = np.arange(5.0)
-    run = Observed(**{**vars(first_of(runs[0], 4)), "accumulation": growing})
-    shares = identification.persistence_shares(scenario.network, [run, first_of(run, 1)], (1, 2))
-    expected = np.zeros((2, 7))
-    expected[:, 2] = np.array([1.0, 2.0]) / scenario.network.critical[2]
-    np.testing.assert_allclose(shares, expected)
-
-
 @pytest.mark.parametrize("by_origin", [True, False])
 def test_what_a_fit_makes_small(scenario, runs, by_origin):
     """Errors that cancel out in their regions count by destination only; far ones linearly."""
@@ -170,12 +159,6 @@ def test_what_a_fit_makes_small(scenario, runs, by_origin):
     far = (2.0 - 0.5 * identification.OUTLIER) * 2.0  # two errors of twice the scale
     found = identification._misfit(p, [wrong, *rest], scale, scheme)
     assert found == pytest.approx(identification.BY_DESTINATION * far / 49 + (0.0 if by_origin else far / 7), rel=1e-3)
-
-
-@pytest.mark.parametrize("ahead, step, expected", [(600.0, 90.0, 7), (10.0, 90.0, 1), (90_000.0, 90.0, 120)])
-def test_intervals_within_a_time(runs, ahead, step, expected):
-    short = first_of(runs[0], 3)
-    assert identification.intervals_within(ahead, step, [*runs, short]) == expected
 
 
 def test_a_run_shorter_than_the_horizon_is_left_out(runs):

@@ -135,8 +135,8 @@ def identify(
         kept = [run for run in runs if run.seed != loading.seeds[-1] or any(run is other for other in more)]
         without = fitted(kept, samples_of(network, kept))
         unseen = [observed(run) for run in (*first, *second) if run.seed == loading.seeds[-1]]
-        text += "\n" + prediction_table(without, unseen, scheme)
         errors = predictions(without, unseen, scheme)
+        text += "\n" + prediction_table(without, errors, loaded.step)
     files.write_text(out / "fit.txt", text + "\n")
     write_fits(out / "fit.csv", fits, errors)
     _write_samples(out / "samples.csv", samples)

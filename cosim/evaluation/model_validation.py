@@ -167,7 +167,6 @@ def prediction_errors(found: Finished, model: Path | None = None) -> pd.DataFram
         for controller, rows in level.rows.groupby("controller", sort=False):
             network = parse(controller).planning(scenario, model).network
             runs = [observed(level.read(controller, seed)) for seed in rows["seed"]]
-            error = predictions(network, runs, scheme)
             columns = {
                 "demand": level.demand,
                 "controller": controller,
@@ -177,13 +176,8 @@ def prediction_errors(found: Finished, model: Path | None = None) -> pd.DataFram
                 "critical_veh": network.critical,
                 "most_share": np.max([run.accumulation.sum(axis=2).max(axis=0) for run in runs], axis=0)
                 / network.critical,
-                "next_interval_rmse_share": error.model[0],
-                "next_interval_persistence_rmse_share": error.persistence[0],
-                "ahead_s": error.ahead,
-                "ahead_rmse_share": error.model[1],
-                "ahead_persistence_rmse_share": error.persistence[1],
             }
-            tables.append(pd.DataFrame(columns))
+            tables.append(pd.DataFrame(columns).join(predictions(network, runs, scheme)))
     return pd.concat(tables, ignore_index=True)
 
 

@@ -227,25 +227,7 @@ def prediction_errors(
     return (last - data[0][:, -1]).sum(-1).numpy()
 
 
-def intervals_within(ahead: float, step: float, runs: Sequence[Observed]) -> int:
-    """Return the control intervals of `step` [s] in `ahead` [s]: at least one, at most those of the longest run."""
-    return min(max(1, round(ahead / step)), max(len(run.demand) for run in runs))
-
-
-def prediction_shares(
-    network: RegionalModel, runs: Sequence[Observed], intervals: Sequence[int], **scheme: Any
-) -> Float[np.ndarray, "L R"]:
-    """Return the RMSE of `prediction_errors` (len(intervals), R), as shares of the critical accumulation [-]."""
-    return _shares(network, [prediction_errors(network, runs, n, **scheme) for n in intervals])
-
-
-def persistence_shares(
-    network: RegionalModel, runs: Sequence[Observed], intervals: Sequence[int]
-) -> Float[np.ndarray, "L R"]:
-    """Return `prediction_shares` of the prediction that no accumulation changes."""
+def persistence_errors(runs: Sequence[Observed], intervals: int) -> Float[np.ndarray, "N R"]:
+    """Return `prediction_errors` of the prediction that no accumulation changes."""
     states = [run.accumulation.sum(axis=2) for run in runs]
-    return _shares(network, [np.concatenate([state[:-n] - state[n:] for state in states]) for n in intervals])
-
-
-def _shares(network: RegionalModel, errors: Sequence[Float[np.ndarray, "_ R"]]) -> Float[np.ndarray, "L R"]:
-    return np.sqrt([(error**2).mean(axis=0) for error in errors]) / network.critical
+    return np.concatenate([state[:-intervals] - state[intervals:] for state in states])

@@ -1,19 +1,17 @@
 """Quality of the fit of each region, and doubts about it, as tables and files."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float
 
 from nmfd.arrays import Points, StatesOverTime
 from nmfd.model import identification
 from nmfd.model.identification import Observed
 from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import files
-from nmfd.runs.tables import text_table, wrapped
+from nmfd.runs.tables import text_columns, text_table, wrapped
 
 SPILLBACK = "held up by a neighbour"  # label of samples that the region's own MFD does not explain
 SAMPLES = 10  # of a region: with fewer it keeps its MFD
@@ -32,6 +30,10 @@ MEANINGS = {  # beginning of a doubt -> meaning and remedy
     "give higher --levels",
     ALONE: "there is no held-out error; give --seeds 2 or more",
 }
+HELD_OUT = (
+    "RMSE of the accumulation in percent of the critical one, in the runs of the last seed, by a fit without them; "
+    "unchanged: of the prediction that no accumulation changes"
+)
 
 
 def region_fits(
@@ -132,65 +134,41 @@ def fit_table(network: RegionalModel, fits: pd.DataFrame, known: Mapping[str, st
             for fit in fits.itertuples(index=False)
         ]
     )
-    lines = meanings([doubt for doubts in fits["doubts"] for doubt in doubts], known)
+    doubts = [doubt for doubts in fits["doubts"] for doubt in doubts]
+    lines = [f"WARNING, {kind}: {text}" for kind, text in known.items() if any(d.startswith(kind) for d in doubts)]
     return "\n".join([table, *wrapped("\n".join(lines))])
 
 
-def meanings(doubts: Sequence[str], known: Mapping[str, str] = MEANINGS) -> list[str]:
-    """Return the meaning of each kind of doubt that occurs."""
-    return [f"WARNING, {kind}: {text}" for kind, text in known.items() if any(d.startswith(kind) for d in doubts)]
+def predictions(network: RegionalModel, runs: Sequence[Observed], scheme: dict) -> pd.DataFrame:
+    """Return the RMSE of predicted accumulations as shares of the critical ones [-], a row per region.
 
+    Columns: next_interval_rmse_share and ahead_rmse_share, of the regional model one interval and ahead_s [s] ahead;
+    next_interval_persistence_rmse_share and ahead_persistence_rmse_share, of the prediction that nothing changes.
 
-@dataclass(frozen=True, kw_only=True)
-class Predictions:
-    """RMSE of predicted accumulations as shares of the critical ones, (2, R): one interval and `ahead` [s] ahead.
-
-    model: of the regional model; persistence: of the prediction that no accumulation changes
+    scheme: step [s], substeps and integrator
     """
-
-    step: float
-    ahead: float
-    model: Float[np.ndarray, "2 R"]
-    persistence: Float[np.ndarray, "2 R"]
-
-
-def predictions(network: RegionalModel, runs: Sequence[Observed], scheme: dict) -> Predictions:
-    """Return the prediction errors of `network` in `runs`; scheme: step, substeps and integrator."""
-    intervals = 1, identification.intervals_within(AHEAD_S, scheme["step"], runs)
-    return Predictions(
-        step=scheme["step"],
-        ahead=intervals[1] * scheme["step"],
-        model=identification.prediction_shares(network, runs, intervals, **scheme),
-        persistence=identification.persistence_shares(network, runs, intervals),
-    )
+    ahead = min(max(1, round(AHEAD_S / scheme["step"])), max(len(run.demand) for run in runs))
+    columns = {}
+    for when, intervals in (("next_interval", 1), ("ahead", ahead)):
+        errors = identification.prediction_errors(network, runs, intervals, **scheme)
+        unchanged = identification.persistence_errors(runs, intervals)
+        for name, part in (("rmse_share", errors), ("persistence_rmse_share", unchanged)):
+            columns[f"{when}_{name}"] = np.sqrt((part**2).mean(axis=0)) / network.critical
+    return pd.DataFrame({**columns, "ahead_s": ahead * scheme["step"]})
 
 
-def prediction_table(network: RegionalModel, held_out: Sequence[Observed], scheme: dict) -> str:
-    """Return the RMSE of the accumulation in runs that the fit did not use, as text."""
-    errors = predictions(network, held_out, scheme)
+def prediction_table(network: RegionalModel, errors: pd.DataFrame, step: float) -> str:
+    """Return `predictions` in runs that the fit did not use, as text; step: control interval [s]."""
+    shown = errors.filter(like="rmse_share")
+    shown = pd.concat([shown, shown.mean().to_frame().T])
     names = [*(f"{region} {name}" for region, name in enumerate(network.region_names)), "mean"]
-    rows = []
-    for n, name in enumerate(names):
-        row = {"region": name}
-        for k, ahead in enumerate((errors.step, errors.ahead)):
-            for label, part in (
-                (f"{ahead:g} s ahead", errors.model[k]),
-                ("unchanged" + k * " ", errors.persistence[k]),
-            ):
-                row[label] = f"{100 * (part.mean() if name == 'mean' else part[n]):.1f} %"
-        rows.append(row)
-    return text_table(
-        rows,
-        "RMSE of the accumulation in percent of the critical one, in the runs of the last seed, by a fit without them; "
-        "unchanged: of the prediction that no accumulation changes",
-    )
+    lines = [[name, *(f"{100 * value:.1f} %" for value in row)] for name, row in zip(names, shown.values, strict=True)]
+    headings = ["region", f"{step:g} s ahead", "unchanged", f"{errors['ahead_s'][0]:g} s ahead", "unchanged"]
+    return text_columns(headings, lines, HELD_OUT)
 
 
-def write_fits(path: Path, fits: pd.DataFrame, held_out: Predictions | None) -> None:
-    """Write fit.csv, a row per region; held_out: None without held-out runs."""
+def write_fits(path: Path, fits: pd.DataFrame, held_out: pd.DataFrame | None = None) -> None:
+    """Write fit.csv, a row per region; held_out: `predictions` in runs that the fit did not use."""
     table = fits.assign(doubts=fits["doubts"].map("; ".join))
-    for part in ("model", "persistence"):
-        for n, when in enumerate(("next_interval", "ahead")):
-            table[f"held_out_{when}_{part}_rmse_share"] = getattr(held_out, part)[n] if held_out else np.nan
-    table["ahead_s"] = held_out.ahead if held_out else np.nan
+    table = table if held_out is None else table.join(held_out.add_prefix("held_out_"))
     files.write_table(path, table, float_format="%.6g")
