@@ -1,1 +1,1 @@
-"""Pictures, pages and films of finished and running simulations."""
+"""Figures and HTML report of finished runs."""

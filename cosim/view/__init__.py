@@ -1,1 +1,1 @@
-"""The city to look at, live and afterwards."""
+"""Map and curves of live and finished runs."""

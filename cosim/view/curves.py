@@ -87,7 +87,9 @@ class Curves:
             legend_label="critical",
         )
         self.plane.line("x", "y", source=self.mfd, color=colours.FAINT, line_width=2, legend_label="MFD of the model")
-        self.lines, self.past, self.present = [], [], []
+        self.lines: list[ColumnDataSource] = []
+        self.past: list[IndexFilter] = []
+        self.present: list[IndexFilter] = []
         for n, name in enumerate(names):
             self._add_run(n, name)
         for plot in (*over_time, self.plane):
@@ -111,8 +113,7 @@ class Curves:
             title.text = f"{name}: {text}"
         horizon, level = self._picture.steps * self._picture.step / MINUTE, float(self._picture.critical[region])
         self.critical.data = {"x": [0.0, horizon], "y": [level, level]}
-        x, y = np.asarray(self._picture.curves[region], np.float32).T
-        self.mfd.data = {"x": x, "y": y}
+        self.mfd.data = dict(zip("xy", np.asarray(self._picture.curves[region], np.float32).T, strict=True))
 
     def show(self, runs: Sequence[Sequence[Frame]], time: float) -> None:
         """Draw the whole frames of every run, and mark the time [s] in the MFD plane."""
