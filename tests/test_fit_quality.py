@@ -126,15 +126,14 @@ FLOW = [[0, 300, 0], [100, 0, 100], [0, 300, 0]]
             "Hardly: regions become critical, but gateways could hold no more than 10",
         ),
         ((0.5, 1.9, 0.2), (10, 600, 10), 0.06, "No: regions become critical, but gateways could hold no more than 3%"),
-        (None, None, 1.0, "Unknown: nothing was simulated"),
     ],
 )
 def test_the_verdict_has_reasons_and_numbers(network, most, started, share, answer):
-    most, started = (None if part is None else np.array(part, dtype=float) for part in (most, started))
+    most, started = np.array(most), np.array(started, dtype=float)
     found = verdict(network, crossing(FLOW, share), most=most, started=started, where="in 2 runs")
     assert found.sentences[0].startswith(f"Can perimeter control help? {answer}"), found.sentences
     text = found.text()
-    assert f"{share:.0%} of the 800 crossings in 2 runs" in text or most is None
+    assert f"{share:.0%} of the 800 crossings in 2 runs" in text
     table = text.partition("\n\n")[2].splitlines()
     assert len(table) == 1 + (crossing(FLOW, 1.0).gateways > 0).sum()
 

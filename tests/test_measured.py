@@ -87,7 +87,7 @@ def test_the_curve_that_made_the_tables_comes_back(tmp_path, made):
         assert np.abs(curve.outflow(x) - CURVE.outflow(x)).max() < 0.01 * CURVE.capacity
         assert fit.r2 > 0.99 and fit.spread < 0.02 and fit.critical_veh == pytest.approx(CURVE.critical, rel=0.03)
         assert fit.doubts == ("coverage unknown",)
-    frame = found.to_frame()
+    frame = found.intervals
     assert len(frame) == 2 * 3 * 40 and frame["reporting"].between(0.999, 1.001).all()
     assert frame["production_veh_km_h"].to_numpy() == pytest.approx(
         3.6 * TRIP * CURVE.outflow(frame["accumulation_veh"].to_numpy()), rel=1e-6
@@ -190,7 +190,6 @@ MISTAKES = {
     ),
     "no trip length": (lambda c, d: (c, d.drop(columns=["long", "lat"])), {}, "give --trip-length"),
     "too few intervals": (lambda c, d: (c[: 20 * 5], d), {}, "fewer than 10 intervals"),
-    "a name too long": (lambda c, d: (c, d), {"name": 101 * "x"}, "network.toml: name: "),
     "a trip length in km": (lambda c, d: (c, d), {"trip_length": 1.2}, "--trip-length: expected a number from 10"),
 }
 
@@ -241,7 +240,7 @@ def test_bad_rows_and_silent_detectors_are_left_out_and_counted(tmp_path, made):
     options = {**written(tmp_path, counts, detectors), "trip_length": TRIP, "skip_bad": True, "out": tmp_path / "city"}
     found = nmfd.identify(**options)
     assert "2 rows marked as errors, 2 rows with a missing or impossible number" in found.text
-    frame = found.to_frame()
+    frame = found.intervals
     assert not ((frame["region"] == "north") & (frame["interval"] == 900)).any() and frame["reporting"].min() >= 0.5
     with pytest.raises(nmfd.InputError, match="exists; choose another"):
         nmfd.identify(**options)

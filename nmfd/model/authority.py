@@ -12,7 +12,7 @@ from jaxtyping import Int, Real
 
 from nmfd.arrays import PerPair, PerRegion
 from nmfd.model.regional_model import RegionalModel
-from nmfd.runs.tables import text_table
+from nmfd.runs.tables import text_columns
 
 ENOUGH = 0.25  # share of the filling vehicles that can be held: control may help
 NOTHING = 0.05  # or less: control does not help
@@ -68,78 +68,67 @@ class Verdict:
     def text(self) -> str:
         """Return the sentences and a table of the boundaries."""
         each = self.boundaries
-        rows = [
-            {
-                "from": i,
-                "to": h,
-                "flow [veh]": f"{each.flow[i, h]:.0f}",
-                "controlled [veh]": f"{each.controlled[i, h]:.0f}",
-                "share": f"{each.shares[i, h]:.0%}",
-                "gateways": each.gateways[i, h],
-                "with signals": each.controllable[i, h],
-            }
-            for i, h in np.argwhere(each.gateways > 0)
-        ]
-        return "\n".join([*self.sentences, "", text_table(rows)]) + "\n"
+        pairs = np.argwhere(each.gateways > 0)
+        columns = {
+            "flow [veh]": [f"{each.flow[i, h]:.0f}" for i, h in pairs],
+            "controlled [veh]": [f"{each.controlled[i, h]:.0f}" for i, h in pairs],
+            "share": [f"{each.shares[i, h]:.0%}" for i, h in pairs],
+            "gateways": each.gateways[*pairs.T],
+            "with signals": each.controllable[*pairs.T],
+        }
+        table = text_columns(["from", "to", *columns], zip(*pairs.T, *columns.values(), strict=True))
+        return "\n".join([*self.sentences, "", table]) + "\n"
 
 
 def verdict(
-    network: RegionalModel, boundaries: Boundaries, *, most: PerRegion | None, started: PerRegion | None, where: str
+    network: RegionalModel, boundaries: Boundaries, *, most: PerRegion, started: PerRegion, where: str
 ) -> Verdict:
     """Return the verdict.
 
-    most: (R,) [-], highest accumulation over the critical one, in any run; started: (R,) [veh], departures by region;
-    both None without a simulation; where: the runs, such as "in 6 loading runs"
+    most: (R,) [-], highest accumulation over the critical one, in any run; started: (R,) [veh], departures by region
+    where: the runs, such as "in 6 loading runs"
     """
-    names = [
-        f"region {region}" if name == str(region) else f"{region} {name}"
-        for region, name in enumerate(network.region_names)
+    names = [f"region {n}" if name == str(n) else f"{n} {name}" for n, name in enumerate(network.region_names)]
+    flow = boundaries.flow.sum()
+    passed = (
+        f"; {boundaries.controlled.sum() / flow:.0%} of the {flow:,.0f} crossings {where} passed one" if flow else ""
+    )
+    ratios = ", ".join(f"{name} {ratio:.2f}" for name, ratio in zip(names, most, strict=True))
+    details = [
+        f"Of {boundaries.gateways.sum()} gateways {boundaries.controllable.sum()} have a signal that perimeter control "
+        f"can use{passed}.",
+        f"Highest accumulation {where}, as a multiple of the critical one: {ratios}.",
     ]
-    flow, controlled = float(boundaries.flow.sum()), float(boundaries.controlled.sum())
-    passed = f"; {controlled / max(flow, 1e-9):.0%} of the {flow:,.0f} crossings {where} passed one" if flow else ""
-    usable, gateways = boundaries.controllable.sum(), boundaries.gateways.sum()
-    details = [f"Of {gateways} gateways {usable} have a signal that perimeter control can use{passed}."]
-    if most is not None:
-        ratios = ", ".join(f"{name} {ratio:.2f}" for name, ratio in zip(names, most, strict=True))
-        details.append(f"Highest accumulation {where}, as a multiple of the critical one: {ratios}.")
     if network.placeholder:
         details.append("The critical accumulations are guesses from lanes and speed limits until cosim identify.")
     elif any(network.doubts):
         doubtful = ", ".join(name for name, doubts in zip(names, network.doubts, strict=True) if doubts)
         details.append(f"The fit is doubtful in {doubtful}: see its warnings.")
-    answer = _answer(names, boundaries, most, started, details)
-    return Verdict(sentences=(f"Can perimeter control help? {answer}", *details), boundaries=boundaries)
-
-
-def _answer(
-    names: list[str], boundaries: Boundaries, most: PerRegion | None, started: PerRegion | None, details: list[str]
-) -> str:
-    """Return the answer; add sentences on critical regions to `details`."""
+    critical, nearest = np.flatnonzero(most >= 1.0), int(np.argmax(most))
+    came, held = boundaries.flow.sum(axis=0), boundaries.controlled.sum(axis=0)
+    holdable = held / np.maximum(came + started, 1.0)
     if not boundaries.controllable.any():
-        return f"No: {NO_GATEWAY}."
-    if most is None or started is None:
-        return "Unknown: nothing was simulated; run cosim identify."
-    if not boundaries.flow.any():
-        return "No: no vehicle crosses a boundary."
-    critical = np.flatnonzero(most >= 1.0)
-    if not len(critical):
-        nearest = int(np.argmax(most))
-        return (
+        answer = f"No: {NO_GATEWAY}."
+    elif not flow:
+        answer = "No: no vehicle crosses a boundary."
+    elif not len(critical):
+        answer = (
             f"No: no region is ever critical, {names[nearest]} comes nearest with {most[nearest]:.2f} of its critical "
             "accumulation; more demand may change that."
         )
-    came, held = boundaries.flow.sum(axis=0), boundaries.controlled.sum(axis=0)
-    holdable = held / np.maximum(came + started, 1.0)
-    for r in critical:
-        details.append(
+    else:
+        details += [
             f"{names[r]} becomes critical: {came[r]:,.0f} vehicles entered from other regions, "
             f"{held[r] / max(came[r], 1.0):.0%} of them past a signal under control, and {started[r]:,.0f} started in "
             f"it; {holdable[r]:.0%} of all could be held."
-        )
-    best = int(critical[np.argmax(holdable[critical])])
-    share = f"gateways could hold no more than {holdable[best]:.0%} of what fills {names[best]}"
-    if holdable[best] <= NOTHING:
-        return f"No: regions become critical, but {share}; try other regions."
-    if holdable[best] < ENOUGH:
-        return f"Hardly: regions become critical, but {share}."
-    return f"It may: {names[best]} becomes critical, and {share.replace('no more than ', '')}."
+            for r in critical
+        ]
+        best = int(critical[np.argmax(holdable[critical])])
+        share = f"{holdable[best]:.0%} of what fills {names[best]}"
+        if holdable[best] <= NOTHING:
+            answer = f"No: regions become critical, but gateways could hold no more than {share}; try other regions."
+        elif holdable[best] < ENOUGH:
+            answer = f"Hardly: regions become critical, but gateways could hold no more than {share}."
+        else:
+            answer = f"It may: {names[best]} becomes critical, and gateways could hold {share}."
+    return Verdict(sentences=(f"Can perimeter control help? {answer}", *details), boundaries=boundaries)

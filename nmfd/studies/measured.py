@@ -25,6 +25,8 @@ from nmfd.runs.tables import wrapped
 from nmfd.studies import fit_quality, plots
 
 U_MIN, U_MAX = 0.1, 0.9  # bounds of the control
+VEHICLE_LENGTH_M = 6.5  # of a vehicle and a loop together
+LEAST_REPORTING = 0.5  # share of a region's detectors, by lane-kilometres, that must report in an interval
 STOP_LINE_KM = 0.03  # before a junction, where queues stand
 FAR = 3.0  # times the median distance between neighbouring detectors: no boundary lies between
 LEAST_COVERAGE, BIASED_SHARE, LEAST_DAYS = 0.3, 0.5, 3
@@ -53,24 +55,15 @@ UNKNOWN_PARTS = (
 class Identified:
     """Identified network and the data behind it.
 
-    samples: by region, "loading" and "unloading" -> (n, 2) of accumulation [veh] and outflow [veh/s]
-    fits: a row per region (fit_quality.region_fits)
-    intervals: a row per region, day and interval; text: report
+    fits: a row per region (fit_quality.region_fits); text: report
+    intervals: a row per region, day and interval, with density_veh_km, flow_veh_h (per lane), reporting (share of the
+        monitored lane-km), accumulation_veh, production_veh_km_h and outflow_veh_s
     """
 
     network: RegionalModel
-    samples: tuple[dict[str, Points], ...]
     fits: pd.DataFrame
     intervals: pd.DataFrame
     text: str
-
-    def to_frame(self) -> pd.DataFrame:
-        """Return a row per region, day and interval.
-
-        Columns: density_veh_km, flow_veh_h (per lane), reporting (share of the monitored lane-km), accumulation_veh,
-        production_veh_km_h, outflow_veh_s.
-        """
-        return self.intervals
 
 
 def identify(
@@ -83,66 +76,51 @@ def identify(
     adjacency: Path | str | None = None,
     city: str | None = None,
     skip_bad: bool = False,
-    vehicle_length: float = 6.5,
     trip_length: float | None = None,
-    least_share: float = 0.5,
-    name: str | None = None,
-    force: bool = False,
 ) -> Identified:
     """Fit an MFD to each region; write network.toml, mfd.png, samples.csv, fit.csv and identify.txt.
 
         identified = nmfd.identify("counts.csv", detectors="detectors.csv", trip_length=1500.0, out="networks/mine")
-        print(identified.text), identified.network.mfds, identified.to_frame()
+        print(identified.text), identified.network.mfds, identified.intervals
 
     counts, detectors, regions, about: tables (nmfd.model.detector_tables)
-    out: folder of the network
+    out: folder of the network, whose name it gets
     adjacency: csv file region,neighbour, or a network.toml of the same regions; None: by the detectors' positions
     city: of several in the tables
     skip_bad: leave out rows with missing or impossible numbers
-    vehicle_length: length of a vehicle and a loop together [m]
     trip_length: mean trip length within a region [m]; None: assumed from the size of the region
-    least_share: share of a region's detectors, by lane-kilometres, that must report in an interval [-]
-    name: of the network; None: that of the folder
-    force: replace a network.toml
 
     Raises InputError, before anything is written.
     """
     out, counts = Path(out), Path(counts)
     paths = [None if file is None else Path(file) for file in (detectors, regions, about, adjacency)]
-    for key, value, low, high in (
-        ("--vehicle-length", vehicle_length, 1.0, 50.0),
-        ("--trip-length", trip_length, 10.0, 1e5),
-        ("--least-share", least_share, 0.0, 1.0),
-    ):
-        if value is not None and not low <= value <= high:
-            raise InputError(f"{key}: {config.got(f'a number from {low:g} to {high:g}', value)}")
-    if (out / "network.toml").exists() and not force:
-        raise InputError(f"{out / 'network.toml'}: exists; choose another --out, or replace it with --force")
+    if trip_length is not None and not 10.0 <= trip_length <= 1e5:
+        raise InputError(f"--trip-length: {config.got('a number from 10 to 100000', trip_length)}")
+    if (out / "network.toml").exists():
+        raise InputError(f"{out / 'network.toml'}: exists; choose another --out")
     rows, left = detector_tables.read_counts(counts, city=city, skip_bad=skip_bad)
     stations = detector_tables.read_detectors(paths[0], paths[1], rows, counts, city=city)
     base = _base_network(paths[3], stations)
     names = _sorted(set(stations["region"])) if base is None else list(base.region_names)
     table = detector_tables.read_about(paths[2], names)
-    lane_km, coverage = _lane_km(stations, table, names, paths[2] or counts)
-    trip_km, assumed = _trip_lengths(stations, table, names, trip_length)
-    intervals = _intervals(rows, stations, vehicle_length, least_share)
+    lane_km, coverage = _lane_km(stations, table, paths[2] or counts)
+    trip_km, assumed = _trip_lengths(stations, table, trip_length)
+    intervals = _intervals(rows, stations)
+    number = intervals["region"].map(names.index)
     for column, per_lane in (("accumulation_veh", "density_veh_km"), ("production_veh_km_h", "flow_veh_h")):
-        intervals[column] = intervals[per_lane] * intervals["region"].map(dict(zip(names, lane_km, strict=True)))
-    per_trip = intervals["region"].map(dict(zip(names, trip_km, strict=True)))
-    intervals["outflow_veh_s"] = intervals["production_veh_km_h"] / per_trip / 3600.0
-    _check_units(intervals, counts, vehicle_length)
-    samples = tuple(_cloud(intervals[intervals["region"] == region]) for region in names)
-    for region, cloud in zip(names, samples, strict=True):
-        if len(fit_quality.own_points(cloud)) < fit_quality.SAMPLES:
-            raise InputError(
-                f"{counts}: region {region} was measured in fewer than {fit_quality.SAMPLES} intervals with "
-                f"{100 * least_share:g} % of its detectors reporting; give more data, a lower --least-share, or join "
-                "it to another region"
-            )
+        intervals[column] = intervals[per_lane] * lane_km[number]
+    intervals["outflow_veh_s"] = intervals["production_veh_km_h"] / trip_km[number] / 3600.0
+    _check_units(intervals, counts)
+    samples = [_cloud(intervals[intervals["region"] == region]) for region in names]
+    for region in fit_quality.nearly_empty(samples):
+        raise InputError(
+            f"{counts}: region {names[region]} was measured in fewer than {fit_quality.SAMPLES} intervals with "
+            f"{100 * LEAST_REPORTING:g} % of its detectors reporting; give more data, or join it to another region"
+        )
     network = base or RegionalModel(
         name="",
         region_names=tuple(names),
-        positions=_positions(stations, table, names),
+        positions=_positions(stations, table),
         u_min=U_MIN,
         u_max=U_MAX,
         mfds=(),
@@ -150,7 +128,7 @@ def identify(
     )
     network = replace(
         network,
-        name=name or out.absolute().name,
+        name=out.absolute().name,
         exit_rates=None,
         capacity=None,
         storage=None,
@@ -183,33 +161,33 @@ def identify(
     out.mkdir(parents=True, exist_ok=True)
     plots.draw_mfds(out / "mfd.png", network, samples)
     files.write_table(out / "samples.csv", intervals, float_format="%.6g")
-    fit_quality.write_fits(out / "fit.csv", fits, None)
+    fit_quality.write_fits(out / "fit.csv", fits)
     files.write_text(out / "identify.txt", report + "\n")
     files.write_text(out / "network.toml", text)
-    return Identified(network=network, samples=samples, fits=fits, intervals=intervals, text=report)
+    return Identified(network=network, fits=fits, intervals=intervals, text=report)
 
 
-def _intervals(rows: pd.DataFrame, detectors: pd.DataFrame, vehicle_length: float, least_share: float) -> pd.DataFrame:
+def _intervals(rows: pd.DataFrame, detectors: pd.DataFrame) -> pd.DataFrame:
     """Return density_veh_km, flow_veh_h (per lane) and reporting [-] by region, day and interval."""
     weights = detectors["lane_km"].fillna(1.0)
     rows = rows.assign(region=rows["detid"].map(detectors["region"]), weight=rows["detid"].map(weights))
     rows = rows.assign(flow=rows["flow"] * rows["weight"], occ=rows["occ"] * rows["weight"])
     table = rows.groupby(["region", "day", "interval"])[["flow", "occ", "weight"]].sum().reset_index()
     table["reporting"] = table["weight"] / table["region"].map(weights.groupby(detectors["region"]).sum())
-    table["density_veh_km"] = table["occ"] / table["weight"] * 1000.0 / vehicle_length
+    table["density_veh_km"] = table["occ"] / table["weight"] * 1000.0 / VEHICLE_LENGTH_M
     table["flow_veh_h"] = table["flow"] / table["weight"]
-    table = table[table["reporting"] >= least_share].sort_values(["region", "day", "interval"], ignore_index=True)
+    table = table[table["reporting"] >= LEAST_REPORTING].sort_values(["region", "day", "interval"], ignore_index=True)
     return table[["region", "day", "interval", "density_veh_km", "flow_veh_h", "reporting"]]
 
 
-def _check_units(intervals: pd.DataFrame, path: Path, vehicle_length: float) -> None:
+def _check_units(intervals: pd.DataFrame, path: Path) -> None:
     """Raise InputError if flow and occupancy give an implausible speed."""
     total = intervals[["production_veh_km_h", "accumulation_veh"]].sum()
     speed, (low, high) = total.iloc[0] / max(total.iloc[1], 1e-9) / 3.6, detector_tables.SPEEDS_M_S
     if not low <= speed <= high:
         raise InputError(
-            f"{path}: flow and occ give a mean speed of {speed:.3g} m/s, with {vehicle_length:g} m for a vehicle over "
-            "a loop; expected flow in veh/h per lane, not per interval, and occ as a share, not percent"
+            f"{path}: flow and occ give a mean speed of {speed:.3g} m/s, with {VEHICLE_LENGTH_M:g} m for a vehicle "
+            "over a loop; expected flow in veh/h per lane, not per interval, and occ as a share, not percent"
         )
 
 
@@ -239,47 +217,45 @@ def _base_network(path: Path | None, detectors: pd.DataFrame) -> RegionalModel |
     return network
 
 
-def _positions(detectors: pd.DataFrame, about: pd.DataFrame, regions: Sequence[str]) -> np.ndarray:
+def _positions(detectors: pd.DataFrame, about: pd.DataFrame) -> np.ndarray:
     """Return (R, 2) [m]: given, or the middle of the detectors; on a circle if neither is known."""
-    middle = detectors.groupby("region")[["x_m", "y_m"]].mean().reindex(list(regions)).to_numpy()
+    middle = detectors.groupby("region")[["x_m", "y_m"]].mean().reindex(about.index).to_numpy()
     places = np.where(np.isnan(about[["x", "y"]].to_numpy()), middle, about[["x", "y"]].to_numpy())
-    angle = 2.0 * np.pi * np.arange(len(regions)) / len(regions)
+    angle = 2.0 * np.pi * np.arange(len(about)) / len(about)
     return places if not np.isnan(places).any() else 1000.0 * np.stack([np.sin(angle), np.cos(angle)], axis=1)
 
 
-def _lane_km(
-    detectors: pd.DataFrame, about: pd.DataFrame, regions: Sequence[str], where: Path
-) -> tuple[np.ndarray, np.ndarray]:
+def _lane_km(detectors: pd.DataFrame, about: pd.DataFrame, where: Path) -> tuple[np.ndarray, np.ndarray]:
     """Return lane-kilometres (R,) and the share of them with detectors (R,), NaN where unknown."""
-    covered = detectors["lane_km"].groupby(detectors["region"]).sum(min_count=1).reindex(list(regions)).to_numpy()
+    covered = detectors["lane_km"].groupby(detectors["region"]).sum(min_count=1).reindex(about.index).to_numpy()
     total = about["lane_km"].to_numpy()
     if (unknown := np.isnan(covered) & np.isnan(total)).any():
         raise InputError(
-            f"{where}: the lane-kilometres of region {regions[int(unknown.argmax())]} are unknown; give the length of "
+            f"{where}: the lane-kilometres of region {about.index[unknown][0]} are unknown; give the length of "
             "the detectors' links with --detectors, or lane_km of every region with --about"
         )
     if (covered > 1.05 * total).any():
         n = int(np.nanargmax(covered / total))
         raise InputError(
-            f"{where}: region {regions[n]}: lane_km: {total[n]:g} is less than the {covered[n]:.4g} km of its "
+            f"{where}: region {about.index[n]}: lane_km: {total[n]:g} is less than the {covered[n]:.4g} km of its "
             "detectors; correct it, or length and lanes in the detectors' table"
         )
     return np.where(np.isnan(total), covered, total), covered / total
 
 
 def _trip_lengths(
-    detectors: pd.DataFrame, about: pd.DataFrame, regions: Sequence[str], trip_length: float | None
+    detectors: pd.DataFrame, about: pd.DataFrame, trip_length: float | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return mean trip lengths within the regions (R,) [km], and which are assumed (R,)."""
     lengths = about["trip_length"].fillna(np.nan if trip_length is None else trip_length).to_numpy(dtype=float) / 1000.0
     assumed = np.isnan(lengths)
     for n in np.flatnonzero(assumed):
-        points = detectors.loc[detectors["region"] == regions[n], ["x_m", "y_m"]].dropna().to_numpy()
+        points = detectors.loc[detectors["region"] == about.index[n], ["x_m", "y_m"]].dropna().to_numpy()
         try:
             lengths[n] = 2.0 / 3.0 * np.sqrt(ConvexHull(points).volume) / 1000.0  # volume of a plane hull: its area
         except (QhullError, ValueError):
             raise InputError(
-                f"region {regions[n]}: the mean trip length is unknown and cannot be assumed without positions; "
+                f"region {about.index[n]}: the mean trip length is unknown and cannot be assumed without positions; "
                 "give --trip-length METRES, or a column trip_length with --about"
             ) from None
     return lengths, assumed
