@@ -250,7 +250,7 @@ def test_bounded_moves_what_correlates():
 
 def readings(known, *, mean=40.0, expansion=0.1, crossings=9.0, x=25.0, probes=10.0, leaving=2.0):
     """Expectations and variances of the readings of one kind each, where all regions and boundaries are alike."""
-    model = estimation._Model(planning_model(SCENARIO), known)
+    model = Estimator(planning_model(SCENARIO), known)
     z = np.zeros(model._size)
     z[model._expansion], z[model._x], z[model._mean] = expansion, x, mean
     z[model._crossings], z[model._probes], z[model._departures] = crossings, probes, 3.0
@@ -283,8 +283,8 @@ def test_the_noise_of_every_kind_of_reading():
 def test_a_detector_is_stuck_at_its_third_same_reading():
     """Two may be chance, and an empty street shows 0 for ever."""
     taken, model = [], Estimator(planning_model(SCENARIO), equipped())
-    advance = model._model.advance
-    model._model.advance = lambda belief, demand, perimeter, splits, observation, loops: (
+    advance = model._advanced
+    model._advanced = lambda belief, demand, perimeter, splits, observation, loops: (
         taken.append(loops[:3].tolist()) or advance(belief, demand, perimeter, splits, observation, loops)
     )
     for first in (7.0, 7.0, 7.0, 7.0, 8.0):

@@ -96,46 +96,15 @@ class Belief:
 
 
 class Estimator:
-    """Filter along one run: call `step` once per control interval."""
-
-    def __init__(self, planning: PlanningModel, instruments: Instruments):
-        self._planning, self._instruments = planning, instruments
-        self._model = _Model(planning, instruments)
-        self.reset()
-
-    def reset(self) -> None:
-        """Return to an empty network."""
-        self._k, self._seen = 0, list[np.ndarray]()
-        self.belief = self._model.empty()
-
-    @property
-    def accumulation(self) -> PerPair:
-        """Estimate of x_ij (R, R) [veh]."""
-        regions = self._planning.network.regions
-        return self.belief.mean[3 * regions :].reshape(regions, regions).copy()
-
-    def step(self, controls: Controls, readings: Readings) -> PerPair:
-        """Return the estimate (R, R) [veh] at the end of the interval under `controls`."""
-        demand = self._planning.forecast[min(self._k, self._planning.steps - 1)]
-        splits = self._planning.network.nominal_splits if controls.splits is None else controls.splits
-        # A detector with three identical readings is stuck.
-        self._seen = [*self._seen[-2:], readings.accumulation]
-        stuck = np.ptp(self._seen, axis=0) == 0 if len(self._seen) == 3 else np.zeros(len(demand), dtype=bool)
-        loops = np.where(stuck & (readings.accumulation > 0), np.nan, readings.accumulation)
-        self.belief = self._model.advance(self.belief, demand, controls.perimeter, splits, readings, loops)
-        self._k += 1
-        return self.accumulation
-
-
-class _Model:
-    """Prediction and update, in torch, whose threads can be limited.
+    """Filter along one run: call `step` once per control interval.
 
     Z = (3 relative errors, x | mean accumulations (R,), crossings (E,), probes (R^2,), departures of probes (R^2,)):
-    state at the end of an interval and readings, jointly Gaussian. E: the boundaries (i, h).
+    state at the end of an interval and readings, jointly Gaussian. E: the boundaries (i, h). Prediction and update are
+    in torch, whose threads can be limited.
     """
 
     def __init__(self, planning: PlanningModel, instruments: Instruments):
-        network, self._instruments = planning.network, instruments
+        network, self._planning, self._instruments = planning.network, planning, instruments
         self._step, self._substeps = planning.step, planning.substeps
         self._parameters, self._probe_share = dynamics.parameters(network), instruments.probe_share
         regions = self._regions = network.regions
@@ -150,27 +119,48 @@ class _Model:
             slice(int(end - size), int(end)) for end, size in zip(ends, sizes, strict=True)
         )
         self._states, self._size = int(ends[2]), int(ends[-1])
-        self._spread = torch.from_numpy(
-            np.concatenate(
-                [np.full(regions, OUTFLOW_ERROR), np.full(regions, DEMAND_ERROR), instruments.detector_error]
-            )
-        )
+        errors = np.full(regions, OUTFLOW_ERROR), np.full(regions, DEMAND_ERROR), instruments.detector_error
+        self._spread = torch.from_numpy(np.concatenate(errors))
         memory = torch.tensor([MEMORY, MEMORY, EXPANSION_MEMORY], dtype=torch.float64)
         self._kept = torch.exp(-self._step / memory).repeat_interleave(regions)
         kept = np.exp(-self._step / MEMORY)
         self._lasting = float((1.0 + kept) / (1.0 - kept))  # variance of white over lasting noise
         self._turns = np.argwhere(network.split_mask)
-        self._from = torch.from_numpy(
-            np.concatenate(
-                [  # cell of each event but departures
-                    self._turns[:, 0] * regions + self._turns[:, 2],
-                    np.arange(regions) * (regions + 1),
-                ]
-            )
-        )
+        # Cell of each event but departures.
+        left = self._turns[:, 0] * regions + self._turns[:, 2], np.arange(regions) * (regions + 1)
+        self._from = torch.from_numpy(np.concatenate(left))
         vehicle, probe = (torch.from_numpy(part) for part in self._effects())
         self._pairs = [_pairs(vehicle, vehicle), _pairs(vehicle, probe), _pairs(probe, probe)]
         self._half = vehicle[cells : cells + regions]
+        self.reset()
+
+    def reset(self) -> None:
+        """Return to an empty network."""
+        self._k, self._seen = 0, list[np.ndarray]()
+        variance = torch.cat([self._spread**2, torch.full((self._cells,), FLOOR, dtype=torch.float64)])
+        self.belief = Belief(
+            mean=np.zeros(self._states),
+            covariance=torch.diag(variance).numpy(),
+            probes=np.zeros((self._regions, self._regions)),
+            surprise=np.nan,
+        )
+
+    @property
+    def accumulation(self) -> PerPair:
+        """Estimate of x_ij (R, R) [veh]."""
+        return self.belief.mean[self._x].reshape(self._regions, self._regions).copy()
+
+    def step(self, controls: Controls, readings: Readings) -> PerPair:
+        """Return the estimate (R, R) [veh] at the end of the interval under `controls`."""
+        demand = self._planning.forecast[min(self._k, self._planning.steps - 1)]
+        splits = self._planning.network.nominal_splits if controls.splits is None else controls.splits
+        # A detector with three identical readings is stuck.
+        self._seen = [*self._seen[-2:], readings.accumulation]
+        stuck = np.ptp(self._seen, axis=0) == 0 if len(self._seen) == 3 else np.zeros(len(demand), dtype=bool)
+        loops = np.where(stuck & (readings.accumulation > 0), np.nan, readings.accumulation)
+        self.belief = self._advanced(self.belief, demand, controls.perimeter, splits, readings, loops)
+        self._k += 1
+        return self.accumulation
 
     def _effects(self) -> tuple[np.ndarray, np.ndarray]:
         """Return changes per event (rows, events) of (x | mean accumulations, crossings), and of (probes, departures).
@@ -192,17 +182,7 @@ class _Model:
         half = 0.5 * place.reshape(regions, regions, -1).sum(axis=1)
         return np.concatenate([place, half, crossing]), np.concatenate([place, departure])
 
-    def empty(self) -> Belief:
-        """Return the belief of an empty network."""
-        mean, variance = np.zeros(self._states), torch.full((self._cells,), FLOOR, dtype=torch.float64)
-        return Belief(
-            mean=mean,
-            covariance=torch.diag(torch.cat([self._spread**2, variance])).numpy(),
-            probes=np.zeros((self._regions, self._regions)),
-            surprise=np.nan,
-        )
-
-    def advance(
+    def _advanced(
         self, belief: Belief, demand: PerPair, perimeter: PerPair, splits: PerTurn, readings: Readings, loops: PerRegion
     ) -> Belief:
         """Return the belief one control interval later; loops: (R,) [veh], valid detector readings."""
@@ -246,9 +226,8 @@ class _Model:
         jacobian[errors:, inputs] = (outputs[1:] - outputs[0]).T / DIFFERENCE
         covariance = jacobian @ torch.from_numpy(belief.covariance) @ jacobian.T
         covariance.diagonal()[:errors] += (1.0 - self._kept**2) * self._spread**2
-        leaving = torch.zeros(self._cells, dtype=torch.float64).index_add_(
-            0, self._from, moves[: len(self._from)]
-        )  # the turns and ends of trips
+        leaving = torch.zeros(self._cells, dtype=torch.float64)
+        leaving.index_add_(0, self._from, moves[: len(self._from)])  # turns and ends of trips
         covariance[errors:, errors:] += self._flow_noise(belief, moves, of_probes, leaving)
         return torch.cat([self._kept * mean[:errors], outputs[0]]).numpy(), covariance, leaving.numpy()
 
@@ -323,29 +302,22 @@ class _Model:
         here, to = self._boundaries.T
         mean, expansion, counts = z[self._mean], z[self._expansion], z[self._crossings]
         share = np.maximum(instruments.detector_share, 1e-6)
-        boundary, gateways = (
-            np.maximum(part[here, to], low)
-            for part, low in ((instruments.counted_share, 1e-6), (instruments.counted_gateways, 1))
-        )
+        boundary = np.maximum(instruments.counted_share[here, to], 1e-6)
+        gateways = np.maximum(instruments.counted_gateways[here, to], 1)
         cells, p = np.full(self._cells, FLOOR), self._probe_share
         there = np.maximum(z[self._x], 1.0)
         kept = np.minimum(np.exp(-leaving / there), np.exp(-self._step / MEMORY))
         thinning = p * (1.0 - p) * there * (1.0 + kept) / (1.0 - kept) + FLOOR
+        # The lasting part of the error of the detectors is a state.
+        loops_noise = np.maximum(mean, 1.0) * (1.0 - share) / share + (instruments.detector_noise * mean) ** 2 + FLOOR
+        uncounted = np.maximum(counts, 1.0) / boundary + COUNT_ERROR**2 * counts**2 / gateways
+        probes = readings.probes.ravel()
         parts = (
-            # the lasting part of the error is a state
-            (
-                loops,
-                (1.0 + expansion) * mean,
-                np.maximum(mean, 1.0) * (1.0 - share) / share + (instruments.detector_noise * mean) ** 2 + FLOOR,
-            ),
-            (
-                readings.crossings[here, to],
-                counts,
-                (1.0 - boundary) * (np.maximum(counts, 1.0) / boundary + COUNT_ERROR**2 * counts**2 / gateways) + FLOOR,
-            ),
-            (readings.probes.ravel(), z[self._probes], cells),
+            (loops, (1.0 + expansion) * mean, loops_noise),
+            (readings.crossings[here, to], counts, (1.0 - boundary) * uncounted + FLOOR),
+            (probes, z[self._probes], cells),
             (readings.probe_departures.ravel(), z[self._departures], cells),
-            (0.0 * readings.probes.ravel(), z[self._probes] - self._probe_share * z[self._x], thinning),
+            (0.0 * probes, z[self._probes] - p * z[self._x], thinning),
         )
         return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
 
