@@ -164,7 +164,7 @@ def test_another_key_does_a_run_again(tmp_path, capsys):
     run_many([run_of("a", calls=calls), run_of("b", calls=calls)], tmp_path / "out", workers=0)
     run_many([run_of("a", calls=calls, policy="q"), run_of("b", calls=calls)], tmp_path / "out", workers=0)
     assert calls == [("a", 0), ("b", 0), ("a", 0)]
-    assert "a-0.nc: done again, controller changed" in capsys.readouterr().err
+    assert "a-0.nc: out of date, controller changed" in capsys.readouterr().err
     rows = run_many([run_of("a", calls=calls, scenario="other")], tmp_path / "out", workers=0)
     assert len(calls) == 4 and list(rows["controller"]) == ["a"]  # b is of another scenario
 

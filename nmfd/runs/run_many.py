@@ -62,7 +62,7 @@ class Run:
 
     @property
     def file(self) -> str:
-        """Return the path of its file below the folder of all runs."""
+        """Path of its file below the folder of all runs."""
         return f"{self.folder}/{self.name}.nc" if self.folder else f"{self.name}.nc"
 
 
@@ -93,12 +93,8 @@ def run_many(
     """
     out = Path(out)
     with _locked(out):
-        keys = {run.file: json.loads(json.dumps(run.key)) for run in runs}
-        shared = _write_manifest(out, runs, workers)
-        rows: dict[str, dict] = {}
-        for file in [*keys, *_other_files(out, shared, keys)]:
-            if (row := _finished_row(out, file, keys.get(file), shared)) is not None:
-                rows[file] = row
+        keys = _write_manifest(out, runs, workers)
+        rows = {file: _row(file, result) for file, key in keys.items() if (result := _finished(out / file, key))}
         todo = [run for run in runs if run.file not in rows]
         try:
             with watched("runs", progress) as show:
@@ -117,7 +113,7 @@ def run_many(
                 f"finished runs are in {out}; the same command with --out {out} continues"
             ) from None
         finally:
-            table = _table(rows, keys)
+            table = _table([rows[file] for file in keys if file in rows])
             write_table(out / TABLE, table)
     return table
 
@@ -149,11 +145,9 @@ def _outcomes(
         return
     if scheduler is not None:
         with _dask(scheduler) as executor:
-            futures = {executor.submit(_alone, run.job, os.getcwd(), time_limit): run for run in todo}
-            yield from _ended(futures)
+            yield from _ended({executor.submit(_alone, run.job, os.getcwd(), time_limit): run for run in todo})
     elif workers == 0:
-        for run in todo:
-            yield run, attempt(run.job)
+        yield from ((run, attempt(run.job)) for run in todo)
     else:
         pool = _pool(min(workers, len(todo)), fresh)
         try:
@@ -213,18 +207,17 @@ def _dask(address: str) -> Iterator[Executor]:
 @contextmanager
 def _locked(out: Path) -> Iterator[None]:
     """Make the folder, and hold it against other processes. Raises InputError."""
+    remedy = "choose another folder with --out"
     if out.exists() and not out.is_dir():
-        raise InputError(f"{out}: is a file; choose another folder with --out")
-    if out.is_dir() and not (out / MANIFEST).is_file() and {path.name for path in out.iterdir()} - {LOCK}:
-        raise InputError(f"{out}: is not empty and holds no {MANIFEST}; choose another folder with --out")
+        raise InputError(f"{out}: is a file; {remedy}")
     out.mkdir(parents=True, exist_ok=True)
+    if not (out / MANIFEST).is_file() and {path.name for path in out.iterdir()} - {LOCK}:
+        raise InputError(f"{out}: is not empty and holds no {MANIFEST}; {remedy}")
     try:
         with FileLock(out / LOCK, timeout=0):
             yield
     except Timeout:
-        raise InputError(
-            f"{out}: another process is writing to it; wait for its end, or choose another folder with --out"
-        ) from None
+        raise InputError(f"{out}: another process is writing to it; wait for its end, or {remedy}") from None
 
 
 def read_manifest(folder: Path) -> dict:
@@ -238,71 +231,58 @@ def read_manifest(folder: Path) -> dict:
 
 
 def _write_manifest(out: Path, runs: Sequence[Run], workers: int) -> dict[str, dict]:
-    """Add the keys of `runs` and this session to the manifest; return folder -> what all runs there share."""
+    """Add `runs` and this session to the manifest; return file -> key of these runs, then of others in the folders."""
     manifest = read_manifest(out) if (out / MANIFEST).is_file() else {"folders": {}, "sessions": []}
     folders = manifest["folders"]
     for run in runs:
-        shared = {name: value for name, value in run.key.items() if name != "controller"}
-        shared = json.loads(json.dumps(shared))
-        if folders.get(run.folder, {}).get("key") != shared:
-            folders[run.folder] = {"key": shared, "controllers": {}}
-        folders[run.folder]["controllers"][_controller_and_seed(run.file)[0]] = run.key.get("controller")
-    seeds = sorted({_controller_and_seed(run.file)[1] for run in runs})
+        key = json.loads(json.dumps(run.key))
+        own = key.pop("controller", None)
+        if folders.get(run.folder, {}).get("key") != key:
+            folders[run.folder] = {"key": key, "controllers": {}}
+        folders[run.folder]["controllers"][_place(run.file)[1]] = own
+    seeds = sorted({_place(run.file)[2] for run in runs})
     manifest["sessions"].append({**provenance(), "seeds": seeds, "workers": workers})
     write_text(out / MANIFEST, json.dumps(manifest, indent=2) + "\n")
-    return {folder: content["key"] for folder, content in folders.items()}
+    there = [path.relative_to(out).as_posix() for name in folders for path in sorted((out / name).glob("[!.]*-*.nc"))]
+    keys = {}
+    for file in (*(run.file for run in runs), *there):
+        folder, controller, _ = _place(file)
+        if controller in folders[folder]["controllers"]:
+            keys[file] = {**folders[folder]["key"], "controller": folders[folder]["controllers"][controller]}
+    return keys
 
 
-def _other_files(out: Path, shared: Mapping[str, dict], keys: Mapping[str, dict]) -> list[str]:
-    """Return the files of runs that are not asked for."""
-    there = (
-        f"{folder}/{p.name}" if folder else p.name for folder in shared for p in sorted((out / folder).glob("[!.]*.nc"))
-    )
-    return [file for file in there if file not in keys]
-
-
-def _finished_row(out: Path, file: str, key: Mapping | None, shared: Mapping[str, dict]) -> dict | None:
-    """Return the row of a finished run; None if there is none, or its key is another one."""
-    if not (out / file).is_file():
-        return None
+def _finished(path: Path, key: Mapping) -> Result | None:
+    """Return the result in `path`; None if there is none, or its key is another one."""
     try:
-        result = Result.read(out / file)
+        result = Result.read(path)
         kept = json.loads(result.key)
-    except (InputError, AttributeError, ValueError):  # cut off, or not of this package
+    except (InputError, AttributeError, ValueError):  # missing, cut off, or not of this package
         return None
-    if key is None:
-        same = {name: value for name, value in kept.items() if name != "controller"} == shared[_folder(file)]
-        return _row(file, result) if same else None
-    if kept != key:
-        changed = ", ".join(sorted(name for name in {**kept, **key} if kept.get(name) != key.get(name)))
-        print(f"{out / file}: done again, {changed} changed", file=sys.stderr)
+    if changed := sorted(name for name in {**kept, **key} if kept.get(name) != key.get(name)):
+        print(f"{path}: out of date, {', '.join(changed)} changed", file=sys.stderr)
         return None
-    return _row(file, result)
+    return result
 
 
 def _row(file: str, outcome: Result | str) -> dict:
-    controller, seed = _controller_and_seed(file)
-    row = {"folder": _folder(file), "controller": controller, "seed": seed}
+    row = dict(zip(("folder", "controller", "seed"), _place(file), strict=True))
     return {**row, "failure": outcome} if isinstance(outcome, str) else {**row, **summary(outcome), "failure": ""}
 
 
-def _folder(file: str) -> str:
-    return file.rpartition("/")[0]
+def _place(file: str) -> tuple[str, str, int]:
+    """Return folder, controller and seed of the file of a run."""
+    folder, _, name = file.rpartition("/")
+    controller, _, seed = name.removesuffix(".nc").rpartition("-")
+    return folder, unquote(controller), int(seed)
 
 
-def _controller_and_seed(file: str) -> tuple[str, int]:
-    controller, _, seed = file.rpartition("/")[2].removesuffix(".nc").rpartition("-")
-    return unquote(controller), int(seed)
-
-
-def _table(rows: Mapping[str, dict], keys: Mapping[str, dict]) -> "pd.DataFrame":
-    """Return the rows as a table: the runs asked for, then the others."""
+def _table(rows: Sequence[dict]) -> "pd.DataFrame":
     import pandas as pd
 
     if not rows:
         return pd.DataFrame(columns=["controller", "seed", "failure"])
-    files = [*(file for file in keys if file in rows), *(file for file in rows if file not in keys)]
-    table = pd.DataFrame([rows[file] for file in files])
+    table = pd.DataFrame(rows)
     table.insert(len(table.columns) - 1, "failure", table.pop("failure"))
     return table if any(table["folder"]) else table.drop(columns="folder")
 
