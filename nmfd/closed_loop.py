@@ -25,21 +25,29 @@ def run(
     """Drive `plant` with `controller` for `scenario.steps` control intervals.
 
     The controller gets the estimate of the plant's own instruments, or, without any, every x_ij with Gaussian noise of
-    `scenario.measurement_std`, drawn from `seed`; the result has both this and the exact state. Observations and
-    controls are copied: a controller may write into either. The faults of the scenario are injected (nmfd.faults). The
-    status of a decision tells of a faulty observation, a command that the plant could not execute, and a decision after
-    the control interval or the controller's `deadline` (s).
+    `scenario.measurement_std`, drawn from `seed`, with the faults of the scenario (nmfd.faults). Observations and
+    controls are copied: a controller may write into either. A decision is late after the control interval or the
+    controller's own `deadline` (s).
 
     progress: is called with the intervals done and `scenario.steps` after every interval
     """
     network = scenario.network
     opened = np.where(network.adjacency, network.u_max, 0.0)
     controller.reset(seed)
-    sensors = _Sensors(scenario, seed)
+    sensors, random = faults.Sensors(scenario.ordered_faults), noise_of(seed)
+
+    def observe() -> tuple[Observation, str]:
+        noise = scenario.measurement_std * random.standard_normal(opened.shape)
+        estimate = plant.observe()
+        return sensors.see(noisy(states[-1], noise) if estimate is None else estimate)
+
     states, controls, decision_time = [plant.reset(seed)], [], []
-    observed, problem = sensors.observe(states[-1], plant.observe())
+    observed, problem = observe()
     observations = [observed]
-    begin, deadline = time.perf_counter(), _deadline(controller, scenario.step)
+    begin, deadline = time.perf_counter(), scenario.step
+    own = getattr(controller, "deadline", None)
+    if isinstance(own, int | float) and own > 0:
+        deadline = min(own, deadline)
     for k in range(scenario.steps):
         given = observed.copy()
         before = time.perf_counter()
@@ -51,7 +59,7 @@ def run(
         states.append(plant.step(command))
         fault = states[-1].problem
         controls.append(_with_status(command, Status.PLANT_FAULT, fault) if fault else command)
-        observed, problem = sensors.observe(states[-1], plant.observe())
+        observed, problem = observe()
         observations.append(observed)
         if progress:
             progress(k + 1, scenario.steps)
@@ -61,7 +69,7 @@ def run(
             "plant": type(plant).__name__,
             "seed": seed,
             "step": scenario.step,
-            "estimated": int(sensors.estimated),
+            "estimated": int(plant.observe() is not None),
             "wall_time": time.perf_counter() - begin,
         },
         accumulation=np.stack([s.accumulation for s in states]),
@@ -79,21 +87,6 @@ def run(
     )
 
 
-class _Sensors:
-    """Sensors between the state and the controller: instruments or noise, and their faults."""
-
-    def __init__(self, scenario: Scenario, seed: int):
-        self._faulty = faults.Sensors(scenario.ordered_faults)
-        self._std, self._random = scenario.measurement_std, noise_of(seed)
-        self.estimated = False
-
-    def observe(self, state: State, estimate: Observation | None) -> tuple[Observation, str]:
-        """Return the observation and its problem, "" if none. estimate: of the plant's own instruments."""
-        noise = self._std * self._random.standard_normal(state.accumulation.shape)
-        self.estimated = estimate is not None
-        return self._faulty.see(noisy(state, noise) if estimate is None else estimate)
-
-
 def noise_of(seed: int) -> np.random.Generator:
     """Return the random generator of the measurement noise of a run."""
     return np.random.default_rng([seed, 0x6E6F6973])
@@ -102,12 +95,6 @@ def noise_of(seed: int) -> np.random.Generator:
 def noisy(state: State, noise: PerPair) -> Observation:
     """Return the measurement of the state with `noise` (R, R) [veh] on the accumulation."""
     return Observation(step=state.step, time=state.time, accumulation=state.accumulation + noise, backlog=state.backlog)
-
-
-def _deadline(controller: Controller, step: float) -> float:
-    """Return the decision deadline (s): the controller's own, capped at the control interval."""
-    own = getattr(controller, "deadline", None)
-    return min(own, step) if isinstance(own, int | float) and own > 0 else step
 
 
 def _copied(controls: Controls) -> Controls:
@@ -119,5 +106,4 @@ def _copied(controls: Controls) -> Controls:
 
 
 def _with_status(controls: Controls, status: Status, note: str) -> Controls:
-    """Return the controls with another status and note."""
     return replace(controls, status=controls.status | status, note="; ".join(filter(None, (controls.note, note))))

@@ -39,9 +39,8 @@ SUMMARY: dict[str, str] = {
 def total_time_spent(result: Result) -> float:
     """Return the total time spent [veh s].
 
-    dt * sum over k = 0 .. T-1 of all vehicles: running, waiting to enter, and removed before. It is the objective of
-    Tumu et al., with vehicles that wait outside; the final state does not count. A removed vehicle counts until the end
-    of the horizon, so that a trip that is not made never counts less than one that is.
+    dt * sum over k = 0 .. T-1 of all vehicles, the objective of Tumu et al., with vehicles that wait outside. A removed
+    vehicle counts until the end of the horizon, so that a trip that is not made never counts less than one that is.
 
         >>> run = nmfd.run("economic_mpc", "no-control", steps=2)
         >>> bool(total_time_spent(run) == run.step * run.accumulation[:2].sum())  # no vehicle waits or was removed
@@ -82,11 +81,6 @@ def decisions(result: Result, kind: Status) -> int:
     return int(((result.status & kind.value) != 0).sum())
 
 
-def late_decisions(result: Result) -> int:
-    """Return the number of decisions after the end of the control interval or their own deadline."""
-    return int(((result.decision_time > result.step) | (result.status & Status.LATE.value != 0)).sum())
-
-
 def notes(result: Result, most: int = 3) -> str:
     """Return the `most` frequent notes of decisions that were not OK, such as "2 x solver failed: ..."."""
     counted = Counter(note for note, status in zip(result.note, result.status, strict=True) if status)
@@ -94,12 +88,10 @@ def notes(result: Result, most: int = 3) -> str:
 
 
 def summary(result: Result) -> dict[str, float | int | str]:
-    """Return one row of a table of runs: column, with its unit in the name -> value.
+    """Return one row of a table of runs: the figures of merit (SUMMARY) and all scalar facts of the run.
 
-    The figures of merit (SUMMARY), and all scalar facts of the run.
-
-        >>> round(summary(nmfd.run("economic_mpc", "no-control", steps=20))["max_accumulation_veh"])
-        12558
+    >>> round(summary(nmfd.run("economic_mpc", "no-control", steps=20))["max_accumulation_veh"])
+    12558
     """
     facts = {name: value for name, value in result.data.attrs.items() if name not in NO_COLUMNS}
     if "accumulation" not in result:
@@ -117,7 +109,7 @@ def summary(result: Result) -> dict[str, float | int | str]:
         "control_step_ms_max": float(decision_ms.max()),
         "solver_failures": decisions(result, Status.SOLVER_FAILURE),
         "fallbacks": decisions(result, Status.FALLBACK),
-        "late_decisions": late_decisions(result),
+        "late_decisions": decisions(result, Status.LATE),
         "sensor_faults": decisions(result, Status.SENSOR_FAULT),
         "plant_faults": decisions(result, Status.PLANT_FAULT),
         "wall_time_s": float(result.wall_time),

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Flag
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
@@ -85,9 +85,7 @@ class Observation:
 
     def copy(self) -> "Observation":
         """Return a copy with its own arrays."""
-        return Observation(
-            step=self.step, time=self.time, accumulation=self.accumulation.copy(), backlog=self.backlog.copy()
-        )
+        return replace(self, accumulation=self.accumulation.copy(), backlog=self.backlog.copy())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,19 +143,17 @@ class Controller(Protocol):
 
 
 class Quantity(NamedTuple):
-    """Named axes, unit ("" of texts) and meaning of a variable of a Result; attributes: more of them."""
+    """Named axes, unit ("" of texts) and meaning of a variable of a Result."""
 
     dimensions: tuple[str, ...]
     unit: str
     text: str
-    attributes: Mapping[str, Any] = {}
 
     def variable(self, values: Any) -> tuple:
         """Return `values` as xarray.Dataset takes them: dimensions, array and attributes."""
         array = np.asarray(values)
         array = array.astype(object) if array.dtype.kind == "U" else array  # as netCDF returns texts
-        units = {"units": self.unit} if self.unit else {}
-        return self.dimensions, array, {"long_name": self.text, **units, **self.attributes}
+        return self.dimensions, array, {"long_name": self.text} | ({"units": self.unit} if self.unit else {})
 
 
 def _apart(function: Callable, *arguments: Any, **options: Any) -> Any:
@@ -166,35 +162,19 @@ def _apart(function: Callable, *arguments: Any, **options: Any) -> Any:
         return thread.submit(function, *arguments, **options).result()
 
 
+_PAIRS = ("time", "region", "destination")
+_TURNS = ("interval", "region", "next_region", "destination")
 VARIABLES: dict[str, Quantity] = {
-    "accumulation": Quantity(("time", "region", "destination"), "veh", "vehicles inside"),
-    "backlog": Quantity(("time", "region", "destination"), "veh", "vehicles waiting to enter"),
+    "accumulation": Quantity(_PAIRS, "veh", "vehicles inside"),
+    "backlog": Quantity(_PAIRS, "veh", "vehicles waiting to enter"),
     "completed": Quantity(("time",), "veh", "completed trips, cumulative"),
-    "removed": Quantity(("time", "region", "destination"), "veh", "vehicles removed on their way, cumulative"),
-    "observed": Quantity(("time", "region", "destination"), "veh", "vehicles inside as observed by the controller"),
-    "observed_backlog": Quantity(
-        ("time", "region", "destination"), "veh", "vehicles waiting to enter as observed by the controller"
-    ),
-    "perimeter": Quantity(
-        ("interval", "region", "next_region"),
-        "1",
-        "share of the desired transfer flow that may pass; 0 if not adjacent",
-    ),
-    "splits": Quantity(
-        ("interval", "region", "next_region", "destination"),
-        "1",
-        "share of the vehicles that heads for the next region; nominal without route guidance",
-    ),
+    "removed": Quantity(_PAIRS, "veh", "vehicles removed on their way, cumulative"),
+    "observed": Quantity(_PAIRS, "veh", "vehicles inside as observed by the controller"),
+    "observed_backlog": Quantity(_PAIRS, "veh", "vehicles waiting to enter as observed by the controller"),
+    "perimeter": Quantity(_TURNS[:3], "1", "share of the desired transfer flow that may pass; 0 if not adjacent"),
+    "splits": Quantity(_TURNS, "1", "share of vehicles that heads for the next region; nominal without guidance"),
     "prices": Quantity(("interval", "region"), "1", "added share of the travel time through the region"),
-    "status": Quantity(
-        ("interval",),
-        "1",
-        "status of the decision, 0 if OK (nmfd.types.Status)",
-        {
-            "flag_masks": np.array([kind.value for kind in Status]),
-            "flag_meanings": " ".join(str(kind.name).lower() for kind in Status),
-        },
-    ),
+    "status": Quantity(("interval",), "1", "status of the decision, 0 if OK (nmfd.types.Status)"),
     "note": Quantity(("interval",), "", "the status in words"),
     "decision_time": Quantity(("interval",), "s", "wall time of Controller.act"),
 }
@@ -217,14 +197,9 @@ class Result:
 
     @classmethod
     def make(cls, attrs: Mapping[str, Any], **arrays: Any) -> "Result":
-        """Return the result of a closed loop with these `attrs` and the arrays of VARIABLES.
-
-        `removed` and `prices` default to zeros.
-        """
+        """Return the result of a closed loop with these `attrs` and the arrays of VARIABLES."""
         import xarray  # half a second, which few commands need
 
-        arrays.setdefault("removed", np.zeros_like(arrays["backlog"]))
-        arrays.setdefault("prices", np.zeros(arrays["perimeter"].shape[:2]))
         times = attrs["step"] * np.arange(len(arrays["accumulation"]))
         coordinates = {
             "time": ("time", times, {"long_name": "time since the start", "units": "s"}),
@@ -246,13 +221,10 @@ class Result:
             data = _apart(xarray.load_dataset, path, engine="netcdf4", decode_times=False, mask_and_scale=False)
         except FileNotFoundError:
             raise InputError(f"{path}: no such run") from None
-        except (OSError, RuntimeError, ValueError, KeyError, AttributeError, TypeError) as error:
-            raise InputError(
-                f"{path}: is no run ({str(error).partition(chr(10))[0]}); delete it and run again"
-            ) from None
-        data.attrs = {
-            name: value.item() if isinstance(value, np.generic) else value for name, value in data.attrs.items()
-        }
+        except Exception as error:
+            reason = str(error).partition("\n")[0]
+            raise InputError(f"{path}: is no run ({reason}); delete it and run again") from None
+        data.attrs = {name: v.item() if isinstance(v, np.generic) else v for name, v in data.attrs.items()}
         return cls(data)
 
     def write(self, path: Path | str) -> None:
@@ -282,11 +254,10 @@ class Result:
         if name.startswith("__") or name == "data":
             raise AttributeError(name)
         if name in self.data.variables:
-            return self.data.variables[name].values
-        try:
+            return self[name]
+        if name in self.data.attrs:
             return self.data.attrs[name]
-        except KeyError:
-            raise AttributeError(f"result without variable or attribute {name!r}") from None
+        raise AttributeError(f"result without variable or attribute {name!r}")
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Return the array of a variable."""
@@ -306,13 +277,9 @@ class Result:
                 data.attrs[name] = value
         return Result(data)
 
-    def add(
-        self, attrs: Mapping[str, Any], about: Mapping[str, Quantity] | None = None, **arrays: np.ndarray
-    ) -> "Result":
+    def add(self, attrs: Mapping[str, Any], about: Mapping[str, Quantity] = {}, **arrays: np.ndarray) -> "Result":
         """Return the result with more attributes, and the `arrays` that are described in `about`."""
-        variables = {
-            name: quantity.variable(arrays[name]) for name, quantity in (about or {}).items() if name in arrays
-        }
+        variables = {name: quantity.variable(arrays[name]) for name, quantity in about.items() if name in arrays}
         return Result(self.data.assign(variables).assign_attrs(attrs))
 
     def without_times(self) -> "xarray.Dataset":
@@ -324,27 +291,18 @@ class Result:
     def to_frame(self) -> "pandas.DataFrame":
         """Return the states as a table: one row per time and pair of regions, (T+1) R R rows.
 
-        Columns controller, plant, seed; time_s; region, destination (x_ij: in region i, bound for j);
-        accumulation_veh; backlog_veh (waiting to enter region i).
-
-            >>> table = nmfd.run("economic_mpc", "no-control", steps=2).to_frame()
-            >>> table.columns.tolist()[3:]
-            ['time_s', 'region', 'destination', 'accumulation_veh', 'backlog_veh']
-            >>> len(table) == 3 * 7 * 7
-            True
+        >>> table = nmfd.run("economic_mpc", "no-control", steps=2).to_frame()
+        >>> table.columns.tolist()[3:]
+        ['time_s', 'region', 'destination', 'accumulation_veh', 'backlog_veh']
         """
         return self._table({"time": "time_s", "accumulation": "accumulation_veh", "backlog": "backlog_veh"})
 
     def controls_frame(self) -> "pandas.DataFrame":
-        """Return the perimeter controls as a table: one row per interval and pair of regions, T R R rows.
-
-        Columns controller, plant, seed; time_s, the beginning of the interval; region, next_region (u_ih: from i to h);
-        perimeter [-]; 0 between regions that are not adjacent.
-        """
+        """Return the perimeter controls as a table: one row per interval and pair of regions, T R R rows."""
         return self._table({"interval": "time_s", "perimeter": "perimeter"})
 
     def _table(self, columns: dict[str, str]) -> "pandas.DataFrame":
-        rows = self.data[[name for name in columns if name in self.data.data_vars]].to_dataframe().reset_index()
+        rows = self.data[list(columns)].to_dataframe().reset_index()
         for place, name in enumerate(("controller", "plant", "seed")):
             rows.insert(place, name, self.data.attrs[name])
         return rows.rename(columns=columns)

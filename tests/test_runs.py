@@ -60,7 +60,6 @@ def test_xarray_opens_a_run_with_names_and_units(tmp_path):
         for name, values in data.variables.items():
             assert values.attrs["long_name"] and ("units" in values.attrs or name == "note"), name
         assert list(data["status"].values) == [0, 0, 0, 3]  # a solver failure and a fallback
-        assert data["status"].attrs["flag_meanings"] == "solver_failure fallback sensor_fault plant_fault late"
         assert list(data["time"].values) == [0.0, 30.0, 60.0, 90.0, 120.0] and data["time"].attrs["units"] == "s"
         assert float(data["accumulation"].sel(time=60.0, region=1, destination=0)) == original.accumulation[2, 1, 0]
 

@@ -101,6 +101,8 @@ def made(**fields) -> Result:
     usual = {
         "observed": fields["accumulation"],
         "observed_backlog": fields["backlog"],
+        "removed": np.zeros_like(fields["backlog"]),
+        "prices": np.zeros(fields["perimeter"].shape[:2]),
         "estimated": False,
         "decision_time": np.zeros(steps),
         "status": np.zeros(steps, dtype=int),

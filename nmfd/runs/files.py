@@ -4,7 +4,7 @@ import hashlib
 import os
 import re
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
@@ -54,19 +54,6 @@ def write_table(path: Path, frame: "pd.DataFrame", **options: str) -> None:
     write_text(path, frame.to_csv(index=False, **options))
 
 
-def read_table(path: Path, types: Mapping[str, type], remedy: str) -> "pd.DataFrame":
-    """Read a csv file of `write_table`; types: of some columns. Raises InputError, which ends with the `remedy`."""
-    import pandas as pd  # heavy
-
-    check_file(path, remedy)
-    try:
-        return pd.read_csv(path).astype(types)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; {remedy}") from None
-    except (OSError, ValueError, KeyError) as error:  # pandas' own errors are ValueErrors
-        raise InputError(f"{path}: is no table of runs ({error}); {remedy}") from None
-
-
 def check_file(path: Path, remedy: str = "give a file") -> None:
     """Raise InputError for a folder, pipe or device, which would be read for ever; a missing file is none of these."""
     if os.path.exists(path) and not os.path.isfile(path):
@@ -100,5 +87,5 @@ def run_name(controller: str, seed: int) -> str:
 def default_folder(scenario: str) -> Path:
     """Return runs/<scenario>-<timestamp> in the current folder, a name that is not taken; scenario: its name."""
     stem = f"{file_name(scenario)}-{datetime.now():%Y%m%d-%H%M%S}"
-    candidates = (Path("runs") / (stem + (f"-{n}" if n > 1 else "")) for n in range(1, 1000))
-    return next(folder for folder in candidates if not folder.exists())
+    names = (stem, *(f"{stem}-{n}" for n in range(2, 1000)))
+    return next(Path("runs", name) for name in names if not Path("runs", name).exists())
