@@ -237,7 +237,6 @@ def bound(
     out: plan file, SCENARIO/NAME.npz if None
     iterations: Adam steps
     """
-    bound_study.check(controller)
     scenario = _loaded(scenario)
     file = _file(scenario, f"{controller}.npz", out)
     with watched(controller, progress) as show:

@@ -61,7 +61,7 @@ def test_lists_that_are_none(listed, given, expected):
 
 
 def test_a_pattern_stands_for_what_has_a_policy(tmp_path, monkeypatch):
-    monkeypatch.setattr("nmfd.studies.benchmark.draw", lambda *given: None)
+    monkeypatch.setattr("nmfd.studies.plots.save", lambda *given: None)
     folder = tiny.write(tmp_path)
     scenario = nmfd.load_scenario(folder)
     names = [one.name for one in strategy.ready(scenario)]
@@ -77,7 +77,7 @@ def test_a_pattern_stands_for_what_has_a_policy(tmp_path, monkeypatch):
 
 
 def test_a_benchmark_of_one_name_is_a_table(tmp_path, monkeypatch):
-    monkeypatch.setattr("nmfd.studies.benchmark.draw", lambda *given: None)
+    monkeypatch.setattr("nmfd.studies.plots.save", lambda *given: None)
     rows = nmfd.benchmark(tiny.write(tmp_path), "no-control", seeds=2, out=tmp_path / "out")
     assert list(rows["seed"]) == [0, 1] and set(rows["failure"]) == {""}
     assert "no-control" in summary_table(rows) and "TTS [veh s]" in summary_table(rows)

@@ -4,18 +4,17 @@ It shares no array with the scenario, so that a controller cannot change the pla
 """
 
 import copy
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool
 
-from nmfd.arrays import PairsOverTime, PerPair
+from nmfd.arrays import PairsOverTime
 from nmfd.errors import InputError
 from nmfd.model.regional_model import RegionalModel, check_step, load_network
-from nmfd.model.scenario import Scenario
+from nmfd.model.scenario import Horizon, Scenario
 from nmfd.runs import config
 from nmfd.runs.config import Problem, Settings, Text, setting
 
@@ -24,45 +23,19 @@ GUIDING = ("mpc-pcrg", "dpc-pcrg")  # prefixes of the controllers that plan with
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlanningModel:
-    """Regional model, forecast and options that a controller, filter or supervisor has before a run.
+class PlanningModel(Horizon):
+    """What a controller, filter or supervisor has before a run; the city may follow another network, or none.
 
-    name: of the scenario
-    network: regional model; the city may follow another one, or none
-    step: control interval (s)
-    steps: T
     forecast: demand from i to j in interval k (veh/s, (T, R, R) [k, i, j])
-    measurement_std: standard deviation of the noise on every observed x_ij (veh)
-    integrator, substeps: of the regional model
-    protected: regions that gating protects
-    controller_options: controller name -> its table in [controllers]
-    initial: vehicles in i bound for j at the start (veh, (R, R)); None for an empty city
-    folder: of the scenario, or None
     """
 
-    name: str
-    network: RegionalModel
-    step: float
-    steps: int
     forecast: PairsOverTime
-    measurement_std: float = 0.0
-    integrator: str = "euler"
-    substeps: int = 1
-    protected: tuple[int, ...] = ()
-    controller_options: Mapping[str, dict] = field(default_factory=dict)
-    initial: PerPair | None = None
-    folder: Path | None = None
 
     @property
     def destinations(self) -> Bool[np.ndarray, " R"]:
         """Regions that are the destination of any trip, (R,)."""
         vehicles = self.forecast.sum(axis=(0, 1))
         return (vehicles if self.initial is None else vehicles + self.initial.sum(axis=0)) > 0
-
-    @property
-    def where(self) -> str:
-        """File that error messages name."""
-        return "scenario.toml" if self.folder is None else str(self.folder / "scenario.toml")
 
 
 class Options(Settings):
@@ -113,21 +86,13 @@ def planning_model(scenario: Scenario, controller: str = "", table: str = "") ->
     elif controller.startswith(GUIDING) and (folder := guided_model(scenario.network)) is not None:
         network = other_model(scenario, folder)
     else:
-        network = copy.deepcopy(scenario.network)
-    return PlanningModel(
-        name=scenario.name,
-        network=network,
-        step=scenario.step,
-        steps=scenario.steps,
-        forecast=scenario.forecast.copy(),
-        measurement_std=scenario.measurement_std,
-        integrator=scenario.integrator,
-        substeps=scenario.substeps,
-        protected=scenario.protected,
-        initial=copy.copy(scenario.initial),
-        folder=scenario.folder,
-        controller_options=copy.deepcopy({**tables, controller: merged} if controller else dict(tables)),
-    )
+        network = scenario.network
+    shared = {
+        part.name: copy.deepcopy(getattr(scenario, part.name)) for part in fields(Horizon) if part.name != "network"
+    }
+    if controller:
+        shared["controller_options"][controller] = copy.deepcopy(merged)
+    return PlanningModel(**shared, network=copy.deepcopy(network), forecast=scenario.forecast.copy())
 
 
 def other_model(scenario: Scenario, folder: Path, where: str = "") -> RegionalModel:

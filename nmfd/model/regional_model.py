@@ -218,11 +218,9 @@ class NetworkTable(Settings):
         count = len(self.regions)
         for i, row in enumerate(self.regions):
             where = f"regions[{i}]"
-            if max(row.adjacent, default=0) >= count:
-                allowed = f"a list of distinct whole numbers from 0 to {count - 1}"
+            if max(row.adjacent, default=0) >= count or i in row.adjacent:
+                allowed = f"a list of distinct whole numbers from 0 to {count - 1} without {i}, the region itself"
                 raise Problem(f"{where}.adjacent", got(allowed, list(row.adjacent)))
-            if i in row.adjacent:
-                raise Problem(f"{where}.adjacent", f"region {i} is listed as adjacent to itself; remove it")
             if row.mfd is None and self.mfd is None:
                 raise Problem(f"{where}.mfd", "missing; add a table [regions.mfd], or [mfd] for all regions")
             if (row.storage is None) != (row.capacity is None):
@@ -235,11 +233,9 @@ class NetworkTable(Settings):
                 if (values := getattr(row, key)) is not None and len(values) != length:
                     raise Problem(f"{where}.{key}", got(f"a list of {length} numbers", list(values)))
             for destination, shares in row.observed_split_ratios.items():
-                if destination not in map(str, range(count)):
-                    allowed = f"destination regions from 0 to {count - 1}"
-                    raise Problem(f"{where}.observed_split_ratios", got(allowed, destination))
-                if not set(shares) <= set(map(str, row.adjacent)) or abs(sum(shares.values()) - 1.0) > 1e-3:
-                    allowed = f"shares of some of the adjacent regions {list(row.adjacent)} with sum 1"
+                known = destination in map(str, range(count)) and set(shares) <= set(map(str, row.adjacent))
+                if not known or abs(sum(shares.values()) - 1.0) > 1e-3:
+                    allowed = f"destination = {{ one of {list(row.adjacent)} = share, ... }} with sum 1"
                     raise Problem(f"{where}.observed_split_ratios.{destination}", got(allowed, shares))
         return self
 

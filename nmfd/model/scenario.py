@@ -23,25 +23,22 @@ from nmfd.runs.config import Name, Numbers, Problem, Regions, Rows, Settings, Te
 LONGEST_STEP_S = 86_400.0
 MOST_STEPS = 10**6
 MOST_FLOW_VEH_S = 1e6
+COPIED = ("name", "step", "steps", "measurement_std", "integrator", "substeps", "protected")  # from file to scenario
+COPIED += ("demand_factor", "forecast_error", "faults", "sumo")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scenario:
-    """T control intervals on a network.
+class Horizon:
+    """Network, control intervals and options, which a scenario shares with the planning models of its controllers.
 
+    name: of the scenario
     step: control interval [s]
     steps: T
-    demand: (T, R, R) [veh/s], [k, i, j]: vehicles that start in i bound for j during interval k
     measurement_std: standard deviation of the Gaussian noise on each observed x_ij [veh]
-    integrator: "euler" or "rk4", of the regional model
-    substeps: integration steps of the regional model per control interval
+    integrator, substeps: "euler" or "rk4", and its steps per control interval, of the regional model
     protected: regions that gating protects
     controller_options: controller -> its table in [controllers], checked by that controller
-    demand_factor: factor already applied to the demand, for a city with vehicles of its own
-    forecast_error: standard deviation of the logarithm of forecast over demand [-]
-    faults: injected into every run (nmfd.faults)
     initial: (R, R) [veh], [i, j]: vehicles in i bound for j at the start; None: empty
-    sumo: table [sumo], checked by cosim
     folder: of scenario.toml, or None
     """
 
@@ -49,18 +46,36 @@ class Scenario:
     network: RegionalModel
     step: float
     steps: int
-    demand: PairsOverTime
     measurement_std: float = 0.0
     integrator: str = "euler"
     substeps: int = 1
     protected: tuple[int, ...] = ()
     controller_options: Mapping[str, dict] = field(default_factory=dict)
+    initial: PerPair | None = None
+    folder: Path | None = None
+
+    @property
+    def where(self) -> str:
+        """File that error messages name."""
+        return "scenario.toml" if self.folder is None else str(self.folder / "scenario.toml")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scenario(Horizon):
+    """T control intervals of a simulated network.
+
+    demand: (T, R, R) [veh/s], [k, i, j]: vehicles that start in i bound for j during interval k
+    demand_factor: factor already applied to the demand, for a city with vehicles of its own
+    forecast_error: standard deviation of the logarithm of forecast over demand [-]
+    faults: injected into every run (nmfd.faults)
+    sumo: table [sumo], checked by cosim
+    """
+
+    demand: PairsOverTime
     demand_factor: float = 1.0
     forecast_error: float = 0.0
     faults: tuple[str, ...] = ()
-    initial: PerPair | None = None
     sumo: Mapping[str, Any] = field(default_factory=dict)
-    folder: Path | None = None
 
     @property
     def start(self) -> PerPair:
@@ -83,16 +98,8 @@ class Scenario:
     @cached_property
     def hash(self) -> str:
         """Hash of all that a run depends on, whatever the names of its files."""
-        content = [
-            self.network.hash,
-            self.step,
-            self.steps,
-            self.measurement_std,
-            self.integrator,
-            self.substeps,
-            self.protected,
-            self.controller_options,
-        ]
+        content = [self.network.hash, self.step, self.steps, self.measurement_std, self.integrator, self.substeps]
+        content += [self.protected, self.controller_options]
         content += [[self.forecast_error, 0]] if self.forecast_error else []
         content += [self.faults] if self.faults else []
         content += [self.initial.tolist()] if self.initial is not None else []
@@ -102,8 +109,7 @@ class Scenario:
     @cached_property
     def ordered_faults(self) -> tuple[Fault, ...]:
         """`faults`, parsed. Raises InputError."""
-        where = "scenario.toml" if self.folder is None else self.folder / "scenario.toml"
-        return tuple(parse(text, f"{where}: faults", self.network.regions) for text in self.faults)
+        return tuple(parse(text, f"{self.where}: faults", self.network.regions) for text in self.faults)
 
 
 def with_demand(scenario: Scenario, *, steps: int | None = None, factor: float = 1.0) -> Scenario:
@@ -199,21 +205,11 @@ def read_scenario(folder: Path | str, settings: Mapping[str, Any] | None = None)
     network = load_network(folder / table.network)
     check_step(network, table.step / table.substeps, str(path))
     scenario = Scenario(
-        name=table.name,
+        **{key: getattr(table, key) for key in COPIED},
         network=network,
-        step=table.step,
-        steps=table.steps,
         demand=table.demand_factor * _demand(table, network, folder),
-        measurement_std=table.measurement_std,
-        integrator=table.integrator,
-        substeps=table.substeps,
-        protected=table.protected,
         controller_options=table.controllers,
-        demand_factor=table.demand_factor,
-        forecast_error=table.forecast_error,
-        faults=table.faults,
         initial=np.array(table.initial) if table.initial else None,
-        sumo=table.sumo,
         folder=folder,
     )
     if max(table.protected, default=0) >= network.regions:

@@ -26,12 +26,6 @@ LEARNING_RATE = 0.15  # of Adam, on logits; decays along a cosine
 INSIDE = 0.02  # distance of starts from the edge of the admissible set, where the gradient is zero
 
 
-def check(name: str) -> None:
-    """Raise InputError unless `name` is a bound."""
-    if name not in NAMES:
-        raise InputError(f"--controller: {name!r} is no bound; choose one of {', '.join(NAMES)}")
-
-
 def compute(
     scenario: Scenario,
     name: str,
@@ -44,21 +38,20 @@ def compute(
 
     starts: strategies of these closed loops; default PI gating and the scenario's own policies
     """
-    check(name)
+    if name not in NAMES:
+        raise InputError(f"--controller: {name!r} is no bound; choose one of {', '.join(NAMES)}")
     guidance, network, steps = NAMES[name], scenario.network, scenario.steps
     begin = neutral_starts(network, steps, guidance=guidance)
-    for strategy in _usual_starts(scenario, guidance) if starts is None else starts:
+    if starts is None:
+        policies = ["dpc-pc", "dpc-pcrg"] if guidance else ["dpc-pc"]
+        trained = [policy for policy in policies if scenario.folder and (scenario.folder / f"{policy}.pt").is_file()]
+        starts = [parse(start) for start in [*(["pi-gating"] if scenario.protected else []), *trained]]
+    for strategy in starts:
         if progress:
             progress(0, steps, f"closed loop {strategy.name}")
         result = closed_loop.run(NmfdPlant(scenario), strategy.make(scenario), scenario, seed=0)
         begin[strategy.name] = result.perimeter, result.splits
     return solve(scenario, begin, guidance=guidance, iterations=iterations, progress=progress)
-
-
-def _usual_starts(scenario: Scenario, guidance: bool) -> list[Strategy]:
-    names = ["dpc-pc", "dpc-pcrg"] if guidance else ["dpc-pc"]
-    trained = [name for name in names if scenario.folder and (scenario.folder / f"{name}.pt").is_file()]
-    return [parse(name) for name in [*(["pi-gating"] if scenario.protected else []), *trained]]
 
 
 def neutral_starts(network: RegionalModel, steps: int, *, guidance: bool) -> dict[str, tuple]:
@@ -83,7 +76,6 @@ def solve(
     *,
     guidance: bool,
     iterations: int = ITERATIONS,
-    learning_rate: float = LEARNING_RATE,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> Plan:
     """Return the best plan by separate descents from `starts`: name -> perimeter (T, R, R) and splits (T, R, R, R).
@@ -94,14 +86,14 @@ def solve(
     parameters = dynamics.parameters(network)
     demand = torch.from_numpy(scenario.demand)
     controls = _Controls(network, scenario.steps, starts.values(), guidance=guidance)
-    optimizer = torch.optim.Adam(controls.logits, lr=learning_rate)
+    optimizer = torch.optim.Adam(controls.logits, lr=LEARNING_RATE)
     best = np.full(len(starts), math.inf)
     kept: list[tuple] = [()] * len(starts)
     iteration = 0
     try:
         for iteration in range(iterations + 1):  # the last only evaluates
             for group in optimizer.param_groups:
-                group["lr"] = learning_rate * 0.5 * (1.0 + math.cos(math.pi * iteration / (iterations + 1)))
+                group["lr"] = LEARNING_RATE * 0.5 * (1.0 + math.cos(math.pi * iteration / (iterations + 1)))
             perimeter, splits = controls()
             totals = _total_time_spent(scenario, parameters, demand, perimeter, splits)
             for n in np.flatnonzero(totals.detach().numpy() < best):
@@ -170,17 +162,9 @@ def _total_time_spent(
 ) -> Float[torch.Tensor, " B"]:
     """Return the total time spent (B,) [veh s] of plans."""
     x = torch.from_numpy(scenario.start).expand(perimeter.shape[1], -1, -1)
-    states = [x]
+    states, scheme = [x], {"integrator": scenario.integrator, "substeps": scenario.substeps}
     for k in range(scenario.steps - 1):
-        x = dynamics.advance(
-            parameters,
-            x,
-            demand[k],
-            perimeter[k],
-            splits[k],
-            scenario.step,
-            integrator=scenario.integrator,
-            substeps=scenario.substeps,
-        )
+        controls = perimeter[k], splits[k]
+        x = dynamics.advance(parameters, x, demand[k], *controls, scenario.step, **scheme)
         states.append(x)
     return scenario.step * torch.stack(states).sum((0, -2, -1))
