@@ -19,10 +19,8 @@ NAMES = {"bound-pc": False, "bound-pcrg": True}  # controller -> with route guid
 class Plan:
     """Open-loop controller with the controls of all T intervals, whatever is measured.
 
-    perimeter: u_ih (-, (T, R, R) [k, i, h])
-    splits: theta_ihj (-, (T, R, R, R) [k, i, h, j]); None without route guidance
-    start: name of the initial plan of the best descent
-    totals: initial plan -> total time spent at the end of its descent (veh s)
+    perimeter: (-, (T, R, R)); splits: (-, (T, R, R, R)), None without route guidance
+    start: initial plan of the best descent; totals: initial plan -> total time spent after its descent (veh s)
     iterations: number of Adam steps
     """
 

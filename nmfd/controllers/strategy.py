@@ -21,14 +21,7 @@ from nmfd.controllers.excitation import Probing
 from nmfd.controllers.mpc import controller as mpc
 from nmfd.controllers.rules import Gating, Greedy, NoControl, PiGating, RouteGuidance, SetPoint
 from nmfd.errors import InputError, did_you_mean
-from nmfd.model.planning import (
-    Options,
-    PlanningModel,
-    guided_model,
-    options,
-    other_model,
-    planning_model,
-)
+from nmfd.model.planning import Options, PlanningModel, guided_model, options, other_model, planning_model
 from nmfd.model.scenario import Scenario
 from nmfd.runs import config, shipped
 from nmfd.runs.files import file_hash
@@ -159,10 +152,9 @@ class Strategy:
         return best[0] if best else name
 
     def make(self, scenario: Scenario, policy: Path | None = None) -> Controller:
-        """Return a controller for `scenario`, which shares no array with it.
+        """Return a controller for `scenario`, which shares no array with it. Raise InputError.
 
         policy: file of a policy, plan or value function instead of the scenario's
-        Raises: InputError
         """
         file, kind = self.file(scenario, policy), self.controller
         known = scenario if kind.reads == PLAN else self._planning(scenario)
@@ -189,10 +181,7 @@ class Strategy:
         return planning_model(scenario, self.controller.name, table)
 
     def file(self, scenario: Scenario, policy: Path | None = None) -> Path | None:
-        """Return the policy, plan or value function that `make` reads: `policy`, or the scenario's; None without.
-
-        Raises: InputError for a missing file, or a `policy` without use
-        """
+        """Return the file that `make` reads, None without: `policy`, or the scenario's. Raise InputError."""
         kind, table = self.controller, self.table(scenario)
         if kind.reads is None:
             if policy is not None:
@@ -207,10 +196,7 @@ class Strategy:
         return path
 
     def fingerprint(self, scenario: Scenario, policy: Path | None = None) -> dict[str, Any]:
-        """Return what its runs depend on besides the city and the demand: options, files and regional model.
-
-        Raises: InputError
-        """
+        """Return what its runs depend on besides city and demand: options, files and model. Raise InputError."""
         name = self.controller.name
         if name == ALONE:
             return {}
@@ -280,19 +266,18 @@ def parse_many(given: str | Sequence[str], scenario: Scenario, *, regional: bool
     if not any(names):
         raise InputError("controllers: expected at least one controller, got none; name one, such as no-control")
     plain = [name for name in names if not _is_pattern(name)]
-    if repeated := [name for n, name in enumerate(plain) if name in plain[:n]]:
-        raise InputError(f"controllers: {repeated[0]} is there twice; name every controller once")
+    if len(set(plain)) < len(plain):
+        raise InputError(f"controllers: {max(plain, key=plain.count)} is there twice; name every controller once")
     result: dict[str, Strategy] = {}
     for name in names:
-        if not _is_pattern(name):
+        if name in plain:
             result[name] = parse(name).regional() if regional else parse(name)
             continue
-        known = [strategy for strategy in ready(scenario) if not (regional and strategy.words)]
-        matching = [strategy for strategy in known if fnmatchcase(strategy.name, name)]
+        known = {one.name: one for one in ready(scenario) if not (regional and one.words)}
+        matching = [match for match in known if fnmatchcase(match, name)]
         if not matching:
-            there = ", ".join(strategy.name for strategy in known)
-            raise InputError(f"controllers: no controller here matches {name!r}; choose from {there}")
-        result |= {strategy.name: strategy for strategy in matching if strategy.name not in (*plain, *result)}
+            raise InputError(f"controllers: no controller here matches {name!r}; choose from {', '.join(known)}")
+        result |= {match: known[match] for match in matching if match not in (*plain, *result)}
     return list(result.values())
 
 
@@ -368,8 +353,6 @@ def _unknown(name: str, word: str, *, controllers: bool) -> InputError:
     where = f"controller {name!r}" if word == name else f"strategy {name!r}: {word!r}"
     words = [*CITY_WORDS, *(f"{stem}-N" for stem in CITY_NUMBERS)]
     hint = did_you_mean(word, [*(CONTROLLERS if controllers else ()), *words])
-    ranges = ", ".join(
-        f"{stem}-N from {low} to {high} {unit}" for stem, (_, low, high, unit, _) in CITY_NUMBERS.items()
-    )
+    ranges = ", ".join(f"{stem}-N from {low} to {high} {u}" for stem, (_, low, high, u, _) in CITY_NUMBERS.items())
     first = f"{', '.join(CONTROLLERS)} or file.py:Class, with words joined by +: " if controllers else ""
     return InputError(f"{where} is unknown{hint}; choose from {first}{', '.join(words)} (whole numbers, {ranges})")

@@ -56,11 +56,7 @@ Declared = TypeVar("Declared", bound=Options)
 
 
 def options(declaration: type[Declared], planning: PlanningModel, name: str, table: str = "") -> Declared:
-    """Return the checked options of controller `name`.
-
-    table: name of the table in error messages, if not `name`
-    Raises: InputError
-    """
+    """Return the checked options of controller `name`; errors name `table` instead. Raise InputError."""
     prefix = f"controllers.{table or name}."
     checked = config.checked(declaration, planning.controller_options.get(name, {}), planning.where, prefix)
     if problem := checked.misfit(planning):
@@ -69,12 +65,10 @@ def options(declaration: type[Declared], planning: PlanningModel, name: str, tab
 
 
 def planning_model(scenario: Scenario, controller: str = "", table: str = "") -> PlanningModel:
-    """Return the planning model of `controller`.
+    """Return the planning model of `controller`, with the options of `table` over its own. Raise InputError.
 
     Its network is the option `model`, else the guided model of the city if the controller guides routes, else the
-    scenario's. The options of [controllers.TABLE] go over those of [controllers.CONTROLLER].
-
-    Raises: InputError
+    scenario's.
     """
     table, tables = table or controller, scenario.controller_options
     merged = {**tables.get(controller, {}), **tables.get(table, {})}

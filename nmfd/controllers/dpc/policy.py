@@ -172,23 +172,13 @@ class DpcController:
         perimeter = perimeter.numpy()
         if splits is not None:
             splits = splits.numpy().astype(float)
-            sums = splits.sum(axis=1, keepdims=True)
+            splits = self._full(splits / np.maximum(splits.sum(axis=1, keepdims=True), 1e-9))  # float32 misses 1
         # The sum is finite if every number is: they are bounded unless they are NaN.
-        if not math.isfinite(perimeter.sum()) or (splits is not None and not math.isfinite(sums.sum())):
-            return Controls(
-                perimeter=self._u_max,
-                splits=None,
-                status=Status.SOLVER_FAILURE | Status.FALLBACK,
-                note="dpc: policy returned NaN, perimeter opened",
-            )
-        if splits is not None:
-            splits /= np.maximum(sums, 1e-9)  # float32 sums miss 1 by 1e-7; those of j = i are 0
-        return Controls(
-            perimeter=self._full(perimeter),
-            splits=None if splits is None else self._full(splits),
-            prices=prices,
-            metering=metering,
-        )
+        if not math.isfinite(perimeter.sum() + (0.0 if splits is None else splits.sum())):
+            failed = Status.SOLVER_FAILURE | Status.FALLBACK
+            note = "dpc: policy returned NaN, perimeter opened"
+            return Controls(perimeter=self._u_max, splits=None, status=failed, note=note)
+        return Controls(perimeter=self._full(perimeter), splits=splits, prices=prices, metering=metering)
 
     def _full(self, listed: np.ndarray) -> np.ndarray:
         """Return (R, R) or (R, R, R) from (R, D) or (R, D, R): all regions instead of the neighbours."""

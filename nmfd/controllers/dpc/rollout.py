@@ -95,7 +95,8 @@ class Rollout:
 
             wide, high = scale * factor(regions), factor(regions, share=0.5)
             # No rate rises above the largest that the integration step was checked for.
-            high = high.clamp(max=1.0 / (self._fastest() * self.planning.step / self.planning.substeps))
+            fastest = p.c if p.exit_rates is None else p.c * p.exit_rates.amax(-1)
+            high = high.clamp(max=1.0 / (fastest * self.planning.step / self.planning.substeps))
             p = replace(
                 p,
                 a=high * p.a / wide**2,
@@ -106,11 +107,6 @@ class Rollout:
                 storage=None if p.storage is None else p.storage * wide,
             )
         self.parameters = p
-
-    def _fastest(self) -> torch.Tensor:
-        """Return the largest rate at which vehicles leave each region (1/s, (R,))."""
-        p = self._nominal
-        return p.c if p.exit_rates is None else p.c * p.exit_rates.amax(-1)
 
     def perturb(self, demand: Demands, level: Levels, noise: float, generator: torch.Generator) -> Demands:
         """Add Gaussian noise of sigma `level` (B,) times `noise` to the pairs with demand, clipped at zero.
@@ -137,12 +133,6 @@ class Rollout:
             substeps=self.planning.substeps,
         )
 
-    def entering(self, policy: Policy, seen: States, demand: States, backlog: States) -> tuple[States, States]:
-        """Return the admitted demand (veh/s, (B, R, R)) and the backlog after it (veh, (B, R, R))."""
-        if not policy.architecture.metering:
-            return demand, backlog
-        return dynamics.admitted(backlog, demand, policy.metering(seen), self.planning.step)
-
     def states(
         self, policy: Policy, x: States, demand: Demands, generator: torch.Generator, step: Callable | None = None
     ) -> tuple[Demands, Demands, Float[torch.Tensor, "T B"]]:
@@ -154,7 +144,10 @@ class Rollout:
         noise *= self.planning.measurement_std
         states, waiting, backlog = [x], [x.new_zeros(len(x))], torch.zeros_like(x)
         for k in range(demand.shape[0] - 1):
-            entering, backlog = self.entering(policy, states[-1] + noise[k], demand[k], backlog)
+            entering = demand[k]
+            if policy.architecture.metering:
+                rates = policy.metering(states[-1] + noise[k])
+                entering, backlog = dynamics.admitted(backlog, entering, rates, self.planning.step)
             states.append((step or self.step)(policy, states[-1], entering, noise[k]))
             waiting.append(backlog.sum((-2, -1)))
         exact = torch.stack(states)

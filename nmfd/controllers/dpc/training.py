@@ -1,7 +1,6 @@
 """Training of DPC policies: roll out the regional model under the policy and descend the total time spent.
 
-Random initial states and demand keep gradients alive: a rollout that gridlocks has none. The policy with the best
-validation on the scenario itself is kept. The same seed gives the same weights.
+Random initial states and demand keep gradients alive: a rollout that gridlocks has none.
 """
 
 import io
@@ -144,15 +143,13 @@ def check(scenario: Scenario, strategy: "Strategy") -> RegionalModel:
     """Return the model to train on. Raise InputError without gateways, or for placeholder MFDs."""
     city, believed = scenario.network, strategy.planning(scenario).network
     file = city.name if city.folder is None else city.folder / "network.toml"
+    still = "nmfd.train(..., anyway=True) trains all the same"
     if city.controllable is not None and not city.controllable.any():
-        raise InputError(
-            f"{file}: controllable: is 0 at every boundary: {NO_GATEWAY}; nmfd.train(..., anyway=True) trains it still"
-        )
+        raise InputError(f"{file}: controllable: is 0 at every boundary: {NO_GATEWAY}; {still}")
     if believed.placeholder:
         raise InputError(
             f"{file if believed.folder is None else believed.folder / 'network.toml'}: placeholder: is true: its MFDs "
-            f"are guesses from lanes and speed limits; run 'cosim identify {city.folder}' first, or set it to false "
-            "after putting in your own MFDs; nmfd.train(..., anyway=True) trains all the same"
+            f"are guesses from lanes and speed limits; run 'cosim identify {city.folder}' or put in your own; {still}"
         )
     return believed
 
@@ -177,10 +174,9 @@ def train(
     anyway: bool = False,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> Path:
-    """Train the policy of `strategy` on the regional model and write it to `out`.
+    """Train the policy of `strategy` and write the best in validation to `out`; the same seed gives the same weights.
 
-    `out` holds the best policy after every validation, `out`.resume the state that `resume` continues from.
-
+    resume: continue from the state in `out`.resume
     compiled: compile the step, about twice as fast after a minute or two; the weights differ by rounding
     anyway: train even if `check` raises
     progress: called with (done, steps, note) after every step
@@ -215,6 +211,14 @@ def train(
         optimizer = torch.optim.Adam(policy.parameters(), lr=setup.learning_rate)
         first, best = 0, float("inf")
         state_file = out.with_name(out.name + ".resume")
+
+        def keep_the_better(best: float) -> float:
+            score = validate(policy, rollout, seed, setup)
+            if not score < best:
+                return best
+            write(checkpoint(policy, planning.network, {**configuration, "validation_veh_s": score}), out)
+            return score
+
         if resume:
             first, best = _restore(state_file, configuration, policy, optimizer, generator)
         for step in range(first, steps):
@@ -222,21 +226,15 @@ def train(
                 cosine = 0.5 * (1.0 + math.cos(math.pi * step / steps))
                 group["lr"] = setup.learning_rate * (0.1 + 0.9 * cosine)
             _descend(policy, rollout, setup, generator, advance, optimizer, step)
-            last = step + 1 == steps
-            if (step + 1) % VALIDATION_PERIOD == 0 or last:
-                if (score := validate(policy, rollout, seed, setup)) < best:
-                    best = score
-                    _keep(policy, planning.network, configuration, best, out)
+            if (step + 1) % VALIDATION_PERIOD == 0 or step + 1 == steps:
+                best = keep_the_better(best)
                 state = {"configuration": configuration, "step": step + 1, "best": best}
                 state |= {"policy": policy.state_dict(), "optimizer": optimizer.state_dict()}
                 write(state | {"generator": generator.get_state()}, state_file)
             if progress:
                 progress(step + 1, steps, f"best {best:.4g} veh s")
         if not steps:  # the initial policy
-            best = validate(policy, rollout, seed, setup)
-            _keep(policy, planning.network, configuration, best, out)
-            if progress:
-                progress(1, 1, f"initial policy {best:.4g} veh s")
+            best = keep_the_better(best)
         if not math.isfinite(best):
             raise RunFailed(f"{strategy.name}: every validation of {steps} steps diverged; lower the learning rate")
         state_file.unlink(missing_ok=True)
@@ -315,17 +313,11 @@ def validate(policy: Policy, rollout: Rollout, seed: int, setup: Training) -> fl
     demand = rollout.perturb(nominal, level, setup.noise, generator)
     if setup.demand_low < setup.demand_high:
         low, high = setup.levels
-        demand = (
-            demand * (low + (high - low) * level[torch.randperm(count, generator=generator)]).to(demand)[:, None, None]
-        )
+        factor = low + (high - low) * level[torch.randperm(count, generator=generator)]
+        demand = demand * factor.to(demand)[:, None, None]
     with torch.no_grad():
         total = rollout.total_time_spent(policy, rollout.start.expand_as(demand[0]), demand, generator)
     return torch.log(total).mean().exp().item()
-
-
-def _keep(policy: Policy, network: RegionalModel, configuration: Mapping[str, Any], score: float, out: Path) -> None:
-    """Write the policy to `out`, with its `score` in validation (veh s)."""
-    write(checkpoint(policy, network, {**configuration, "validation_veh_s": score}), out)
 
 
 def _restore(
@@ -338,11 +330,9 @@ def _restore(
     """Restore the state of a training; return the number of its next step and its best validation."""
     state = read_file(state_file, "nothing to resume; train without --resume")
     for key, value in configuration.items():
-        if state["configuration"].get(key) != value:
-            raise InputError(
-                f"{state_file}: {key}: was {state['configuration'].get(key)!r}, now {value!r}; resume with the same "
-                "settings or train without --resume"
-            )
+        if (before := state["configuration"].get(key)) != value:
+            remedy = "resume with the same settings or train without --resume"
+            raise InputError(f"{state_file}: {key}: was {before!r}, now {value!r}; {remedy}")
     policy.load_state_dict(state["policy"])
     optimizer.load_state_dict(state["optimizer"])
     generator.set_state(state["generator"])

@@ -23,10 +23,9 @@ from nmfd.controllers.mpc.ipopt import Ipopt
 from nmfd.controllers.mpc.projected_gradient import AT_REST, TIME_LIMIT, Late, Minimum, minimise
 from nmfd.controllers.mpc.terminal import Terminal, read
 from nmfd.controllers.rules import PiGating
-from nmfd.errors import InputError
 from nmfd.model.planning import Options, PlanningModel, options
 from nmfd.model.regional_model import RegionalModel
-from nmfd.runs.config import Problem, setting, whole
+from nmfd.runs.config import Problem, error, setting, whole
 from nmfd.types import Controls, Observation, Status
 
 MAX_ITERATIONS = 1000  # of the solver, per decision
@@ -167,16 +166,9 @@ class EconomicMpc:
         self._ipopt = None
         if self.options.solver == "ipopt":
             if terminal is not None:
-                raise InputError(
-                    f"{planning.where}: controllers.{self.name}.solver: ipopt has no terminal cost; omit it"
-                )
-            self._ipopt = Ipopt(
-                planning,
-                guidance=guidance,
-                horizon=horizon,
-                iterations=MAX_ITERATIONS,
-                seconds=DEADLINE_SHARE * self.deadline,
-            )
+                raise error(planning.where, f"controllers.{self.name}.solver", "ipopt has no terminal cost; omit it")
+            limits = {"iterations": MAX_ITERATIONS, "seconds": DEADLINE_SHARE * self.deadline}
+            self._ipopt = Ipopt(planning, guidance=guidance, horizon=horizon, **limits)
         self.reset()
 
     def reset(self, seed: int = 0) -> None:
@@ -190,26 +182,22 @@ class EconomicMpc:
             self._beyond = partial(self._terminal, step=observation.step + self.options.horizon)
         last = np.concatenate([self._plan[1:], self._plan[-1:]]) if self._left else self._open
         try:
-            if self._left and self._cheaper(self._open, last, start, demand, deadline):
-                last = self._open
+            if self._left:
+                cost = partial(self._exact, start, demand, deadline=deadline, beyond=self._beyond)
+                last = self._open if cost(self._open)[0] < cost(last)[0] else last
             minimum = self._solve(start, demand, last, deadline)
         except Late:
             return self._fallback(observation, last, TIME_LIMIT)
-        except (ArithmeticError, ValueError, RuntimeError) as error:  # of NumPy and SciPy, LinAlgError too
-            return self._fallback(observation, last, f"solver failed ({type(error).__name__})")
+        except (ArithmeticError, ValueError, RuntimeError) as failure:  # of NumPy and SciPy, LinAlgError too
+            return self._fallback(observation, last, f"solver failed ({type(failure).__name__})")
         known = np.isfinite(minimum.gap)
         reason = None if known and minimum.gap <= ACCEPTABLE_TOLERANCE * minimum.value else minimum.reason
         if reason is not None and (minimum.point is last or not known) and reason != AT_REST:
             return self._fallback(observation, last, reason)
         self._plan, self._left, self._gates = minimum.point, self._moves - 1, False
-        return (
-            self._first() if reason is None else self._first(Status.SOLVER_FAILURE, f"{reason}: best plan so far used")
-        )
-
-    def _cheaper(self, plan: Plan, than: Plan, start: PerCell, demand: Demands, deadline: float) -> bool:
-        """Return True if `plan` costs less by the exact model. Raise Late."""
-        costs = [self._exact(start, demand, one, deadline=deadline, beyond=self._beyond)[0] for one in (plan, than)]
-        return costs[0] < costs[1]
+        if reason is None:
+            return self._first()
+        return self._first(Status.SOLVER_FAILURE, f"{reason}: best plan so far used")
 
     def _fallback(self, observation: Observation, last: Plan, reason: str) -> Controls:
         """Return the controls of an interval without a new plan."""
@@ -246,11 +234,7 @@ class EconomicMpc:
         return start, demand[:, :, self._used].reshape(horizon, -1)
 
     def _solve(self, start: PerCell, demand: Demands, plan: Plan, deadline: float) -> Minimum:
-        """Return the best plan from `plan` on, with its value (veh) by the rounded model.
-
-        deadline: by time.perf_counter (s)
-        Raises: Late
-        """
+        """Return the best plan from `plan` on, with its value (veh) by the rounded model. Raise Late."""
         if self._ipopt is not None:
             return self._by_ipopt(self._ipopt, start, demand)
         return minimise(

@@ -126,9 +126,7 @@ def derivative(model: Turns, x: PerCell, demand: PerCell, perimeter: PerEdge, sp
     return change, (x, leaving, q, change_of_q, wish, share, boundary)
 
 
-def _boundary(
-    model: Turns, wish: PerEdge, perimeter: PerEdge, accumulation: PerRegion
-) -> tuple[PerEdge, PerEdge, PerEdge, PerEdge]:
+def _boundary(model: Turns, wish: PerEdge, perimeter: PerEdge, accumulation: PerRegion) -> tuple[PerEdge, ...]:
     """Return the share of `wish` (veh/s, (E,)) that passes, and its derivatives by wish, u and accumulation ahead."""
     assert model.capacity is not None and model.storage is not None
     ahead = model.edges[:, 1]
@@ -232,9 +230,8 @@ def vehicle_steps(
     x, total, tape = start, 0.0, []
     for node, k in enumerate(interval):
         _look(deadline)
-        x, records = advance(
-            model, x, demand[node // substeps], plan[k, :edges], plan[k, edges:], step / substeps, integrator
-        )
+        u, theta = plan[k, :edges], plan[k, edges:]
+        x, records = advance(model, x, demand[node // substeps], u, theta, step / substeps, integrator)
         if gradient:
             tape.append(records)
         if (node + 1) % substeps == 0:
@@ -248,9 +245,8 @@ def vehicle_steps(
         _look(deadline)
         if (node + 1) % substeps == 0:
             adjoint = adjoint + 1.0
-        adjoint, of_decision = pull_advance(
-            model, adjoint, plan[k, :edges], plan[k, edges:], tape.pop(), step / substeps, integrator
-        )
+        u, theta = plan[k, :edges], plan[k, edges:]
+        adjoint, of_decision = pull_advance(model, adjoint, u, theta, tape.pop(), step / substeps, integrator)
         of_plan[k] += of_decision
     return total, of_plan
 
@@ -270,18 +266,15 @@ def affected_vehicles(
 
     For an edge, the vehicles that want to cross it in that interval; for a turn, those that leave its cell.
     """
-    edges = len(model.edges)
-    x, leaving = start, np.zeros((len(plan), len(model.turns)))
-    wish = np.zeros((len(plan), edges))
+    edges, affected, x = len(model.edges), np.zeros_like(plan), start
     for node, k in enumerate(_intervals(plan, len(demand), substeps)):
         _look(deadline)
-        x, records = advance(
-            model, x, demand[node // substeps], plan[k, :edges], plan[k, edges:], step / substeps, integrator
-        )
-        now = step / substeps * records[0][1][model.source]
-        leaving[k] += now
-        wish[k] += np.bincount(model.edge, plan[k, edges:] * now, edges)
-    return np.concatenate([wish, leaving], axis=1)
+        u, theta = plan[k, :edges], plan[k, edges:]
+        x, records = advance(model, x, demand[node // substeps], u, theta, step / substeps, integrator)
+        leaving = step / substeps * records[0][1][model.source]
+        affected[k, :edges] += np.bincount(model.edge, theta * leaving, edges)
+        affected[k, edges:] += leaving
+    return affected
 
 
 def _look(deadline: float) -> None:

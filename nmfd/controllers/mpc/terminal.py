@@ -76,16 +76,9 @@ def write(terminal: Terminal, path: Path) -> None:
     arrays = {
         f"{name}_{kind}": a.astype(np.float32) for name, w, b in layers for kind, a in (("weight", w), ("bias", b))
     }
+    others = {name: getattr(terminal, name) for name in ("steps", "used", "scale", "network_hash", "controller")}
     with atomic(path) as temporary:
-        np.savez_compressed(
-            temporary,
-            steps=np.array(terminal.steps),
-            used=terminal.used,
-            scale=terminal.scale,
-            network_hash=np.array(terminal.network_hash),
-            controller=np.array(terminal.controller),
-            **arrays,
-        )
+        np.savez_compressed(temporary, **others, **arrays)
 
 
 def read(path: Path, planning: PlanningModel, controller: str) -> Terminal:
@@ -105,10 +98,8 @@ def read(path: Path, planning: PlanningModel, controller: str) -> Terminal:
     except Exception:
         raise InputError(f"{path}: is no value function") from None
     if terminal.network_hash != planning.network.hash or not np.array_equal(terminal.used, planning.destinations):
-        raise InputError(
-            f"{path}: network_hash: was learned for another regional model or other destinations than those of "
-            f"{planning.network.name!r}"
-        )
+        other = "was learned for another regional model or other destinations than those of"
+        raise InputError(f"{path}: network_hash: {other} {planning.network.name!r}")
     if terminal.controller != controller:
         raise InputError(f"{path}: is the value function of {terminal.controller}, not of {controller}")
     return terminal
