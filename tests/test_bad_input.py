@@ -76,7 +76,7 @@ FILES = {
     "no TOML": ("name = tiny", ROW, "is not valid TOML"),
     "own neighbour": (tiny.SCENARIO, ROW.replace("[0]", "[0, 1]"), "regions[1].adjacent: "),
     "no way": (tiny.SCENARIO, ROW.replace("= [0]", "= []").replace("= [1]", "= []"), "cannot be reached"),
-    "no MFD": (tiny.SCENARIO, ROW.replace("c = 0.0042", "c = -1"), "c must be positive"),
+    "no MFD": (tiny.SCENARIO, ROW.replace("c = 0.0042", "c = -1"), "mfd.c: "),
     "bounds": (tiny.SCENARIO, ROW.replace("max = 0.9", "max = 0.1"), "min must be less"),
     "controller": (tiny.SCENARIO + "\n[controllers.pi-gatin]\nkp = 1\n", ROW, "did you mean pi-gating?"),
     "option": (tiny.SCENARIO + "\n[controllers.dpc-pc]\nwidht = 1\n", ROW, "controllers.dpc-pc.widht: unknown key"),

@@ -9,7 +9,6 @@ from tiny import made
 
 from nmfd.api import load_scenario
 from nmfd.controllers.strategy import CONTROLLERS
-from nmfd.model.mfd import Mfd
 from nmfd.studies import plots
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "economic_mpc"
@@ -78,11 +77,6 @@ def test_mfd_with_samples(ax, scenario):
     plots.mfd(ax, scenario.network.mfds[0], samples)
     assert ax.get_ylim()[1] > 8.0 and ax.get_xlim()[1] > 6000.0
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("accumulation [veh]", "outflow [veh/s]")
-
-
-def test_mfd_without_a_tail(ax):
-    plots.mfd(ax, Mfd(a=0.0, b=-1e-6, c=0.004, jam=float("inf")))
-    assert np.isfinite(ax.get_xlim()).all()
 
 
 def test_spawn_matrix_shows_the_trips_of_every_pair(ax, scenario):

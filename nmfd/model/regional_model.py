@@ -149,13 +149,13 @@ class MfdTable(Settings):
 
     a: float = setting("cubic coefficient", unit="veh^-2 s^-1")
     b: float = setting("quadratic coefficient", unit="veh^-1 s^-1")
-    c: float = setting("linear coefficient, positive", unit="s^-1")
+    c: float = setting("linear coefficient", unit="s^-1", gt=0.0)
     jam: float = setting("accumulation beyond which the outflow is constant", unit="veh", gt=0.0, le=MOST_VEHICLES)
 
     @model_validator(mode="after")
     def _valid(self) -> "MfdTable":
         if problem := self.mfd.problem():
-            raise Problem("c" if self.c <= 0 else "jam", problem)
+            raise Problem("jam", problem)
         return self
 
     @property

@@ -66,7 +66,7 @@ def benchmark(
     plant: str,
     *,
     out: Path,
-    policies: Mapping[str, Path] | None = None,
+    policies: Mapping[str, Path],
     workers: int = 1,
     progress: Progress = None,
 ) -> "pd.DataFrame":
@@ -75,7 +75,6 @@ def benchmark(
     Raises:
         InputError: a controller cannot be made
     """
-    policies = policies or {}
     key = key_of(scenario, strategies, plant, policies)
     runs = [
         Run(
@@ -121,9 +120,6 @@ def key_of(
         "network": scenario.network.name,
         "network_hash": scenario.network.hash,
         "plant": plant,
-        "step_s": scenario.step,
-        "steps": scenario.steps,
-        "measurement_std_veh": scenario.measurement_std,
     }
     return lambda name: {**shared, "controller": own[name]}
 

@@ -64,8 +64,8 @@ def region_fits(
             f"{FEW} ({len(points)})": len(points) < SAMPLES,
             f"{POOR} {r2:.2f}": len(points) >= SAMPLES and not r2 >= EXPLAINED,  # NaN too
             f"{SHORT} ({100 * share:.0f} % of critical)": share < 1.0,
-            f"{ENDLESS} (jam {curve.jam:.0f}, critical {curve.critical:.0f} veh)": np.isfinite(curve.jam)
-            and curve.outflow(curve.jam) > (1.0 - FALL) * curve.capacity,
+            f"{ENDLESS} (jam {curve.jam:.0f}, critical {curve.critical:.0f} veh)": curve.outflow(curve.jam)
+            > (1.0 - FALL) * curve.capacity,
             ALONE: seeds < 2,
         }
         rows.append(

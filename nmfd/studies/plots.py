@@ -124,7 +124,7 @@ def mfd(ax: Axes, mfd: Mfd, samples: Mapping[str, np.ndarray] | None = None) -> 
     samples: label -> (n, 2) of accumulation [veh] and outflow [veh/s], such as {"loading": ..., "unloading": ...}
     """
     clouds = {label: np.asarray(cloud) for label, cloud in (samples or {}).items() if len(cloud)}
-    right = 1.15 * (mfd.jam if np.isfinite(mfd.jam) else 2.0 * mfd.critical)
+    right = 1.15 * mfd.jam
     if clouds:
         largest = max(cloud[:, 0].max() for cloud in clouds.values())
         right = min(right, max(1.5 * mfd.critical, 1.1 * largest))
