@@ -161,13 +161,6 @@ def test_both_rates_are_those_of_the_mfd():
     np.testing.assert_allclose(casadi_rate, expected, rtol=1e-13)
 
 
-def test_the_outflow_stays_at_its_jam_value_beyond():
-    jam = NETWORK.mfds[0].jam
-    n = torch.linspace(jam, 3.0 * jam, 7, dtype=torch.float64)
-    outflow = dynamics.rate(PARAMETERS, n) * n
-    torch.testing.assert_close(outflow, outflow[:1].expand(7), rtol=1e-12, atol=0.0)
-
-
 def test_a_boundary_passes_the_smaller_of_wish_and_limit():
     """Far from each other the smooth minimum is the smaller one; a region that is full takes next to nobody."""
     p = dynamics.parameters(LIMITED)

@@ -29,8 +29,6 @@ PerCell = Float[np.ndarray, " C"]
 PerMove = Float[np.ndarray, " M"]
 CellIndex = Int[np.ndarray, " C"]
 MoveIndex = Int[np.ndarray, " M"]
-CellMask = Bool[np.ndarray, " C"]
-MoveMask = Bool[np.ndarray, " M"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +52,7 @@ class Acyclic:
     move_from: MoveIndex
     move_to: MoveIndex
     move_next: MoveIndex
-    move_onward: MoveMask
+    move_onward: Bool[np.ndarray, " M"]
     fallback: CellIndex
     a: PerRegion
     b: PerRegion
@@ -68,10 +66,8 @@ class Acyclic:
 def build(network: RegionalModel) -> Acyclic:
     """Return all cells reachable from x_iiij, and their moves."""
     neighbours = [np.flatnonzero(row) for row in network.adjacency]
-    cells: dict[tuple[int, int, int, int], int] = {}
-    for i in range(network.regions):
-        for j in range(network.regions):
-            cells[i, i, i, j] = len(cells)
+    pairs = np.ndindex(network.adjacency.shape)
+    cells: dict[tuple[int, int, int, int], int] = {(i, i, i, j): n for n, (i, j) in enumerate(pairs)}
     start = np.arange(network.regions**2).reshape(network.regions, network.regions)
     queue, fallback = list(cells), {}
     moves: list[tuple[int, int, int, bool]] = []
@@ -113,7 +109,7 @@ def build(network: RegionalModel) -> Acyclic:
     )
 
 
-def shares(model: Acyclic, splits: PerTurn) -> tuple[PerMove, CellMask]:
+def shares(model: Acyclic, splits: PerTurn) -> tuple[PerMove, Bool[np.ndarray, " C"]]:
     """Return theta_ogihj of each move (M,) [-], and the forced cells (C,) bool.
 
     A cell is forced to its least-bad move if theta, splits (R, R, R) [-], leads only to its origin or previous region.

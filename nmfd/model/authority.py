@@ -88,7 +88,7 @@ def verdict(
     most: (R,) [-], highest accumulation over the critical one, in any run; started: (R,) [veh], departures by region
     where: the runs, such as "in 6 loading runs"
     """
-    names = [f"region {n}" if name == str(n) else f"{n} {name}" for n, name in enumerate(network.region_names)]
+    names = network.titles
     flow = boundaries.flow.sum()
     passed = (
         f"; {boundaries.controlled.sum() / flow:.0%} of the {flow:,.0f} crossings {where} passed one" if flow else ""

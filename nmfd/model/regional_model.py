@@ -71,6 +71,11 @@ class RegionalModel:
         return len(self.region_names)
 
     @property
+    def titles(self) -> tuple[str, ...]:
+        """Number and name of each region, such as "3 centre"; "region 3" if that is the name."""
+        return tuple(f"region {n}" if name == str(n) else f"{n} {name}" for n, name in enumerate(self.region_names))
+
+    @property
     def critical(self) -> PerRegion:
         """Critical accumulations (R,) [veh]."""
         return np.array([mfd.critical for mfd in self.mfds])

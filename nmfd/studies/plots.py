@@ -114,7 +114,7 @@ def region_accumulation(
     ax.set_ylabel("accumulation [veh]")
     highest = max((t.accumulation[:, region].sum(axis=1).max() for t in trajectories), default=0.0)
     ax.set_ylim(0.0, 1.06 * max(highest, 1.25 * critical))
-    ax.set_title(region_title(network, region), fontsize="medium")
+    ax.set_title(network.titles[region], fontsize="medium")
     return ax
 
 
@@ -155,7 +155,7 @@ def draw_mfds(path: Path, network: RegionalModel, samples: Sequence[Mapping[str,
     drawing, axes = panels(len(shown))
     for region, ax in zip(shown, axes, strict=True):
         mfd(ax, network.mfds[region], samples[region] if samples else None)
-        title = region_title(network, region) if len(shown) == network.regions else "every region"
+        title = network.titles[region] if len(shown) == network.regions else "every region"
         ax.set_title(title, fontsize="medium")
     legend_below(drawing, axes)
     return save(drawing, path)
@@ -201,7 +201,7 @@ def demand(ax: Axes, scenario: Scenario) -> Axes:
     time = time_axis(ax, scenario.step * np.arange(end + 1))
     if len(used):
         rates = np.concatenate([arriving[used, :end], arriving[used, end - 1 : end]], axis=1)
-        labels = [f"to {region_title(scenario.network, j)}" for j in used]
+        labels = [f"to {scenario.network.titles[j]}" for j in used]
         ax.stackplot(time, rates, step="post", labels=labels, colors=_tones(len(used)), linewidth=0)
     ax.set_ylabel("demand [veh/s]")
     ax.set_ylim(bottom=0.0)
@@ -255,9 +255,3 @@ def _thousands(axis: Axis) -> None:
 
 def _tones(count: int) -> list:
     return [colormaps["tab10"](n % 10) for n in range(count)]
-
-
-def region_title(network: RegionalModel, region: int) -> str:
-    """Return number and name of a region, or the number alone if that is the name."""
-    name = network.region_names[region]
-    return f"region {region}" if name == str(region) else f"{region} {name}"
