@@ -98,13 +98,13 @@ def run(
         if steps < 1:
             raise InputError(f"steps: expected 1 or more control intervals, got {steps} instead")
         scenario = with_demand(scenario, steps=steps)
+    acting, name = strategy.make(scenario, None if policy is None else Path(policy)), type(plant).__name__
     if isinstance(plant, str):
-        _check_plant(plant, ", or give an object")
-    acting = strategy.make(scenario, None if policy is None else Path(policy))
-    driven = PLANTS[plant](scenario) if isinstance(plant, str) else plant
+        _check_plant(plant)
+        name, plant = plant, PLANTS[plant](scenario)
     with watched(strategy.name, progress) as show:
-        result = closed_loop.run(driven, acting, scenario, seed=seed, progress=show)
-    return result.assign(controller=strategy.name, plant=plant if isinstance(plant, str) else type(plant).__name__)
+        result = closed_loop.run(plant, acting, scenario, seed=seed, progress=show)
+    return result.assign(controller=strategy.name, plant=name)
 
 
 def benchmark(
@@ -208,18 +208,8 @@ def train(
     compiled = chosen.descend and chosen.steps >= training.WORTH_COMPILING and rollout.can_compile(device)
     try:
         with watched(controller, progress) as show:
-            return training.train(
-                scenario,
-                strategy,
-                seed=seed,
-                out=file,
-                steps=steps,
-                resume=resume,
-                device=device,
-                compiled=compiled,
-                anyway=anyway,
-                progress=show,
-            )
+            how = {"steps": steps, "resume": resume, "device": device, "compiled": compiled, "anyway": anyway}
+            return training.train(scenario, strategy, seed=seed, out=file, progress=show, **how)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"the best policy so far, if any, is {file}; add --resume to continue") from None
 
@@ -254,14 +244,12 @@ def show(scenario: Scenario | Path | str, *, out: Path | str | None = None) -> s
     folder.mkdir(parents=True, exist_ok=True)
     files = draw_scenario(folder, scenario)
     total = scenario.step * scenario.demand.sum()
-    return "\n".join(
-        [
-            f"{scenario.name}: {scenario.network.regions} regions, {total:,.0f} trips between "
-            f"{int((scenario.demand.sum(axis=0) > 0).sum())} pairs, peak {scenario.demand.sum(axis=(1, 2)).max():.3g} "
-            f"veh/s, {scenario.steps} control intervals of {scenario.step:g} s",
-            *(f"Written to {file}" for file in files),
-        ]
+    line = (
+        f"{scenario.name}: {scenario.network.regions} regions, {total:,.0f} trips between "
+        f"{int((scenario.demand.sum(axis=0) > 0).sum())} pairs, peak {scenario.demand.sum(axis=(1, 2)).max():.3g} "
+        f"veh/s, {scenario.steps} control intervals of {scenario.step:g} s"
     )
+    return "\n".join([line, *(f"Written to {file}" for file in files)])
 
 
 def catalogue() -> str:
@@ -305,17 +293,13 @@ def check_policies(policies: Mapping[str, Path], strategies: Sequence[Strategy])
     known = [strategy.name for strategy in strategies]
     for name in policies:
         if name not in known:
-            raise InputError(
-                f"--policy: {name!r} is not among {', '.join(known)}{did_you_mean(name, known)}; add it there"
-            )
+            near = did_you_mean(name, known)
+            raise InputError(f"--policy: {name!r} is not among {', '.join(known)}{near}; add it there")
 
 
-def _check_plant(plant: str, more: str = "") -> None:
-    """Raise InputError for an unknown name; more: other allowed values."""
+def _check_plant(plant: str) -> None:
     if plant not in PLANTS:
-        raise InputError(
-            f"plant {plant!r} is unknown{did_you_mean(plant, PLANTS)}; choose from {', '.join(PLANTS)}{more}"
-        )
+        raise InputError(f"plant {plant!r} is unknown{did_you_mean(plant, PLANTS)}; choose from {', '.join(PLANTS)}")
 
 
 def _loaded(scenario: Scenario | Path | str) -> Scenario:

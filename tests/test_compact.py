@@ -186,8 +186,6 @@ def test_it_is_trained_and_kept_in_a_file(tmp_path):
         (scenario / "scenario.toml").write_text(text + TABLE.format(price=0.0, descend=descend))
         files[descend] = scenario / "dpc-pcrg.pt" if descend == "true" else tmp_path / "first.pt"
         good(nmfd("train", scenario, "--controller", "dpc-pcrg", "--out", files[descend]))
-    (scenario / "scenario.toml").write_text(text + TABLE.format(price=0.0, descend="false"))
-    (scenario / "scenario.toml").write_text(text + TABLE.format(price=0.0, descend="true"))
     loaded = load_scenario(scenario)
     first, trained = (load_policy(file, loaded.network) for file in files.values())
     assert first[0].numbers.tolist() == pytest.approx([1.0, 2.0, 0.0, 0.0, 0.6, 0.0, 0.6, 1.5, 0.0, 0.0, 1.0])

@@ -1,4 +1,4 @@
-"""DPC: constraints by construction, policy files, and training that resumes as if uninterrupted."""
+"""DPC: constraints by construction, policy files, and training."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -123,11 +123,10 @@ def test_a_policy_of_the_other_kind_is_refused(tmp_path, scenario):
         (lambda path: path.unlink(), "no such policy"),
         (lambda path: path.write_bytes(b"not a policy"), "is no policy file"),
         (lambda path: path.write_bytes(path.read_bytes()[:2000]), "is no policy file"),
-        (lambda path: torch.save({"format": 99}, path), "is no policy file"),
-        (lambda path: torch.save({"format": 1}, path), "is damaged"),
-        (lambda path: torch.save([1, 2], path), "is no policy file"),
+        (lambda path: torch.save({}, path), "is damaged"),
+        (lambda path: torch.save([1, 2], path), "is damaged"),
     ],
-    ids=["missing", "text", "truncated", "format", "empty", "list"],
+    ids=["missing", "text", "truncated", "empty", "list"],
 )
 def test_a_damaged_policy_file_is_one_line(tmp_path, damage, problem):
     path = saved(tmp_path / "p.pt", policy(guidance=False), NETWORK)
@@ -139,26 +138,6 @@ def test_a_damaged_policy_file_is_one_line(tmp_path, damage, problem):
 
 def weights(path):
     return torch.load(path, weights_only=True)["weights"]
-
-
-@pytest.mark.parametrize("controller", ["dpc-pc", "dpc-pcrg"])
-def test_a_resumed_training_is_the_uninterrupted_one(tmp_path, scenario, monkeypatch, controller):
-    monkeypatch.setattr(training, "VALIDATION_PERIOD", 2)
-
-    def interrupt(done, steps, note):
-        if done == 5:
-            raise KeyboardInterrupt
-
-    straight, broken = tmp_path / "straight.pt", tmp_path / "broken.pt"
-    training.train(scenario, parse(controller), seed=3, out=straight, steps=8)
-    with pytest.raises(KeyboardInterrupt):
-        training.train(scenario, parse(controller), seed=3, out=broken, steps=8, progress=interrupt)
-    training.train(scenario, parse(controller), seed=3, out=broken, steps=8, resume=True)
-    for name, tensor in weights(straight).items():
-        assert torch.equal(tensor, weights(broken)[name]), name
-    assert not list(tmp_path.glob("*.resume"))
-    loaded = load(broken, planning_model(scenario), guidance=controller == "dpc-pcrg")
-    assert loaded.name == controller
 
 
 def test_another_seed_is_another_policy(tmp_path, scenario):

@@ -214,7 +214,7 @@ class Strategy:
     def outside_training(self, scenario: Scenario, level: float, policy: Path | None = None) -> str:
         """Return a sentence if `level` times the demand is outside the training range of its policy, else ""."""
         file = self.file(scenario, policy) if self.controller.reads == POLICY else None
-        return "" if file is None else policy_file.outside_training(policy_file.read_policy_file(file), level)
+        return "" if file is None else policy_file.outside_training(policy_file.read_file(file), level)
 
 
 def parse(controller: str | Controller, city: str = "") -> Strategy:

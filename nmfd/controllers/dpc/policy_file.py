@@ -13,8 +13,6 @@ from nmfd.errors import InputError
 from nmfd.model.planning import PlanningModel
 from nmfd.model.regional_model import RegionalModel
 
-FORMAT = 1
-
 
 def new_policy(network: RegionalModel, architecture: Architecture) -> Policy:
     """Return a policy of this architecture with initial weights."""
@@ -24,7 +22,6 @@ def new_policy(network: RegionalModel, architecture: Architecture) -> Policy:
 def checkpoint(policy: Policy, network: RegionalModel, configuration: Mapping) -> dict:
     """Return the content of a policy file: weights and scale, architecture, network hash, configuration."""
     return {
-        "format": FORMAT,
         "architecture": asdict(policy.architecture),
         "network": network.name,
         "network_hash": network.hash,
@@ -33,8 +30,8 @@ def checkpoint(policy: Policy, network: RegionalModel, configuration: Mapping) -
     }
 
 
-def read_file(path: Path, missing: str) -> Any:
-    """Read a file of torch.save on the CPU without executing code from it. Raise InputError."""
+def read_file(path: Path, missing: str = "no such policy; train one with 'nmfd train'") -> Any:
+    """Read a checkpoint or the state of a training, without executing code from it. Raise InputError."""
     if not Path(path).is_file():
         raise InputError(f"{path}: {missing}")
     try:
@@ -43,17 +40,9 @@ def read_file(path: Path, missing: str) -> Any:
         raise InputError(f"{path}: is no policy file; train one with 'nmfd train'") from None
 
 
-def read_policy_file(path: Path) -> Any:
-    """Read the checkpoint in `path`. Raise InputError if it is none."""
-    content = read_file(path, "no such policy; train one with 'nmfd train'")
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise InputError(f"{path}: is no policy file of format {FORMAT}; train one with 'nmfd train'")
-    return content
-
-
 def load_policy(path: Path, network: RegionalModel) -> tuple[Policy, dict]:
     """Return the policy in `path` and its checkpoint. Raise InputError if it was trained for another network."""
-    content = read_policy_file(path)
+    content = read_file(path)
     try:
         names = {field.name for field in fields(Architecture)}
         architecture = Architecture(**{key: value for key, value in content["architecture"].items() if key in names})
