@@ -153,6 +153,8 @@ class Estimation:
         """Return the readings since the last call."""
         known, regions, meter = self._known, self._city.regions, self._meter
         density = self._occupancy / max(self._samples, 1) / 100.0 / VEHICLE_LENGTH_M
+        lane_length = np.bincount(self._region, self._length, regions)
+        share = known.detector_share * lane_length / np.maximum(lane_length, 1e-9)
         vehicles = np.bincount(self._region, density * self._length, regions)
         counts, flow = np.zeros((regions, regions)), meter.gateway_flow()
         for gateway, there, crossed in zip(self._city.gateways, self._layout.counted, flow - self._flow, strict=True):
@@ -163,7 +165,7 @@ class Estimation:
         unknown = np.full((regions, regions), np.nan)
         with np.errstate(divide="ignore", invalid="ignore"):
             return Readings(
-                accumulation=np.where(known.detector_share > 0, vehicles / known.detector_share, np.nan),
+                accumulation=np.where(share > 0, vehicles / share, np.nan),
                 crossings=np.where(known.counted_share > 0, counts / known.counted_share, np.nan),
                 probes=meter.probes() if known.probe_share > 0 else unknown,
                 probe_departures=departed.astype(float) if known.probe_share > 0 else unknown,
