@@ -1,10 +1,13 @@
-"""What was seen on the streets of made-up cities in a control interval."""
+"""Made-up cities, and means over their streets in a control interval."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from cosim.plant.sampling import StreetMeans
+from cosim.sumo.net import City, Gateway
 
 # Of a session: nobody stands, or is near the end of a lane.
 FAR_FROM_THE_END = {
@@ -13,6 +16,34 @@ FAR_FROM_THE_END = {
     "lane": lambda lane: (1e9, frozenset()),
 }
 MANY = 1e5  # veh: so many that nothing else counts
+
+
+def city(region_of: Mapping[str, int], successors: Mapping[str, Sequence[str]], **others: Any) -> City:
+    """Return a city with these edges, 10 m long, and a gateway wherever a move leads into another region."""
+    edges = tuple(edge for edge in sorted(region_of) if edge in successors)
+    moves = [(e, f) for e in edges for f in successors[e]]
+    gateways = [
+        Gateway(source=region_of[e], target=region_of[f], from_edge=e, to_edge=f, signal=None, links=())
+        for e, f in moves
+        if region_of[e] != region_of[f]
+    ]
+    properties = {
+        "length": dict.fromkeys(edges, 10.0),
+        "speed": dict.fromkeys(edges, 1.0),
+        "turn_time": dict.fromkeys(moves, 0.0),
+    }
+    return City(
+        net_file=Path(),
+        regions=max(region_of.values()) + 1,
+        region_of=region_of,
+        edges=edges,
+        lanes=dict.fromkeys(edges, 1),
+        lane_ids={},
+        successors={edge: tuple(successors[edge]) for edge in edges},
+        gateways=tuple(sorted(gateways, key=lambda g: (g.source, g.target))),
+        signals={},
+        **(properties | others),
+    )
 
 
 def seen(

@@ -81,30 +81,10 @@ def test_a_link_that_is_never_red_is_held_once_per_cycle(position):
     assert {state[3] for state in states[: round(90 - position)]} == {"g"}
 
 
-@pytest.mark.parametrize("mode", MODES)
-def test_before_any_command_the_original_programme_runs(mode):
-    signal = GatewaySignal(programme(SINGLE), {0: (0, 1)}, start=0.0, redistribute=mode == REDISTRIBUTE)
-    original = [state for state, duration in SINGLE for _ in range(duration)]
-    assert [signal.update(float(second)) for second in range(270)] == 3 * original
-
-
 def test_a_time_just_before_the_end_of_the_cycle_is_in_its_last_phase():
     """Sums of simulation steps are off by some rounding."""
     signal = GatewaySignal(programme(SINGLE), {0: (0, 1)}, start=0.0)
     assert signal.update(90.0 - 1e-7) == "ry" and signal.update(90.0) == "Gr"
-
-
-def test_hold_back_touches_the_gateway_only():
-    held = play(PHASES, {0: (0, 1)}, "hold-back", [np.zeros((2, 2))] * 3)
-    free = play(PHASES, {0: (0, 1)}, "hold-back", [np.ones((2, 2))] * 3)
-    assert [s[1:] for s in held] == [s[1:] for s in free]
-
-
-def test_redistribute_gives_the_seconds_to_the_crossing_street():
-    free = play(SINGLE, {0: (0, 1)}, "redistribute", [np.ones((2, 2))] * 3)[90:180]
-    held = play(SINGLE, {0: (0, 1)}, "redistribute", [np.zeros((2, 2))] * 3)[90:180]
-    assert sum(s[0] == "G" for s in held) == MIN_GREEN
-    assert sum(s[1] == "G" for s in held) == sum(s[1] == "G" for s in free) + 42 - MIN_GREEN
 
 
 def test_redistribute_leaves_the_time_between_greens_alone():

@@ -77,12 +77,6 @@ def test_a_region_without_measurements(scenario):
     check_notes(notes, 4, 10, "measurement 2 of 4 entries missing, last ones used")
 
 
-def test_several_faults_are_all_named(scenario):
-    _, _, notes = driven(scenario, "missing:1", "delayed:1")
-    assert notes[1] == "measurement 1 intervals late"
-    assert notes[0].startswith("measurement 0 intervals late") or "missing" in notes[0]
-
-
 class Mad(NoControl):
     """A controller whose controls are infinite."""
 

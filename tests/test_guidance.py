@@ -1,20 +1,18 @@
 """The searches of route guidance against all ways there are, in a small random city."""
 
-import math
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import Mock
 
 import libsumo
 import numpy as np
 import pytest
+import streets
 from streets import FAR_FROM_THE_END, seen
 
-from cosim.plant.guidance import Guide, _Present, shifted
+from cosim.plant.guidance import Guide
 from cosim.plant.meter import Event
-from cosim.plant.routes import FAR_S, FEWEST_TREES, MOST_NODES, Home, Moves, Searches, Trees, Ways
-from cosim.sumo.net import City, Gateway
+from cosim.plant.routes import MOST_NODES, Home, Moves, Searches, Trees, Ways
 
 EDGES, REGION = 40, np.repeat([0, 1, 2, 3], 10)
 
@@ -132,16 +130,6 @@ def test_ways_that_come_back_are_found_where_they_are_the_fastest_of_all(city, w
     assert back > 10
 
 
-def test_what_is_ahead_is_hardly_less_than_the_least_time(city):
-    first, second, turn, time = city
-    outside, entry = Moves(first, second, allowed=REGION != 0, reverse=True), np.array([12, 25])
-    exact = least(city, REGION != 0)[entry].min(axis=0)[10:]
-    ahead = outside.ahead(outside.number[entry], time, turn)[outside.number[10:EDGES]]
-    assert np.isfinite(exact).any() and (ahead <= exact).all()
-    np.testing.assert_allclose(ahead[np.isfinite(exact)], exact[np.isfinite(exact)], rtol=1e-5)
-    assert (ahead[~np.isfinite(exact)] == FAR_S).all()
-
-
 @pytest.mark.parametrize("kept", [MOST_NODES, 1])
 def test_ways_home_are_the_fastest_up_to_a_limit(city, kept):
     first, second, turn, time = city
@@ -161,21 +149,6 @@ def test_ways_home_are_the_fastest_up_to_a_limit(city, kept):
                     )
 
 
-def test_of_the_trees_the_one_not_asked_for_longest_goes_first():
-    searches, mine, others = Searches(most=100), object(), object()
-    for begin in range(10):
-        assert searches.put(mine, begin, (begin,), 10) == (begin,)
-    assert searches.get(others, 3) is None and all(searches.get(mine, begin) for begin in (0, *range(2, 10)))
-    searches.put(others, 3, ("x",), 10)
-    assert searches.get(mine, 1) is None and searches.get(mine, 0) == (0,) and searches.get(others, 3) == ("x",)
-    searches.put(mine, 0, ("new",), 5)  # instead of the old one, whose nodes count no more
-    searches.put(mine, 11, ("y",), 5)
-    assert searches.get(mine, 2) == (2,) and searches.get(mine, 0) == ("new",)
-    searches.put(mine, 12, ("large",), 1000)
-    left = [begin for begin in range(13) if searches.get(mine, begin)]
-    assert len(left) + bool(searches.get(others, 3)) == FEWEST_TREES and left[-2:] == [11, 12]
-
-
 # A main road a m b t of 10 s each, of which m is in another region, and the side street s of `side` s from a to t.
 REGION_OF = {"a": 0, "b": 0, "m": 1, "s": 0, "t": 2}
 AFTER = {"a": ("m", "s"), "b": ("t",), "m": ("b",), "s": ("t",), "t": ()}
@@ -186,31 +159,7 @@ DRIVER = Event(vehicle="driver", source=None, region=0, destination=2, edge="t")
 
 def crossroads(route, *, ways_return, side=40.0, to_region_1=0.5, period=0.0, lanes=True):
     """A guide, its commands, the routes of the drivers, and where they are, which is at their routes' first edges."""
-    moves = [(e, f) for e, after in AFTER.items() for f in after]
-    edges = tuple(sorted(AFTER))
-    city = City(
-        net_file=Path(),
-        regions=3,
-        region_of=REGION_OF,
-        edges=edges,
-        length=dict.fromkeys(edges, 10.0) | {"s": side},
-        lanes=dict.fromkeys(edges, 1),
-        lane_ids={},
-        speed=dict.fromkeys(edges, 1.0),
-        successors=AFTER,
-        turn_time=dict.fromkeys(moves, 0.0),
-        signals={},
-        gateways=tuple(
-            sorted(
-                (
-                    Gateway(source=REGION_OF[e], target=REGION_OF[f], from_edge=e, to_edge=f, signal=None, links=())
-                    for e, f in moves
-                    if REGION_OF[e] != REGION_OF[f]
-                ),
-                key=lambda g: (g.source, g.target),
-            )
-        ),
-    )
+    length = dict.fromkeys(AFTER, 10.0) | {"s": side}
     routes, road = {"driver": route}, Mock(side_effect=lambda vehicle: routes[vehicle][0])
     session = SimpleNamespace(
         road=road,
@@ -225,7 +174,7 @@ def crossroads(route, *, ways_return, side=40.0, to_region_1=0.5, period=0.0, la
     splits[0, 1:, 2], splits[1, 0, 2] = (to_region_1, 1.0 - to_region_1), 1.0
     guide = Guide(
         session,
-        city,
+        streets.city(REGION_OF, AFTER, length=length),
         own,
         compliance=1.0,
         most_detour=60.0,
@@ -276,13 +225,6 @@ def test_who_is_bound_for_a_region_does_not_see_its_price():
     assert "".join(routes["driver"]) == "ambt"  # 20 s less; t itself is in region 2, and takes the same both ways
 
 
-def test_without_lanes_a_way_is_kept_unless_another_one_saves_its_share():
-    """In the mesoscopic model 30 % of the other one's time, whatever the delay; and never where nobody is."""
-    guide, *_ = crossroads(tuple("ambt"), ways_return=True, lanes=False)
-    for takes, kept in ((39.0, True), (52.0, True), (52.1, False), (math.inf, False)):
-        assert guide._keeps(_Present([0, 2, 1, 4], takes, 20.0, True), 40.0) == kept
-
-
 def test_drivers_are_asked_again_where_they_are():
     """On his way over m, which comes to a stand, a driver turns into the side street if he is asked in time."""
     for period, asked in ((0.0, 99), (2.5, 3), (6.0, 6)):
@@ -317,10 +259,3 @@ def test_whoever_comes_into_another_region_is_no_more_asked_as_in_the_one_before
         guide.apply([])
         assert road.call_count == calls
     assert guide.realised.sum() == 2
-
-
-def test_shifted_shares_keep_their_sum_and_follow_theta():
-    wish, own = np.array([0.5, 0.3, 0.2]), np.array([0.6, 0.2, 0.2])
-    np.testing.assert_allclose(shifted(wish, own, own), wish)
-    moved = shifted(wish, own, np.array([0.3, 0.5, 0.2]))
-    np.testing.assert_allclose(moved, [0.25, 0.55, 0.2])

@@ -6,13 +6,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import streets
 from streets import FAR_FROM_THE_END, seen
 
 from cosim.evaluation.simulate import simulate
 from cosim.plant import guidance
 from cosim.plant.guidance import Guide
 from cosim.plant.meter import Event
-from cosim.sumo.net import City, Gateway
 from nmfd.api import load_scenario
 from nmfd.controllers.strategy import parse
 from nmfd.types import Controls
@@ -35,31 +35,13 @@ class Town:
 
     def __init__(self, *, through_a, through_b, theta, own=0.5, most_detour=1e9, compliance=1.0, seed=0, lanes=True):
         length = dict.fromkeys(EDGES, 10.0) | {"a": through_a, "b": through_b, "u": 5.0}
-        city = City(
-            net_file=Path(),
-            regions=4,
-            region_of=REGION_OF,
-            edges=EDGES,
+        city = streets.city(
+            REGION_OF,
+            AFTER,
             length=length,
-            lanes=dict.fromkeys(EDGES, 1),
-            lane_ids={},
-            speed=dict.fromkeys(EDGES, 1.0),
-            successors=AFTER,
             turn_time={(e, f): 1.0 for e, after in AFTER.items() for f in after},
-            signals={},
             over={("s", "a"): (":s_1",), ("a", "t"): (":a_1",)},
             inside={":a_1": 9.0, ":s_1": 9.0},
-            gateways=tuple(
-                sorted(
-                    (
-                        Gateway(source=REGION_OF[e], target=REGION_OF[f], from_edge=e, to_edge=f, signal=None, links=())
-                        for e, after in AFTER.items()
-                        for f in after
-                        if REGION_OF[e] != REGION_OF[f]
-                    ),
-                    key=lambda g: (g.source, g.target),
-                )
-            ),
         )
         self.routes, self.takes_it, self.shares = {}, True, np.zeros((2, 4, 4, 4))
         for shares, to_a in zip(self.shares, (own, theta), strict=True):
@@ -108,11 +90,6 @@ class Town:
             assert self.routes[vehicle] in (("s", "a", "t"), ("s", "b", "t"))
             ways += self.routes[vehicle][1]
         return ways
-
-
-def test_own_split_ratios_leave_everybody_on_the_fastest_way():
-    assert Town(through_a=30.0, through_b=90.0, theta=0.5).drive(12, by="b") == 12 * "a"
-    assert Town(through_a=90.0, through_b=30.0, theta=0.5).drive(12, by="a") == 12 * "b"
 
 
 @pytest.mark.parametrize("theta, expected", [(0.0, 0), (0.25, 20), (0.4, 32), (0.5, 40), (0.8, 40)])
@@ -250,7 +227,7 @@ class _Gate:
 
 
 def test_guided_is_guidance_by_travel_times_wherever_the_controller_says_nothing():
-    """The same bytes as of a controller that commands the drivers' own split ratios; and without it nobody is guided."""
+    """The same bytes as with a controller that commands the own split ratios; without it nobody is guided."""
     scenario = load_scenario(Path(__file__).parents[1] / "scenarios" / "grid7_peak")
     scenario = replace(scenario, steps=1, demand=scenario.demand[15:16])
     own = scenario.network.nominal_splits

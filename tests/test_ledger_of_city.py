@@ -38,10 +38,6 @@ RECKLESS = (
     'jmIgnoreFoeProb="1" jmIgnoreFoeSpeed="99" jmIgnoreJunctionFoeProb="1" jmDriveAfterRedTime="999" '
     'collisionMinGapFactor="0"'
 )
-PARKING = "".join(
-    f'<parkingArea id="p{n}" lane="{lane}_0" startPos="20" endPos="60" roadsideCapacity="{n % 2}"/>'
-    for n, lane in enumerate(("B1C1", "B2C2", "C1D1", "C2D2"))
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,12 +140,6 @@ CASES = {
         trips=10,
         expects=("arrivals",),
     ),
-    "calibrators-on-last-edges": Case(
-        additional="".join(CALIBRATOR.format(edge, 5, flow(20)) for edge in ("C1D1", "C2D2")),
-        vehicles='<flow id="f" begin="0" end="150" period="2" from="A1B1" to="C1D1"/>',
-        trips=20,
-        expects=("removals",),
-    ),
     "collisions": Case(
         type=RECKLESS,
         trips=300,
@@ -157,15 +147,8 @@ CASES = {
         options=("--collision.check-junctions",),
         expects=("removals",),
     ),
-    "collisions-teleport": Case(
-        type=RECKLESS, trips=300, session={"collision_action": "teleport"}, options=("--collision.check-junctions",)
-    ),
-    "removed-by-program": Case(script=remove(3), expects=("arrivals", "removals")),
-    "removed-as-arrived": Case(script=remove(2), expects=("removals",)),
-    "removed-as-teleport": Case(script=remove(0, 4), expects=("removals",)),
     "removed-as-anything": Case(script=remove(0, 1, 2, 3, 4), expects=("removals",)),
     "removed-after-the-step": Case(script=remove(3), late=True, expects=("removals",)),
-    "shortened": Case(script=shorten, expects=("arrivals", "redirected")),
     "another-target": Case(script=change_target, expects=("arrivals", "redirected")),
     "added-by-program": Case(script=add, trips=40, expects=("arrivals",)),
     "ids-used-again": Case(script=reuse, expects=("removals",)),
@@ -177,40 +160,12 @@ CASES = {
         ),
         expects=("arrivals", "redirected"),
     ),
-    "ending-rerouter": Case(additional=REROUTER.format('<destProbReroute id="terminateRoute" probability="1"/>')),
-    "route-rerouter": Case(
-        additional='<route id="other" edges="B1C1 C1C2"/>'
-        + REROUTER.replace("A1B1 B1C1 B2C2 C2B2 C1B1 B1B2 C1C2", "B1C1").format(
-            '<routeProbReroute id="other" probability="1"/>'
-        ),
-        expects=("arrivals", "redirected"),
-    ),
     "closing-rerouter": Case(
         additional=REROUTER.format(
             '<closingReroute id="C1D1" disallow="all"/><closingReroute id="B2C2" disallow="all"/>'
         ),
         options=("--ignore-route-errors",),
         expects=("given_up",),
-    ),
-    "closing-rerouter-that-diverts": Case(
-        additional=REROUTER.format(
-            '<closingReroute id="C1D1" disallow="all"/><destProbReroute id="C3D3" probability="1"/>'
-        ),
-        options=("--ignore-route-errors",),
-        expects=("arrivals",),
-    ),
-    "parking-rerouter": Case(
-        additional=PARKING
-        + '<rerouter id="r" edges="B1C1 B2C2 C1D1 C2D2"><interval begin="0" end="900">'
-        + "".join(f'<parkingAreaReroute id="p{n}"/>' for n in range(4))
-        + "</interval></rerouter>",
-        vehicles="".join(
-            f'<trip id="park{n}" depart="{3 * n}" from="A{1 + n % 2}B{1 + n % 2}" to="B{1 + n % 2}C{1 + n % 2}">'
-            f'<stop parkingArea="p{n % 2}" duration="40"/></trip>'
-            for n in range(30)
-        ),
-        trips=40,
-        expects=("arrivals",),
     ),
     "stops-beside-the-road": Case(
         vehicles="".join(
@@ -233,12 +188,6 @@ CASES = {
         options=("--ignore-route-errors", "--time-to-teleport.disconnected", "1"),
         expects=("jumps",),
     ),
-    "disconnected": Case(
-        vehicles="".join(
-            f'<vehicle id="gap{n}" depart="{4 * n}"><route edges="A1B1 C2D2"/></vehicle>' for n in range(20)
-        ),
-        options=("--ignore-route-errors",),
-    ),
     "long-waits": Case(
         vehicles='<flow id="f" begin="0" end="99" period="0.3" from="A1B1" to="C1D1"/>',
         options=("--max-depart-delay", "10"),
@@ -251,24 +200,6 @@ CASES = {
             for n in range(30)
         ),
         trips=20,
-        expects=("arrivals",),
-    ),
-    "from-the-middle-of-a-route": Case(
-        vehicles="".join(
-            f'<vehicle id="m{n}" depart="{2 * n}" departEdge="2"><route edges="A1B1 B1C1 C1D1 D1D2"/></vehicle>'
-            for n in range(20)
-        ),
-        trips=40,
-        expects=("arrivals",),
-    ),
-    "rerouting-drivers": Case(
-        options=("--device.rerouting.probability", "0.5", "--device.rerouting.period", "20"), expects=("arrivals",)
-    ),
-    "zones": Case(
-        additional='<taz id="w" edges="A1B1 A2B2"/><taz id="e"><tazSink id="C1D1" weight="1"/>'
-        '<tazSink id="B1C1" weight="1"/><tazSource id="D1C1" weight="1"/></taz>',
-        vehicles='<flow id="z" begin="0" end="200" period="4" fromTaz="w" toTaz="e"/>',
-        trips=40,
         expects=("arrivals",),
     ),
     "everything": Case(
@@ -285,7 +216,7 @@ CASES = {
     ),
 }
 # What SUMO's mesoscopic model does not have: collisions, standing drivers, places on edges, parking rerouters.
-MICRO_ONLY = {"collisions", "collisions-teleport", "teleports", "teleports-off-the-net", "moved-by-program"}
+MICRO_ONLY = {"collisions", "teleports", "teleports-off-the-net", "moved-by-program"}
 QUICK = {  # in the default suite
     ("calibrators", False),
     ("collisions", False),

@@ -133,11 +133,6 @@ def test_weights_by_hand():
     assert found["c", "d"] == pytest.approx(2.0)
 
 
-def test_what_is_upstream_on_the_same_road_counts_too():
-    assert weights(x=5.0)[0]["a", "b"] == pytest.approx(5.0)
-    assert weights(d=9.0)[0]["c", "d"] == 0.0  # nobody on d wants to go on anywhere
-
-
 @pytest.mark.parametrize("length, weight", [(10.0, 5.0 + 0.25 * 8.0), (100.0, 5.0)])
 def test_a_short_piece_before_the_signal_is_not_all_of_the_queue(length, weight):
     """x leads into a, and for three quarters of its vehicles elsewhere; within 100 m they count by that share."""

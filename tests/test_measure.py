@@ -1,38 +1,24 @@
 """The meter on a session that is made up: every vehicle followed by hand from loading to arrival."""
 
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import streets
 
 from cosim.plant.meter import Event, Meter
-from cosim.sumo.net import City, Gateway
 from nmfd.ledger import LedgerError
 
 # a0 -> b0 -> b1 -> c0 in a row, regions 0, 1, 1, 2, and a way back c0 -> a0. Entries: b0, c0 and a0.
 EDGES = {"a0": 0, "b0": 1, "b1": 1, "c0": 2}
-GATEWAYS = (("a0", "b0"), ("b1", "c0"), ("c0", "a0"))
 
 
-def city(length=100.0, speed=10.0):
-    return City(
-        net_file=Path("none"),
-        regions=3,
-        region_of={**EDGES, ":j_0": 1},
-        edges=tuple(EDGES),
-        length=dict.fromkeys(EDGES, length),
-        lanes=dict.fromkeys(EDGES, 1),
-        lane_ids={},
-        successors={},
-        turn_time={},
-        speed=dict.fromkeys(EDGES, speed),
-        signals={},
-        gateways=tuple(
-            Gateway(source=EDGES[a], target=EDGES[b], from_edge=a, to_edge=b, signal=None, links=())
-            for a, b in GATEWAYS
-        ),
-    )
+CITY = streets.city(
+    {**EDGES, ":j_0": 1},
+    {"a0": ("b0",), "b0": ("b1",), "b1": ("c0",), "c0": ("a0",)},
+    length=dict.fromkeys(EDGES, 100.0),
+    speed=dict.fromkeys(EDGES, 10.0),
+)
 
 
 class Streets:
@@ -93,7 +79,7 @@ class Streets:
 def play():
     """A function that makes one simulation step: new=, move=, gone= and so on; the meter's events of it."""
     session = Streets()
-    meter = Meter(session, city(), probes=frozenset({"p"}))
+    meter = Meter(session, CITY, probes=frozenset({"p"}))
 
     def step(*, new=(), move=None, gone=(), loads=(), jumps=(), lands=(), waiting=None):
         session.clear()
@@ -223,41 +209,10 @@ def test_probes_are_counted_apart(play):
     assert (play.meter.probes() == 0).all()
 
 
-def test_back_into_a_region_is_an_entry_again(play):
-    play.session.routes = {"v": ("a0", "b0", "b1", "c0", "a0")}
-    play.step(new=["v"])
-    regions = []
-    for edge in ("b0", "b1", "c0", "a0"):
-        regions += [event.region for _ in range(3) for event in play.step(move={"v": edge})]
-    assert regions == [1, 2, 0]
-    assert (play.meter.accumulation() == x((0, 0))).all()
-
-
-def test_departures_come_before_entries_and_both_by_name(play):
-    play.session.routes = {name: ("a0", "b0", "b1") for name in "wvut"}
-    play.step(new=["w", "v"])
-    play.step(move={"w": "b0", "v": "b0"})
-    found = play.step(new=["u", "t"])
-    assert [(event.vehicle, event.source) for event in found] == [("t", None), ("u", None), ("v", 0), ("w", 0)]
-
-
 def test_public_transport_is_not_free(play):
     play.session.routes, play.session.bound = {"bus": ("a0", "b0")}, {"bus"}
     assert [event.free for event in play.step(new=["bus"])] == [False]
     assert [event.free for _ in range(3) for event in play.step(move={"bus": "b0"})] == [False]
-
-
-@pytest.mark.parametrize("length, speed, every", [(100.0, 10.0, 3), (20.0, 10.0, 1), (40.0, 10.0, 2), (10.0, 50.0, 1)])
-def test_short_entries_are_polled_more_often(length, speed, every):
-    """At least twice while a vehicle drives along them, at most every step, at least every three seconds."""
-    session = Streets()
-    meter, session.routes = Meter(session, city(length, speed)), {"v": ("a0", "b0")}
-    session.new, session.places = ["v"], {"v": "a0"}
-    meter.observe()
-    session.clear()
-    session.places["v"] = "b0"
-    steps = next(n for n in range(2, 9) if meter.observe())
-    assert meter._poll_steps == every and steps == max(every, 2)
 
 
 @pytest.mark.parametrize(

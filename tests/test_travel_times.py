@@ -1,14 +1,13 @@
 """What streets and junctions take, worked out by hand: a, 100 m at up to 10 m/s, leads over a junction to b and c."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
+import streets
 from streets import seen
 
 from cosim.plant.routes import EMPTY_WEIGHT, PRIOR_VEH_S, STANDING_M_S, WINDOW_S, TravelTimes
-from cosim.sumo.net import City
 
 NOBODY = math.nan
 
@@ -16,20 +15,12 @@ NOBODY = math.nan
 @pytest.fixture
 def times():
     """Into b one turns over two internal edges, of which the first is shared with c."""
-    edges = ("a", "b", "c")
-    city = City(
-        net_file=Path(),
-        regions=1,
-        region_of=dict.fromkeys(edges, 0),
-        edges=edges,
-        length=dict.fromkeys(edges, 100.0),
-        lanes=dict.fromkeys(edges, 1),
-        lane_ids={},
-        speed=dict.fromkeys(edges, 10.0),
-        successors={"a": ("b", "c"), "b": (), "c": ()},
+    city = streets.city(
+        {"a": 0, "b": 0, "c": 0},
+        {"a": ("b", "c"), "b": (), "c": ()},
+        length=dict.fromkeys("abc", 100.0),
+        speed=dict.fromkeys("abc", 10.0),
         turn_time={("a", "b"): 2.0, ("a", "c"): 1.0},
-        gateways=(),
-        signals={},
         over={("a", "b"): (":1", ":2"), ("a", "c"): (":1",)},
         inside={":1": 8.0, ":2": 4.0},
     )

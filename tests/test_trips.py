@@ -64,13 +64,6 @@ def test_no_trip_starts_or_ends_on_a_radial_or_in_a_pocket(trips, city):
     assert not any(edge.endswith(".p") for route in trips.routes for edge in (route[0], route[-1]))
 
 
-def test_drivers_spread(trips):
-    by_ends: dict = {}
-    for route in trips.routes:
-        by_ends.setdefault((route[0], route[-1]), set()).add(route)
-    assert max(len(routes) for routes in by_ends.values()) > 1
-
-
 def test_seeds(city, scenario, tmp_path):
     paths = [tmp_path / f"{n}.rou.xml" for n in range(3)]
     count = [
@@ -86,7 +79,3 @@ def test_seeds(city, scenario, tmp_path):
 def test_demand_for_other_regions(city):
     with pytest.raises(InputError, match="demand for 3 regions, but the city has 7"):
         make_trips(city, np.zeros((2, 3, 3)), 90.0, seed=1)
-
-
-def test_no_demand_no_trips(city, tmp_path):
-    assert not write_trips(city, np.zeros((2, 7, 7)), 90.0, 1, tmp_path / "none.rou.xml").routes

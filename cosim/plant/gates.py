@@ -67,12 +67,11 @@ class GatewaySignal:
             self._cycle_start += self._cycle
             self._ends = list(accumulate(self._durations()))
         phase = min(bisect_right(self._ends, now - self._cycle_start + 1e-6), len(self._ends) - 1)
-        base, changes = self._states[phase], [self._cycle_start + self._ends[phase]]
-        shown = list(base)
+        shown, self.next_change = list(self._states[phase]), self._cycle_start + self._ends[phase]
         for link, movement in self._movements.items():
-            shown[link], change = self._filter(link, movement, base[link], phase, now)
-            changes.append(change)
-        self._shown, self._since, self.next_change = "".join(shown), now, min(changes)
+            shown[link], change = self._filter(link, movement, shown[link], phase, now)
+            self.next_change = min(self.next_change, change)
+        self._shown, self._since = "".join(shown), now
         return self._shown
 
     def green_time(self) -> dict[int, float]:
@@ -109,7 +108,9 @@ class GatewaySignal:
             if not movement.open or (always and now - movement.opened_at >= self._cycle - 1e-6):
                 movement.open, movement.cut_at = True, NEVER
                 if self._shown:  # the window during which control starts is left whole
-                    movement.opened_at, movement.cut_at = now, now + _kept(movement.share, full)
+                    least = min(MIN_GREEN_S, full)
+                    kept = full if movement.share >= 1.0 else least + round(movement.share * (full - least))
+                    movement.opened_at, movement.cut_at = now, now + kept
             if now < movement.cut_at:
                 return base, movement.cut_at
         else:
@@ -129,12 +130,6 @@ class _Movement:
     def __init__(self, pair: tuple[int, int]):
         self.pair, self.green_time, self.share = pair, 0.0, 1.0
         self.open, self.opened_at, self.cut_at = False, -NEVER, NEVER
-
-
-def _kept(share: float, full: float) -> float:
-    """Return the green that is kept of a window of `full` seconds."""
-    least = min(MIN_GREEN_S, full)
-    return full if share >= 1.0 else least + round(share * (full - least))
 
 
 def _windows(programme: Programme, link: int) -> dict[int, float]:
@@ -173,9 +168,9 @@ def _apportion(total: float, weights: list[float]) -> list[float]:
 
 
 class Ration:
-    """The green of one gateway link, limited per cycle; share 1 is no limit.
+    """The green of one gateway link, limited per cycle.
 
-    pair: (i, h), whose command it follows
+    pair: (i, h), whose command it follows; share: [-] of the cycles that begin from now on, 1 is no limit
     """
 
     def __init__(self, pair: tuple[int, int], *, cycle: float, yellow: float, start: float, full: float | None = None):
@@ -183,14 +178,10 @@ class Ration:
         self.pair, self._green_time = pair, 0.0
         self._full = cycle if full is None else full
         self._cycle, self._least, self._yellow = cycle, min(MIN_GREEN_S, self._full), yellow
-        self._share, self._budget, self._spent = 1.0, NEVER, 0.0
+        self.share, self._budget, self._spent = 1.0, NEVER, 0.0
         self._cycle_end = start
         self._open, self._opened_at = False, -NEVER
         self._light, self._since, self._yellow_until = "r", start, start
-
-    def command(self, share: float) -> None:
-        """Set the share [-] of the cycles that begin from now on."""
-        self._share = share
 
     @property
     def limited(self) -> bool:
@@ -207,15 +198,13 @@ class Ration:
 
         Call it also when `light` changes. lasting: a green lasts for the minimum green at least
         """
-        if self._light in GREEN:
-            self._spent += now - self._since
-            self._green_time += now - self._since
-        self._since = now
+        green = now - self._since if self._light in GREEN else 0.0
+        self._spent, self._green_time, self._since = self._spent + green, self._green_time + green, now
         while now >= self._cycle_end - 1e-6:
             self._cycle_end += self._cycle
             self._spent = 0.0
-            limit = self._least + self._share * (self._full - self._least)
-            self._budget = NEVER if self._share >= 1.0 else limit
+            limit = self._least + self.share * (self._full - self._least)
+            self._budget = NEVER if self.share >= 1.0 else limit
         self._light, again = self._filter(light, now, lasting)
         return self._light, min(again, self._cycle_end)
 
@@ -278,30 +267,24 @@ class ResponsiveSignal:
     def command(self, share: PerPair) -> None:
         """Set the shares (R, R) [-] from the next cycle on."""
         for ration in self._rations.values():
-            ration.command(float(share[ration.pair]))
-        self._limited = any(share[ration.pair] < 1.0 for ration in self._rations.values())
+            ration.share = float(share[ration.pair])
+        self._limited = any(ration.share < 1.0 for ration in self._rations.values())
         self._next = self._since
 
     def play(self, now: float) -> None:
         """Set the state from `now` [s] on, or leave the signal to SUMO."""
-        if self._held:
-            base = self._session.state_underneath(self.signal, self._programme)
-        else:
-            base = self._session.signal_state(self.signal)
+        session, signal = self._session, self.signal
+        base = session.state_underneath(signal, self._programme) if self._held else session.signal_state(signal)
         if base == self._base and now < self._next - 1e-6:
             return
         before, self._base = self._base, base
         if base != before:
             self._since = now
-        shown = list(base)
-        self._next = NEVER
+        shown, self._next = list(base), NEVER
         for link, ration in self._rations.items():
             begun = not before or before[link] not in GREEN  # a window that begins lasts for SUMO's own minimum
-            light, again = ration.show(
-                "G" if not before and base[link] == "y" else base[link],  # a first yellow as that after a green
-                now,
-                lasting=begun or link in self._always,
-            )
+            own = "G" if not before and base[link] == "y" else base[link]  # a first yellow as that after a green
+            light, again = ration.show(own, now, lasting=begun or link in self._always)
             self._next = min(self._next, again)
             if light == "y" or base[link] in "Ggy":
                 shown[link] = light

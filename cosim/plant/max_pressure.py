@@ -20,6 +20,7 @@ counts for the share of green in these and the LOOKAHEAD_S that follow.
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import lru_cache
+from itertools import permutations
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -72,7 +73,7 @@ class MaxPressure:
         self._programmed = float(np.mean([_intergreen(signal) for signal in signals])) if signals else 0.0
         self._junctions = [Junction(signal, session.time, pairs.get(signal.id)) for signal in signals]
         self._approaches = [Approaches(signal, roads.watched, session.time) for signal in signals]
-        self._rationed = [junction for junction in self._junctions if junction.rationed]
+        self._rationed = [junction for junction in self._junctions if junction.rations]
         self._next = session.time
         for junction in self._junctions:
             show(junction.signal, junction.state)
@@ -142,8 +143,9 @@ class MaxPressure:
 class Junction:
     """The states of one signal, second by second: a stage, or the transition between two stages.
 
-    stages: their number; stage: the present or coming one; stage_since: time at which it begins [s]; lost: [s] between
-    stages so far; next_change: time of the next `advance` [s]
+    stages: their number; stage: the present or coming one; stage_since: time at which it begins [s]
+    rations: link index -> limit of the green of a gateway link
+    lost: [s] between stages so far; next_change: time of the next `advance` [s]
     """
 
     def __init__(self, signal: Signal, now: float, gateways: Mapping[int, tuple[int, int]] | None = None):
@@ -153,26 +155,24 @@ class Junction:
         self._base = signal.phases[self._numbers[0]].state
         self._green_since, self.stage_since = now, now
         cycle = sum(phase.duration for phase in signal.phases)
-        self._rations = {
+        self.rations = {
             link: Ration(pair, cycle=cycle, yellow=yellow_time(signal.phases, link), start=now)
             for link, pair in (gateways or {}).items()
         }
         self._movement = {link.index: (link.from_edge, link.to_edge) for link in signal.links}
         self._coming: list[tuple[float, str]] = []
-        self.lost = 0.0
         self._between: dict[tuple[int, int], list[Phase]] = {}  # stage, next stage -> phases between them
-        self.state = self._base
-        self.next_change = now if self._rations else NEVER  # until then, commands hold from the first second on
-
-    @property
-    def rationed(self) -> bool:
-        """Return True if commands limit the green of a link here."""
-        return bool(self._rations)
+        self.lost, self.state = 0.0, self._base
+        self.next_change = now if self.rations else NEVER  # until then, commands hold from the first second on
 
     def command(self, share: PerPair) -> None:
         """Set the shares (R, R) [-] of the cycles that begin from now on."""
-        for ration in self._rations.values():
-            ration.command(float(share[ration.pair]))
+        for ration in self.rations.values():
+            ration.share = float(share[ration.pair])
+
+    def green_time(self, now: float) -> dict[int, float]:
+        """Return the green of every gateway link before `now` [s]."""
+        return {link: ration.green_time(now) for link, ration in self.rations.items()}
 
     def exhausted(self) -> set[tuple[str, str]]:
         """Return (edge, next edge) of the gateway movements without more green in this cycle."""
@@ -180,11 +180,7 @@ class Junction:
 
     def exhausted_links(self) -> list[int]:
         """Return the gateway links without more green in this cycle."""
-        return [link for link, ration in self._rations.items() if ration.exhausted]
-
-    def green_time(self, now: float) -> dict[int, float]:
-        """Return the green of every gateway link before `now` [s]."""
-        return {link: ration.green_time(now) for link, ration in self._rations.items()}
+        return [link for link, ration in self.rations.items() if ration.exhausted]
 
     def may_switch(self, now: float) -> bool:
         """Return True if the stage may end at `now` [s]."""
@@ -217,7 +213,7 @@ class Junction:
             self._base = self._coming.pop(0)[1]
         self.next_change = self._coming[0][0] if self._coming else NEVER
         shown = list(self._base)
-        for link, ration in self._rations.items():
+        for link, ration in self.rations.items():
             lasting = all(state[link] in GREEN for _, state in self._coming)
             shown[link], again = ration.show(shown[link], now, lasting=lasting)
             self.next_change = min(self.next_change, again)
@@ -232,16 +228,11 @@ def stages_of(signal: Signal) -> tuple[int, ...]:
 
     Programmes have the same phase twice, and phases in which a part of the green goes on for the last vehicles.
     """
-    level = {n: [LEVELS.index(light) for light in signal.phases[n].state] for n in signal.stages}
-
-    def needless(n: int) -> bool:
-        return any(
-            all(a <= b for a, b in zip(level[n], level[m], strict=True)) and (level[n] != level[m] or m < n)
-            for m in level
-            if m != n
-        )
-
-    return tuple(n for n in level if not needless(n))
+    level = {n: np.array([LEVELS.index(light) for light in signal.phases[n].state]) for n in signal.stages}
+    covered = {
+        n for n, m in permutations(level, 2) if (level[n] <= level[m]).all() and (m < n or (level[n] < level[m]).any())
+    }
+    return tuple(n for n in level if n not in covered)
 
 
 def transition(phases: tuple[Phase, ...], source: int, target: int) -> list[Phase]:
@@ -276,9 +267,8 @@ def transition(phases: tuple[Phase, ...], source: int, target: int) -> list[Phas
 
 def _intergreen(signal: Signal) -> float:
     """Return the share of the cycle between two stages in the original programme."""
-    durations = [(phase.duration, is_stage(phase.state)) for phase in signal.phases]
-    between = sum(seconds for seconds, green in durations if not green)
-    return between / max(sum(seconds for seconds, _ in durations), 1.0)
+    between = sum(phase.duration for phase in signal.phases if not is_stage(phase.state))
+    return between / max(sum(phase.duration for phase in signal.phases), 1.0)
 
 
 class Approaches:
