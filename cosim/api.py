@@ -324,7 +324,7 @@ def import_city(
     begin: str | None = None,
     end: str | None = None,
     seed: int = 0,
-    force: bool = False,
+    seeds: int = 3,
 ) -> str:
     """Write network and scenario of a SUMO city; return a report.
 
@@ -333,6 +333,7 @@ def import_city(
     demand: "peak" generates a morning peak
     level: factor on the vehicles, or on the peak
     begin, end: time window, in seconds or as h:m:s
+    seeds: runs without control whose densities are averaged
     """
     number = int(regions) if str(regions).isdecimal() else None
     if number is not None and number < 2:
@@ -352,7 +353,7 @@ def import_city(
             begin=None if begin is None else seconds(begin, "--begin"),
             end=None if end is None else seconds(end, "--end"),
             seed=seed,
-            force=force,
+            seeds=seeds,
             progress=lambda stage, share=0.0: show and show(round(100 * share), 100, stage),
         )
     return f"{text}\nWritten to {out} (see map.png, quality.csv, gateways.csv) and {scenario}"

@@ -266,8 +266,8 @@ def get(name: str | None) -> None:
 @click.option("--begin", metavar="TIME", help="Start in s or h:m:s. [default: the sumocfg's]")
 @click.option("--end", metavar="TIME", help="End of departures in s or h:m:s. [default: the sumocfg's]")
 @seed_option()
-@click.option("--out", type=FOLDER, required=True, metavar="DIR", help="Network folder, such as networks/mycity.")
-@click.option("--force", is_flag=True, help="Replace an existing network and scenario.")
+@click.option("--seeds", type=COUNT, default=3, show_default=True, help="Runs without control, to average densities.")
+@click.option("--out", type=FOLDER, required=True, metavar="DIR", help="New folder, such as networks/mycity.")
 def import_(source: Path | None, bbox: str | None, **options: Any) -> None:
     """Make a network and a scenario of any SUMO city.
 

@@ -11,10 +11,9 @@ import pandas as pd
 import pytest
 import sumo
 from commands import cosim, good
-from tiny_city import driven
+from tiny_city import driven, pieces
 
 from cosim.evaluation.simulate import simulate
-from cosim.importing.quality import pieces
 from cosim.importing.streets import read_streets
 from nmfd.api import load_scenario
 from nmfd.controllers.strategy import parse

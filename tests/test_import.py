@@ -95,7 +95,6 @@ def test_gateways_and_quality_add_up(imported):
     assert crossing == set(zip(gateways.from_edge, gateways.to_edge, strict=True))
     assert set(gateways.control) <= {"controlled", "no signal"} and (gateways.control == "controlled").any()
     whole = quality.iloc[-1]
-    assert whole.boundary_flow_veh == gateways.flow_veh.sum() > 0
     free = gateways.flow_veh[gateways.control != "controlled"].sum() / gateways.flow_veh.sum()
     assert whole.uncontrolled_share == pytest.approx(free, abs=1e-3)
     answer = (network / "verdict.txt").read_text().splitlines()[0]
@@ -103,7 +102,6 @@ def test_gateways_and_quality_add_up(imported):
     shares = load_network(network).controllable
     assert (shares > 0).any() and ((shares >= 0) & (shares <= 1)).all() and load_network(network).placeholder
     assert quality.lane_km[:-1].sum() == pytest.approx(whole.lane_km, abs=0.02)
-    assert (quality.pieces[:-1] == 1).all() and whole.variance_within <= whole.variance_before
 
 
 def test_import_is_deterministic_and_atomic(imported, config, tmp_path):
@@ -115,7 +113,7 @@ def test_import_is_deterministic_and_atomic(imported, config, tmp_path):
         for one, other in zip(here, there, strict=True):
             assert one.is_dir() or one.read_bytes() == other.read_bytes(), one.name
     line = error_line(cosim("import", config, "--regions", 3, "--out", tmp_path / "networks" / "tiny"))
-    assert "network.toml exists" in line and "--force" in line
+    assert "exists; choose another name" in line
 
 
 def test_scenario_drives_the_original_vehicles(imported, config):
@@ -234,8 +232,8 @@ def test_options_and_includes_of_the_user_count(config, tmp_path):
             tmp_path / "networks" / "x",
         )
     )
-    assert "60 vehicles in" in text and "vehicles times 2.5, the scale" in text
-    assert "not taken over from city.sumocfg: max-depart-delay = 60" in text
+    assert "60 vehicles in" in text
+    assert "not taken over from city.sumocfg: max-depart-delay = 60, scale = 2.5" in text
     scenario = load_scenario(tmp_path / "scenarios" / "x")
     assert scenario.demand_factor == 2.5 and scenario.demand.sum() * scenario.step == pytest.approx(150.0)
     assert settings(scenario).mesoscopic
@@ -369,7 +367,9 @@ def test_identification_gives_both_models_and_the_import_takes_the_second_away(i
     assert all("one seed" in doubts for doubts in loaded.network.doubts)
     assert text.count("Can perimeter control help?") == 2 and (tmp_path / "loading" / "fit.csv").is_file()
     assert loaded.network.controllable is not None and loaded.network.controllable.any()
-    tiny_city.imported(tmp_path, 2, config, force=True)
+    shutil.rmtree(network)
+    shutil.rmtree(scenario)
+    tiny_city.imported(tmp_path, 2, config)
     assert planning_model(load_scenario(scenario), "dpc-pcrg").network.regions == 2
 
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import tiny_city
+from tiny_city import pieces
 
 from cosim.importing.baseline import INTERVAL_S, Baseline
 from cosim.importing.partition import make_blocks, partition, read_regions
-from cosim.importing.quality import pieces
 from cosim.importing.regions import finish
 from cosim.importing.streets import read_streets
 from nmfd.errors import InputError

@@ -8,8 +8,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import sumo
+from scipy.sparse.csgraph import connected_components
 
 from cosim.importing.importer import import_city
+from cosim.importing.streets import Streets, graph
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
 from nmfd.model.scenario import Scenario
@@ -79,6 +81,13 @@ def network(folder: Path, *options: str, name: str = "city.net.xml") -> Path:
         *options,
     )
     return folder / name
+
+
+def pieces(streets: Streets, members: np.ndarray) -> int:
+    """Number of parts into which some edges fall by the connections between them."""
+    numbers = np.cumsum(members) - 1
+    links = streets.links[members[streets.links].all(axis=1)]
+    return int(connected_components(graph(numbers[links], int(members.sum())), directed=False)[0])
 
 
 def city(folder: Path, *options: str) -> Path:

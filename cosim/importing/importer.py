@@ -2,8 +2,8 @@
 
 import gzip
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+import shutil
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -22,18 +22,23 @@ from cosim.importing.regions import finish
 from cosim.importing.streets import Streets, read_streets
 from cosim.sumo.arrays import EdgeNumbers
 from cosim.sumo.net import load_city
-from nmfd.arrays import PairsOverTime
 from nmfd.errors import InputError
 from nmfd.model import authority
-from nmfd.model.planning import GUIDED
-from nmfd.model.regional_model import RegionalModel
+from nmfd.model.regional_model import RegionalModel, network_toml
 from nmfd.runs.files import temporary_folder
+from nmfd.runs.tables import text_table
 from nmfd.studies import plots
 
 LARGE_CITY_EDGES = 5000  # for cars: beyond, the run without control is mesoscopic, so that it takes a minute
 NET = "city.net.xml.gz"
 FILES = {"routes": "vehicles.rou.xml.gz", "background": "background.rou.xml.gz", "additional": "city.add.xml.gz"}
 TYPES = ("vType", "vTypeDistribution")
+COMMENT = """Imported from {}. The MFDs are PLACEHOLDERS from lane length and speed limits:
+# cosim identify replaces them by measured ones."""
+CAPTION = (
+    "density: in the busiest quarter of an hour without control, per lane; variance: over the region's streets; "
+    "uncontrolled: share of the boundary flow that passes no controllable signal"
+)
 
 
 def import_city(
@@ -52,32 +57,37 @@ def import_city(
     seed: int = 0,
     seeds: int = 3,
     iterations: int = ITERATIONS,
-    force: bool = False,
     progress: Progress = lambda stage, share=0.0: None,
 ) -> str:
     """Write the network and the scenario of a city; return a report.
 
-    Args:
-        source: a sumocfg, a net.xml, a file of OpenStreetMap, or a box of it.
-        out, scenario: folders of the network and the scenario.
-        regions: their number, or the user's own table edge,region.
-        left_hand: side of OpenStreetMap's streets.
-        routes: files with vehicles beside those of the sumocfg.
-        peak: generate a morning peak instead.
-        level: multiplies the vehicles or the peak [-].
-        mesoscopic: the scenario uses SUMO's queue model.
-        begin, end: [s], instead of the sumocfg's.
-        seeds: runs without control whose densities are averaged.
-        iterations: of the assignment of the peak.
-        force: replace an existing network and scenario.
+    source: a sumocfg, a net.xml, a file of OpenStreetMap, or a box of it
+    out, scenario: new folders of the network and the scenario
+    regions: their number, or the user's own table edge,region
+    left_hand: side of OpenStreetMap's streets
+    routes: files with vehicles beside those of the sumocfg
+    peak: generate a morning peak instead
+    level: multiplies the vehicles or the peak [-]
+    mesoscopic: the scenario uses SUMO's queue model
+    begin, end: [s], instead of the sumocfg's
+    seeds: runs without control whose densities are averaged
+    iterations: of the assignment of the peak
 
     Raises:
         InputError: for input that cannot be used; nothing is written then.
     """
-    _check_free(out, scenario, force)
+    for folder in (out, scenario):
+        if folder.name in ("", "..") or "," in str(folder):
+            raise InputError(f"--out: expected a folder such as networks/mycity, without a comma, got {folder} instead")
+        if folder.exists():
+            raise InputError(f"--out: {folder} exists; choose another name, or remove it")
     progress("reading")
-    with sumo_input(source, progress, left_hand=left_hand) as case:
-        case = _window(replace(case, routes=(*case.routes, *routes)), begin, end)
+    with sumo_input(source, progress, left_hand=left_hand) as case, temporary_folder() as scratch:
+        case = replace(case, routes=(*case.routes, *routes))
+        case = replace(case, begin=case.begin if begin is None else begin, end=case.end if end is None else end)
+        if case.begin < 0 or (case.end is not None and case.end <= case.begin):
+            window = f"begin {case.begin:g} s, end {case.end} s"
+            raise InputError(f"{case.source}: expected 0 s <= begin < end, got {window}")
         streets = read_streets(case.net, case.additional)
         own = None if isinstance(regions, int) else read_regions(streets, regions)
         traffic = read_traffic(case, streets, seed)
@@ -95,73 +105,68 @@ def import_city(
         elif begin is None:
             case = model.without_idle(case, traffic)
         clock = model.clock(case, streets, traffic)
-        with _folders(out, scenario) as (net_folder, folder):
-            files = _write_traffic(folder, traffic)
-            baseline = averaged_runs(streets, folder, files, model.options(case, clock), factor, meso, seeds, progress)
-            progress("partition")
-            left = quality.left_alone(streets, traffic.switched)
-            if own is None:
-                labels = partition(streets, baseline, regions, uncontrollable=left)
-            else:
-                labels = finish(streets, own, renumber=False)
-            if labels.max() < 1:
-                raise InputError(f"{streets.path}: no two regions can be made that can be reached from each other")
-            network = model.network_of(streets, labels, out.name, baseline)
-            content = case.net.read_bytes()
-            _zip(net_folder / NET, gzip.decompress(content) if case.net.suffix == ".gz" else content)
-            pd.DataFrame({"edge": streets.edges, "region": labels}).to_csv(net_folder / "regions.csv", index=False)
-            city = load_city(net_folder / NET, net_folder / "regions.csv", network.regions)
-            tables = quality.tables(streets, labels, network.region_names, city, baseline, left)
-            verdict = quality.import_verdict(network, tables.gateways, labels, baseline)
-            network = replace(network, controllable=verdict.boundaries.shares)
-            progress("writing")
-            report = _report(case, streets, traffic, clock, tables, left, baseline, assigned)
-            if isinstance(regions, int) and network.regions < regions:
-                report.append(
-                    f"{network.regions} regions instead of {regions}: others could not be reached, or fell apart"
-                )
-            elif own is not None and (moved := int((own != labels)[streets.drivable & (own >= 0)].sum())):
-                report.append(f"{moved:,} streets are in other regions than in {regions}: regions must be connected")
-            report += verdict.sentences
-            texts = {
-                net_folder / "network.toml": model.network_text(network, NET, case.source.name),
-                net_folder / "import.txt": "\n".join(report) + "\n",
-                net_folder / authority.FILE: verdict.text(),
-                folder / "scenario.toml": model.scenario_text(
-                    network,
-                    clock,
-                    case,
-                    name=scenario.name,
-                    files=files,
-                    leave=traffic.switched,
-                    network_path=os.path.relpath(out, scenario).replace(os.sep, "/"),
-                    protected=_densest(streets, labels, baseline),
-                    factor=factor,
-                    mesoscopic=mesoscopic,
-                ),
-                **({net_folder / "NOTICE.txt": case.notice} if case.notice else {}),
-            }
-            for path, text in texts.items():
-                path.write_text(text, encoding="utf-8")
-            _write_tables(net_folder, folder, tables, model.region_demand(traffic, labels, clock))
-            _draw(net_folder / "map.png", streets, labels, network, tables)
+        net_folder, folder = scratch / "network", scratch / "scenario"
+        net_folder.mkdir()
+        folder.mkdir()
+        files = _write_traffic(folder, traffic)
+        baseline = averaged_runs(streets, folder, files, model.options(case, clock), factor, meso, seeds, progress)
+        progress("partition")
+        left = quality.left_alone(streets, traffic.switched)
+        if own is None:
+            labels = partition(streets, baseline, regions, uncontrollable=left)
+        else:
+            labels = finish(streets, own, renumber=False)
+        if labels.max() < 1:
+            raise InputError(f"{streets.path}: no two regions can be made that can be reached from each other")
+        progress("writing")
+        network = model.network_of(streets, labels, out.name, baseline)
+        content = case.net.read_bytes()
+        _zip(net_folder / NET, gzip.decompress(content) if case.net.suffix == ".gz" else content)
+        pd.DataFrame({"edge": streets.edges, "region": labels}).to_csv(net_folder / "regions.csv", index=False)
+        city = load_city(net_folder / NET, net_folder / "regions.csv", network.regions)
+        tables = quality.tables(streets, labels, network.region_names, city, baseline, left)
+        verdict = quality.import_verdict(network, tables.gateways, labels, baseline)
+        network = replace(network, controllable=verdict.boundaries.shares)
+        report = _report(case, streets, traffic, clock, tables, left, baseline, assigned)
+        if isinstance(regions, int) and network.regions < regions:
+            report.append(f"{network.regions} regions instead of {regions}: others could not be reached, or fell apart")
+        elif own is not None and (moved := int((own != labels)[streets.drivable & (own >= 0)].sum())):
+            report.append(f"{moved:,} streets are in other regions than in {regions}: regions must be connected")
+        report += verdict.sentences
+        load = np.bincount(labels, baseline.density(streets) * streets.lane_metres)
+        texts = {
+            net_folder / "network.toml": network_toml(
+                network, {"net": NET, "regions": "regions.csv"}, COMMENT.format(case.source.name)
+            ),
+            net_folder / "import.txt": "\n".join(report) + "\n",
+            net_folder / authority.FILE: verdict.text(),
+            folder / "scenario.toml": model.scenario_text(
+                network,
+                clock,
+                case,
+                name=scenario.name,
+                files=files,
+                leave=traffic.switched,
+                network_path=os.path.relpath(out, scenario).replace(os.sep, "/"),
+                protected=int(np.argmax(load / np.bincount(labels, streets.lane_metres))),
+                factor=factor,
+                mesoscopic=mesoscopic,
+            ),
+        }
+        if case.notice:
+            texts[net_folder / "NOTICE.txt"] = case.notice
+        for path, text in texts.items():
+            path.write_text(text, encoding="utf-8")
+        pd.DataFrame(tables.quality).to_csv(net_folder / "quality.csv", index=False)
+        pd.DataFrame(tables.gateways).to_csv(net_folder / "gateways.csv", index=False)
+        demand = model.region_demand(traffic, labels, clock)
+        rows = [(k, i, j, f"{demand[k, i, j]:.6g}") for k, i, j in np.argwhere(demand > 0)]
+        pd.DataFrame(rows, columns=["interval", "from", "to", "veh_s"]).to_csv(folder / "demand.csv", index=False)
+        _draw(net_folder / "map.png", streets, labels, network, tables)
+        for temporary, place in ((net_folder, out), (folder, scenario)):
+            place.parent.mkdir(parents=True, exist_ok=True)
+            shutil.move(temporary, place)
     return "\n".join(report)
-
-
-def _check_free(out: Path, scenario: Path, force: bool) -> None:
-    for folder, file in ((out, "network.toml"), (scenario, "scenario.toml")):
-        if folder.name in ("", "..") or "," in str(folder) or (folder.exists() and not folder.is_dir()):
-            raise InputError(f"--out: expected a folder such as networks/mycity, without a comma, got {folder} instead")
-        if (folder / file).exists() and not force:
-            raise InputError(f"--out: {folder / file} exists; choose another folder, or --force to replace it")
-
-
-def _window(case: SumoInput, begin: float | None, end: float | None) -> SumoInput:
-    """Apply --begin and --end to a case. Raises InputError."""
-    case = replace(case, begin=case.begin if begin is None else begin, end=case.end if end is None else end)
-    if case.begin < 0 or (case.end is not None and case.end <= case.begin):
-        raise InputError(f"{case.source}: expected 0 s <= begin < end, got begin {case.begin:g} s, end {case.end} s")
-    return case
 
 
 def _peak(
@@ -174,25 +179,26 @@ def _peak(
     mesoscopic: bool,
     progress: Progress,
 ) -> tuple[Traffic, Assigned]:
-    """Generate a morning peak beside the city's other traffic, and assign its routes. Only cars drive in that."""
+    """Generate a morning peak beside the city's other traffic, and assign its routes."""
     if count := len(beside.depart):
         raise InputError(f"--demand: {case.source} has {count:,} vehicles; omit --demand, or give the network alone")
     peak = morning_peak(streets, level=level, begin=case.begin, seed=seed)
     known = {part.get("id") for element in beside.shared for part in element.iter("vType")}
     types = tuple(e for e in peak.shared if e.get("id") not in known)  # the city may define a type car
     traffic = replace(
-        peak,
-        background=beside.background,
+        beside,
+        vehicles=peak.vehicles,
+        depart=peak.depart,
+        origin=peak.origin,
+        destination=peak.destination,
         shared=beside.shared + types,
-        switched=beside.switched,
         notes={**beside.notes, **peak.notes},
     )
     clock = model.clock(case, streets, traffic)
     others = [element for element in traffic.shared if element.tag not in TYPES]
     with temporary_folder() as folder:
-        additional = [folder / "city.add.xml"] if others else []
-        for path in additional:
-            ElementTree.ElementTree(wrapped(others, "additional")).write(path)
+        additional = folder / "city.add.xml"
+        ElementTree.ElementTree(wrapped(others, "additional")).write(additional)
         assigned = assign(
             streets.path.absolute(),
             [*(element for element in traffic.shared if element.tag in TYPES), *traffic.vehicles],
@@ -200,7 +206,7 @@ def _peak(
             end=clock.end,
             seed=seed,
             iterations=iterations,
-            additional=additional,
+            additional=[additional] if others else [],
             mesoscopic=mesoscopic,
             time_to_teleport=case.time_to_teleport,
             progress=progress,
@@ -211,27 +217,6 @@ def _peak(
     return traffic, assigned
 
 
-@contextmanager
-def _folders(out: Path, scenario: Path) -> Iterator[tuple[Path, Path]]:
-    """Provide temporary folders for network and scenario, which take their places together at the end."""
-    with ExitStack() as stack:
-        pairs = []
-        for folder in (out, scenario):
-            folder.parent.mkdir(parents=True, exist_ok=True)
-            pairs.append((stack.enter_context(temporary_folder(f".{folder.name}-", where=folder.parent)), folder))
-        yield pairs[0][0], pairs[1][0]
-        for temporary, folder in pairs:
-            folder.mkdir(exist_ok=True)
-            # A folder without its toml file counts as empty: that file goes first and comes last.
-            for old in folder.glob("*.toml"):
-                if (temporary / old.name).exists():
-                    old.unlink()
-            if folder == out:  # the model of guided drivers in other regions
-                (folder / GUIDED / "network.toml").unlink(missing_ok=True)
-            for file in sorted(temporary.iterdir(), key=lambda file: (file.suffix == ".toml", file.name)):
-                os.replace(file, folder / file.name)
-
-
 def _write_traffic(folder: Path, traffic: Traffic) -> dict[str, list[str]]:
     """Write vehicles, background and what they refer to; return the file names by key of [sumo]."""
     contents = {
@@ -240,37 +225,23 @@ def _write_traffic(folder: Path, traffic: Traffic) -> dict[str, list[str]]:
         "additional": (traffic.shared, "additional"),
     }
     for key, (elements, tag) in contents.items():
-        if len(elements):
+        if elements:
             root = wrapped(elements, tag)
             ElementTree.indent(root)
             _zip(folder / FILES[key], ElementTree.tostring(root))
-    return {key: [FILES[key]] if len(elements) else [] for key, (elements, _) in contents.items()}
-
-
-def _write_tables(net_folder: Path, folder: Path, tables: quality.Tables, demand: PairsOverTime) -> None:
-    pd.DataFrame(tables.quality).to_csv(net_folder / "quality.csv", index=False)
-    pd.DataFrame(tables.gateways).to_csv(net_folder / "gateways.csv", index=False)
-    rows = [(k, i, j, f"{demand[k, i, j]:.6g}") for k, i, j in np.argwhere(demand > 0)]
-    pd.DataFrame(rows, columns=["interval", "from", "to", "veh_s"]).to_csv(folder / "demand.csv", index=False)
+    return {key: [FILES[key]] if elements else [] for key, (elements, _) in contents.items()}
 
 
 def _draw(path: Path, streets: Streets, regions: EdgeNumbers, network: RegionalModel, tables: quality.Tables) -> None:
     width, height = np.ptp(streets.centre, axis=0) + 1.0
     drawing = plots.figure(6.2, float(np.clip(6.2 * height / width, 3.0, 8.0)) + 0.8)
-    ax = maps.region_map(drawing.subplots(), streets, regions, network.region_names, network.positions)
-    maps.gateway_marks(ax, streets, tables)
+    maps.region_map(drawing.subplots(), streets, regions, network.region_names, network.positions, tables)
     drawing.savefig(path, dpi=130, metadata={"Software": None})
 
 
 def _zip(path: Path, content: bytes) -> None:
     """Write a gzip file without a date: the same content gives the same bytes."""
-    with path.open("wb") as stream, gzip.GzipFile(fileobj=stream, mode="wb", filename="", mtime=0) as packed:
-        packed.write(content)
-
-
-def _densest(streets: Streets, regions: np.ndarray, baseline: Baseline) -> int:
-    load = np.bincount(regions, baseline.density(streets) * streets.lane_metres)
-    return int(np.argmax(load / np.bincount(regions, streets.lane_metres)))
+    path.write_bytes(gzip.compress(content, mtime=0))
 
 
 def _notes(traffic: Traffic) -> str:
@@ -288,37 +259,28 @@ def _report(
     assigned: Assigned | None,
 ) -> list[str]:
     """Return what was imported, left alone and left out, in lines."""
-    source, gateway_signals = case.source.name, {g["signal"] for g in tables.gateways if g["signal"]}
-    detached = (streets.drivable & ~streets.main_part).sum()
-    skipped = sorted(gateway_signals.intersection(left))
-    left_out = list(case.left_out)
-    if case.step_length != (step := float(model.options(case, clock)["step-length"])):
-        left_out.append(f"step-length = {case.step_length:g}, not {step:g}")
     lines = [
-        f"{source}: {len(streets.edges):,} edges, {streets.drivable.sum():,} for cars"
-        + (f" ({detached:,} of them cut off from the rest)" if detached else "")
+        f"{case.source.name}: {len(streets.edges):,} edges, {streets.drivable.sum():,} for cars"
         + (", left-hand traffic" if streets.left_hand else "")
         + f"; {len(streets.logics):,} signals; {len(traffic.vehicles):,} vehicles in {clock.steps} intervals of "
         f"{clock.step:g} s{_notes(traffic)}",
-        quality.quality_table(tables),
+        text_table(tables.quality, CAPTION),
         f"without control: driving takes {baseline.pace(streets):.1f} times as long as at the speed limits; "
         f"{baseline.teleports} teleports, {baseline.running} vehicles on the road and {baseline.waiting} waiting to "
-        "enter at the end",
+        f"enter at the end, {baseline.dropped:,} without a route or a free lane",
     ]
     if assigned is not None:
         gap, iteration, count = assigned.gaps[assigned.best], assigned.best + 1, len(assigned.gaps)
         lines.append(f"routes by duaIterate.py: relative gap {100 * gap:.1f} % in iteration {iteration} of {count}")
         if gap > GAP:
             lines.append(f"WARNING: a relative gap above {100 * GAP:g} %: rerouting gains what drivers know already")
-    if skipped:
-        lines.append(
-            f"left alone at boundaries: {len(skipped)} of {len(gateway_signals)} signals, such as {skipped[0]} "
-            f"({left[skipped[0]]}); see gateways.csv"
-        )
-    if baseline.dropped:
-        lines.append(f"{baseline.dropped:,} vehicles never drove: SUMO found no route or no free lane for them")
+    if skipped := sorted({g["signal"] for g in tables.gateways}.intersection(left)):
+        lines.append(f"{len(skipped)} signals at boundaries left alone, such as {skipped[0]} ({left[skipped[0]]})")
+    changed = list(case.left_out)
     if case.scale != 1.0:
-        lines.append(f"vehicles times {case.scale:g}, the scale in {source}")
-    if left_out:
-        lines.append(f"not taken over from {source}: {', '.join(left_out)}")
+        changed.append(f"scale = {case.scale:g}, vehicles are multiplied instead")
+    if case.step_length != (step := float(model.options(case, clock)["step-length"])):
+        changed.append(f"step-length = {case.step_length:g}, not {step:g}")
+    if changed:
+        lines.append(f"not taken over from {case.source.name}: {', '.join(changed)}")
     return lines

@@ -8,7 +8,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 
-from cosim.importing.quality import Tables
+from cosim.importing.quality import CONTROLLED, Tables
 from cosim.importing.streets import Streets
 from cosim.sumo.arrays import EdgeNumbers, Points
 from nmfd.arrays import Positions
@@ -19,39 +19,36 @@ SMALLEST_RING_SHARE = 0.02  # of the area of the largest ring
 COLOURS = ("#4e79a7", "#f28e2b", "#59a14f", "#e15759", "#76b7b2", "#b07aa1", "#edc948", "#9c755f", "#ff9da7", "#8cd17d")
 
 
-def colour(region: int) -> str:
-    """Return the colour of a region on maps, as #rrggbb."""
-    return COLOURS[region % len(COLOURS)]
-
-
-def region_map(ax: Axes, streets: Streets, regions: EdgeNumbers, names: Sequence[str], places: Positions) -> Axes:
-    """Draw every street in the colour of its region."""
+def region_map(
+    ax: Axes, streets: Streets, regions: EdgeNumbers, names: Sequence[str], places: Positions, tables: Tables
+) -> Axes:
+    """Draw streets in the colour of their region, and gateways, filled if a controllable signal stands there."""
     members = np.flatnonzero(streets.drivable)
     lines = LineCollection(
         [streets.shapes[n] for n in members],
         linewidths=0.6 + 0.5 * np.minimum(streets.lanes[members], 4),
         capstyle="round",
-        colors=[colour(region) for region in regions[members]],
+        colors=[COLOURS[region % len(COLOURS)] for region in regions[members]],
     )
     ax.add_collection(lines)
     ax.autoscale_view()
     ax.set_aspect("equal")
     ax.set_axis_off()
     for region, (x, y) in enumerate(places):
-        box = {"boxstyle": "round,pad=0.25", "facecolor": "white", "edgecolor": colour(region), "alpha": 0.85}
+        box = {
+            "boxstyle": "round,pad=0.25",
+            "facecolor": "white",
+            "edgecolor": COLOURS[region % len(COLOURS)],
+            "alpha": 0.85,
+        }
         title = f"{region} {names[region]}"
         ax.text(x, y, title, ha="center", va="center", fontsize="small", zorder=5, bbox=box)
-    return ax
-
-
-def gateway_marks(ax: Axes, streets: Streets, tables: Tables) -> Axes:
-    """Mark the ends of edges at boundaries, filled if a controllable signal stands there."""
     for controlled, face, label in ((True, "black", "gateway with a signal"), (False, "white", "without control")):
-        edges = sorted({g["from_edge"] for g in tables.gateways if (g["control"] == "controlled") == controlled})
+        edges = sorted({g["from_edge"] for g in tables.gateways if (g["control"] == CONTROLLED) == controlled})
         x, y = np.array([streets.shapes[streets.number[edge]][-1] for edge in edges]).reshape(-1, 2).T
         if len(x):
             ax.scatter(x, y, s=14, facecolor=face, edgecolor="black", linewidths=0.8, zorder=4, label=label)
-    if ax.get_legend_handles_labels()[0]:
+    if tables.gateways:
         ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.01), ncols=2, frameon=False, fontsize="small")
     return ax
 
@@ -61,10 +58,8 @@ def rings_round(
 ) -> list[list[Points]]:
     """Return the outlines of every region, the largest first: rings (n, 2) [m] round the places nearest to its edges.
 
-    Args:
-        shapes: of E edges, each (n, 2) [m].
-        members: (E,) bool, the edges that count.
-        blocks: share of the map's extent between streets that is still no hole.
+    shapes: of E edges, (n, 2) [m]; members: (E,) bool, edges that count
+    blocks: share of the map's extent between streets that is still no hole
     """
     points, of = _sampled(shapes, members)
     low, high = points.min(axis=0), points.max(axis=0)

@@ -16,7 +16,7 @@ from cosim.sumo.net import JAM_SPACING
 from nmfd.arrays import PairsOverTime
 from nmfd.model.identification import observed_split_ratios
 from nmfd.model.mfd import Mfd
-from nmfd.model.regional_model import RegionalModel, network_toml
+from nmfd.model.regional_model import RegionalModel
 from nmfd.runs.config import quoted
 
 # Shape of the published MFD until one is measured: g = c (ALPHA y^2 + BETA y + 1) x with y = x / jam.
@@ -116,13 +116,6 @@ def _placeholders(streets: Streets, regions: np.ndarray, baseline: Baseline) -> 
     visit = np.where(np.isnan(measured), 0.7 * np.maximum(across, 100.0), np.maximum(measured, 50.0))
     rate, jam = SIGNAL_SPEED_SHARE * speed / visit, np.maximum(JAM_SHARE * lanes / JAM_SPACING, 10.0)
     return tuple(Mfd(a=c * ALPHA / n**2, b=c * BETA / n, c=c, jam=n) for c, n in zip(rate, jam, strict=True))
-
-
-def network_text(network: RegionalModel, net: str, source: str) -> str:
-    """Return the network.toml; `source` names the imported file."""
-    comment = f"Imported from {source}. The MFDs are PLACEHOLDERS from lane length and speed limits:\n"
-    comment += "# cosim identify replaces them by measured ones."
-    return network_toml(network, {"net": net, "regions": "regions.csv"}, comment)
 
 
 def options(case: SumoInput, clock: Clock) -> dict[str, str]:

@@ -18,7 +18,7 @@ from nmfd.model.regional_model import RegionalModel, load_network
 from nmfd.model.scenario import Scenario
 from nmfd.studies import plots
 
-REGION_COLUMNS = ["region", "name", "edges", "lane_km", "signals", "pieces", "gateways", "controlled_gateways"]
+REGION_COLUMNS = ["region", "name", "edges", "lane_km", "signals", "gateways", "controlled_gateways"]
 
 
 class City:
@@ -45,7 +45,7 @@ class City:
     def regions(self) -> pd.DataFrame:
         """One row per region.
 
-        name, edges and lane_km for cars, signals, pieces (1 is connected), gateways and controlled ones, centre x_m and
+        name, edges and lane_km for cars, signals, gateways and controlled ones, centre x_m and
         y_m, and critical_veh, jam_veh and max_outflow_veh_s of its MFD
         """
         rows = pd.DataFrame(self._tables.quality[:-1])[REGION_COLUMNS].astype({"region": int})
@@ -62,8 +62,8 @@ class City:
     def plot(self, ax: Axes | None = None) -> Axes:
         """Draw streets in the colour of their region, and gateways, into `ax` or a new figure."""
         ax = plots.figure(6.5, 6.0).subplots() if ax is None else ax
-        maps.region_map(ax, self._streets, self._regions, self.network.region_names, self._places)
-        return maps.gateway_marks(ax, self._streets, self._tables)
+        names = self.network.region_names
+        return maps.region_map(ax, self._streets, self._regions, names, self._places, self._tables)
 
     def __repr__(self) -> str:
         return f"<City {self.name}: {len(self.regions)} regions, {len(self.gateways)} gateways>"
