@@ -2,7 +2,6 @@
 
 import math
 
-import pandas as pd
 import pytest
 from made_up import rows_of
 
