@@ -11,7 +11,7 @@ from nmfd.runs import shipped
 MOST = 300_000  # bytes of a notebook with its outputs
 
 
-def test_there_are_four_and_all_are_small_and_have_their_outputs():
+def test_there_are_two_and_all_are_small_and_have_their_outputs():
     assert [file.name[0] for file in NOTEBOOKS] == list("1234")
     nbformat = pytest.importorskip("nbformat")
     for file in NOTEBOOKS:
