@@ -84,7 +84,7 @@ def shown_commands() -> list:
 
 def settings() -> list[type[BaseModel]]:
     """Return every pydantic model of the house once; a field that a subclass inherits counts there only."""
-    graph = grimp.build_graph("nmfd", "cosim")
+    graph = grimp.build_graph("nmfd", "cosim", cache_dir=None)
     for module in graph.modules:
         __import__(module) if not module.endswith("__main__") else None
     kinds, queue = [], [BaseModel]
@@ -124,7 +124,7 @@ def room(module: str) -> str:
 
 def arrows() -> set[tuple[str, str]]:
     """Return the imports between rooms."""
-    graph = grimp.build_graph("nmfd", "cosim", exclude_type_checking_imports=True)
+    graph = grimp.build_graph("nmfd", "cosim", exclude_type_checking_imports=True, cache_dir=None)
     inside = floors()
     found = (
         (room(one), room(other)) for one in graph.modules for other in graph.find_modules_directly_imported_by(one)

@@ -227,7 +227,7 @@ class _Gate:
 
 
 def test_guided_is_guidance_by_travel_times_wherever_the_controller_says_nothing():
-    """The same bytes as with a controller that commands the own split ratios; without it nobody is guided."""
+    """The bytes are those of a controller that commands the nominal split ratios; without it no driver is guided."""
     scenario = load_scenario(Path(__file__).parents[1] / "scenarios" / "grid7_peak")
     scenario = replace(scenario, steps=1, demand=scenario.demand[15:16])
     own = scenario.network.nominal_splits

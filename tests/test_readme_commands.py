@@ -28,7 +28,7 @@ REDUCED = {  # what is added; of an option that is there already the last counts
     "nmfd list": [],
 }
 NOT_RUN = {  # what takes long or needs more, and where it is tested
-    "cosim watch": "test_watch.py",
+    "cosim watch": "test_view.py",
     "cosim tune": "test_tuning.py",
     "nmfd bound": "test_bound.py",
     "nmfd robustness": "test_robustness.py",

@@ -128,7 +128,7 @@ def averaged_runs(
             write_recorded_trips(original, drawn, scratch / "vehicles.rou.xml")
             measure = scratch / "measure.add.xml"
             data = f'<edgeData id="all" freq="{INTERVAL_S:g}" file="edges.xml" excludeEmpty="true"/>'
-            measure.write_text(f"<additional>{data}</additional>")
+            measure.write_text(f"<additional>{data}</additional>", encoding="utf-8")
             options |= {
                 "net-file": file_list([streets.path]),
                 "route-files": file_list([scratch / "vehicles.rou.xml", *background]),

@@ -34,7 +34,9 @@ def load(name: str) -> Any:
         module.__file__ = str(path)
         sys.path.append(str(path.parent))  # for modules beside it
         try:
-            _located(name, "import", lambda: exec(compile(path.read_text("utf-8"), path, "exec"), vars(module)))
+            _located(
+                name, "import", lambda: exec(compile(path.read_text(encoding="utf-8"), path, "exec"), vars(module))
+            )
         except InputError:
             del sys.modules[key]
             raise

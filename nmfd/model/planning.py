@@ -24,7 +24,7 @@ GUIDING = ("mpc-pcrg", "dpc-pcrg")  # prefixes of the controllers that plan with
 
 @dataclass(frozen=True, kw_only=True)
 class PlanningModel(Horizon):
-    """What a controller, filter or supervisor has before a run; the city may follow another network, or none.
+    """Model of a controller or filter before a run; the city may follow another network, or none.
 
     forecast: demand from i to j in interval k (veh/s, (T, R, R) [k, i, j])
     """

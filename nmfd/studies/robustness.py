@@ -129,7 +129,15 @@ def improvement_table(rows: "pd.DataFrame") -> str:
     lines = [["trips", *(f"{total:,.0f}" for total in count.values())]]
     for name in _compared(rows):
         gains = improvements(rows, name)
-        lines.append([name, *("{:.1f} ± {:.1f}".format(*gains[s]) if s in gains else "-" for s in count)])
+        lines.append(
+            [
+                name,
+                *(
+                    "{:.1f} ± {:.1f}".format(*gains[s]) if s in gains and gains[s][0] == gains[s][0] else "-"
+                    for s in count
+                ),
+            ]
+        )
     return text_columns(["sigma", *(f"{sigma:g}" for sigma in count)], lines, CAPTION)
 
 
