@@ -12,7 +12,7 @@ from cosim.evaluation import estimation_errors, model_validation, results, stati
 from cosim.evaluation import evaluate as evaluation
 from cosim.evaluation import identify as identification
 from cosim.evaluation.runs import runs_of
-from cosim.evaluation.simulate import simulate
+from cosim.evaluation.simulate import Simulation, simulate
 from cosim.importing import get as cities
 from cosim.importing import importer
 from cosim.importing.case import parse_box, seconds
@@ -25,6 +25,7 @@ from nmfd.controllers.strategy import parse, parse_many
 from nmfd.errors import InputError
 from nmfd.metrics import summary
 from nmfd.model.scenario import Scenario, with_demand
+from nmfd.runs import shipped
 from nmfd.runs.files import default_folder, file_name, write_table
 from nmfd.runs.progress import Progress, watched
 from nmfd.runs.run_many import raise_failures, run_many
@@ -76,15 +77,10 @@ def run(
         raise InputError(f"demand: expected a number above 0 up to 10, got {demand:g} instead")
     outputs = {kind: Path(file) for kind, file in (sumo_output or {}).items()}
     check(outputs)
+    policy = None if policy is None else Path(policy)
     with watched(strategy.name, progress) as show:
         return simulate(
-            with_demand(scenario, steps=steps),
-            strategy,
-            seed=seed,
-            demand=demand,
-            policy=None if policy is None else Path(policy),
-            outputs=outputs,
-            progress=show,
+            Simulation(with_demand(scenario, steps=steps), strategy, seed, demand, policy, outputs), progress=show
         )
 
 
@@ -166,17 +162,17 @@ def watch(
 
     port: of the page, any that is free if 0; the other arguments as in `run_controllers`
     """
-    loaded, strategies = load_scenario(scenario, settings), [parse(name) for name in dict.fromkeys(controllers)]
+    loaded = load_scenario(scenario, settings)
+    jobs = [Simulation(loaded, parse(name), seed, demand) for name in dict.fromkeys(controllers)]
     if gui:
         window = Window(options=("--start", "true", "--quit-on-end", "true", "--delay", "20"))
         try:
             with watched("watch", None) as show:
-                result = simulate(loaded, strategies[0], seed=seed, demand=demand, progress=show, window=window)
-                rows = {strategies[0].name: summary(result)}
+                rows = {jobs[0].strategy.name: summary(simulate(jobs[0], progress=show, window=window))}
         except LOST:
             return "The window was closed before the end."
     else:
-        runs = live.watch(loaded, strategies, seed=seed, demand=demand, port=port, browse=_has_screen(), tell=_say)
+        runs = live.watch(jobs, port=port, browse=_has_screen(), tell=_say)
         rows = {run.name: run.row for run in runs if run.row is not None}
     return "\n".join(
         f"{name}, seed {seed}: total time spent {row['total_time_spent_veh_s']:.4g} veh s, "
@@ -360,7 +356,7 @@ def import_city(
 
 
 def identify(
-    scenario: Path,
+    scenario: Path | str,
     *,
     settings: Mapping[str, Any] | None = None,
     levels: Sequence[float] = (0.6, 0.8, 1.0),
@@ -375,23 +371,23 @@ def identify(
 ) -> str:
     """Fit the regional model of a SUMO city to loading runs and write its network.toml; return a report.
 
-    scenario: a scenario or the folder of an imported network
+    scenario: a scenario, or a network with a scenario of its name beside it; name or folder
     levels: factors on the demand of the loading runs
     seeds: loading runs per level, from seed 1000
     city: strategy options of the loading runs, such as "guided+max-pressure" or "own"; own, then guided, if None
     network: folder of the model, the scenario's network if None
     runs: folders of finished runs to fit as well
     """
+    scenario = shipped.found(scenario, shipped.SCENARIO, shipped.NETWORK)
     if (scenario / "network.toml").exists():
         scenario = scenario.resolve().parent.parent / "scenarios" / scenario.name
     loaded = load_scenario(scenario, settings)
-    words = (city or "own").split("+")
-    options = [word for word in words if word not in ("own", "guided")]
+    strategy = parse("no-control", "" if city == "own" else city or "")
     kinds = [False, True] if city is None and network is None and identification.without_model(loaded) else []
     if len(kinds) > 1 and runs:
         raise InputError("--runs: fits one model; say which, by --with own or --with guided")
     report = []
-    for guided in kinds or ["guided" in words]:
+    for guided in kinds or [strategy.guides]:
         loaded = load_scenario(scenario, settings)  # the second model takes the split ratios of the first
         suffix = "-guided" if guided else ""
         folder = Path("runs") / f"{file_name(loaded.name)}-identify{suffix}" if out is None else out
@@ -401,7 +397,7 @@ def identify(
             levels=levels,
             seeds=range(1000, 1000 + seeds),
             guided=guided,
-            options=options,
+            options=[word for word in strategy.words if word != "guided"],
             network=network,
             iterations=iterations,
             runs=runs,

@@ -1,5 +1,6 @@
 """Command line `cosim`: it parses options and calls cosim.api."""
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,15 +17,15 @@ from nmfd.cli import (
     SCENARIO,
     SEED,
     VERSION,
-    WORKERS,
     Commands,
+    Number,
     listed,
     out_option,
     seed_option,
 )
 from nmfd.errors import InputError
 
-LEVEL = click.FloatRange(0.0, 10.0, min_open=True)
+LEVEL = Number(0.0, 10.0, min_open=True)
 CONTROLLER = click.option(
     "--controller",
     required=True,
@@ -36,6 +37,13 @@ CONTROLLER = click.option(
 AGAINST = click.option("--against", metavar="NAME[+...]", help="Second controller, on the same trips.")
 STEPS = click.option("--steps", type=COUNT, help="Control intervals. [default: the scenario's]")
 DEMAND = click.option("--demand", type=LEVEL, default=1.0, show_default=True, help="Factor on the demand.")
+WORKERS = click.option(
+    "--workers",
+    type=COUNT,
+    default=lambda: os.cpu_count() or 1,
+    show_default="one per core",
+    help="Runs at a time.",
+)
 LEVELS = click.option(
     "--demand", "levels", type=listed(LEVEL), default="1", show_default=True, help="Factors on the demand."
 )

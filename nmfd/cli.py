@@ -20,6 +20,15 @@ COUNT = click.IntRange(1, 10**6)
 SEED = click.IntRange(0, 2**31 - 1)  # SUMO's seeds have 32 bits
 
 
+class Number(click.FloatRange):
+    """Number in a range; NaN is in none."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Parse a number."""
+        number = super().convert(value, param, ctx)
+        return number if number == number else self.fail(f"{value!r} is not a number.", param, ctx)
+
+
 class Commands(click.Group):
     """Command group with sections in its help that ends user errors and Ctrl-C in one line on stderr."""
 
@@ -67,7 +76,7 @@ def listed(kind: click.ParamType) -> Callable[[str], tuple]:
 
     def parse(text: str) -> tuple:
         values = tuple(kind.convert(word.strip(), None, None) for word in text.split(","))
-        if len(set(values)) < len(values) or any(value != value for value in values):
+        if len(set(values)) < len(values):
             raise click.BadParameter(f"expected distinct values separated by commas, got {text!r} instead")
         return values
 
@@ -217,7 +226,7 @@ def benchmark(scenario: Path, settings: dict, out: Path | None, **options: Any) 
 @CONTROLLERS
 @click.option(
     "--sigmas",
-    type=listed(click.FloatRange(0.0)),
+    type=listed(Number(0.0)),
     default="0,0.25,0.5,0.75,1,1.5,2,3,5",
     show_default=True,
     help="Standard deviations of the demand noise (veh/s).",

@@ -28,8 +28,8 @@ def instead_of_sumo(patch, result) -> None:
 
     def outcomes(todo, *_):
         for run in todo:
-            asked = {name: run.job.keywords[name] for name in ("seed", "demand")}
-            yield run, result(*run.job.args, **asked)
+            job = run.job
+            yield run, result(job.scenario, job.strategy, seed=job.seed, demand=job.demand)
 
     patch.setattr(run_many, "_outcomes", outcomes)
 

@@ -13,7 +13,7 @@ import sumo
 from commands import cosim, good
 from tiny_city import driven, pieces
 
-from cosim.evaluation.simulate import simulate
+from cosim.evaluation.simulate import Simulation, simulate
 from cosim.importing.streets import read_streets
 from nmfd.api import load_scenario
 from nmfd.controllers.strategy import parse
@@ -106,7 +106,7 @@ def test_max_pressure_takes_no_longer_than_fixed_time(tmp_path, name, level):
     assert result.exit_code == 0, result.output + str(result.exception)
     spent = {}
     for signals in ("no-control", "max-pressure", "max-pressure-cyclic"):
-        run = simulate(load_scenario(tmp_path / "scenarios" / name), parse(signals), seed=1, demand=level)
+        run = simulate(Simulation(load_scenario(tmp_path / "scenarios" / name), parse(signals), seed=1, demand=level))
         spent[signals] = total_time_spent(run)
         assert run.completed[-1] == run.trips, signals
     assert max(spent, key=spent.get) == "no-control", spent

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from cosim.evaluation import estimation_errors
-from cosim.evaluation.simulate import simulate
+from cosim.evaluation.simulate import Simulation, simulate
 from cosim.plant.detectors import instruments, lay_out, probes
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import Settings, settings
@@ -147,7 +147,7 @@ def test_states_are_estimated_with_the_model_of_those_who_drive():
     scenario = load_scenario(SCENARIO, {"steps": INTERVALS})
     models = [strategy.planning(scenario).network for strategy in strategies]
     assert [model.folder.name for model in models] == ["grid7_guided", "grid7_max_pressure"]
-    found = simulate(scenario, strategies[0], seed=3)
+    found = simulate(Simulation(scenario, strategies[0], seed=3))
     for model, same in zip(models, (True, False), strict=True):
         plant = SumoPlant(
             scenario,

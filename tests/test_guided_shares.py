@@ -9,7 +9,7 @@ import pytest
 import streets
 from streets import FAR_FROM_THE_END, seen
 
-from cosim.evaluation.simulate import simulate
+from cosim.evaluation.simulate import Simulation, simulate
 from cosim.plant import guidance
 from cosim.plant.guidance import Guide
 from cosim.plant.meter import Event
@@ -232,7 +232,7 @@ def test_guided_is_guidance_by_travel_times_wherever_the_controller_says_nothing
     scenario = replace(scenario, steps=1, demand=scenario.demand[15:16])
     own = scenario.network.nominal_splits
     by_hand, option, off = (
-        simulate(scenario, parse(_Gate(splits), city), seed=1)
+        simulate(Simulation(scenario, parse(_Gate(splits), city), seed=1))
         for city, splits in (("", own), ("guided", None), ("", None))
     )
     assert option["guided"].sum() > 0 and off["guided"].sum() == 0

@@ -16,7 +16,7 @@ from bokeh.models import Button
 from bokeh.resources import CDN
 from commands import cosim, error_line
 
-from cosim.evaluation.simulate import simulate
+from cosim.evaluation.simulate import Simulation, simulate
 from cosim.sumo.net import city_of
 from cosim.view import live, page, picture
 from cosim.view.picture import CityPicture, Frame
@@ -46,7 +46,7 @@ def drawn(scenario):
 
 @pytest.fixture(scope="module")
 def plain(scenario, strategy):
-    return simulate(scenario, strategy, seed=3)
+    return simulate(Simulation(scenario, strategy, seed=3))
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +57,7 @@ def seen(scenario, strategy, drawn):
     release = threading.Timer(1.0, lambda: setattr(limit, "value", live.FOREVER))
     reporter, begin = live.Reporter(0, scenario, messages, limit, delay), time.perf_counter()
     release.start()
-    result = simulate(scenario, strategy, seed=3, observer=reporter)
+    result = simulate(Simulation(scenario, strategy, seed=3), observer=reporter)
     assert time.perf_counter() - begin > 1.0
     return [messages.get()[1] for _ in range(messages.qsize())], result
 
@@ -142,7 +142,7 @@ def test_runs_in_processes_of_their_own(scenario, strategy, tmp_path):
     """One run ends, one is wrong, and pausing holds a run."""
     (tmp_path / "wrong.py").write_text("class Wrong:\n    pass\n")
     wrong = parse(f"{tmp_path / 'wrong.py'}:Wrong")
-    show = live.Show(scenario, [strategy, wrong], seed=3)
+    show = live.Show([Simulation(scenario, strategy, seed=3), Simulation(scenario, wrong, seed=3)])
 
     def wait(condition):
         end = time.monotonic() + 60.0
@@ -168,7 +168,7 @@ def test_runs_in_processes_of_their_own(scenario, strategy, tmp_path):
 
 
 def test_a_process_that_dies_is_an_error(scenario, strategy):
-    show = live.Show(scenario, [strategy], seed=3)
+    show = live.Show([Simulation(scenario, strategy, seed=3)])
     try:
         show._processes[0].kill()
         show._processes[0].join()
@@ -181,13 +181,14 @@ def test_a_process_that_dies_is_an_error(scenario, strategy):
 def test_watching_ends_when_the_runs_have_ended_and_nobody_looks(scenario, strategy, monkeypatch):
     monkeypatch.setattr(live, "OPENING_S", 0.0)
     lines = []
-    [run] = live.watch(scenario, [strategy], seed=3, tell=lines.append)
+    jobs = [Simulation(scenario, strategy, seed=3)]
+    [run] = live.watch(jobs, tell=lines.append)
     assert run.row["completed_veh"] > 0 and lines[0].startswith("Watch it at http://localhost:")
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         with pytest.raises(InputError, match="choose another"):
-            live.watch(scenario, [strategy], seed=3, port=taken.getsockname()[1], tell=lines.append)
+            live.watch(jobs, port=taken.getsockname()[1], tell=lines.append)
 
 
 def test_wrong_ways_to_watch(scenario):

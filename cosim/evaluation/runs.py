@@ -2,13 +2,12 @@
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from functools import partial
 from importlib import metadata
 from pathlib import Path
 
 import numpy as np
 
-from cosim.evaluation.simulate import simulate
+from cosim.evaluation.simulate import Simulation
 from cosim.plant import incidents
 from cosim.plant.launch import own_vehicles
 from cosim.plant.programmes import check_strategy
@@ -64,14 +63,13 @@ def runs_of(
         Run(
             run_name(strategy.name, seed),
             keys[strategy.name],
-            partial(
-                simulate,
+            Simulation(
                 scenario,
                 strategy,
-                seed=seed,
-                demand=demand,
-                policy=policies.get(strategy.name),
-                outputs=dict(outputs.paths(tuple(sumo_output), out, strategy.name, seed)),
+                seed,
+                demand,
+                policies.get(strategy.name),
+                dict(outputs.paths(tuple(sumo_output), out, strategy.name, seed)),
             ),
             folder,
         )

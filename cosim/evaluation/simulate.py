@@ -4,7 +4,9 @@ import math
 import time
 from collections.abc import Callable, Collection, Mapping
 from contextlib import ExitStack
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
@@ -61,24 +63,37 @@ FACTS = {  # attribute of a result, column of runs.csv -> meaning
 }
 
 
-def simulate(
-    scenario: Scenario,
-    strategy: Strategy,
-    *,
-    seed: int,
-    demand: float = 1.0,
-    policy: Path | None = None,
-    outputs: Mapping[str, Path] | None = None,
-    progress: Callable[[int, int], None] | None = None,
-    observer: Observer | None = None,
-    window: Window | None = None,
-) -> Result:
-    """Run `strategy` in SUMO, in this process, which may hold no other SUMO session.
+@dataclass(frozen=True)
+class Simulation:
+    """One closed loop in SUMO, a picklable job.
 
     seed: of trips, drivers and guidance
     demand: multiple of the scenario's demand
     policy: policy file instead of the scenario's
     outputs: kind of SUMO's own output (cosim.sumo.outputs) -> file
+    """
+
+    scenario: Scenario
+    strategy: Strategy
+    seed: int
+    demand: float = 1.0
+    policy: Path | None = None
+    outputs: Mapping[str, Path] = field(default_factory=dict)
+
+    def __call__(self, **how: Any) -> Result:
+        """Return `simulate` of it."""
+        return simulate(self, **how)
+
+
+def simulate(
+    job: Simulation,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+    observer: Observer | None = None,
+    window: Window | None = None,
+) -> Result:
+    """Do a simulation in this process, which may hold no other SUMO session.
+
     progress: called as progress(done, steps) after every control interval
     observer: gets the state of the run while it goes on
     window: options of sumo-gui
@@ -87,10 +102,10 @@ def simulate(
         InputError: the strategy cannot run in this city
     """
     begin = time.perf_counter()
-    name, scenario = scenario.name, with_demand(scenario, factor=demand)
-    controller = strategy.make(scenario, policy)
+    strategy, scenario = job.strategy, with_demand(job.scenario, factor=job.demand)
+    controller = strategy.make(scenario, job.policy)
     with ExitStack() as stack:
-        files = {kind: stack.enter_context(atomic(path)) for kind, path in (outputs or {}).items()}
+        files = {kind: stack.enter_context(atomic(path)) for kind, path in job.outputs.items()}
         plant = SumoPlant(
             scenario,
             settings=settings(scenario).changed(**strategy.city),
@@ -100,15 +115,15 @@ def simulate(
             window=window,
         )
         stack.callback(plant.close)
-        result = closed_loop.run(plant, controller, scenario, seed=seed, progress=progress)
+        result = closed_loop.run(plant, controller, scenario, seed=job.seed, progress=progress)
         result = result.assign(controller=strategy.name, plant="sumo")
         plant_facts, leaks, trip_facts = plant.facts(), set(plant.leaks()), plant.trip_facts()
         result = settled(result.add({}, RECORD, **plant.record()))
         backlog = result.backlog.sum(axis=(1, 2))
         facts = {
-            "scenario": name,
+            "scenario": job.scenario.name,
             "scenario_folder": str(scenario.folder or ""),
-            "demand": float(demand),
+            "demand": float(job.demand),
             **plant_facts,
             "departed_veh": int(result.departures.sum()),
             "final_backlog_veh": int(backlog[-1]),
@@ -118,7 +133,7 @@ def simulate(
             "delay_gini": delay_gini(result, plant.time_loss()),
             **queue_facts(result, plant.city),
             "notes": metrics.notes(result),
-            "outside_training": strategy.outside_training(scenario, demand, policy),
+            "outside_training": strategy.outside_training(scenario, job.demand, job.policy),
             "leaking_share": leaking_share(result, plant.city, leaks),
             **_estimate_errors(scenario, result),
             "overhead_share": 1.0 - plant_facts["sumo_time_s"] / result.wall_time,

@@ -9,7 +9,6 @@ import webbrowser
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,17 +17,16 @@ from bokeh.models import Button, Select
 from bokeh.server.server import Server
 from tornado.ioloop import PeriodicCallback
 
-from cosim.evaluation.simulate import simulate
+from cosim.evaluation.simulate import Simulation, simulate
 from cosim.plant.settings import settings
 from cosim.sumo.arrays import PerEdge
 from cosim.sumo.net import City
 from cosim.view.page import Page
 from cosim.view.picture import CityPicture, Frame, after, between, first
-from nmfd.controllers.strategy import Strategy
 from nmfd.errors import InputError, RunFailed
 from nmfd.metrics import summary
 from nmfd.model.scenario import Scenario
-from nmfd.types import Controls, Result, State
+from nmfd.types import Controls, State
 
 REFRESH_MS = 250  # between two pictures
 FRAME_RATE = 8.0  # frames per second of wall time within control intervals, at most
@@ -70,16 +68,15 @@ class Show:
     limit: time [s] at which the runs wait; delay: least wall time per simulated second [s]; both are shared values
     """
 
-    def __init__(self, scenario: Scenario, strategies: Sequence[Strategy], **settings: Any):
-        """settings: seed and demand of cosim.evaluation.simulate.simulate"""
+    def __init__(self, jobs: Sequence[Simulation]):
         spawn = multiprocessing.get_context("spawn")
-        self.runs = [Seen(strategy.name) for strategy in strategies]
+        self.runs = [Seen(job.strategy.name) for job in jobs]
         self.picture: CityPicture | None = None
         self._messages = spawn.Queue()
         self.limit, self.delay = spawn.Value("d", FOREVER), spawn.Value("d", 0.0)
         self._processes = [
-            spawn.Process(target=run, args=(n, job, scenario, self._messages, self.limit, self.delay), daemon=True)
-            for n, job in enumerate(partial(simulate, scenario, strategy, **settings) for strategy in strategies)
+            spawn.Process(target=run, args=(n, job, self._messages, self.limit, self.delay), daemon=True)
+            for n, job in enumerate(jobs)
         ]
         for process in self._processes:
             process.start()
@@ -121,11 +118,11 @@ class Show:
         self._messages.close()
 
 
-def run(n: int, job: Callable[..., Result], scenario: Scenario, messages: Any, limit: Any, delay: Any) -> None:
+def run(n: int, job: Simulation, messages: Any, limit: Any, delay: Any) -> None:
     """Do a job as number n, and send its picture, frames, and summary or error."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the server ends the runs
     try:
-        result = job(observer=Reporter(n, scenario, messages, limit, delay))
+        result = simulate(job, observer=Reporter(n, job.scenario, messages, limit, delay))
         messages.put((n, summary(result)))
     except (InputError, RunFailed) as error:
         messages.put((n, error))
@@ -222,29 +219,24 @@ class Viewer:
 
 
 def watch(
-    scenario: Scenario,
-    strategies: Sequence[Strategy],
+    jobs: Sequence[Simulation],
     *,
-    seed: int = 0,
-    demand: float = 1.0,
     port: int = 0,
     browse: bool = False,
     tell: Callable[[str], None] = print,
 ) -> list[Seen]:
-    """Run strategies side by side with a live page until they have ended and the page is closed.
+    """Do simulations side by side with a live page until they have ended and the page is closed.
 
-    Args:
-        seed, demand: see cosim.evaluation.simulate.simulate.
-        port: of the page on this machine; 0 for a free one.
-        browse: open the page in a browser.
-        tell: called with a line that has the address.
+    port: of the page on this machine; 0 for a free one
+    browse: open the page in a browser
+    tell: called with a line that has the address
 
     Raises:
-        InputError: for a port in use, or a strategy that cannot run in the city.
-        RunFailed: if a run fails.
+        InputError: a port in use, or a strategy that cannot run in the city
+        RunFailed: a run failed
     """
     logging.getLogger("bokeh").setLevel(logging.ERROR)
-    show = Show(scenario, strategies, seed=seed, demand=demand)
+    show = Show(jobs)
     try:
         while show.picture is None and not show.over:
             show.update()

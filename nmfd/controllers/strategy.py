@@ -238,7 +238,7 @@ def parse(controller: str | Controller, city: str = "") -> Strategy:
         if not (callable(getattr(controller, "reset", None)) and callable(getattr(controller, "act", None))):
             raise InputError(f"controller: expected a name or an object with reset and act, got {controller!r}")
         first = getattr(controller, "name", type(controller).__name__)
-        name, words = (f"{first}+{city}", city.split("+")) if city else (first, [])
+        name, words = (f"{first}+{city}", _split(f"+{city}")[1]) if city else (first, [])
         kind = ControllerType(name=first, text="object", make=lambda planning: controller)
     settings: dict[str, Any] = {"gateways_fixed": first != ALONE}
     by_key: dict[str, str] = {}
