@@ -77,12 +77,10 @@ def instruments(city: City, layout: Layout, probe_share: float) -> Instruments:
         for weights in (lane_length, lane_length * equipped, lane_length**2 * equipped)
     )
     share = seen / whole
-    boundary, counted, number = np.zeros((3, city.regions, city.regions))
+    boundary, counted = np.zeros((2, city.regions, city.regions))
     for gateway, there in zip(city.gateways, layout.counted, strict=True):
-        pair = gateway.source, gateway.target
-        boundary[pair] += 1.0
-        counted[pair] += there
-        number[pair] += there
+        boundary[gateway.source, gateway.target] += 1.0
+        counted[gateway.source, gateway.target] += there
     return Instruments(
         detector_share=share,
         # Of samples of links, weighted by lane length: which links hold the queues lasts, their reach changes.
@@ -90,7 +88,7 @@ def instruments(city: City, layout: Layout, probe_share: float) -> Instruments:
         / np.maximum(seen, 1e-9),
         detector_noise=SPREAD_ALONG_LINK * np.sqrt(squares) / np.maximum(seen, 1e-9),
         counted_share=counted / np.maximum(boundary, 1.0),
-        counted_gateways=number,
+        counted_gateways=counted,
         probe_share=probe_share,
     )
 
@@ -114,6 +112,7 @@ class Estimation:
     """Loops and probes of one run, and the filter that they feed.
 
     Call `sample` every READING_PERIOD_S, and `update` at the end of every control interval.
+    accumulation: (R, R) [veh], the estimate
     """
 
     def __init__(
@@ -122,6 +121,7 @@ class Estimation:
         """meter: follows the probes; known: of the layout (`instruments`); planning: model of the filter"""
         self._session, self._meter, self._known, self._layout, self._city = session, meter, known, layout, city
         self._filter, self._flow = Estimator(planning, known), meter.gateway_flow()
+        self.accumulation = self._filter.accumulation
         loops = _loops(city, layout)
         self._loops, edges = [name for name, *_ in loops], [edge for *_, edge in loops]
         each = dict(zip(layout.edges, map(len, layout.positions), strict=True))
@@ -139,11 +139,7 @@ class Estimation:
 
     def update(self, controls: Controls) -> None:
         """Filter the readings of the interval that has just ended under `controls`."""
-        self._filter.step(controls, self.readings())
-
-    def accumulation(self) -> PerPair:
-        """Return the estimate (R, R) [veh]."""
-        return self._filter.accumulation
+        self.accumulation = self._filter.step(controls, self.readings())
 
     def backlog(self) -> PerPair:
         """Return (R, R) [veh]: metered trips that wait, and the probes that wait to enter, scaled up."""

@@ -98,13 +98,8 @@ class Launch:
 
     def _options(self) -> list[str]:
         settings = self._settings
-        options = [
-            *outputs.options(self.trip_file, self._outputs),
-            "--begin",
-            str(settings.begin),
-            "--ignore-route-errors",
-            str(bool(settings.routes)).lower(),
-        ]
+        options = [*outputs.options(self.trip_file, self._outputs), "--begin", str(settings.begin)]
+        options += ["--ignore-route-errors", str(bool(settings.routes)).lower()]
         if settings.rerouting > 0:
             options += [*REROUTING, "--device.rerouting.probability", str(settings.rerouting)]
         if settings.mesoscopic:

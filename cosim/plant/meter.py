@@ -28,8 +28,8 @@ POLL_PERIOD_S = 3.0  # longest time between two looks at the entry edges
 class _Vehicle:
     """A vehicle that SUMO has loaded.
 
-    origin, destination: regions; edge: last one of its route; announced: region of its last Event, which may be ahead
-    of `region` on a junction; free: guidance may reroute it; region: the present one, None before the departure
+    origin, destination: regions; edge: last one of its route; announced: region of its last Event, perhaps ahead
+    free: guidance may reroute it; region: the present one, None before the departure
     """
 
     origin: int
@@ -122,12 +122,11 @@ class Meter:
 
     def state(self, step: int, time: float) -> State:
         """Return the state at `time` [s] since the start, when control step `step` begins. Raises LedgerError."""
-        accumulation, backlog = self.accumulation(step), self.backlog()
         return State(
             step=step,
             time=time,
-            accumulation=accumulation,
-            backlog=backlog,
+            accumulation=self.accumulation(step),
+            backlog=self.backlog(),
             completed=float(self.arrivals.sum()),
             removed=(self.removals + self.given_up).astype(float),
         )
@@ -227,10 +226,8 @@ class Meter:
 
     def backlog(self) -> PerPair:
         """Return (R, R) [veh] due to depart from i for j, but not inserted yet; book those that SUMO dropped."""
-        waiting, pending = self.held(), self._session.pending()
-        for vehicle in pending:
-            known = self._load(vehicle)
-            waiting[known.origin, known.destination] += 1
+        pending = self._session.pending()
+        waiting = self.held() + self._waiting(pending)
         ahead = {vehicle for vehicle, known in self._vehicles.items() if known.region is None}.difference(pending)
         for vehicle in ahead.difference(self._session.known()) if ahead else ():
             self._leave(vehicle)
@@ -251,18 +248,17 @@ class Meter:
 
     def probe_backlog(self) -> PerPair:
         """Return (R, R) [veh] of the backlog: probes."""
+        return self._waiting(self._probes.intersection(self._session.pending()))
+
+    def _waiting(self, vehicles: Iterable[str]) -> PerPair:
         waiting = np.zeros(self._running.shape)
-        for vehicle in self._probes.intersection(self._session.pending()):
+        for vehicle in vehicles:
             known = self._load(vehicle)
             waiting[known.origin, known.destination] += 1
         return waiting
 
     def _off_road(self, on_road: Collection[str]) -> set[str]:
-        """Return vehicles that the mesoscopic model holds off a jammed road until there is room.
-
-        They are on their way, neither on the road nor teleporting, but SUMO still has them. The others have left; SUMO
-        may say so later.
-        """
+        """Return vehicles that the mesoscopic model holds off a jammed road; the others off the road have left."""
         under_way = {vehicle for vehicle, known in self._vehicles.items() if known.region is not None}
         lost = under_way.difference(on_road, self._teleporting)
         held = lost.intersection(self._session.known())

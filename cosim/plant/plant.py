@@ -169,7 +169,7 @@ class SumoPlant:
         return Observation(
             step=self._k,
             time=self._k * self._scenario.step,
-            accumulation=self._estimation.accumulation(),
+            accumulation=self._estimation.accumulation,
             backlog=self._estimation.backlog(),
         )
 

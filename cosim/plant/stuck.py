@@ -78,8 +78,7 @@ class Junctions:
                 if self._session.halting(edge)
                 for vehicle in self._session.vehicles_on(edge)
             ]
-            if vehicles := [vehicle for time, vehicle in sorted(standing) if -time >= JUNCTION_PATIENCE_S]:
-                self._free(vehicles)
+            self._free([vehicle for time, vehicle in sorted(standing) if -time >= JUNCTION_PATIENCE_S])
 
     def _free(self, vehicles: list[str]) -> None:
         """Put the vehicles of one junction on the streets behind it, if there is room for all."""

@@ -192,7 +192,8 @@ def _built(recipe_file: Path, network: RegionalModel) -> SumoFiles:
     files = SumoFiles(net_file=folder / f"{network.name}.net.xml", regions_csv=folder / "regions.csv")
     stamp_file = folder / f"{network.name}.stamp"
     recipe = read_recipe(recipe_file, network.regions)
-    stamp = _stamp(recipe_file)
+    content = recipe_file.read_bytes() + Path(__file__).read_bytes() + metadata.version("eclipse-sumo").encode()
+    stamp = hashlib.sha256(content).hexdigest()
     built = all(file.is_file() for file in (stamp_file, files.net_file, files.regions_csv))
     if built and stamp_file.read_text(encoding="utf-8") == stamp:
         return files
@@ -204,12 +205,6 @@ def _built(recipe_file: Path, network: RegionalModel) -> SumoFiles:
         with atomic(file) as temporary:
             temporary.write_bytes(content)
     return files
-
-
-def _stamp(recipe_file: Path) -> str:
-    """Return a hash of the recipe, this file and SUMO's version."""
-    content = recipe_file.read_bytes() + Path(__file__).read_bytes() + metadata.version("eclipse-sumo").encode()
-    return hashlib.sha256(content).hexdigest()
 
 
 def read_recipe(path: Path, regions: int) -> Recipe:
@@ -234,12 +229,7 @@ def read_recipe(path: Path, regions: int) -> Recipe:
                     path, "outer.regions", f"expected {allowed} at x = {x:g}, y = {y:g}, got {word!r} instead"
                 )
             nodes[f"o{i}{j}"] = Node(id=f"o{i}{j}", x=x, y=y, region=int(word), centre=False)
-    return Recipe(table=table, nodes=nodes, streets=_streets(nodes))
-
-
-def _streets(nodes: dict[str, Node]) -> list[tuple[str, str]]:
-    """Return both directions between neighbours on a line; lines of the lattice may go on as streets of the centre."""
-    streets = []
+    streets = []  # both directions between neighbours; lines of the lattice may go on as streets of the centre
     for along, across in (("x", "y"), ("y", "x")):
         lines: dict[float, list[Node]] = {}
         for node in nodes.values():
@@ -248,7 +238,7 @@ def _streets(nodes: dict[str, Node]) -> list[tuple[str, str]]:
             line.sort(key=lambda node: getattr(node, along))
             for a, b in pairwise(line):
                 streets += [(a.id, b.id), (b.id, a.id)]
-    return streets
+    return Recipe(table=table, nodes=nodes, streets=streets)
 
 
 def _movements(recipe: Recipe, start: str, end: str) -> dict[str, str]:
@@ -273,8 +263,8 @@ def _heading(a: Node, b: Node) -> tuple[int, int]:
     return (b.x > a.x) - (b.x < a.x), (b.y > a.y) - (b.y < a.y)
 
 
-def _plain_xml(recipe: Recipe) -> tuple[str, str, str, dict[str, int]]:
-    """Return nodes, edges and connections for netconvert, and the region of every edge."""
+def _plain_xml(recipe: Recipe) -> tuple[dict[str, str], dict[str, int]]:
+    """Return node, edge and connection files for netconvert, and the region of every edge."""
     nodes = recipe.nodes
     legs = {name: sum(a == name for a, _ in recipe.streets) for name in nodes}
     node_rows = [
@@ -291,15 +281,8 @@ def _plain_xml(recipe: Recipe) -> tuple[str, str, str, dict[str, int]]:
                 joint = f"{name}.j"
                 length = abs(end.x - start.x) + abs(end.y - start.y)
                 share = 1.0 - (recipe.table.centre.pocket + JUNCTION_RADIUS_M) / length
-                node_rows.append(
-                    _row(
-                        "node",
-                        id=joint,
-                        x=start.x + share * (end.x - start.x),
-                        y=start.y + share * (end.y - start.y),
-                        type="priority",
-                    )
-                )
+                x, y = start.x + share * (end.x - start.x), start.y + share * (end.y - start.y)
+                node_rows.append(_row("node", id=joint, x=x, y=y, type="priority"))
                 pieces = [(name, a, joint, 1), (f"{name}.p", joint, b, 2)]
                 connection_rows += [_link(name, f"{name}.p", 0, lane) for lane in (0, 1)]
         else:
@@ -316,11 +299,8 @@ def _plain_xml(recipe: Recipe) -> tuple[str, str, str, dict[str, int]]:
             target = first[b, turns[turn]]
             for lane, into in zip(lanes_of_turn, _into(turn, len(lanes_of_turn), lanes[target]), strict=True):
                 connection_rows += [_link(source, target, lane, number) for number in into]
-    return _file("nodes", node_rows), _file("edges", edge_rows), _file("connections", connection_rows), region_of
-
-
-def _file(tag: str, rows: list[str]) -> str:
-    return f"<{tag}>\n{''.join(rows)}</{tag}>\n"
+    tables = {"node": node_rows, "edge": edge_rows, "connection": connection_rows}
+    return {kind: f"<{kind}s>\n{''.join(rows)}</{kind}s>\n" for kind, rows in tables.items()}, region_of
 
 
 def _leads_in(recipe: Recipe, a: str, b: str) -> bool:
@@ -353,7 +333,7 @@ def build(recipe: Recipe, where: str) -> tuple[bytes, bytes]:
 
     Raises InputError if netconvert fails.
     """
-    *plain, region_of = _plain_xml(recipe)
+    files, region_of = _plain_xml(recipe)
     with temporary_folder() as folder:
         options = {
             "output-file": "net.xml",
@@ -363,19 +343,13 @@ def build(recipe: Recipe, where: str) -> tuple[bytes, bytes]:
             "tls.allred.time": ALL_RED_S,
             "tls.left-green.time": LEFT_GREEN_S,
         }
-        for kind, content in zip(("node", "edge", "connection"), plain, strict=True):
+        for kind, content in files.items():
             (folder / f"{kind}.xml").write_text(content, encoding="utf-8")
             options[f"{kind}-files"] = f"{kind}.xml"
         program = str(Path(sumo.SUMO_HOME) / "bin" / "netconvert")
         command = [program, *(part for key, value in options.items() for part in (f"--{key}", str(value)))]
-        result = subprocess.run(
-            command,
-            cwd=folder,
-            capture_output=True,
-            text=True,
-            check=False,
-            env={**os.environ, "SUMO_HOME": sumo.SUMO_HOME},
-        )
+        environment = {**os.environ, "SUMO_HOME": sumo.SUMO_HOME}
+        result = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, env=environment)
         if result.returncode:
             lines = [line for line in result.stderr.splitlines() if line.startswith("Error")] or ["unknown error"]
             raise InputError(f"{where}: netconvert cannot build it: {lines[0]}; correct the recipe")

@@ -125,11 +125,7 @@ def load_city(net_file: Path, regions_csv: Path, regions: int) -> City:
         gateways=_gateways(links, region_of),
         signals={c.source: c.signal for c in links if c.signal},
         over=over,
-        inside={
-            edge: internal[edge][1]
-            for edge in sorted({edge for way in over.values() for edge in way})
-            if internal[edge][1] > 0.0
-        },
+        inside={edge: internal[edge][1] for edge in sorted(set().union(*over.values())) if internal[edge][1] > 0.0},
     )
 
 
@@ -191,20 +187,13 @@ def _read_net(
                         lanes_of[edge] = lanes
                         cars |= {(edge, int(attribute(lane, "index"))) for lane in open_lanes}
                     else:
-                        internal[edge] = max(
-                            ((length / speed, length) for length, speed, _ in lanes), default=(0.0, 0.0)
-                        )
+                        internal[edge] = max(((long / speed, long) for long, speed, _ in lanes), default=(0.0, 0.0))
                 elif element.tag == "connection":
+                    source, target = attribute(element, "from"), attribute(element, "to")
+                    link = int(element.get("linkIndex", -1))
+                    lanes_joined = (int(attribute(element, key)) for key in ("fromLane", "toLane"))
                     connections.append(
-                        _Connection(
-                            attribute(element, "from"),
-                            attribute(element, "to"),
-                            element.get("via"),
-                            element.get("tl"),
-                            int(element.get("linkIndex", -1)),
-                            int(attribute(element, "fromLane")),
-                            int(attribute(element, "toLane")),
-                        )
+                        _Connection(source, target, element.get("via"), element.get("tl"), link, *lanes_joined)
                     )
                 if element.tag in ("edge", "connection", "junction", "tlLogic"):
                     element.clear()
@@ -262,13 +251,11 @@ def _internal_regions(
     regions: dict[str, int] = {}
     of_junction: dict[str, int] = {}
     for connection in connections:
-        target = region_of.get(connection.target)
-        if target is None:
-            continue
-        if connection.via:
-            regions[connection.via.rpartition("_")[0]] = target
-        if connection.source.startswith(":"):
-            regions[connection.source] = target
+        if (target := region_of.get(connection.target)) is not None:
+            if connection.via:
+                regions[connection.via.rpartition("_")[0]] = target
+            if connection.source.startswith(":"):
+                regions[connection.source] = target
     for edge, region in regions.items():
         of_junction.setdefault(edge.rpartition("_")[0], region)
     return {edge: regions.get(edge, of_junction.get(edge.rpartition("_")[0], 0)) for edge in internal}

@@ -12,14 +12,13 @@ from cosim.sumo.xml_files import BROKEN, attribute, opened
 from nmfd.errors import InputError, RunFailed, did_you_mean
 from nmfd.runs.files import run_name
 
-# Kind -> ending of its file. The emissions of every vehicle in every step are gigabytes, unless compressed.
+# Kind -> ending of its file. Emissions in every step are gigabytes, unless compressed.
 KINDS = {
     "tripinfo": "tripinfo.xml",
     "summary": "summary.xml",
     "edgedata": "edgedata.xml",
     "emission": "emission.xml.gz",
 }
-ZIPPED = "emission"  # on a full disk SUMO ends its process while it writes this one
 EMISSION_CLASS = "HBEFA4/PC_petrol_Euro-4"  # SUMO's default
 KG_PER_MG = 1e-6
 END_TAG_BYTES = 200  # these last bytes of a file hold the end tag of its root
@@ -29,10 +28,9 @@ END_TAG_BYTES = 200  # these last bytes of a file hold the end tag of its root
 class TripFacts:
     """Sums over all trips that were due before the end of the simulation.
 
-    trips: their number; completed: at the last edge of their route; removed: taken out before; travel_time: on the road
-    [s]; departure_delay: between wanted and real departure [s]; time_loss: against driving freely [s]; co2, fuel: [kg]
-    of all vehicles on the road (EMISSION_CLASS)
-    Trips under way or not departed count with the time until the end.
+    completed: at the last edge of their route; removed: taken out before; travel_time: on the road [s]
+    departure_delay: between wanted and real departure [s]; time_loss: against driving freely [s]
+    co2, fuel: [kg] of all vehicles (EMISSION_CLASS); trips under way or not departed count until the end
     """
 
     trips: int = 0
@@ -49,8 +47,7 @@ class TripFacts:
 class End:
     """The end of a vehicle's trip.
 
-    edge: its last one, "" if unknown; reason: tripinfo's `vaporized` (calibrator, collision, teleport, traci ...), ""
-    at the end of its route; time_loss: against driving freely [s]
+    edge: last one, "" if unknown; reason: tripinfo's `vaporized`, "" at the end of the route; time_loss: [s]
     """
 
     vehicle: str
@@ -94,16 +91,14 @@ class TripReader:
                 self._offset = stream.tell()
             if last:
                 self._parser.close()
-            return self._ends(left)
+            elements = [event[-1] for event in self._parser.read_events()]
+            return self._ends([e for e in elements if isinstance(e, Element) and e.tag == "tripinfo"], left)
         except BROKEN as error:
             raise unfinished(self._path, error) from None
 
-    def _ends(self, left: Callable[[str], bool]) -> list[End]:
+    def _ends(self, elements: Iterable[Element], left: Callable[[str], bool]) -> list[End]:
         ends = []
-        for event in self._parser.read_events():
-            element = event[-1]
-            if not isinstance(element, Element) or element.tag != "tripinfo":
-                continue
+        for element in elements:
             vehicle, reason = element.get("id", ""), element.get("vaporized", "")
             departed, loss = float(attribute(element, "depart")) >= 0, _time_loss(element)
             ended = float(attribute(element, "arrival")) >= 0 or (departed and left(vehicle))
@@ -138,13 +133,6 @@ def _added(facts: TripFacts, trip: Element, *, ended: bool, completed: bool) -> 
     )
 
 
-def parse(text: str) -> tuple[str, ...]:
-    """Return kinds of outputs from a text with commas. Raises InputError."""
-    kinds = tuple(dict.fromkeys(kind.strip() for kind in text.removesuffix(",").split(",")))
-    check(kinds)
-    return kinds
-
-
 def check(kinds: Iterable[str]) -> None:
     """Raise InputError for an unknown kind of output."""
     for kind in kinds:
@@ -162,18 +150,10 @@ def paths(kinds: tuple[str, ...], folder: Path, controller: str, seed: int) -> t
 
 def options(trip_file: Path, outputs: Mapping[str, Path]) -> list[str]:
     """Return the options with which SUMO writes `trip_file`, for `TripReader`, and `outputs`, kind -> file."""
-    more = [part for kind in ("summary", "emission") if kind in outputs for part in (kind, outputs[kind])]
-    return [
-        "--tripinfo-output",
-        str(trip_file),
-        "--tripinfo-output.write-unfinished",
-        "true",
-        "--tripinfo-output.write-undeparted",
-        "true",
-        "--device.emissions.probability",
-        "1",
-        *(f"--{part}-output" if isinstance(part, str) else str(part) for part in more),
-    ]
+    more = [(f"--{kind}-output", str(outputs[kind])) for kind in ("summary", "emission") if kind in outputs]
+    unfinished = "--tripinfo-output.write-unfinished true --tripinfo-output.write-undeparted true"
+    command = ["--tripinfo-output", str(trip_file), *unfinished.split(), "--device.emissions.probability", "1"]
+    return [*command, *(part for pair in more for part in pair)]
 
 
 def write_edge_data(path: Path, target: Path, period: float) -> None:
@@ -203,5 +183,4 @@ def check_whole(outputs: Mapping[str, Path]) -> None:
 
 def unfinished(path: Path, error: Exception | None = None) -> RunFailed:
     """Return the error of a file of SUMO's that ends too early."""
-    noticed = "" if error is None else f" ({error})"
-    return RunFailed(f"{path}: SUMO did not finish this file{noticed}: is the disk full?")
+    return RunFailed(f"{path}: SUMO did not finish this file{f' ({error})' if error else ''}: is the disk full?")

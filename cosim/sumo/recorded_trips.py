@@ -4,6 +4,7 @@ import math
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -54,7 +55,7 @@ def read_recorded_trips(paths: Sequence[Path]) -> RecordedTrips:
         if root.tag != "routes":
             raise InputError(f"{path}: expected a SUMO route file, got a file of <{root.tag}> instead")
         elements += [(path, element) for element in root]
-    departs, ids = np.empty(len(elements)), set()
+    departs, ids = np.full(len(elements), np.nan), set()
     for n, (path, element) in enumerate(elements):
         if element.tag not in ("vehicle", "trip"):
             raise InputError(
@@ -65,15 +66,13 @@ def read_recorded_trips(paths: Sequence[Path]) -> RecordedTrips:
         if not name or name in ids:
             raise InputError(f"{path}: {element.tag} {n}: id: expected a unique one, got {name!r} instead")
         ids.add(name)
-        try:
+        with suppress(KeyError, ValueError):
             departs[n] = float(element.attrib["depart"])
-            if not 0.0 <= departs[n] < math.inf:
-                raise ValueError
-        except (KeyError, ValueError):
+        if not 0.0 <= departs[n] < math.inf:
             raise InputError(
-                f"{path}: vehicle {element.get('id')}: depart: expected a time from 0 s up, got "
-                f"{element.get('depart')!r} instead; move it to a file in sumo.background"
-            ) from None
+                f"{path}: vehicle {name}: depart: expected a time from 0 s up, got {element.get('depart')!r} instead; "
+                "move it to a file in sumo.background"
+            )
     order = np.argsort(departs, kind="stable")
     return RecordedTrips(depart=departs[order], elements=tuple(elements[n][1] for n in order))
 
@@ -162,15 +161,12 @@ def draw(originals: RecordedTrips, *, seed: int, factor: float, jitter: float, b
     for n, times in enumerate(copies):
         for copy in range(times):
             depart = max(float(originals.depart[n] + shifts[copy, n]), min(begin, float(originals.depart[n])))
-            drawn.append((round(depart, 2), n, _copy(names[n], copy, taken) if copy else names[n]))
+            stem, name = names[n], f"{names[n]}.{copy}" if copy else names[n]
+            while copy and name in taken:
+                stem += "."
+                name = f"{stem}.{copy}"
+            drawn.append((round(depart, 2), n, name))
     return sorted(drawn, key=lambda vehicle: vehicle[:2])
-
-
-def _copy(name: str, number: int, taken: set[str]) -> str:
-    """Return an id for a copy that no other vehicle has."""
-    while (candidate := f"{name}.{number}") in taken:
-        name += "."
-    return candidate
 
 
 def write_recorded_trips(originals: RecordedTrips, drawn: Sequence[DrawnTrip], path: Path) -> None:
@@ -191,7 +187,7 @@ def write_held_trips(
     shared: `read_routes`; region_of: edge -> region
     """
     elements, written = [], set[int]()
-    trips: list[tuple[float, int, int, dict[str, str]]] = []
+    departs, routes, orders = [], [], []
     for depart, n, name in drawn:
         element = originals.elements[n]
         route = _meterable_route(element, shared)
@@ -203,14 +199,15 @@ def write_held_trips(
             written.add(n)
             elements.append(ElementTree.Element("route", id=known, edges=" ".join(route)))
         order = {ORDERED[key]: value for key, value in element.attrib.items() if key in ORDERED}
-        order = {"vehID": name, "routeID": known, **order}
-        trips.append((depart, region_of[route[0]], region_of[route[-1]], order))
+        orders.append({"vehID": name, "routeID": known, **order})
+        departs.append(depart)
+        routes.append(route)
     _write(path, elements)
     return HeldTrips(
-        depart=np.array([depart for depart, _, _, _ in trips]),
-        origin=np.array([origin for _, origin, _, _ in trips], dtype=int),
-        destination=np.array([destination for _, _, destination, _ in trips], dtype=int),
-        orders=tuple(order for _, _, _, order in trips),
+        depart=np.array(departs, dtype=float),
+        origin=np.array([region_of[route[0]] for route in routes], dtype=int),
+        destination=np.array([region_of[route[-1]] for route in routes], dtype=int),
+        orders=tuple(orders),
     )
 
 

@@ -118,11 +118,10 @@ class Session:
             else:
                 _start_window(window, self.command)
         except (*REFUSALS, *FATAL) as error:
+            words = _one_line(error)
             if window is not None:
-                raise InputError(
-                    f"sumo-gui cannot show {net_file}: {_one_line(error)}; check DISPLAY, or omit --gui"
-                ) from None
-            raise InputError(f"{net_file}: SUMO cannot run it with {routes}: {_one_line(error)}") from None
+                raise InputError(f"sumo-gui cannot show {net_file}: {words}; check DISPLAY, or omit --gui") from None
+            raise InputError(f"{net_file}: SUMO cannot run it with {routes}: {words}") from None
         Session._open = True
         self._flush = _flush_all() if window is None else None
         self.time = self._sumo.simulation.getTime()
@@ -139,11 +138,8 @@ class Session:
         self.started_teleport = simulation.getStartingTeleportIDList
         self.ended_teleport = simulation.getEndingTeleportIDList
         # Vehicles now: on the road, without teleporting ones; all that are loaded and have not arrived; due to depart.
-        self.running, self.known, self.pending = (
-            vehicle.getIDList,
-            vehicle.getLoadedIDList,
-            simulation.getPendingVehicles,
-        )
+        self.running, self.known = vehicle.getIDList, vehicle.getLoadedIDList
+        self.pending = simulation.getPendingVehicles
         # One vehicle: its edge, normal or internal; its route; its place on it; time since it stopped [s]; length [m].
         self.road, self.route, self.route_index = vehicle.getRoadID, vehicle.getRoute, vehicle.getRouteIndex
         self.standing_time, self.vehicle_length = vehicle.getWaitingTime, vehicle.getLength
@@ -187,9 +183,9 @@ class Session:
         drivers with another lane.
         """
         routing = self._sumo.edge.getLastStepMeanSpeed(edge)
-        lanes = self._lanes_of.get(edge)
-        if lanes is None:
-            lanes = self._lanes_of[edge] = self._lanes(edge)
+        if edge not in self._lanes_of:
+            self._lanes_of[edge] = self._lanes(edge)
+        lanes = self._lanes_of[edge]
         if len(lanes) > 1:
             counts = [self._sumo.lane.getLastStepVehicleNumber(lane) for lane in lanes]
             if total := sum(counts):  # 0 in the mesoscopic model, which has no lanes
@@ -224,11 +220,9 @@ class Session:
 
     def room(self, lane: str) -> float:
         """Return the free length at the beginning of a lane [m]."""
-        rear = [
-            self._sumo.vehicle.getLanePosition(vehicle) - self._sumo.vehicle.getLength(vehicle)
-            for vehicle in self._sumo.lane.getLastStepVehicleIDs(lane)
-        ]
-        return min(rear, default=self._sumo.lane.getLength(lane))
+        position, length = self._sumo.vehicle.getLanePosition, self._sumo.vehicle.getLength
+        vehicles = self._sumo.lane.getLastStepVehicleIDs(lane)
+        return min((position(v) - length(v) for v in vehicles), default=self._sumo.lane.getLength(lane))
 
     def set_down(self, vehicle: str, lane: str, position: float) -> bool:
         """Put a vehicle at `position` [m] on a lane of its route; return False if SUMO refuses."""
@@ -247,24 +241,18 @@ class Session:
         """Let a vehicle depart now. order: arguments of libsumo.vehicle.add, with a route that SUMO knows"""
         self._sumo.vehicle.add(**order, depart="now")
 
-    def reroutes(self, vehicle: str) -> bool:
-        """Return True if a vehicle has SUMO's rerouting device."""
-        return self._sumo.vehicle.getParameter(vehicle, "has.rerouting.device") == "true"
-
     def programme(self, signal: str) -> Programme:
         """Return the programme that runs on `signal` now."""
         light, types = self._sumo.trafficlight, self._sumo.constants
         active = light.getProgram(signal)
         logic = self._logic(signal, active)
         elapsed = sum(phase.duration for phase in logic.phases[: light.getPhase(signal) + 1])
-        left = light.getNextSwitch(signal) - self._sumo.simulation.getTime()
-        in_order = not any(phase.next for phase in logic.phases)
         return Programme(
             signal=signal,
             id=active,
             phases=tuple(Phase(duration=p.duration, state=p.state) for p in logic.phases),
-            position=elapsed - left,
-            static=logic.type == types.TRAFFICLIGHT_TYPE_STATIC and in_order,
+            position=elapsed - (light.getNextSwitch(signal) - self._sumo.simulation.getTime()),
+            static=logic.type == types.TRAFFICLIGHT_TYPE_STATIC and not any(phase.next for phase in logic.phases),
             actuated=logic.type in (types.TRAFFICLIGHT_TYPE_ACTUATED, types.TRAFFICLIGHT_TYPE_DELAYBASED),
         )
 
@@ -289,10 +277,8 @@ class Session:
         return tuple(f"{edge}_{n}" for n in range(self._sumo.edge.getLaneNumber(edge)))
 
     def _logic(self, signal: str, programme: str) -> Any:
-        for logic in self._sumo.trafficlight.getAllProgramLogics(signal):
-            if logic.programID == programme:
-                return logic
-        raise RuntimeError(f"signal {signal} has no programme {programme}")
+        logics = self._sumo.trafficlight.getAllProgramLogics(signal)
+        return next(logic for logic in logics if logic.programID == programme)
 
 
 def _accepted(order: Callable, *arguments: object) -> bool:
@@ -315,10 +301,7 @@ def _flush_all() -> Callable[[], None] | None:
 
 
 def _keep_freed() -> None:
-    """Make glibc keep freed memory: SUMO and the searches take and free large blocks thousands of times a second.
-
-    New pages for these took a sixth of the time of a guided run in Luxembourg. Other C libraries are left alone.
-    """
+    """Make glibc keep freed memory: new pages took a sixth of the time of a guided run in Luxembourg."""
     with suppress(AttributeError, OSError, TypeError):
         for option, size in KEPT_BYTES.items():
             ctypes.CDLL(None).mallopt(option, size)

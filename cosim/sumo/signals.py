@@ -7,8 +7,7 @@ from pathlib import Path
 
 from cosim.sumo.net import City
 from cosim.sumo.session import Phase
-from cosim.sumo.xml_files import BROKEN, attribute, read_xml
-from nmfd.errors import InputError
+from cosim.sumo.xml_files import attribute, read_xml
 
 GREEN = frozenset("Gg")
 FIXED, ACTUATED = "static", ("actuated", "delay_based")  # SUMO's types of programmes; those timed by detectors
@@ -63,13 +62,6 @@ def read_signals(
     Simple ones are of these `kinds`, with two stages or more, phases in order, and red, yellow and green only. Of
     several programmes the last one counts, as in SUMO: first those of the network file, then of `additional` files.
     """
-    try:
-        return _signals(city, additional, kinds)
-    except BROKEN as error:
-        raise InputError(f"{city.net_file}: its signals cannot be read ({error}); build it with netconvert") from None
-
-
-def _signals(city: City, additional: Iterable[Path], kinds: Collection[str]) -> tuple[list[Signal], list[str]]:
     root = read_xml(city.net_file)
     links: dict[str, list[Link]] = {}
     closed: dict[str, list[Link]] = {}
@@ -89,14 +81,11 @@ def _signals(city: City, additional: Iterable[Path], kinds: Collection[str]) -> 
     logics = {
         attribute(logic, "id"): logic for file in (root, *map(read_xml, additional)) for logic in file.iter("tlLogic")
     }
-    simple, others = [], []
-    for name, logic in logics.items():
-        signal = _simple(logic, tuple(links.get(name, ())), tuple(closed.get(name, ())), kinds)
-        if signal is not None:
-            simple.append(signal)
-        else:
-            others.append(name)
-    return sorted(simple, key=lambda signal: signal.id), sorted(others)
+    signals = {
+        name: _simple(logic, tuple(links.get(name, ())), tuple(closed.get(name, ())), kinds)
+        for name, logic in sorted(logics.items())
+    }
+    return [signal for signal in signals.values() if signal], [name for name, s in signals.items() if s is None]
 
 
 def _simple(

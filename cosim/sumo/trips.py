@@ -129,14 +129,13 @@ def make_trips(city: City, demand: PairsOverTime, step: float, seed: int) -> Tri
     positions = rng.random(len(depart))
     trees = Ways(city, rng)
     number = {edge: n for n, edge in enumerate(city.edges)}
-    first, last = np.empty(len(depart), dtype=int), np.empty(len(depart), dtype=int)
+    first, last = np.empty((2, len(depart)), dtype=int)
     for n, (i, j) in enumerate(zip(origin, destination, strict=True)):
         first[n] = number[_draw(starts[i], draws[n, 0])]
         last[n] = number[_draw(goals[j], draws[n, 1])]
-    for n in np.flatnonzero(first == last):
+    for n in np.flatnonzero(first == last):  # to the next edge instead
         edges, _ = goals[destination[n]]
-        other = (edges.index(city.edges[first[n]]) + 1) % len(edges)
-        last[n] = number[edges[other]]
+        last[n] = number[edges[(edges.index(city.edges[first[n]]) + 1) % len(edges)]]
     routes = trees.routes(first, last, tastes)
     for n, route in enumerate(routes):
         if len(route) < 2:
@@ -183,7 +182,10 @@ def _ends(city: City, region: int, *, departing: bool) -> tuple[list[str], np.nd
     Edges from which a trip leaves the region at once, turn pockets and short pieces count only if nothing else is left.
     """
     edges = [edge for edge in city.edges if city.region_of[edge] == region]
-    before = _predecessors(city)
+    before: dict[str, list[str]] = {edge: [] for edge in city.edges}
+    for edge, after in city.successors.items():
+        for other in after:
+            before[other].append(edge)
     onward: Mapping[str, Sequence[str]] = city.successors if departing else before
     good = [
         edge
@@ -195,18 +197,9 @@ def _ends(city: City, region: int, *, departing: bool) -> tuple[list[str], np.nd
     return ends, weights / weights[-1]
 
 
-def _predecessors(city: City) -> dict[str, list[str]]:
-    before: dict[str, list[str]] = {edge: [] for edge in city.edges}
-    for edge, after in city.successors.items():
-        for other in after:
-            before[other].append(edge)
-    return before
-
-
 def _stays(city: City, edge: str, onward: Mapping[str, Sequence[str]]) -> bool:
     """Return True if a way on from the edge stays in its region; a dead end does not."""
-    seen = {edge}
-    here = edge
+    here, seen = edge, {edge}
     while len(onward[here]) == 1 and onward[here][0] not in seen:
         here = onward[here][0]
         if city.region_of[here] != city.region_of[edge]:
