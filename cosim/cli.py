@@ -288,9 +288,10 @@ def import_(source: Path | None, bbox: str | None, **options: Any) -> None:
       cosim import city.net.xml.gz --regions 6 --demand peak --out networks/mycity
       cosim import --bbox 11.32,44.48,11.36,44.50 --regions 4 --demand peak --out networks/mycity
     """
-    if (source is None) == (bbox is None):
+    place = bbox if source is None else source
+    if place is None or (source is not None and bbox is not None):
         raise InputError("cosim import: expected either a file or --bbox; give one of them")
-    click.echo(cosim.api.import_city(bbox if source is None else source, **options))
+    click.echo(cosim.api.import_city(place, **options))
 
 
 @main.command()

@@ -208,8 +208,18 @@ def train(
     compiled = chosen.descend and chosen.steps >= training.WORTH_COMPILING and rollout.can_compile(device)
     try:
         with watched(controller, progress) as show:
-            how = {"steps": steps, "resume": resume, "device": device, "compiled": compiled, "anyway": anyway}
-            return training.train(scenario, strategy, seed=seed, out=file, progress=show, **how)
+            return training.train(
+                scenario,
+                strategy,
+                seed=seed,
+                out=file,
+                steps=steps,
+                resume=resume,
+                device=device,
+                compiled=compiled,
+                anyway=anyway,
+                progress=show,
+            )
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"the best policy so far, if any, is {file}; add --resume to continue") from None
 
@@ -280,9 +290,12 @@ def _first_sentence(file: Path) -> str:
 
 def _file(scenario: Scenario, name: str, out: Path | str | None) -> Path:
     """Return the file that `out` names, or `name` in the scenario's folder; check that its folder exists."""
-    if out is None and scenario.folder is None:
+    if out is not None:
+        file = Path(out)
+    elif scenario.folder is not None:
+        file = shipped.beside(scenario.folder, name, "--out FILE", scenario=True)
+    else:
         raise InputError(f"{name}: expected a file to write to; give out")
-    file = Path(out) if out is not None else shipped.beside(scenario.folder, name, "--out FILE", scenario=True)
     if not file.parent.is_dir():
         raise InputError(f"{file.parent}: no such folder; make it or choose another --out")
     return file

@@ -109,11 +109,10 @@ def identify(
     more = [run for folder in loading.runs for run in finished(folder, loaded)]
 
     def load(stage: int, **options: object) -> list[Result]:
-        named = progress and (
-            lambda done, total, note="": progress(done, total, f"loading runs {stage + 1} of 2; {note}")
+        show = _named(progress, f"loading runs {stage + 1} of 2; ")
+        return _load(
+            loaded, loading, loading.stages[stage], options, out, workers=workers, scheduler=scheduler, progress=show
         )
-        how = {"workers": workers, "scheduler": scheduler, "progress": named}
-        return _load(loaded, loading, loading.stages[stage], options, out, **how)
 
     first = load(0)
     network = static_model(loaded, first, guided=loading.guided)
@@ -122,7 +121,7 @@ def identify(
     scheme: dict = {"step": loaded.step, "substeps": loaded.substeps, "integrator": loaded.integrator}
 
     def fitted(runs: Sequence[Result], samples: Sequence[dict]) -> RegionalModel:
-        fitting = progress and (lambda done, total, note="": progress(done, total, f"fitting, {note}"))
+        fitting = _named(progress, "fitting, ")
         seen = [observed(run) for run in runs]
         model = identification.fit(network, seen, iterations=loading.iterations, progress=fitting, **scheme)
         return as_it_was(network, model, nearly_empty(samples))
@@ -149,6 +148,13 @@ def identify(
     files.write_text(target / "network.toml", network_toml(model, _sumo_table(own, target), comment))
     files.write_text(target / authority.FILE, verdict.text())
     return "\n".join([text, *wrapped("\n".join(verdict.sentences))])
+
+
+def _named(progress: Callable[[int, int, str], None] | None, stage: str) -> Callable[..., None] | None:
+    """Return a progress function whose notes begin with the stage."""
+    if progress is None:
+        return None
+    return lambda done, total, note="": progress(done, total, stage + note)
 
 
 def _check_target(loading: Loading, name: str, target: Path, own: Path) -> None:

@@ -85,10 +85,10 @@ def predict_next(scenario: Scenario, result: Result, intervals: int = 1) -> Floa
     x = torch.from_numpy(result.accumulation[: len(result.perimeter) + 1 - intervals])
     demand = torch.from_numpy(result["departures"] / scenario.step)
     perimeter, splits = torch.from_numpy(result.perimeter), torch.from_numpy(result.splits)
-    p, scheme = parameters(scenario.network), {"integrator": scenario.integrator, "substeps": scenario.substeps}
+    p, step, integrator = parameters(scenario.network), scenario.step, scenario.integrator
     for n in range(intervals):
         k = slice(n, n + len(x))
-        x = advance(p, x, demand[k], perimeter[k], splits[k], scenario.step, **scheme)
+        x = advance(p, x, demand[k], perimeter[k], splits[k], step, integrator=integrator, substeps=scenario.substeps)
     return x.sum(-1).numpy()
 
 

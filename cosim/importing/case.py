@@ -221,9 +221,16 @@ def fetch_osm(box: Box, folder: Path) -> Path:
     options = ["--output-dir", str(folder), "--prefix", "osm", "--gzip", "--url", SERVERS, "--retries", "2"]
     options += ["--road-types", '{"highway": ["."]}']
     environment = os.environ | {"SUMO_HOME": sumo.SUMO_HOME}
-    kept = {"capture_output": True, "text": True, "errors": "replace", "stdin": subprocess.DEVNULL}
     try:
-        done = subprocess.run([*program, *options], timeout=SERVER_TIME_LIMIT_S, env=environment, **kept)
+        done = subprocess.run(
+            [*program, *options],
+            timeout=SERVER_TIME_LIMIT_S,
+            env=environment,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            stdin=subprocess.DEVNULL,
+        )
         reason = (done.stderr.strip().splitlines() or [f"status {done.returncode}"])[-1] if done.returncode else ""
     except subprocess.TimeoutExpired:
         reason = f"no answer in {SERVER_TIME_LIMIT_S:g} s"

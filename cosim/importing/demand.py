@@ -238,8 +238,8 @@ class _Reader:
             edges = self._draw(self._distribution(nested))
             element.remove(nested)
             element.append(Element("route", {"edges": " ".join(edges)}))
-            for name in ZONES:
-                element.attrib.pop(name, None)
+            for zone in ZONES:
+                element.attrib.pop(zone, None)
             return edges, True
         if route is not None:
             route.attrib.pop("id", None)

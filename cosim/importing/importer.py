@@ -112,7 +112,7 @@ def import_city(
         baseline = averaged_runs(streets, folder, files, model.options(case, clock), factor, meso, seeds, progress)
         progress("partition")
         left = quality.left_alone(streets, traffic.switched)
-        if own is None:
+        if isinstance(regions, int):
             labels = partition(streets, baseline, regions, uncontrollable=left)
         else:
             labels = finish(streets, own, renumber=False)

@@ -57,7 +57,8 @@ class Actuation:
             for plan in own
             if plan.actuated
         ]
-        phases |= {signal.signal: signal.phases for signal in (*self._fixed, *self._responsive)}
+        self._gates: list[GatewaySignal | ResponsiveSignal] = [*self._fixed, *self._responsive]
+        phases |= {signal.signal: signal.phases for signal in self._gates}
         self._commanded: Collection[str] = phases.keys()
         self.original_green = _programmed_green(city, phases, step)
 
@@ -67,7 +68,7 @@ class Actuation:
         share = np.clip((perimeter - network.u_min) / (network.u_max - network.u_min), 0.0, 1.0)
         if self._pressure is not None:
             self._pressure.command(share)
-        for signal in (*self._fixed, *self._responsive):
+        for signal in self._gates:
             signal.command(share)
 
     def play(self) -> None:
@@ -85,7 +86,7 @@ class Actuation:
     def green_time(self) -> PerGateway:
         """Return (G,) [s] of green so far per gateway, mean of its links; NaN where no command arrives."""
         green = {} if self._pressure is None else self._pressure.green_time()
-        green |= {signal.signal: signal.green_time() for signal in (*self._fixed, *self._responsive)}
+        green |= {signal.signal: signal.green_time() for signal in self._gates}
         return np.array(
             [
                 sum(green[g.signal][link] for link in g.links) / len(g.links) if g.signal in green else np.nan

@@ -102,7 +102,8 @@ class SumoPlant:
         self._estimation = None
         if estimated:
             self._estimation = Estimation(session, city, self._layout, meter, self._instruments, self._planning)
-        self._sampler, self._streets = StreetSampler(session, city), None
+        self._sampler = StreetSampler(session, city)
+        self._streets: StreetMeans | None = None
         self._guide = Guide(
             session,
             city,
@@ -153,11 +154,11 @@ class SumoPlant:
         assert abs(session.time - end) < 1e-6
         self._k += 1
         state = self._meter.state(self._k, self._k * scenario.step)
-        self._streets: StreetMeans | None = self._sampler.finish(self._incidents.closed)
+        self._streets = streets = self._sampler.finish(self._incidents.closed)
         if self._estimation:
             self._estimation.update(controls)
         self._state = replace(state, problem=self._incidents.problem())
-        row = self._recorder.add(self._streets)
+        row = self._recorder.add(streets)
         if self._observer:
             self._observer.recorded(controls, self._state, row)
         return self._state

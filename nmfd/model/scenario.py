@@ -23,8 +23,10 @@ from nmfd.runs.config import Name, Numbers, Problem, Regions, Rows, Settings, Te
 LONGEST_STEP_S = 86_400.0
 MOST_STEPS = 10**6
 MOST_FLOW_VEH_S = 1e6
-COPIED = ("name", "step", "steps", "measurement_std", "integrator", "substeps", "protected")  # from file to scenario
-COPIED += ("demand_factor", "forecast_error", "faults", "sumo")
+COPIED = (  # from file to scenario
+    *("name", "step", "steps", "measurement_std", "integrator", "substeps", "protected"),
+    *("demand_factor", "forecast_error", "faults", "sumo"),
+)
 
 
 @dataclass(frozen=True, kw_only=True)

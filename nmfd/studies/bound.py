@@ -162,9 +162,17 @@ def _total_time_spent(
 ) -> Float[torch.Tensor, " B"]:
     """Return the total time spent (B,) [veh s] of plans."""
     x = torch.from_numpy(scenario.start).expand(perimeter.shape[1], -1, -1)
-    states, scheme = [x], {"integrator": scenario.integrator, "substeps": scenario.substeps}
+    states = [x]
     for k in range(scenario.steps - 1):
         controls = perimeter[k], splits[k]
-        x = dynamics.advance(parameters, x, demand[k], *controls, scenario.step, **scheme)
+        x = dynamics.advance(
+            parameters,
+            x,
+            demand[k],
+            *controls,
+            scenario.step,
+            integrator=scenario.integrator,
+            substeps=scenario.substeps,
+        )
         states.append(x)
     return scenario.step * torch.stack(states).sum((0, -2, -1))

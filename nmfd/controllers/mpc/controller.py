@@ -167,8 +167,10 @@ class EconomicMpc:
         if self.options.solver == "ipopt":
             if terminal is not None:
                 raise error(planning.where, f"controllers.{self.name}.solver", "ipopt has no terminal cost; omit it")
-            limits = {"iterations": MAX_ITERATIONS, "seconds": DEADLINE_SHARE * self.deadline}
-            self._ipopt = Ipopt(planning, guidance=guidance, horizon=horizon, **limits)
+            seconds = DEADLINE_SHARE * self.deadline
+            self._ipopt = Ipopt(
+                planning, guidance=guidance, horizon=horizon, iterations=MAX_ITERATIONS, seconds=seconds
+            )
         self.reset()
 
     def reset(self, seed: int = 0) -> None:
