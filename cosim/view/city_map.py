@@ -1,21 +1,13 @@
 """The map of one run: streets by density, regions with their numbers, gates with their green."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from bokeh.models import (
-    ColorBar,
-    ColumnDataSource,
-    FixedTicker,
-    HoverTool,
-    LinearColorMapper,
-    PanTool,
-    ResetTool,
-    ScaleBar,
-    WheelZoomTool,
-)
+from bokeh.models import ColorBar, ColumnDataSource, FixedTicker, HoverTool, LinearColorMapper, ScaleBar
 from bokeh.plotting import figure
 
+from cosim.sumo.arrays import Points
 from cosim.view import colours
 from cosim.view.picture import CityPicture, Frame
 
@@ -37,15 +29,13 @@ class CityMap:
             sizing_mode="stretch_width",
             match_aspect=True,
             title=title,
-            tools="",
+            tools="pan,wheel_zoom,reset",
+            active_scroll="wheel_zoom",
             toolbar_location=None,
             outline_line_color=None,
             lod_threshold=None,
         )
         self.plot.axis.visible = self.plot.grid.visible = False
-        wheel = WheelZoomTool()
-        self.plot.add_tools(PanTool(), wheel, ResetTool())
-        self.plot.toolbar.active_scroll = wheel
         self.regions = self._add_regions()
         self.streets = self._add_streets()
         self.arrows = self._add_arrows()
@@ -88,8 +78,7 @@ class CityMap:
         rings = [(r, ring) for r, outline in enumerate(self._picture.outlines) for ring in outline]
         source = ColumnDataSource(
             {
-                "xs": [_floats(ring[:, 0]) for _, ring in rings],
-                "ys": [_floats(ring[:, 1]) for _, ring in rings],
+                **_lines([ring for _, ring in rings]),
                 "region": [r for r, _ in rings],
                 "width": np.ones(len(rings), np.float32),
                 "line": [colours.FAINT] * len(rings),
@@ -103,26 +92,18 @@ class CityMap:
         picture = self._picture
         thin, per_lane = (0.8, 0.4) if len(picture.edges) > 2000 else (1.6, 0.9)  # pixels
         offset = LINE_OFFSET * float(np.ptp(np.concatenate(picture.shapes)[:, 0]))
-        lines = [_to_the_right(shape, offset) for shape in picture.shapes]
         source = ColumnDataSource(
             {
-                "xs": [_floats(line[:, 0]) for line in lines],
-                "ys": [_floats(line[:, 1]) for line in lines],
+                **_lines([_to_the_right(shape, offset) for shape in picture.shapes]),
                 "edge": list(picture.edges),
-                "density": np.zeros(len(lines), np.float32),
+                "density": np.zeros(len(picture.edges), np.float32),
                 "width": _floats(thin + per_lane * picture.lanes),
             }
         )
         mapper = LinearColorMapper(palette=colours.SCALE, low=0.0, high=JAM_DENSITY)
         self.plot.add_layout(colour_bar(mapper, "density [veh/km and lane]", [0.0, 50.0, 100.0]), "below")
-        drawn = self.plot.multi_line(
-            "xs",
-            "ys",
-            source=source,
-            line_width="width",
-            line_cap="round",
-            line_color={"field": "density", "transform": mapper},
-        )
+        colour = {"field": "density", "transform": mapper}
+        drawn = self.plot.multi_line("xs", "ys", source=source, line_width="width", line_cap="round", line_color=colour)
         self._hover(drawn, ("street", "@edge"), ("density [veh/km and lane]", "@density{0.0}"))
         return source
 
@@ -146,18 +127,8 @@ class CityMap:
         )
         self.plot.scatter("x", "y", size="halo", source=source, color=colours.QUEUE, alpha=0.3, line_color=None)
         discs = self.plot.scatter("x", "y", size="size", source=source, fill_color=colours.PAPER, line_color="rim")
-        self.plot.wedge(
-            "x",
-            "y",
-            radius="radius",
-            radius_units="screen",
-            start_angle=np.pi / 2,
-            end_angle="end",
-            direction="clock",
-            source=source,
-            color=colours.GREEN,
-            line_color=None,
-        )
+        share = {"start_angle": np.pi / 2, "end_angle": "end", "direction": "clock", "radius_units": "screen"}
+        self.plot.wedge("x", "y", "radius", source=source, color=colours.GREEN, line_color=None, **share)
         self._hover(discs, ("gate", "@way"), ("green / original green", "@green"), ("queue [veh]", "@queue{0.0}"))
         return source
 
@@ -170,56 +141,24 @@ class CityMap:
             angle = np.arctan2(along[1], along[0]) - np.pi / 2
             rows.append([*(begin + 0.3 * along), *(begin + 0.7 * along), angle])
         columns = np.array(rows, np.float32).reshape(-1, 5).T
-        zeros = np.zeros(len(rows), np.float32)
-        source = ColumnDataSource(
-            {
-                **dict(zip(("x", "y", "x1", "y1", "angle"), columns, strict=True)),
-                "width": zeros,
-                "head": zeros,
-                "guided": zeros,
-            }
-        )
+        source = ColumnDataSource(dict(zip(("x", "y", "x1", "y1", "angle"), columns, strict=True)))
+        for name in ("width", "head", "guided"):
+            source.add(np.zeros(len(rows), np.float32), name)
         self.plot.segment("x", "y", "x1", "y1", source=source, line_width="width", color=colours.GUIDED, alpha=0.55)
-        heads = self.plot.scatter(
-            "x1",
-            "y1",
-            marker="triangle",
-            angle="angle",
-            size="head",
-            source=source,
-            color=colours.GUIDED,
-            line_color=None,
-            alpha=0.8,
-        )
+        tip = {"marker": "triangle", "angle": "angle", "size": "head", "line_color": None, "alpha": 0.8}
+        heads = self.plot.scatter("x1", "y1", source=source, color=colours.GUIDED, **tip)
         self._hover(heads, ("guided drivers [veh]", "@guided{0}"))
         return source
 
     def _add_numbers(self) -> None:
         x, y = _floats(self._picture.places[:, 0]), _floats(self._picture.places[:, 1])
         self.plot.scatter(x, y, size=24, fill_color=colours.PAPER, fill_alpha=0.9, line_color=colours.INK)
-        self.plot.text(
-            x,
-            y,
-            text=[str(r) for r in range(self._picture.regions)],
-            text_align="center",
-            text_baseline="middle",
-            text_font_size="12px",
-            text_font_style="bold",
-            text_color=colours.INK,
-        )
-        self.plot.add_layout(
-            ScaleBar(
-                range=self.plot.x_range,
-                unit="m",
-                location="bottom_left",
-                bar_length=0.15,
-                background_fill_alpha=0.0,
-                border_line_alpha=0.0,
-                label_text_color=colours.FAINT,
-                bar_line_color=colours.FAINT,
-                label_text_font_size="11px",
-            )
-        )
+        labels = [str(r) for r in range(self._picture.regions)]
+        middle = {"text_align": "center", "text_baseline": "middle", "text_font_size": "12px"}
+        self.plot.text(x, y, text=labels, text_color=colours.INK, **middle)
+        clear = {"background_fill_alpha": 0.0, "border_line_alpha": 0.0, "label_text_font_size": "11px"}
+        scale = ScaleBar(range=self.plot.x_range, unit="m", location="bottom_left", bar_length=0.15, **clear)
+        self.plot.add_layout(scale)
 
     def _hover(self, renderer: Any, *tooltips: tuple[str, str]) -> None:
         self.plot.add_tools(HoverTool(renderers=[renderer], tooltips=list(tooltips)))
@@ -239,22 +178,9 @@ def mean(values: np.ndarray) -> float:
 
 def colour_bar(mapper: LinearColorMapper, title: str, ticks: list[float]) -> ColorBar:
     """Return a small horizontal scale to stand below a plot."""
-    return ColorBar(
-        color_mapper=mapper,
-        title=title,
-        ticker=FixedTicker(ticks=ticks),
-        height=8,
-        width=220,
-        location=(0, 0),
-        padding=4,
-        orientation="horizontal",
-        title_text_font_style="normal",
-        title_text_font_size="11px",
-        title_text_color=colours.FAINT,
-        major_label_text_font_size="11px",
-        bar_line_color=None,
-        major_tick_line_color=None,
-    )
+    size = {"height": 8, "width": 220, "location": (0, 0), "padding": 4, "orientation": "horizontal"}
+    text = {"title_text_font_size": "11px", "title_text_color": colours.FAINT, "major_label_text_font_size": "11px"}
+    return ColorBar(color_mapper=mapper, title=title, ticker=FixedTicker(ticks=ticks), **size, **text)
 
 
 def _wedge_end(share: np.ndarray | float) -> np.ndarray:
@@ -264,6 +190,10 @@ def _wedge_end(share: np.ndarray | float) -> np.ndarray:
 
 def _floats(values: np.ndarray) -> np.ndarray:
     return np.asarray(values, dtype=np.float32)
+
+
+def _lines(shapes: Sequence[Points]) -> dict[str, Any]:
+    return {"xs": [_floats(shape[:, 0]) for shape in shapes], "ys": [_floats(shape[:, 1]) for shape in shapes]}
 
 
 def _to_the_right(shape: np.ndarray, distance: float) -> np.ndarray:

@@ -3,16 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from bokeh.models import (
-    CDSView,
-    ColumnDataSource,
-    FixedTicker,
-    HoverTool,
-    IndexFilter,
-    LinearColorMapper,
-    Plot,
-    Span,
-)
+from bokeh.models import CDSView, ColumnDataSource, FixedTicker, HoverTool, IndexFilter, LinearColorMapper, Plot, Span
 from bokeh.plotting import figure
 
 from cosim.view import colours
@@ -41,9 +32,8 @@ class Load:
         self.plot.grid.visible = False
         self._source = ColumnDataSource({"image": [self._values([])]})
         mapper = LinearColorMapper(palette=colours.SCALE, low=0.0, high=DARKEST_LOAD, nan_color=colours.LAND)
-        self.plot.image(
-            "image", x=0.0, y=-0.5, dw=horizon, dh=picture.regions, source=self._source, color_mapper=mapper
-        )
+        place = {"x": 0.0, "y": -0.5, "dw": horizon, "dh": picture.regions}
+        self.plot.image("image", source=self._source, color_mapper=mapper, **place)
         self.plot.add_layout(colour_bar(mapper, "accumulation / critical [-]", [0.0, 1.0, 2.0]), "below")
         self.now = _now(self.plot)
 
@@ -52,7 +42,6 @@ class Load:
         self._source.data = {"image": [self._values(whole)]}
 
     def _values(self, whole: Sequence[Frame]) -> np.ndarray:
-        """Return (R, T) loads, NaN where there is no frame."""
         values = np.full((self._picture.regions, self._picture.steps), np.nan, np.float32)
         for frame in whole[1:]:
             values[:, frame.intervals - 1] = frame.accumulation / self._picture.critical
@@ -77,15 +66,7 @@ class Curves:
             plot.x_range.start, plot.x_range.end = 0.0, picture.steps * picture.step / MINUTE
         self.gates.y_range.start, self.gates.y_range.end = -0.04, 1.08
         self.critical, self.mfd = (ColumnDataSource({"x": [], "y": []}) for _ in range(2))
-        self.region.line(
-            "x",
-            "y",
-            source=self.critical,
-            color=colours.INK,
-            line_dash="dotted",
-            line_width=1.5,
-            legend_label="critical",
-        )
+        self.region.line("x", "y", source=self.critical, color=colours.INK, line_dash="dotted", legend_label="critical")
         self.plane.line("x", "y", source=self.mfd, color=colours.FAINT, line_width=2, legend_label="MFD of the model")
         self.lines: list[ColumnDataSource] = []
         self.past: list[IndexFilter] = []
@@ -93,13 +74,11 @@ class Curves:
         for n, name in enumerate(names):
             self._add_run(n, name)
         for plot in (*over_time, self.plane):
-            legend = plot.legend[0]
-            legend.update(location="top_left", background_fill_alpha=0.75, border_line_alpha=0.0)
-            legend.update(label_text_font_size="11px", spacing=0, padding=2)
+            style = {"label_text_font_size": "11px", "background_fill_alpha": 0.75, "border_line_alpha": 0.0}
+            plot.legend[0].update(location="top_left", spacing=0, padding=2, **style)
         for plot in (self.gates, self.plane):  # where values may be anywhere
-            legend = plot.legend[0]
-            legend.update(location="left", ncols=2, margin=0)
-            plot.add_layout(legend, "below")
+            plot.legend[0].update(location="left", ncols=2, margin=0)
+            plot.add_layout(plot.legend[0], "below")
         self.titles = [plot.title for plot in (self.region, self.plane, self.gates)]  # they name the region
         self.now = [_now(plot) for plot in over_time]
 
@@ -145,49 +124,28 @@ class Curves:
         for plot, column in ((self.region, "accumulation"), (self.trips, "completed"), (self.spent, "spent")):
             plot.line("time", column, legend_label=name, **style)
         self.gates.step("time", "u", mode="before", legend_label=f"u, {name}", **style)
-        self.gates.scatter(
-            "time",
-            "green",
-            source=source,
-            size=5,
-            marker=marker,
-            line_color=colour,
-            fill_color=colours.PAPER,
-            legend_label=f"green, {name}",
-        )
         past, present = IndexFilter(indices=[]), IndexFilter(indices=[])
-        points = {"source": source, "marker": marker, "color": colour}
-        self.plane.scatter("accumulation", "outflow", view=CDSView(filter=past), size=4, alpha=0.5, **points)
-        self.plane.scatter(
-            "accumulation", "outflow", view=CDSView(filter=present), size=12, legend_label=name, **points
-        )
+        points = {"source": source, "marker": marker, "line_color": colour}
+        self.gates.scatter("time", "green", size=5, fill_color=colours.PAPER, legend_label=f"green, {name}", **points)
+        points |= {"x": "accumulation", "y": "outflow", "fill_color": colour}
+        self.plane.scatter(view=CDSView(filter=past), size=4, alpha=0.5, **points)
+        self.plane.scatter(view=CDSView(filter=present), size=12, legend_label=name, **points)
         self.lines.append(source)
         self.past.append(past)
         self.present.append(present)
 
 
 def _figure(title: str, x: str, y: str, height: int = CURVE_HEIGHT) -> Plot:
-    plot = figure(
-        title=title,
-        height=height,
-        sizing_mode="stretch_width",
-        tools="",
-        toolbar_location=None,
-        x_axis_label=x,
-        y_axis_label=y,
-        outline_line_color=None,
-    )
-    plot.axis.axis_label_text_font_style = "normal"
+    bare = {"tools": "", "toolbar_location": None, "outline_line_color": None, "sizing_mode": "stretch_width"}
+    plot = figure(title=title, height=height, x_axis_label=x, y_axis_label=y, **bare)
     plot.axis.axis_label_text_color = plot.axis.major_label_text_color = colours.FAINT
-    plot.axis.axis_line_color = plot.axis.major_tick_line_color = colours.LINE
-    plot.axis.minor_tick_line_color = None
-    plot.grid.grid_line_color, plot.grid.grid_line_alpha = colours.LINE, 0.6
-    plot.title.text_font_size, plot.title.text_color = "13px", colours.INK
+    plot.axis.axis_line_color = plot.axis.major_tick_line_color = plot.grid.grid_line_color = colours.LINE
     plot.add_tools(HoverTool(tooltips=[(x, "$x{0.0}"), (y, "$y{0.00}")]))
     return plot
 
 
 def _now(plot: Plot) -> Span:
+    """Add a line at a time to a plot."""
     span = Span(location=0.0, dimension="height", line_color=colours.INK, line_width=1)
     plot.add_layout(span)
     return span

@@ -92,8 +92,8 @@ class Page:
     def layout(self, bar: Sequence[LayoutDOM]) -> LayoutDOM:
         """Return the page as one model, with `bar` above it."""
         curves = self.curves
-        beside = [] if len(self.maps) > 1 else [column(curves.region, curves.plane, sizing_mode="stretch_width")]
-        below = [curves.region, curves.plane] if len(self.maps) > 1 else []
+        pair = [curves.region, curves.plane]
+        beside, below = ([], pair) if len(self.maps) > 1 else ([column(*pair, sizing_mode="stretch_width")], [])
         for n, one in enumerate(self.maps):
             one.plot.name = f"map{n}"
         curves.plane.name = "plane"
@@ -126,11 +126,13 @@ def with_slider(picture: CityPicture, runs: Mapping[str, Sequence[Frame]]) -> La
     of_region = [
         *((one.regions, ["width", "line", "fill"]) for one in page.maps),
         *((line, list(OF_REGION)) for line in page.curves.lines),
-        (page.curves.critical, ["x", "y"]),
-        (page.curves.mfd, ["x", "y"]),
+        *((source, ["x", "y"]) for source in (page.curves.critical, page.curves.mfd)),
     ]
-    film, choices, words, first = _tables(moving), _tables(of_region), [], page.region
-    texts: list[list[str]] = [[] for _ in page.curves.titles]
+    film, choices = (
+        [[source, ColumnDataSource({name: [] for name in names}), names] for source, names in sources]
+        for sources in (moving, of_region)
+    )
+    words, first, texts = [], page.region, [[] for _ in page.curves.titles]
     for k in range(last + 1):
         page.show([frames[min(k, len(frames) - 1)] for frames in whole], k * picture.step)
         _add_row(film)
@@ -144,16 +146,8 @@ def with_slider(picture: CityPicture, runs: Mapping[str, Sequence[Frame]]) -> La
     page.choose(first)
     page.trace(whole, begin * picture.step)
     page.show([frames[min(begin, len(frames) - 1)] for frames in whole], begin * picture.step)
-    slider = Slider(
-        start=0.0,
-        end=last * step,
-        value=begin * step,
-        step=step,
-        title="time [min]",
-        name="time",
-        sizing_mode="stretch_width",
-        styles={"flex": "1 1 240px"},
-    )
+    wide = {"sizing_mode": "stretch_width", "styles": {"flex": "1 1 240px"}}
+    slider = Slider(start=0.0, end=last * step, value=begin * step, step=step, title="time [min]", name="time", **wide)
     play = Toggle(label="Play", name="play", width=90, button_type="primary")
     callback = CustomJS(
         args={
@@ -178,11 +172,6 @@ def with_slider(picture: CityPicture, runs: Mapping[str, Sequence[Frame]]) -> La
     return page.layout([play, slider, page.regions])
 
 
-def _tables(sources: Sequence[tuple[ColumnDataSource, list[str]]]) -> list[list[Any]]:
-    """Return [source, empty table of its columns, columns] for every source."""
-    return [[source, ColumnDataSource({name: [] for name in names}), names] for source, names in sources]
-
-
 def _add_row(tables: Sequence[Sequence[Any]]) -> None:
     """Add the present values of the sources to their tables."""
     for source, table, names in tables:
@@ -204,15 +193,13 @@ def numbers(names: Sequence[str], frames: Sequence[Frame | None], time: float) -
     heads = "".join(f"<td style='color:{colours.FAINT};padding:0 10px'>{label}</td>" for label in labels)
     lines = []
     for (colour, _), name, frame in zip(colours.RUNS, names, frames, strict=False):
-        totals: list[float] = []
+        cells = ""
         if frame is not None:
             totals = [frame.accumulation.sum(), frame.waiting, frame.completed, frame.time_spent / HOUR, frame.removed]
-        cells = "".join(f"<td style='font-size:18px;padding:0 10px'>{value:,.0f}</td>" for value in totals)
-        note = "" if frame is None else escape(frame.note[:200])
-        lines.append(
-            f"<tr><th style='color:{colour};text-align:left;font-size:15px'>{escape(name)}</th>{cells}"
-            f"<td style='color:{colours.QUEUE}'>{note}</td></tr>"
-        )
+            cells = "".join(f"<td style='font-size:18px;padding:0 10px'>{value:,.0f}</td>" for value in totals)
+            cells += f"<td style='color:{colours.QUEUE}'>{escape(frame.note[:200])}</td>"
+        head = f"<th style='color:{colour};text-align:left;font-size:15px'>{escape(name)}</th>"
+        lines.append(f"<tr>{head}{cells}</tr>")
     return (
         "<table style='text-align:right'><tr><th style='font-size:20px;text-align:left;white-space:nowrap'>"
         f"{time / MINUTE:.1f} min</th>{heads}</tr>{''.join(lines)}</table>"

@@ -18,15 +18,8 @@ CURVE_POINTS = 60  # of an MFD
 CURVE_END = 2.0  # critical accumulations, or the jam accumulation if that is less
 REGION_REACH = 0.08  # of the map's extent: places farther from all streets belong to no region
 GATE_SETBACK = 0.015  # of the map's extent: distance of a gate from the end of its street
-ROW = (  # variables of a result that `after` reads
-    "gateway_green",
-    "gateway_original_green",
-    "gateway_queue",
-    "arrivals",
-    "crossings",
-    "edge_vehicles",
-    "guided",
-)
+ROW = ("gateway_green", "gateway_original_green", "gateway_queue")  # variables of a result that `after` reads
+ROW += ("arrivals", "crossings", "edge_vehicles", "guided")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,6 +72,7 @@ class CityPicture:
         shapes, network = edge_shapes(city), scenario.network
         region = np.array([city.region_of[edge] for edge in city.edges])
         middles = np.array([shape.mean(axis=0) for shape in shapes])
+        axes = [np.linspace(0.0, min(mfd.jam, CURVE_END * mfd.critical), CURVE_POINTS) for mfd in network.mfds]
         return cls(
             name=scenario.name,
             region_names=network.region_names,
@@ -91,7 +85,7 @@ class CityPicture:
             places=np.stack([middles[region == r].mean(axis=0) for r in range(city.regions)]),
             gates=_gates(city, dict(zip(city.edges, shapes, strict=True))),
             critical=network.critical,
-            curves=[_curve(mfd.critical, mfd.jam, mfd.outflow) for mfd in network.mfds],
+            curves=[np.stack([x, mfd.outflow(x)], axis=1) for x, mfd in zip(axes, network.mfds, strict=True)],
             step=scenario.step,
             steps=scenario.steps,
         )
@@ -152,18 +146,13 @@ def between(picture: CityPicture, before: Frame, time: float, vehicles: PerEdge)
         before,
         time=time,
         whole=False,
-        density=_density(picture, vehicles),
+        density=(vehicles / picture.lane_km).astype(np.float16),
         accumulation=np.bincount(picture.region, vehicles, picture.regions),
     )
 
 
 def after(
-    picture: CityPicture,
-    before: Frame,
-    spent: float,
-    controls: Controls,
-    state: State,
-    row: Mapping[str, np.ndarray],
+    picture: CityPicture, before: Frame, spent: float, controls: Controls, state: State, row: Mapping[str, np.ndarray]
 ) -> Frame:
     """Return the frame at the end of a control interval; spent: unfinished vehicles at its start [veh]."""
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -173,7 +162,7 @@ def after(
         time=state.time,
         intervals=state.step,
         whole=True,
-        density=_density(picture, row["edge_vehicles"].astype(float)),
+        density=(row["edge_vehicles"].astype(float) / picture.lane_km).astype(np.float16),
         accumulation=state.accumulation.sum(axis=1),
         outflow=regional_outflow(flows, picture.step)[0],
         waiting=float(state.backlog.sum()),
@@ -207,16 +196,6 @@ def frames(picture: CityPicture, result: Any) -> list[Frame]:
         row = {name: getattr(result, name)[k] for name in ROW}
         made.append(after(picture, made[-1], float(states[k].unfinished.sum()), controls, state, row))
     return made
-
-
-def _density(picture: CityPicture, vehicles: PerEdge) -> PerEdge:
-    """Return the density of the streets in half precision."""
-    return (vehicles / picture.lane_km).astype(np.float16)
-
-
-def _curve(critical: float, jam: float, outflow: Any) -> Points:
-    x = np.linspace(0.0, min(jam, CURVE_END * critical), CURVE_POINTS)
-    return np.stack([x, outflow(x)], axis=1)
 
 
 def _gates(city: City, shapes: Mapping[str, Points]) -> tuple[Gate, ...]:
