@@ -96,8 +96,8 @@ class Actuation:
 
     def as_shown(self, green: PerGateway) -> PerGateway:
         """Return `green` (G,) [s] of the last interval, the original one where a signal did not obey."""
-        failed = [gateway.signal in self._incidents.refused for gateway in self._city.gateways]
-        return np.where(failed, self.original_green, green)
+        refused = self._incidents.refused
+        return np.where([gateway.signal in refused for gateway in self._city.gateways], self.original_green, green)
 
     def pressure_facts(self) -> dict[str, float]:
         """Return max_pressure.FACTS of this run; NaN without max-pressure."""

@@ -1,11 +1,10 @@
 """Loop detectors on a share of the links, a share of the vehicles as probes, and the estimate from both.
 
-Loops are SUMO's own, on every lane of an equipped link and at up to three places along it: a count of the vehicles on a
-link with a signal needs one near its entry, one in the middle and one near the stop line (Vigos, Papageorgiou and Wang,
+Loops are SUMO's own, on every lane of an equipped link, at up to three places along it (Vigos, Papageorgiou and Wang,
 "Real-time estimation of vehicle-count within signalized links", Transportation Research C 16, 2008). The density of a
-lane is the mean occupancy of its loops over the length of a vehicle; vehicles on junctions are not seen. Vehicles over
-a boundary are counted at the gateways that lead into an equipped link. Of probes, region and destination are known at
-the end of every control interval, also while they wait to enter.
+lane is the mean occupancy of its loops over the length of a vehicle. Vehicles over a boundary are counted at the
+gateways that lead into an equipped link. Region and destination of probes are known at the end of every control
+interval, also while they wait to enter.
 """
 
 from collections.abc import Sequence

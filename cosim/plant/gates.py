@@ -7,9 +7,8 @@ keeps m + s (L - m) seconds
 - of every cycle at a signal that SUMO times by detectors (ResponsiveSignal) or max-pressure runs (Ration): L is the
   nominal green in a cycle, or the whole cycle.
 
-Then come the original yellow and red. Green is only taken away, so no two movements are green together that never
-were, and s = 1 is the original programme. The green that is taken stays red (hold-back), or phases without a gateway
-movement get it within an unchanged cycle and unchanged intergreens (redistribute).
+Then come the original yellow and red. Green is only taken away: no new conflicts, and s = 1 is the original programme.
+The green that is taken stays red (hold-back), or phases without a gateway movement get it (redistribute).
 """
 
 from bisect import bisect_right

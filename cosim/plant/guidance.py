@@ -1,22 +1,17 @@
 """Route guidance to reroutes: every vehicle gets its next region when it enters a region, in shares theta.
 
-Guidance tells drivers travel times, which moves their wishes away from the split ratios without guidance. Theta shifts
-these wishes as it shifts the drivers' own split ratios in the regional model (`shifted`); theta equal to these is
-guidance by travel times alone. Prices are another way: all drivers with another destination are told longer travel
-times through a region, and no share is commanded, so those with a good alternative divert.
+Travel times move the drivers' wishes away from the split ratios without guidance. Theta shifts these wishes as it does
+the drivers' own split ratios in the regional model (`shifted`). Prices lengthen the travel times through a region for
+drivers with another destination; then no share is commanded.
 
 Drivers are assigned deterministically, not at random: each takes the next region that costs least, with a bonus for
-regions that are behind their share, which grows until the shares are met by the drivers who lose least. Random
-assignment sends a driver at the western edge of a region round its eastern end, and jams a city that flows without it.
+regions that are behind their share. Random assignment sends drivers round the far end of a region, and jams a city.
 
 A guided vehicle in region i bound for edge d takes the fastest way inside i to a gateway i -> h, and from there to d
-without coming back to i, at recent travel times (cosim.plant.routes) as its class of drivers sees them. In the region
-of d it takes the fastest way there. With a period, it is guided again where it is, as long as it stays in i. No driver
-takes a detour much longer, whatever theta is, and none leaves the present way for a small gain, because every change
-makes the travel times of others wrong: 2 % of the time where a fifth of it is delay, 30 % where most of it is.
-
-Where the boundaries of regions are ragged, a main road may leave i and come back. With `ways_return` the fastest way of
-all is open to all drivers and counts for the region that it enters when it leaves i for good.
+without coming back to i, at recent travel times (cosim.plant.routes) as its class of drivers sees them. With a period,
+it is guided again in i. No driver takes a much longer detour, and none leaves the present way for a small gain, because
+every change makes the travel times of others wrong. With `ways_return`, for ragged boundaries, the fastest way of all
+is open to all drivers and counts for the region that it enters when it leaves i for good.
 """
 
 import math
@@ -60,8 +55,7 @@ def shifted(wish: Sequence[float], own: Sequence[float], theta: Sequence[float])
 
 @dataclass(eq=False)
 class _Visit:
-    """A driver who follows, in one region. taste: class of drivers; following: next region that was given last, in
-    control interval `interval`."""
+    """A driver who follows, in one region; `following`, the next region, was given in `interval`."""
 
     event: Event
     taste: int
@@ -71,17 +65,12 @@ class _Visit:
 
 @dataclass(frozen=True)
 class _Present:
-    """The present way of a driver.
+    """The present way of a driver."""
 
-    way: edges, None on roads closed to cars; takes: [s] from the end of the first one, infinite if it is not the
-    driver's; delay: [s] of these; bound: a search would find it, by known moves and, unless ways may return, without
-    coming back into the region
-    """
-
-    way: list[int] | None
-    takes: float = math.inf
-    delay: float = math.inf
-    bound: bool = False
+    way: list[int] | None  # edges; None on roads closed to cars
+    takes: float = math.inf  # [s] from the end of the first edge
+    delay: float = math.inf  # [s] of these
+    bound: bool = False  # a search would find it
 
 
 class Guide:
@@ -285,14 +274,12 @@ class Guide:
     def _present(self, vehicle: str, here: int, time: PerEdge) -> _Present:
         """Return the present way of a driver on edge `here`, at `time` (E,) [s]."""
         route = self._session.route(vehicle)[self._session.route_index(vehicle) :]
-        way: list[int] = []
-        try:
-            way += map(self._index.__getitem__, route)
-        except KeyError:
+        way = [self._index[edge] for edge in route if edge in self._index]
+        if len(way) < len(route):
             return _Present(None)
         if way[0] != here:
             return _Present(way)
-        moves = list(map(self._move.get, pairwise(way)))
+        moves = [self._move.get(pair) for pair in pairwise(way)]
         known = np.array([move for move in moves if move is not None], dtype=int)
         times, ahead = self._times, np.array(way[1:], dtype=int)
         takes = time.take(ahead).sum() + times.turns.take(known).sum()
@@ -386,7 +373,6 @@ class Guide:
     def _by_all_moves(
         self, region: int, taste: int, free: int | None, time: PerEdge
     ) -> tuple[Trees, PerGateway, PerGateway] | None:
-        """Return the argument `everywhere` of Ways."""
         if self._anywhere is None:
             return None
         first, second, move, _ = self._gateways[region]

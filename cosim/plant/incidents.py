@@ -30,7 +30,6 @@ class Incidents:
 
     Call `begin` at the start of every control interval and `play` before every simulation step. A signal that stops or
     starts to obey shows yellow first where it loses a green.
-    refused: signals that did not take their states in this interval
     """
 
     def __init__(self, faults: Sequence[Fault], session: Session, city: City):
@@ -96,12 +95,10 @@ class Incidents:
         target = None if signal in self._silent else self._commanded.get(signal)
         if target is None:
             session.restart_programme(signal, self._own[signal])
-        ends = [
-            a in GREEN and b not in GREEN
-            for a, b in zip(shown, session.signal_state(signal) if target is None else target, strict=True)
-        ]
-        if any(ends):
-            session.set_signal_state(signal, "".join("y" if end else a for end, a in zip(ends, shown, strict=True)))
+        coming = session.signal_state(signal) if target is None else target
+        between = "".join("y" if a in GREEN and b not in GREEN else a for a, b in zip(shown, coming, strict=True))
+        if between != shown:
+            session.set_signal_state(signal, between)
             self._yellow_end[signal] = session.time + DEFAULT_YELLOW_S
         elif target is not None:
             session.set_signal_state(signal, target)

@@ -6,10 +6,9 @@ pressure sum c(l, m) max(w(l, m), 0) over its movements, c their saturation flow
 gets the green, after the original yellow and all-red. Perimeter control rations the green of the gateway movements
 (cosim.plant.gates.Ration); a movement whose ration is spent exerts no pressure.
 
-x counts vehicles per lane; on lanes that several movements share, and upstream of the turn lanes, r divides them, from
-the demand's static routes. Vehicles on streets closed to cars, such as buses, press for the stages that serve them. A
-shared lane counts for the stages that serve all of it; if there is none, for the others with the chance that its first
-vehicle is served, because that vehicle holds up all behind it.
+x counts vehicles per lane; on shared lanes and upstream of the turn lanes, r divides them, from the demand's static
+routes. Vehicles on streets closed to cars, such as buses, press for the stages that serve them. A shared lane counts
+for the stages that serve all of it; if there is none, for the others with the chance that its first vehicle is served.
 
 Acyclic (Varaiya): the next stage is the one with the highest pressure; a link that was red for MAX_RED_S while a
 vehicle waited there comes first. Cyclic (Levin, Hu and Odell, "Max-pressure signal control with cyclical phase
@@ -224,10 +223,7 @@ class Junction:
 
 
 def stages_of(signal: Signal) -> tuple[int, ...]:
-    """Return the phases to choose from: stages that no other stage covers.
-
-    Programmes have the same phase twice, and phases in which a part of the green goes on for the last vehicles.
-    """
+    """Return the phases to choose from: stages whose green no other stage covers."""
     level = {n: np.array([LEVELS.index(light) for light in signal.phases[n].state]) for n in signal.stages}
     covered = {
         n for n, m in permutations(level, 2) if (level[n] <= level[m]).all() and (m < n or (level[n] < level[m]).any())
@@ -303,7 +299,6 @@ class Approaches:
 
 @lru_cache(maxsize=4096)  # a city shows the same states all day
 def _green(state: str) -> np.ndarray:
-    """(K,) bool, not to be written to"""
     return np.isin(list(state), list(GREEN))
 
 
@@ -323,8 +318,8 @@ class Roads:
                 self._before[other].append(edge)
         cars = [lane for edge in city.edges for lane in city.lane_ids[edge]]
         links = [link for signal in signals for link in signal.links]
-        others = [link for signal in signals for link in signal.others]
-        self.lanes = list(dict.fromkeys([*cars, *(lane_id(link) for link in (*links, *others))]))
+        others = (lane_id(link) for signal in signals for link in signal.others)
+        self.lanes = list(dict.fromkeys([*cars, *map(lane_id, links), *others]))
         self.lane_number = {lane: n for n, lane in enumerate(self.lanes)}
         self._links: dict[str, list[Link]] = {}
         self._cars = frozenset(cars)
@@ -337,20 +332,15 @@ class Roads:
         for edge, target in self.movements:
             row = self._queue(edge, target, arriving=True)
             end = self._chain(target)[-1]
-            for onward, share in self._shares(end, self._targets(end)).items():
+            for onward, share in self._turns(end).items():
                 for lane, part in self._queue(end, onward).items():
                     row[lane] = row.get(lane, 0.0) - share * part
             rows.append(row)
         self.weights = _sparse(rows, len(self.lanes))
 
     def stages(self, signals: Iterable[Signal]) -> tuple[csr_array, list[int]]:
-        """Return (S, M) saturation flows [lanes] of movements in stages, and the number of each signal's first stage.
-
-        A shared lane gives a stage that serves a part of it nothing if another stage serves all of it, else its share
-        times the chance that its first vehicle is served.
-        """
-        rows: list[dict[int, float]] = []
-        begins: list[int] = []
+        """Return (S, M) saturation flows [lanes] of movements in stages, and each signal's first stage."""
+        rows, begins = list[dict[int, float]](), list[int]()
         for signal in signals:
             begins.append(len(rows))
             states = [signal.phases[number].state for number in stages_of(signal)]
@@ -359,11 +349,11 @@ class Roads:
             for state, parts in zip(states, served, strict=True):
                 row: dict[int, float] = {}
                 for link in {(k.from_edge, k.lane, k.to_edge): k for k in signal.links}.values():
-                    lane = lane_id(link)
+                    lane, light = lane_id(link), state[link.index]
                     counts = lane in self._cars and (lane not in whole or parts.get(lane, 0.0) >= WHOLE)
-                    if state[link.index] in GREEN and counts:
+                    if light in GREEN and counts:
                         share = self._lane_shares(lane)[link.to_edge]
-                        gain = share * min(parts[lane], 1.0) * (1.0 if state[link.index] == "G" else PERMISSIVE)
+                        gain = share * min(parts[lane], 1.0) * (1.0 if light == "G" else PERMISSIVE)
                         movement = self.movements[link.from_edge, link.to_edge]
                         row[movement] = row.get(movement, 0.0) + gain
                 rows.append(row)
@@ -371,9 +361,7 @@ class Roads:
 
     def shared(self, signals: Iterable[Signal]) -> tuple[int, int, int]:
         """Return the numbers of lanes before signals, served in part by a stage, and served whole by none."""
-        lanes: set[str] = set()
-        split: set[str] = set()
-        whole: set[str] = set()
+        lanes, split, whole = set[str](), set[str](), set[str]()
         for signal in signals:
             lanes |= {lane_id(link) for link in signal.links} & self._cars
             for number in stages_of(signal):
@@ -392,7 +380,7 @@ class Roads:
     def _queue(self, edge: str, to: str, *, arriving: bool = False) -> dict[int, float]:
         """Return lane -> share of its vehicles from `edge` to `to`. arriving: also from beyond the road"""
         queue = {}
-        share = self._shares(edge, self._targets(edge))[to]
+        share = self._turns(edge)[to]
         for lane in self._city.lane_ids[edge]:
             if own := self._lane_shares(lane).get(to) if edge in self._links else share:
                 queue[self.lane_number[lane]] = own
@@ -431,13 +419,13 @@ class Roads:
     def _arriving(self, edge: str, length: float) -> dict[str, float]:
         """Return edge without a signal that leads to `edge`, within REACH_M -> share of its vehicles that take it.
 
-        Roads are cut into pieces shorter than their queues. length: from the beginning of `edge` to the signal [m]
+        length: from the beginning of `edge` to the signal [m]
         """
         shares, todo = {edge: 1.0}, [(edge, length)]
         for onward, there in todo:
             for before in self._before[onward] if there < REACH_M else ():
                 if before not in self._links and before not in shares:
-                    shares[before] = shares[onward] * self._shares(before, self._targets(before))[onward]
+                    shares[before] = shares[onward] * self._turns(before)[onward]
                     todo.append((before, there + self._city.length[before]))
         del shares[edge]
         return shares
@@ -446,13 +434,12 @@ class Roads:
         edge = lane.rpartition("_")[0]
         return self._shares(edge, sorted({link.to_edge for link in self._links[edge] if lane_id(link) == lane}))
 
-    def _targets(self, edge: str) -> list[str]:
-        """Return the next edges of `edge`, with a signal or not."""
-        if edge in self._links:
-            return sorted({link.to_edge for link in self._links[edge]})
-        return list(self._city.successors[edge])
+    def _turns(self, edge: str) -> dict[str, float]:
+        """Return turning shares among all next edges of `edge`, with a signal or not."""
+        links = self._links.get(edge)
+        return self._shares(edge, sorted({link.to_edge for link in links}) if links else self._city.successors[edge])
 
-    def _shares(self, edge: str, targets: list[str]) -> dict[str, float]:
+    def _shares(self, edge: str, targets: Sequence[str]) -> dict[str, float]:
         """Return turning shares among `targets`, equal ones without flow."""
         flows = np.array([self._flows.get((edge, target), 0.0) for target in targets])
         total = flows.sum()

@@ -95,9 +95,8 @@ class SumoPlant:
         self._metering = None
         if held is not None:
             self._metering = Metering(session, held, critical, level=settings.metering, step=scenario.step)
-        estimated, known = settings.measurement == ESTIMATE, frozenset[str]()
-        if estimated:
-            known = probes(self._launch.vehicles, settings.probe_share, seed)
+        estimated = settings.measurement == ESTIMATE
+        known = probes(self._launch.vehicles, settings.probe_share if estimated else 0.0, seed)
         self._meter = meter = Meter(session, city, known, self._trips, self._metering)
         self._estimation = None
         if estimated:
@@ -129,7 +128,7 @@ class SumoPlant:
     def step(self, controls: Controls) -> State:
         """Simulate one control interval: actuate, simulate, measure and guide in every simulation step; then record."""
         session, scenario = self.session, self._scenario
-        end, steps = session.time + scenario.step, round(scenario.step / session.step_length)
+        steps = round(scenario.step / session.step_length)
         reading, sampling = (
             min(max(1, round(seconds / session.step_length)), steps) for seconds in (READING_PERIOD_S, SAMPLE_PERIOD_S)
         )
@@ -149,9 +148,10 @@ class SumoPlant:
             if self._estimation and n % reading == 0:
                 self._estimation.sample()
             if n % sampling == 0:
-                self._sample()
+                self._sampler.sample()
+                if self._observer:
+                    self._observer.sampled(session.time, *self._sampler.last)
             self._guide.apply(events)
-        assert abs(session.time - end) < 1e-6
         self._k += 1
         state = self._meter.state(self._k, self._k * scenario.step)
         self._streets = streets = self._sampler.finish(self._incidents.closed)
@@ -232,11 +232,6 @@ class SumoPlant:
             return len(self._launch.vehicles)
         meter = self._meter
         return int(meter.departures.sum() + meter.backlog().sum() + meter.given_up.sum())
-
-    def _sample(self) -> None:
-        self._sampler.sample()
-        if self._observer:
-            self._observer.sampled(self.session.time, *self._sampler.last)
 
     def _splits(self, controls: Controls) -> PerTurn | None:
         """Return the split ratios of the guidance: the drivers' own ones mean guidance by travel times alone."""

@@ -71,8 +71,7 @@ def city_signals(city: City, scenario: Scenario, settings: Settings) -> CitySign
 def write_actuated(path: Path, signals: Iterable[Signal]) -> None:
     """Write an additional file that makes fixed-time signals gap-based actuated ones of SUMO.
 
-    A stage may last half as long again as in the fixed-time programme: in congestion all stages reach their limits, and
-    the shares of the green are those of the fixed-time programme.
+    A stage lasts up to 1.5 times its fixed time: in congestion, the shares of the green are those of the programme.
     """
     rows = ["<additional>\n"]
     for signal in signals:

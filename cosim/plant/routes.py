@@ -15,7 +15,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from cosim.plant.sampling import StreetMeans
-from cosim.sumo.arrays import EdgeMask, GatewayMask, MoveEnds, PerEdge, PerGateway, PerInside, PerMove
+from cosim.sumo.arrays import EdgeMask, GatewayMask, MoveEnds, PerEdge, PerGateway, PerMove
 from cosim.sumo.net import City
 
 MESO_SMOOTHING = 0.5  # weight of the newest control interval in the mesoscopic model
@@ -34,13 +34,6 @@ class TravelTimes:
     first, second: (M,), numbers of the edges that each move joins; free: (E,) [s], in free flow; free_turns: (M,) [s]
     edges: (E,) [s], present times along edges; turns: (M,) [s], of moves over junctions
     """
-
-    first: MoveEnds
-    second: MoveEnds
-    free: PerEdge
-    free_turns: PerMove
-    edges: PerEdge
-    turns: PerMove
 
     def __init__(self, city: City, *, lanes: bool = True):
         """lanes: False in the mesoscopic model"""
@@ -77,13 +70,11 @@ class TravelTimes:
         self.edges = np.maximum(self._length / np.maximum(speed, STANDING_M_S), self.free)
         self._crossing = kept * self._crossing + seen.crossing * seen.duration
         self._crossed = kept * self._crossed + seen.crossed * seen.duration
-        self.turns = np.maximum(np.bincount(self._move, self._over()[self._via], len(self.turns)), self.free_turns)
-
-    def _over(self) -> PerInside:
-        """Return [s] over each internal edge, 0 without vehicles."""
+        # Over each internal edge [s], 0 without vehicles.
         standing = np.where(self._crossing > 0.0, self._longest, 0.0)
-        takes = np.divide(self._crossing, self._crossed, out=standing.copy(), where=self._crossed > 0.0)
-        return np.minimum(takes, self._longest)
+        takes = np.divide(self._crossing, self._crossed, out=standing, where=self._crossed > 0.0)
+        over = np.minimum(takes, self._longest)[self._via]
+        self.turns = np.maximum(np.bincount(self._move, over, len(self.turns)), self.free_turns)
 
 
 class Moves:
@@ -245,20 +236,17 @@ class Ways:
         self._searches, self._from_here, self._to_there = searches, object(), object()
 
     def cost(self, here: int, target: int, most: float) -> tuple[PerGateway, GatewayMask]:
-        """Return (G,) [s] from the end of `here` to the end of `target`, infinite above `most`; and (G,) bool, a way
-        exists."""
+        """Return (G,) [s] from the end of `here` to that of `target`, infinite above `most`; (G,), a way exists."""
         last = int(self._outside.number[target])
         open_ways = self._leading[self._inside.number[here]] & self._reached[last]
         within = max(most - self._ahead[last], 0.0)
         tree = self._searches.get(self._from_here, here)
         if tree is None or tree[0] < within:
-            cost, before = dijkstra(
-                self._costs[0], indices=self._inside.number[here], return_predecessors=True, limit=within
-            )
+            node = self._inside.number[here]
+            cost, before = dijkstra(self._costs[0], indices=node, return_predecessors=True, limit=within)
             there = cost[self._first] + self._entering
-            tree = self._searches.put(
-                self._from_here, here, (within, there, float(there.min(initial=np.inf)), before), len(before)
-            )
+            entry = within, there, float(there.min(initial=np.inf)), before
+            tree = self._searches.put(self._from_here, here, entry, len(before))
         _, there, nearest, _ = tree
         if nearest == np.inf:
             return there, open_ways
@@ -266,9 +254,8 @@ class Ways:
         onward = self._searches.get(self._to_there, target)
         if onward is None or onward[0] < left:
             cost, after = dijkstra(self._costs[1], indices=last, return_predecessors=True, limit=left)
-            onward = self._searches.put(
-                self._to_there, target, (left, cost[self._second] + self._ahead[last], after), len(after)
-            )
+            back = left, cost[self._second] + self._ahead[last], after
+            onward = self._searches.put(self._to_there, target, back, len(after))
         return there + onward[1], open_ways
 
     def returning(self, here: int, target: int, most: float) -> tuple[float, int]:
