@@ -63,7 +63,7 @@ def test_density_finds_the_congested_quarter(streets):
 def test_boundaries_are_at_signals(streets):
     """Half of the junctions have signals: more of the boundary is there than if none of these could be used."""
     at = streets.junctions[streets.links[:, 0], 1]
-    signalled = np.random.default_rng(1).random(len(streets.places)) < 0.5
+    signalled = np.random.default_rng(1).random(streets.junctions.max() + 1) < 0.5
     signals = tuple("s" if signalled[place] else None for place in at)
     with_signals = replace(streets, link_signals=signals)
     run = baseline(streets, np.random.default_rng(0).exponential(0.03, len(streets.edges)))

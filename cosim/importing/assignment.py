@@ -27,11 +27,9 @@ from nmfd.runs.files import temporary_folder
 ITERATIONS = 20  # mesoscopic simulations, at most
 GAP = 0.05  # relative gap at which the assignment ends
 CAR_FOLLOWING_SHARE = 0.5  # of the iterations, in the car-following model after the mesoscopic ones
-TRAVEL_TIME_PERIOD_S = 300
 GAP_SAMPLE = 2000  # drivers from whom the gap is estimated, at most
 NAME = "peak"  # of the files that duaIterate.py makes
-ALWAYS = f"""--aggregation {TRAVEL_TIME_PERIOD_S} --routing-algorithm CH --disable-warnings --disable-summary
-    --continue-on-unbuild"""
+ALWAYS = "--aggregation 300 --routing-algorithm CH --disable-warnings --disable-summary --continue-on-unbuild".split()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,11 +59,8 @@ def assign(
 ) -> Assigned:
     """Assign routes to vehicles that have routes at free flow. The same seed gives the same routes.
 
-    Args:
-        net: an absolute path.
-        elements: the vehicle types, and the vehicles by departure.
-        iterations: at most, one or more.
-        mesoscopic: the city is driven in the mesoscopic model.
+    net: an absolute path; elements: the vehicle types, and the vehicles by departure
+    iterations: at most, one or more; mesoscopic: the city is driven in the mesoscopic model
 
     Raises:
         InputError: with SUMO's own words if it refuses.
@@ -105,7 +100,7 @@ def _iterate(folder: Path, n: int, options: Sequence[str], *, where: str) -> Non
     program = Path(sumo.SUMO_HOME) / "tools" / "assign" / "duaIterate.py"
     start = ["--skip-first-routing", "--routes", str(_routes(folder, 0))] if n == 0 else ["--trips", f"{NAME}.xml"]
     done = subprocess.run(
-        [sys.executable, program, *start, "--first-step", str(n), "--last-step", str(n + 1), *ALWAYS.split(), *options],
+        [sys.executable, program, *start, "--first-step", str(n), "--last-step", str(n + 1), *ALWAYS, *options],
         cwd=folder,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
@@ -120,10 +115,9 @@ def _iterate(folder: Path, n: int, options: Sequence[str], *, where: str) -> Non
 
 
 def _relative_gap(folder: Path, net: Path, n: int, *, begin: float, seed: int) -> float:
-    """Return the relative gap [-] of the routes of iteration n, estimated from at most GAP_SAMPLE drivers.
+    """Return the relative gap [-] of iteration n, estimated from at most GAP_SAMPLE drivers.
 
-    It is the time that drivers would have saved on the routes that were fastest at their departures, over the time on
-    these routes, all at the travel times of the iteration's simulation.
+    It is the time that drivers would have saved on the fastest routes, over the time on these.
     """
     (weights,) = (folder / f"{n:03d}").glob("dump_*.xml.gz")
     root = read_xml(_routes(folder, n))

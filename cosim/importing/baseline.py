@@ -104,10 +104,9 @@ def averaged_runs(
 ) -> Baseline:
     """Run the city with seeds 0, 1, ... and average the presence; all else is that of seed 0.
 
-    Args:
-        files: routes of the demand, background and additional -> names of files in the folder.
-        times: SUMO's options begin, end [s], and others.
-        factor: multiplies the demand [-]; seed 0 departs as recorded.
+    files: routes of the demand, background and additional -> names of files in the folder
+    times: SUMO's options begin, end [s], and others
+    factor: multiplies the demand [-]; seed 0 departs as recorded
 
     Raises:
         InputError: with SUMO's own words if it refuses.

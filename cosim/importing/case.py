@@ -18,21 +18,13 @@ from cosim.sumo.xml_files import BROKEN, opened, read_xml
 from nmfd.errors import InputError
 from nmfd.runs.files import temporary_folder
 
-# Names that SUMO gives the same option.
-FILES = {
-    "net-file": ("net-file", "net", "n"),
-    "route-files": ("route-files", "routes", "r"),
-    "additional-files": ("additional-files", "additional", "a"),
-    "begin": ("begin", "b"),
-    "end": ("end", "e"),
-}
 ENDLESS_S = 1e9  # a later end is none
 TAKEN = ("step-length", "time-to-teleport", "scale", "mesosim")
 # Options that change what is written or shown, or how fast, but not the traffic.
 IDLE = re.compile(
     r".*output.*|.*log.*|.*threads|(verbose|no-warnings|quit|start|delay|seed|random|precision|version|remote|xml|gui|"
-    r"window|tracker|breakpoints|print|human|save|summary|tripinfo|vehroute|fcd|netstate|statistic|queue|emission|"
-    r"device\.emissions|link|save-|load|osg|demo|game|language|registry|meso-).*"
+    r"window|tracker|print|human|save|summary|tripinfo|vehroute|fcd|netstate|statistic|queue|emission|"
+    r"device\.emissions|link|language|meso-).*"
 )
 # As SUMO's documentation recommends: sumo.dlr.de/docs/Networks/Import/OpenStreetMap.html. OpenStreetMap does not say
 # what signals show: they come out actuated.
@@ -78,14 +70,10 @@ class SumoInput:
     @property
     def scale(self) -> float:
         """SUMO's factor of the demand [-]. Raises InputError."""
-        text = self.options.get("scale", "1")
         try:
-            value = float(text)
+            return float(text := self.options.get("scale", "1"))
         except ValueError:
-            value = math.nan
-        if not 0.0 < value <= 100.0:
-            raise InputError(f"{self.source}: scale: expected a number above 0 up to 100, got {text!r} instead")
-        return value
+            raise InputError(f"{self.source}: scale: expected a number, got {text!r} instead") from None
 
     @property
     def step_length(self) -> float:
@@ -106,20 +94,16 @@ class SumoInput:
     @property
     def left_out(self) -> list[str]:
         """Options that may change the traffic and are not taken over, as NAME = VALUE."""
-        return [
-            f"{name} = {value}"
-            for name, value in sorted(self.options.items())
-            if name not in TAKEN and not IDLE.fullmatch(name)
-        ]
+        options = sorted(self.options.items())
+        return [f"{name} = {value}" for name, value in options if name not in TAKEN and not IDLE.fullmatch(name)]
 
 
 @contextmanager
 def sumo_input(source: Path | Box, progress: Progress, *, left_hand: bool = False) -> Iterator[SumoInput]:
     """Provide the simulation of a source; a network that is built for it goes at the end of the block.
 
-    Args:
-        source: a sumocfg, a net.xml(.gz), a file of OpenStreetMap, or a box of it.
-        left_hand: of OpenStreetMap, which does not say on which side of its streets vehicles drive.
+    source: a sumocfg, a net.xml(.gz), a file of OpenStreetMap, or a box of it
+    left_hand: of OpenStreetMap, which does not say on which side of its streets vehicles drive
 
     Raises:
         InputError: for a source that cannot be read, or no answer for a box.
@@ -141,11 +125,7 @@ def sumo_input(source: Path | Box, progress: Progress, *, left_hand: bool = Fals
 
 
 def read_sumo_input(path: Path) -> SumoInput:
-    """Read a sumocfg, or take a net.xml(.gz) as a simulation without demand.
-
-    Raises:
-        InputError: for a file of another kind, or a missing file it names.
-    """
+    """Read a sumocfg, or take a net.xml(.gz) as a simulation without demand. Raises InputError."""
     root = _root(path)
     if root.tag == "net":
         return SumoInput(source=path, net=path)
@@ -153,44 +133,29 @@ def read_sumo_input(path: Path) -> SumoInput:
         raise InputError(
             f"{path}: expected a sumocfg, a net.xml or a file of OpenStreetMap, got a file of <{root.tag}> instead"
         )
-    given = {}
-    for element in read_xml(path).iter():
-        value = element.get("value", element.get("v"))
-        if value is not None:
-            given[element.tag] = value
-    options = {}
-    for name, alike in FILES.items():
-        options[name] = next((given.pop(other) for other in alike if other in given), "")
-    if not options["net-file"]:
+    options = {e.tag: value for e in read_xml(path).iter() if (value := e.get("value", e.get("v"))) is not None}
+    files: dict[str, tuple[Path, ...]] = {}
+    for key in ("net-file", "route-files", "additional-files"):
+        files[key] = tuple(path.parent / name.strip() for name in options.pop(key, "").split(",") if name.strip())
+        for file in files[key]:
+            if not file.is_file():
+                raise InputError(f"{path}: {key}: no such file: {file}; correct the name or add the file")
+    if not files["net-file"]:
         raise InputError(f'{path}: net-file: missing; add <net-file value="city.net.xml"/> to its <input>')
-    end = seconds(options["end"] or "-1", f"{path}: end")
+    end = seconds(options.pop("end", "-1"), f"{path}: end")
     return SumoInput(
         source=path,
-        net=_files(path, "net-file", options["net-file"])[0],
-        routes=_files(path, "route-files", options["route-files"]),
-        additional=_files(path, "additional-files", options["additional-files"]),
-        begin=seconds(options["begin"] or "0", f"{path}: begin"),
+        net=files["net-file"][0],
+        routes=files["route-files"],
+        additional=files["additional-files"],
+        begin=seconds(options.pop("begin", "0"), f"{path}: begin"),
         end=end if 0 < end < ENDLESS_S else None,
-        options=given,
+        options=options,
     )
 
 
-def _files(config: Path, key: str, value: str) -> tuple[Path, ...]:
-    """Resolve a comma-separated list of files of a sumocfg; ${NAME} is a variable of the environment."""
-    value = re.sub(r"\$\{(\w+)\}", lambda name: os.environ.get(name[1], name[0]), value)
-    files = tuple(config.parent / name.strip() for name in re.split("[,;]", value) if name.strip())
-    for file in files:
-        if not file.is_file():
-            raise InputError(f"{config}: {key}: no such file: {file}; correct the name or add the file")
-    return files
-
-
 def seconds(text: str, where: str) -> float:
-    """Convert a SUMO time, in seconds or as [days:]hours:minutes:seconds, to seconds.
-
-    Args:
-        where: file and key that an InputError names.
-    """
+    """Convert a SUMO time, seconds or [days:]hours:minutes:seconds; `where` is named by an InputError."""
     try:
         parts = [float(part) for part in text.split(":")]
         if not 1 <= len(parts) <= 4 or len(parts) == 2 or not all(map(math.isfinite, parts)):
@@ -222,25 +187,23 @@ def fetch_osm(box: Box, folder: Path) -> Path:
     options += ["--road-types", '{"highway": ["."]}']
     environment = os.environ | {"SUMO_HOME": sumo.SUMO_HOME}
     try:
-        done = subprocess.run(
+        subprocess.run(
             [*program, *options],
             timeout=SERVER_TIME_LIMIT_S,
             env=environment,
             capture_output=True,
+            check=True,
             text=True,
             errors="replace",
             stdin=subprocess.DEVNULL,
         )
-        reason = (done.stderr.strip().splitlines() or [f"status {done.returncode}"])[-1] if done.returncode else ""
-    except subprocess.TimeoutExpired:
-        reason = f"no answer in {SERVER_TIME_LIMIT_S:g} s"
-    file = folder / "osm_bbox.osm.xml.gz"
-    if reason or not file.exists():
+        return next(folder.glob("osm_bbox.osm.xml.gz"))
+    except (subprocess.SubprocessError, StopIteration) as error:
+        reason = (getattr(error, "stderr", "") or str(error)).strip().splitlines()[-1:]
         raise InputError(
-            f"--bbox: {where}: osmGet.py got nothing from OpenStreetMap ({reason}); without internet access give a "
-            "file of the area, exported at https://www.openstreetmap.org/export"
-        )
-    return file
+            f"--bbox: {where}: osmGet.py got nothing from OpenStreetMap ({' '.join(reason)}); without internet access "
+            "give a file of the area, exported at https://www.openstreetmap.org/export"
+        ) from None
 
 
 def _converted(osm: Path, folder: Path, left_hand: bool) -> Path:

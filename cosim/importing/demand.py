@@ -2,8 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -15,7 +14,7 @@ from cosim.importing.case import SumoInput, seconds
 from cosim.importing.streets import Streets
 from cosim.sumo.arrays import PerTrip, TripNumbers
 from cosim.sumo.recorded_trips import BOUND
-from cosim.sumo.xml_files import Missing, attribute, read_xml
+from cosim.sumo.xml_files import read_xml
 from nmfd.errors import InputError
 
 DRIVERS = ("vehicle", "trip", "flow")
@@ -55,10 +54,7 @@ class Traffic:
 def read_traffic(case: SumoInput, streets: Streets, seed: int) -> Traffic:
     """Read all route and additional files of a case.
 
-    Flows become single vehicles, with departures and routes drawn by `seed` where they are random.
-
-    Raises:
-        InputError: for a file that is no XML, a broken time or number, and an id that two vehicles have.
+    Flows become single vehicles, with departures and routes drawn by `seed` where they are random. Raises InputError.
     """
     return _Reader(case, streets, np.random.default_rng([seed, 0x696D70])).read()
 
@@ -83,8 +79,7 @@ class _Reader:
                 elif element.tag in OTHERS:
                     self._background.append(element)
                 elif element.tag not in DROPPED:
-                    with _blamed(element, path):
-                        self._learn(element)
+                    self._learn(element, path)
                     switched |= {name for e in element.iter("wautJunction") if (name := e.get("junctionID"))}
                     shared.append(element)
         vehicles = []
@@ -104,47 +99,55 @@ class _Reader:
         kept = self._checked(vehicles)
         if self._background:
             self._notes["persons, containers and vehicles left alone, in all"] = len(self._background)
+        depart, origin, destination, _, elements = zip(*kept, strict=True) if kept else ((),) * 5
         return Traffic(
-            vehicles=tuple(row[4] for row in kept),
-            depart=np.array([row[0] for row in kept], dtype=float),
-            origin=np.array([row[1] for row in kept], dtype=int),
-            destination=np.array([row[2] for row in kept], dtype=int),
+            vehicles=tuple(elements),
+            depart=np.array(depart, dtype=float),
+            origin=np.array(origin, dtype=int),
+            destination=np.array(destination, dtype=int),
             background=tuple(sorted(self._background, key=_begin)),
             shared=tuple(shared),
             switched=tuple(sorted(switched)),
             notes=dict(self._notes),
         )
 
-    def _learn(self, element: Element) -> None:
-        """Store types and routes that vehicles refer to. Raises ValueError."""
+    def _learn(self, element: Element, path: Path) -> None:
+        """Store types and routes that vehicles refer to."""
+        name = element.get("id", "")
         if element.tag == "vType":
-            self._classes[attribute(element, "id")] = element.get("vClass", "passenger")
+            self._classes[name] = element.get("vClass", "passenger")
         elif element.tag == "vTypeDistribution":
             members = [e.get("vClass", "passenger") for e in element.iter("vType")]
             members += [self._classes.get(name, "passenger") for name in element.get("vTypes", "").split()]
             first = members[0] if members else "passenger"
             if first == "passenger":  # what lorries among them may drive is not held against the cars
                 first = next((kind for kind in members if kind not in (first, *BOUND)), first)
-            self._classes[attribute(element, "id")] = first
+            self._classes[name] = first
             for member in element.iter("vType"):
-                self._classes[attribute(member, "id")] = member.get("vClass", "passenger")
+                self._classes[member.get("id", "")] = member.get("vClass", "passenger")
         elif element.tag in ("route", "routeDistribution"):
             for route in element.iter("route"):
                 if edges := route.get("edges"):
                     self._routes[route.get("id", "")] = edges.split()
             if element.tag == "routeDistribution":
-                likeliest = max(self._distribution(element), key=lambda route: route[0], default=(0.0, []))
-                self._routes[attribute(element, "id")] = likeliest[1]
+                likeliest = max(self._distribution(element, path), key=lambda route: route[0], default=(0.0, []))
+                self._routes[name] = likeliest[1]
 
-    def _distribution(self, distribution: Element) -> list[tuple[float, list[str]]]:
-        """Return (probability, edges) of every route in a distribution."""
-        routes = [
-            (float(r.get("probability", 1.0)), r.get("edges", "").split() or self._routes.get(r.get("refId", ""), []))
-            for r in distribution.iter("route")
-        ]
-        names = distribution.get("routes", "").split()
-        shares = [float(p) for p in distribution.get("probabilities", "").split()] or [1.0] * len(names)
+    def _distribution(self, distribution: Element, path: Path) -> list[tuple[float, list[str]]]:
+        """Return (probability, edges) of every route in a distribution. Raises InputError."""
+        try:
+            routes = [
+                (float(route.get("probability", 1.0)), route.get("edges", "").split() or self._named(route, "refId"))
+                for route in distribution.iter("route")
+            ]
+            names = distribution.get("routes", "").split()
+            shares = [float(p) for p in distribution.get("probabilities", "").split()] or [1.0] * len(names)
+        except ValueError as error:
+            raise InputError(f"{path}: routeDistribution: {error}; correct its probability") from None
         return routes + [(p, self._routes.get(name, [])) for p, name in zip(shares, names, strict=False)]
+
+    def _named(self, element: Element, key: str) -> list[str]:
+        return self._routes.get(element.get(key, ""), [])
 
     def _expand(self, flow: Element, path: Path) -> list[Element]:
         """Return the single vehicles of a flow. Raises InputError."""
@@ -197,8 +200,7 @@ class _Reader:
                 self._background.append(element)
                 self._notes["vehicles without a time of departure, left alone"] += 1
                 continue
-            with _blamed(element, path):
-                edges, driven = self._edges(element)
+            edges, driven = self._edges(element, path)
             if (reason := self._reason(element, depart, begin, end, edges, driven)) is not None:
                 self._notes[f"{reason}, left out"] += 1
                 continue
@@ -230,12 +232,12 @@ class _Reader:
     def _is_car(self, element: Element) -> bool:
         return self._classes.get(element.get("type", ""), "passenger") == "passenger"
 
-    def _edges(self, element: Element) -> tuple[list[str], bool]:
+    def _edges(self, element: Element, path: Path) -> tuple[list[str], bool]:
         """Return (edges of a vehicle's route, True), or (edges that a trip must pass, False)."""
         nested = element.find("routeDistribution")
         route = element.find("route") if nested is None else None
         if nested is not None:  # as marouter and duarouter write them: a vehicle keeps the route drawn for it here
-            edges = self._draw(self._distribution(nested))
+            edges = self._draw(self._distribution(nested, path))
             element.remove(nested)
             element.append(Element("route", {"edges": " ".join(edges)}))
             for zone in ZONES:
@@ -244,8 +246,8 @@ class _Reader:
         if route is not None:
             route.attrib.pop("id", None)
             return route.get("edges", "").split(), True
-        if name := element.get("route"):
-            return self._routes.get(name, []), True
+        if element.get("route"):
+            return self._named(element, "route"), True
         if not element.get("from") or not element.get("to"):
             return [], False
         return [element.get("from", ""), *element.get("via", "").split(), element.get("to", "")], False
@@ -267,18 +269,6 @@ class _Reader:
         if len(good) < len(kept):
             self._notes["trips without a way to their end, left out"] += len(kept) - len(good)
         return good
-
-
-@contextmanager
-def _blamed(element: Element, path: Path) -> Iterator[None]:
-    """Raise InputError for a missing attribute or a broken number of an element."""
-    try:
-        yield
-    except Missing as error:
-        raise InputError(f"{path}: {error}; add it") from None
-    except ValueError as error:
-        where = f"{path}: {element.tag} {element.get('id')}"
-        raise InputError(f"{where}: weight or probability: expected a number ({error}); correct it") from None
 
 
 def _silent(element: Element) -> Element:

@@ -4,8 +4,7 @@ The centre is where the signals are. All drivers take a fastest route at free fl
 a longer one for a signal, as one of DRIVER_CLASSES groups of drivers perceives the times.
 """
 
-from collections.abc import Iterable
-from xml.etree.ElementTree import Element
+from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -27,18 +26,13 @@ PILOT_TRIPS = 1500  # from which the mean trip time is estimated
 def morning_peak(streets: Streets, *, level: float, begin: float, seed: int) -> Traffic:
     """Generate trips on the largest part of the network in which every edge can be reached from every other.
 
-    Args:
-        level: 1 keeps PEAK_DENSITY under way if vehicles meet no queue.
-        begin: of the peak [s].
+    level: 1 keeps PEAK_DENSITY under way if vehicles meet no queue; begin: of the peak [s]
 
     Raises:
         InputError: for a network that is too small.
     """
-    if streets.core.sum() < 4:
-        raise InputError(
-            f"{streets.path}: only {streets.core.sum()} streets can be reached from each other; give a demand of your "
-            "own with route-files in a sumocfg"
-        )
+    if (count := streets.core.sum()) < 4:
+        raise InputError(f"{streets.path}: only {count} streets can be reached from each other; give vehicles instead")
     random = np.random.default_rng([seed, 0x7065616B])
     ends = _Ends(streets, random)
     ways = _Ways(streets, random)
@@ -50,11 +44,11 @@ def morning_peak(streets: Streets, *, level: float, begin: float, seed: int) -> 
     depart = begin + np.sort(_times(random.random(count)))
     routes = ways.routes(first, last)
     kept = np.array([bool(route) for route in routes])
-    vehicles = (
-        _vehicle(n, time, [streets.edges[edge] for edge in route])
-        for n, (time, route) in enumerate(zip(depart, routes, strict=True))
-        if route
-    )
+    free = {"departLane": "best", "departSpeed": "max", "departPos": "random_free", "arrivalPos": "random"}
+    vehicles = []
+    for n in np.flatnonzero(kept):
+        vehicles.append(Element("vehicle", {"id": f"v{n}", "type": "car", "depart": f"{depart[n]:.2f}", **free}))
+        SubElement(vehicles[-1], "route", {"edges": " ".join(streets.edges[edge] for edge in routes[n])})
     return Traffic(
         vehicles=tuple(vehicles),
         depart=depart[kept],
@@ -154,10 +148,3 @@ def _times(uniform: np.ndarray) -> np.ndarray:
     rate = np.minimum(np.minimum(clock / RAMP_UP_S, 1.0), (clock[-1] - clock) / RAMP_DOWN_S)
     share = np.concatenate([[0.0], np.cumsum((rate[1:] + rate[:-1]) / 2)])
     return np.interp(uniform, share / share[-1], clock)
-
-
-def _vehicle(n: int, depart: float, edges: Iterable[str]) -> Element:
-    free = {"departLane": "best", "departSpeed": "max", "departPos": "random_free", "arrivalPos": "random"}
-    vehicle = Element("vehicle", {"id": f"v{n}", "type": "car", "depart": f"{depart:.2f}", **free})
-    vehicle.append(Element("route", {"edges": " ".join(edges)}))
-    return vehicle

@@ -48,11 +48,7 @@ class Blocks:
 
 
 def read_regions(streets: Streets, path: Path) -> EdgeNumbers:
-    """Read the region of every edge from a table edge,region; -1 for edges it does not name.
-
-    Raises:
-        InputError: for an unreadable table, unknown edges, fewer than two regions, or a region without edges for cars.
-    """
+    """Read the region of every edge from a table edge,region; -1 for edges it does not name. Raises InputError."""
     try:
         table = pd.read_csv(path, dtype={"edge": str, "region": int}, encoding="utf-8-sig", skipinitialspace=True)
         edges, regions = table["edge"].str.strip(), table["region"].to_numpy()
@@ -75,9 +71,8 @@ def partition(
 ) -> EdgeNumbers:
     """Cluster the streets into regions of similar density without control.
 
-    Args:
-        regions: requested number; fewer result if clusters cannot be reached from each other.
-        uncontrollable: signals that perimeter control cannot use.
+    regions: requested number; fewer result if clusters cannot be reached from each other
+    uncontrollable: signals that perimeter control cannot use
 
     Raises:
         InputError: if the network has too few streets for the requested regions.

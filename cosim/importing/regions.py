@@ -13,11 +13,10 @@ DIRECTIONS = ("east", "north-east", "north", "north-west", "west", "south-west",
 
 
 def finish(streets: Streets, labels: EdgeNumbers, *, renumber: bool = True) -> EdgeNumbers:
-    """Return a region for every edge, from labels of the edges for cars; -1 in `labels` is an unknown region.
+    """Return a region for every edge, from labels of the edges for cars, -1 for none.
 
-    Regions come out connected, and each can be reached from each. Pieces and regions that fail join a neighbour, so
-    that fewer regions may remain. Edges closed to cars, and detached parts of the network, join an adjoining region or
-    the nearest. Regions are numbered from north to south, or with renumber = False in the order of the labels.
+    Regions become connected, and each can be reached from each; those that fail join a neighbour. Other edges join an
+    adjoining region or the nearest. Regions are numbered from north to south, or in the order of the labels.
     """
     regions = labels.copy()
     regions[~streets.drivable] = -1
@@ -26,7 +25,10 @@ def finish(streets: Streets, labels: EdgeNumbers, *, renumber: bool = True) -> E
         regions = connect(streets, regions)
         if (victim := _not_reachable(streets, regions)) is None:
             break
-        regions = _merged(streets, regions, victim)
+        pairs = regions[streets.links]  # the region joins the neighbour with the most connections
+        beyond = np.concatenate([pairs[pairs[:, 0] == victim, 1], pairs[pairs[:, 1] == victim, 0]])
+        beyond = beyond[(beyond != victim) & (beyond >= 0)]
+        regions = np.where(regions == victim, np.argmax(np.bincount(beyond)), regions)
     everywhere = np.ones(len(streets.edges), dtype=bool)
     regions = _spread(streets, regions, streets.all_links, everywhere)
     return _numbered(streets, regions) if renumber else np.unique(regions, return_inverse=True)[1]
@@ -49,13 +51,11 @@ def connect(streets: Streets, regions: EdgeNumbers) -> EdgeNumbers:
         if not loose.any():
             return regions
         # A piece may adjoin loose pieces only: then it waits for the next round.
-        votes: dict[int, dict[int, int]] = {}
-        for a, b in np.concatenate([links, links[:, ::-1]]):
-            if loose[a] and not loose[b]:
-                votes.setdefault(piece[a], {}).setdefault(int(regions[b]), 0)
-                votes[piece[a]][int(regions[b])] += 1
-        for number, by_region in votes.items():
-            regions[loose & (piece == number)] = max(sorted(by_region), key=by_region.__getitem__)
+        both = np.concatenate([links, links[:, ::-1]])
+        both = both[loose[both[:, 0]] & ~loose[both[:, 1]]]
+        votes = [(number, regions[both[piece[both[:, 0]] == number, 1]]) for number in np.unique(piece[both[:, 0]])]
+        for number, neighbours in votes:
+            regions[loose & (piece == number)] = np.argmax(np.bincount(neighbours))
     return regions
 
 
@@ -87,14 +87,6 @@ def _not_reachable(streets: Streets, regions: np.ndarray) -> int | None:
     return None if not len(outside) else int(used[outside[np.argmin(size[outside])]])
 
 
-def _merged(streets: Streets, regions: np.ndarray, victim: int) -> np.ndarray:
-    """Join `victim` to the neighbour with which it has the most connections."""
-    pairs = regions[streets.links]
-    beyond = np.concatenate([pairs[pairs[:, 0] == victim, 1], pairs[pairs[:, 1] == victim, 0]])
-    numbers, count = np.unique(beyond[(beyond != victim) & (beyond >= 0)], return_counts=True)
-    return np.where(regions == victim, numbers[np.argmax(count)], regions)
-
-
 def _spread(streets: Streets, regions: np.ndarray, links: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """Give the `wanted` edges without a region that of a linked edge, else of the nearest."""
     regions, both = regions.copy(), np.concatenate([links, links[:, ::-1]])
@@ -115,8 +107,7 @@ def _numbered(streets: Streets, regions: np.ndarray) -> np.ndarray:
     used = np.unique(regions)
     middle = {region: _gravity(streets, regions == region) for region in used}
     order = sorted(used, key=lambda region: (-round(middle[region][1], 1), middle[region][0]))
-    place = {region: n for n, region in enumerate(order)}
-    return np.array([place[region] for region in regions])
+    return np.argsort(order)[np.searchsorted(used, regions)]
 
 
 def positions(streets: Streets, regions: EdgeNumbers) -> Positions:

@@ -21,11 +21,7 @@ from nmfd.errors import InputError
 
 @dataclass(frozen=True, kw_only=True)
 class Logic:
-    """Signal programme.
-
-    kind: SUMO's type, such as "static", or "branching" for a static one whose phases do not follow in order
-    cycle [s]
-    """
+    """Signal programme with its cycle [s]; kind: SUMO's type, or "branching" if phases do not follow in order."""
 
     programme: str
     kind: str
@@ -39,7 +35,7 @@ class Streets:
     drivable: (E,) bool, with a lane for cars
     length [m], lanes (those for cars), speed [m/s]: (E,)
     shapes: E arrays (n, 2) [m]; centre: (E, 2) [m], half way along
-    junctions: (E, 2), numbers of the junctions where the edge begins and ends; places: junction -> its number
+    junctions: (E, 2), numbers of the junctions where the edge begins and ends
     links: (L, 2) edges that a connection joins, both drivable, by lanes for cars; all_links: for any vehicle
     link_signals: L signals, of each of the links, None without one
     roundabouts: lists of edges
@@ -56,7 +52,6 @@ class Streets:
     shapes: tuple[Points, ...]
     centre: Float[np.ndarray, "E 2"]
     junctions: Int[np.ndarray, "E 2"]
-    places: Mapping[str, int]
     links: Int[np.ndarray, "L 2"]
     all_links: Int[np.ndarray, "_ 2"]
     link_signals: tuple[str | None, ...]
@@ -118,11 +113,7 @@ class _Edge(NamedTuple):
 
 
 def read_streets(net: Path, additional: Iterable[Path] = ()) -> Streets:
-    """Read a net.xml(.gz), and the signal programmes of additional files, which replace those of the network.
-
-    Raises:
-        InputError: for a file that is no network, or has no edge for cars.
-    """
+    """Read a net.xml(.gz), and signal programmes of additional files, which replace those there. Raises InputError."""
     rows: dict[str, _Edge] = {}
     links: list[Mapping[str, str]] = []  # attributes of connections
     roundabouts: list[list[str]] = []
@@ -156,8 +147,8 @@ def read_streets(net: Path, additional: Iterable[Path] = ()) -> Streets:
     if not any(row.cars for row in rows.values()):
         raise InputError(f"{net}: has no edge that cars may use; give a road network")
     edges = tuple(sorted(rows))
-    number, places = {edge: n for n, edge in enumerate(edges)}, dict[str, int]()
-    ends = [[places.setdefault(name, len(places)) for name in (rows[edge].start, rows[edge].end)] for edge in edges]
+    number = {edge: n for n, edge in enumerate(edges)}
+    ends = np.array([(rows[edge].start, rows[edge].end) for edge in edges])
     every, signal_of = set(), {}
     for link in links:
         if link["from"] in number and link["to"] in number:
@@ -175,8 +166,7 @@ def read_streets(net: Path, additional: Iterable[Path] = ()) -> Streets:
         speed=np.array([rows[edge].speed for edge in edges]),
         shapes=tuple(rows[edge].shape for edge in edges),
         centre=np.array([_middle(rows[edge].shape) for edge in edges]),
-        junctions=np.array(ends),
-        places=places,
+        junctions=np.unique(ends, return_inverse=True)[1].reshape(-1, 2),
         links=np.array(cars, dtype=int).reshape(-1, 2),
         all_links=np.array(sorted(every), dtype=int).reshape(-1, 2),
         link_signals=tuple(signal_of[pair] for pair in cars),
