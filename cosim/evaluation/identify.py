@@ -2,15 +2,13 @@
 
 First the city is loaded without perimeter control, and every region's MFD is fitted to its outflow samples. Then it is
 loaded under a probing controller, whose set points come from these MFDs, and the whole model is fitted to all runs by
-prediction error (nmfd.model.identification). Finished runs of other controllers may be added: if loading runs lock,
-only these show a controlled city under such a demand.
+prediction error. Finished runs of other controllers may be added.
 """
 
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -97,8 +95,7 @@ def identify(
 ) -> str:
     """Load a city, fit its regional model, and write its network.toml and verdict.txt; return the fit as text.
 
-    Samples, mfd.png, fit.csv and the loading runs go to `out`, a folder per level. Finished loading runs are kept: the
-    same call continues after an interruption and gives the same model.
+    Samples, figures and loading runs go to `out`; the same call continues after an interruption.
 
     Raises:
         InputError: for a network without a folder, or a target that must not be written.
@@ -109,10 +106,18 @@ def identify(
     more = [run for folder in loading.runs for run in finished(folder, loaded)]
 
     def load(stage: int, **options: object) -> list[Result]:
+        """Do the loading runs of a stage at all levels that are not finished; return all of them."""
         show = _named(progress, f"loading runs {stage + 1} of 2; ")
-        return _load(
-            loaded, loading, loading.stages[stage], options, out, workers=workers, scheduler=scheduler, progress=show
-        )
+        strategy, tables = parse(loading.stages[stage]), loaded.controller_options
+        table = strategy.table(loaded)
+        tuned = replace(loaded, controller_options={**tables, table: {**tables.get(table, {}), **options}})
+        runs = [
+            run
+            for level in loading.levels
+            for run in runs_of(tuned, [strategy], loading.seeds, demand=level, folder=f"level-{level:g}")
+        ]
+        raise_failures(run_many(runs, out, workers=workers, scheduler=scheduler, progress=show))
+        return [Result.read(out / run.file) for run in runs]
 
     first = load(0)
     network = static_model(loaded, first, guided=loading.guided)
@@ -138,14 +143,25 @@ def identify(
         text += "\n" + prediction_table(without, errors, loaded.step)
     files.write_text(out / "fit.txt", text + "\n")
     write_fits(out / "fit.csv", fits, errors)
-    _write_samples(out / "samples.csv", samples)
+    rows = [
+        (i, branch, *point) for i, cloud in enumerate(samples) for branch, points in cloud.items() for point in points
+    ]
+    table = pd.DataFrame(rows, columns=["region", "branch", "accumulation_veh", "outflow_veh_s"])
+    files.write_table(out / "samples.csv", table, float_format="%.6g")
     plots.draw_mfds(out / "mfd.png", model, samples)
     model = replace(model, placeholder=False, doubts=tuple(fits["doubts"]))
     verdict = run_verdict(model, first)
     model = replace(model, controllable=verdict.boundaries.shares)
     target.mkdir(parents=True, exist_ok=True)
-    comment = _comment(loaded.name, loading, len(first) + len(second), more)
-    files.write_text(target / "network.toml", network_toml(model, _sumo_table(own, target), comment))
+    comment = (
+        f"Written by cosim identify from {len(runs)} runs of {loaded.name} under "
+        f"{', '.join(dict.fromkeys(run.controller for run in runs))};\n"
+        f"# loading runs: demand times {', '.join(map('{:g}'.format, loading.levels))}, seeds {min(loading.seeds)} to "
+        f"{max(loading.seeds)}."
+    )
+    sumo = config.read(own / "network.toml").get("sumo", {})
+    sumo |= {key: files.relative(own / sumo[key], target) for key in PATHS if isinstance(sumo.get(key), str)}
+    files.write_text(target / "network.toml", network_toml(model, sumo, comment))
     files.write_text(target / authority.FILE, verdict.text())
     return "\n".join([text, *wrapped("\n".join(verdict.sentences))])
 
@@ -171,20 +187,6 @@ def _check_target(loading: Loading, name: str, target: Path, own: Path) -> None:
         raise InputError(f"--network: {there} is no folder that can be written to; choose another")
 
 
-def _load(scenario: Scenario, loading: Loading, controller: str, options: dict, out: Path, **how: Any) -> list[Result]:
-    """Do the loading runs of one controller at all levels that are not finished; return all of them."""
-    strategy, tables = parse(controller), scenario.controller_options
-    table = strategy.table(scenario)
-    tuned = replace(scenario, controller_options={**tables, table: {**tables.get(table, {}), **options}})
-    runs = [
-        run
-        for level in loading.levels
-        for run in runs_of(tuned, [strategy], loading.seeds, demand=level, folder=f"level-{level:g}")
-    ]
-    raise_failures(run_many(runs, out, **how))
-    return [Result.read(out / run.file) for run in runs]
-
-
 def finished(folder: Path, scenario: Scenario) -> list[Result]:
     """Read all runs of a folder of `cosim run` or `cosim evaluate`. Raises InputError for runs of another city."""
     found = results.read(folder)
@@ -195,11 +197,7 @@ def finished(folder: Path, scenario: Scenario) -> list[Result]:
 
 
 def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool) -> RegionalModel:
-    """Return the network with an MFD per region, fitted to outflow samples, and own split ratios unless guided.
-
-    Raises:
-        InputError: if every region was nearly empty.
-    """
+    """Return the network with fitted MFDs, and own split ratios unless guided. Raises InputError for empty runs."""
     network = replace(scenario.network, exit_rates=None, capacity=None, storage=None)
     samples = samples_of(network, results)
     empty = nearly_empty(samples)
@@ -247,37 +245,3 @@ def run_verdict(network: RegionalModel, results: Sequence[Result]) -> authority.
     started = np.sum([result["departures"].sum(axis=(0, 2)) for result in results], axis=0).astype(float)
     where = f"in {len(results)} loading run{'s' * (len(results) > 1)} under {results[0].controller}"
     return authority.verdict(network, boundaries, most=most, started=started, where=where)
-
-
-def _comment(name: str, loading: Loading, count: int, more: Sequence[Result]) -> str:
-    """Return the first lines of network.toml: the runs that the model is fitted to."""
-    first, second = loading.stages
-    levels, seeds = ", ".join(f"{level:g}" for level in loading.levels), loading.seeds
-    text = (
-        f"Regional model: written by cosim identify from {count} loading runs of {name} under {first} and\n# {second}, "
-        f"demand times {levels}, seeds {min(seeds)} to {max(seeds)}"
-    )
-    if more:
-        names = ", ".join(sorted({run.controller for run in more}))
-        numbers = [run.seed for run in more]
-        text += f",\n# and from {len(more)} runs under {names}, seeds {min(numbers)} to {max(numbers)}"
-    return f"{text}."
-
-
-def _sumo_table(folder: Path, target: Path) -> dict[str, str]:
-    """Return the table [sumo] of the network in `folder` with paths relative to `target`."""
-    table = config.read(folder / "network.toml").get("sumo", {})
-    return {
-        key: files.relative(folder / value, target) if key in PATHS and isinstance(value, str) else value
-        for key, value in table.items()
-    }
-
-
-def _write_samples(path: Path, samples: Sequence[dict]) -> None:
-    rows = [
-        (region, branch, f"{x:.1f}", f"{g:.5f}")
-        for region, cloud in enumerate(samples)
-        for branch, points in cloud.items()
-        for x, g in points
-    ]
-    files.write_table(path, pd.DataFrame(rows, columns=["region", "branch", "accumulation_veh", "outflow_veh_s"]))

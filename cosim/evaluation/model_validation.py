@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from cosim.evaluation.results import Finished
 from cosim.evaluation.simulate import regional_outflow
@@ -35,9 +35,8 @@ OF_ONE_RUN = (
 HEADINGS = ["region", "name", "critical", "mean", "RMSE", "of critical", "if nothing changed", "bias"]
 HEADINGS += ["next interval RMSE", "of critical", "if nothing changed"]
 OF_ALL_RUNS = (
-    "RMSE of the accumulation predicted from every recorded state under the recorded departures and controls, as a "
-    "share of the region's critical accumulation, mean of the regions; if nothing changed: of constant accumulation; "
-    "most: largest accumulation of any region in any run, as a share of its critical one"
+    "RMSE of the accumulation predicted from every recorded state, and most: largest accumulation of any region, as "
+    "shares of the critical accumulation; RMSE: mean of the regions"
 )
 
 
@@ -80,47 +79,42 @@ def predict(scenario: Scenario, result: Result) -> Result:
     return closed_loop.run(NmfdPlant(same), Replay(result), same, seed=result.seed).assign(plant="nmfd")
 
 
-def predict_next(scenario: Scenario, result: Result, intervals: int = 1) -> Float[np.ndarray, "K R"]:
-    """Predict the accumulations [veh] some intervals ahead of every recorded state, (T + 1 - intervals, R)."""
-    x = torch.from_numpy(result.accumulation[: len(result.perimeter) + 1 - intervals])
-    demand = torch.from_numpy(result["departures"] / scenario.step)
-    perimeter, splits = torch.from_numpy(result.perimeter), torch.from_numpy(result.splits)
-    p, step, integrator = parameters(scenario.network), scenario.step, scenario.integrator
-    for n in range(intervals):
-        k = slice(n, n + len(x))
-        x = advance(p, x, demand[k], perimeter[k], splits[k], step, integrator=integrator, substeps=scenario.substeps)
-    return x.sum(-1).numpy()
+def errors(scenario: Scenario, result: Result, predicted: Result) -> pd.DataFrame:
+    """Return the prediction errors of a run, a row per region and one for "all" together.
 
-
-def errors(scenario: Scenario, result: Result, predicted: Result) -> list[dict]:
-    """Return the prediction errors of a run, a row per region and one for "all" together."""
+    The next interval is predicted from every recorded state under the recorded departures and controls.
+    """
     network, simulated = scenario.network, result.accumulation.sum(-1)
-    whole, ahead = predicted.accumulation.sum(-1) - simulated, predict_next(scenario, result) - simulated[1:]
-    rows = []
-    for i in [*range(network.regions), "all"]:
-        part = slice(None) if i == "all" else slice(i, i + 1)
-        critical, seen = float(network.critical[part].sum()), simulated[:, part].sum(1)
-        off, next_off = whole[:, part].sum(1), ahead[:, part].sum(1)
-        rows.append(
-            {
-                "region": i,
-                "name": "all regions" if i == "all" else network.region_names[i],
-                "critical_veh": critical,
-                "mean_veh": float(seen.mean()),
-                "rmse_veh": _rms(off),
-                "rmse_share": _rms(off) / critical,
-                "persistence_rmse_veh": _rms(seen[0] - seen),
-                "bias_veh": float(off.mean()),
-                "next_interval_rmse_veh": _rms(next_off),
-                "next_interval_rmse_share": _rms(next_off) / critical,
-                "next_interval_persistence_rmse_veh": _rms(np.diff(seen)),
-            }
-        )
-    return rows
+    recorded = (result.accumulation[:-1], result["departures"] / scenario.step, result.perimeter, result.splits)
+    x, demand, perimeter, splits = map(torch.from_numpy, recorded)
+    p, step, integrator = parameters(network), scenario.step, scenario.integrator
+    following = advance(p, x, demand, perimeter, splits, step, integrator=integrator, substeps=scenario.substeps)
+    off = _with_all(predicted.accumulation.sum(-1) - simulated)
+    next_off = _with_all(following.sum(-1).numpy() - simulated[1:])
+    seen, critical = _with_all(simulated), np.append(network.critical, network.critical.sum())
+    return pd.DataFrame(
+        {
+            "region": [*range(network.regions), "all"],
+            "name": [*network.region_names, "all regions"],
+            "critical_veh": critical,
+            "mean_veh": seen.mean(axis=0),
+            "rmse_veh": _rms(off),
+            "rmse_share": _rms(off) / critical,
+            "persistence_rmse_veh": _rms(seen[0] - seen),
+            "bias_veh": off.mean(axis=0),
+            "next_interval_rmse_veh": _rms(next_off),
+            "next_interval_rmse_share": _rms(next_off) / critical,
+            "next_interval_persistence_rmse_veh": _rms(np.diff(seen, axis=0)),
+        }
+    )
 
 
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt((values**2).mean()))
+def _with_all(values: RegionCounts) -> np.ndarray:
+    return np.column_stack([values, values.sum(axis=1)])
+
+
+def _rms(values: np.ndarray) -> np.ndarray:
+    return np.sqrt((values**2).mean(axis=0))
 
 
 def error_table(rows: pd.DataFrame) -> str:
@@ -133,9 +127,9 @@ def error_table(rows: pd.DataFrame) -> str:
 
 
 def write_comparison(folder: Path, scenario: Scenario, result: Result) -> pd.DataFrame:
-    """Write compare-<run>.csv and two figures beside a run; return the rows of `errors`."""
+    """Write compare-<run>.csv and a figure beside a run; return the rows of `errors`."""
     network, predicted = scenario.network, predict(scenario, result)
-    rows = pd.DataFrame(errors(scenario, result, predicted))
+    rows = errors(scenario, result, predicted)
     name = files.run_name(result.controller, result.seed)
     files.write_table(folder / f"compare-{name}.csv", rows)
     drawing, axes = plots.panels(network.regions + 1)
@@ -145,16 +139,13 @@ def write_comparison(folder: Path, scenario: Scenario, result: Result) -> pd.Dat
     axes[-1].set_title("all regions", fontsize="medium")
     plots.legend_below(drawing, axes, columns=4)
     plots.save(drawing, folder / f"compare-{name}-accumulation.png")
-    samples = [outflow_samples([result], network.u_max, region, network.adjacency) for region in range(network.regions)]
-    plots.draw_mfds(folder / f"compare-{name}-mfd.png", network, samples)
     return rows
 
 
 def prediction_errors(found: Finished, model: Path | None = None) -> pd.DataFrame:
     """Return the prediction errors of all runs of a folder, a row per strategy, demand level and region.
 
-    Args:
-        model: folder of the predicting network; None for that with which each controller plans.
+    model: folder of the predicting network; None for that with which each controller plans
 
     Raises:
         InputError: if the city has changed since the runs.
