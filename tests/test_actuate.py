@@ -100,17 +100,6 @@ def test_every_window_of_a_link_keeps_its_minimum_green():
     assert held == 5 * "G" + 3 * "y" + 15 * "r" + 5 * "G" + 3 * "y" + 59 * "r"
 
 
-def test_green_time_is_what_was_shown():
-    signal = GatewaySignal(programme(PHASES), {0: (0, 1)}, start=0.0)
-    signal.command(np.full((2, 2), 0.5))
-    green, shown = 0, ""
-    for second in range(271):
-        if second >= signal.next_change:
-            shown = signal.update(float(second))
-        green += shown[0] in "Gg" and second < 270
-    assert signal.green_time()[0] == green > 0
-
-
 def test_u_max_is_the_original_programme_to_the_fraction_of_a_second():
     phases = [("Gr", 42.4), ("yr", 3), ("rG", 41.6), ("ry", 3)]
     signal = GatewaySignal(programme(phases), {0: (0, 1)}, start=0.0)

@@ -1,6 +1,5 @@
 """The searches of route guidance against all ways there are, in a small random city."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 from unittest.mock import Mock
 
@@ -248,14 +247,3 @@ def test_on_a_junction_it_is_too_late_and_who_arrived_is_not_asked():
         guide.apply([])
         assert "".join(routes["driver"]) == expected
     assert road.call_count == 5  # when he came, twice on the junction, behind it, and when he had arrived
-
-
-def test_whoever_comes_into_another_region_is_no_more_asked_as_in_the_one_before():
-    guide, _, routes, road = crossroads(tuple("ambt"), ways_return=True, period=2.0)
-    guide.apply([DRIVER])
-    routes["driver"] = tuple("mbt")
-    guide.apply([replace(DRIVER, source=0, region=1)])
-    for calls in (2, 3, 3, 4):  # every two steps, since he came to m
-        guide.apply([])
-        assert road.call_count == calls
-    assert guide.realised.sum() == 2

@@ -144,16 +144,6 @@ def test_who_waits_on_a_junction_is_seen(waited, expected):
         assert town.routes["new"][1] == expected
 
 
-def test_what_was_assigned_before_fades():
-    town = Town(through_a=30.0, through_b=31.0, theta=0.0)
-    town.drive(10)
-    assert town.guide._assigned[0, :, 3].tolist() == [0.0, 0.0, 10.0, 0.0]
-    assert town.guide._wished[0, :, 3].tolist() == [0.0, 10.0, 0.0, 0.0]
-    town.command()
-    assert town.guide._assigned[0, 2, 3] == pytest.approx(9.0) and town.guide._wished[0, 1, 3] == pytest.approx(9.0)
-    assert town.guide.realised.sum() == 10
-
-
 def test_a_refused_way_counts_for_no_region():
     town = Town(through_a=30.0, through_b=90.0, theta=0.5)
     town.takes_it = False
@@ -166,12 +156,6 @@ def test_compliance_and_drivers_who_are_not_free():
     assert Town(through_a=30.0, through_b=90.0, theta=0.5).drive(5, by="b", free=False) == "bbbbb"
     half = Town(through_a=30.0, through_b=90.0, theta=0.5, compliance=0.5).drive(200, by="b")
     assert 75 < half.count("a") < 125
-
-
-def test_without_a_command_nobody_is_guided():
-    town = Town(through_a=30.0, through_b=90.0, theta=0.5)
-    town.guide.command(None, None)
-    assert town.drive(3, by="b") == "bbb"
 
 
 @pytest.mark.parametrize(

@@ -150,7 +150,6 @@ CASES = {
     "removed-as-anything": Case(script=remove(0, 1, 2, 3, 4), expects=("removals",)),
     "removed-after-the-step": Case(script=remove(3), late=True, expects=("removals",)),
     "another-target": Case(script=change_target, expects=("arrivals", "redirected")),
-    "added-by-program": Case(script=add, trips=40, expects=("arrivals",)),
     "ids-used-again": Case(script=reuse, expects=("removals",)),
     "moved-by-program": Case(script=move, expects=("jumps",)),
     "taken-back": Case(script=forget, expects=("given_up",)),
@@ -160,26 +159,7 @@ CASES = {
         ),
         expects=("arrivals", "redirected"),
     ),
-    "closing-rerouter": Case(
-        additional=REROUTER.format(
-            '<closingReroute id="C1D1" disallow="all"/><closingReroute id="B2C2" disallow="all"/>'
-        ),
-        options=("--ignore-route-errors",),
-        expects=("given_up",),
-    ),
-    "stops-beside-the-road": Case(
-        vehicles="".join(
-            f'<trip id="s{n}" depart="{5 * n}" from="A1B1" to="C1D1"><stop lane="B1C1_0" endPos="60" duration="40" '
-            f'parking="{n % 2}"/></trip>'
-            for n in range(20)
-        ),
-        trips=40,
-        expects=("arrivals",),
-    ),
     "teleports": Case(script=block, session={"time_to_teleport": 8.0}),
-    "teleports-off-the-net": Case(
-        script=block, session={"time_to_teleport": 8.0}, options=("--time-to-teleport.remove",), expects=("removals",)
-    ),
     "disconnected-teleports": Case(
         vehicles="".join(
             f'<vehicle id="gap{n}" depart="{4 * n}"><route edges="A1B1 C2D2"/></vehicle>' for n in range(20)
@@ -216,7 +196,7 @@ CASES = {
     ),
 }
 # What SUMO's mesoscopic model does not have: collisions, standing drivers, places on edges, parking rerouters.
-MICRO_ONLY = {"collisions", "teleports", "teleports-off-the-net", "moved-by-program"}
+MICRO_ONLY = {"collisions", "teleports", "moved-by-program"}
 QUICK = {  # in the default suite
     ("calibrators", False),
     ("collisions", False),

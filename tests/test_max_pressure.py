@@ -179,17 +179,6 @@ def test_a_lane_that_no_stage_serves_wholly_counts_as_its_first_vehicle_is_likel
     assert dense[3, movement["b", "f"]] == pytest.approx(0.25 * 0.25)
 
 
-def test_lanes_are_those_of_cars():
-    """A bus lane on the right: the cars' lane of a is its second one, and who is on the first has no weight."""
-    town = SimpleNamespace(**{**vars(TOWN), "lane_ids": {**LANE_IDS, "a": ("a_1",)}})
-    crossing = signal(CROSS, (link(0, "a", "b", lane=0), link(0, "a", "b", lane=1), link(1, "c", "d")), "s")
-    roads = Roads(town, [crossing], {})
-    column = {lane: n for n, lane in enumerate(roads.lanes)}
-    weights = roads.weights.toarray()[roads.movements["a", "b"]]
-    assert weights[column["a_1"]] == 1.0 and weights[column["a_0"]] == 0.0
-    assert roads.stages([crossing])[0].toarray()[0, roads.movements["a", "b"]] == 1.0
-
-
 @pytest.fixture
 def junctions():
     """Max-pressure at both signals, what s has shown, and the vehicles on every lane of an edge."""

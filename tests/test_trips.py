@@ -10,7 +10,6 @@ from cosim.sumo.build import ensure_built
 from cosim.sumo.net import load_city
 from cosim.sumo.trips import make_trips, write_trips
 from nmfd.api import load_scenario
-from nmfd.errors import InputError
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
 
@@ -74,8 +73,3 @@ def test_seeds(city, scenario, tmp_path):
     assert first == again != other
     vehicles = list(ElementTree.fromstring(first).iter("vehicle"))
     assert [vehicle.get("id") for vehicle in vehicles] == [f"v{n}" for n in range(len(count[0].routes))]
-
-
-def test_demand_for_other_regions(city):
-    with pytest.raises(InputError, match="demand for 3 regions, but the city has 7"):
-        make_trips(city, np.zeros((2, 3, 3)), 90.0, seed=1)
