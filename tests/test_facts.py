@@ -35,7 +35,7 @@ def test_trips_under_way_and_not_departed_count_with_what_they_have_spent(tmp_pa
     read = reader.facts
     assert (read.trips, read.completed, read.travel_time, read.departure_delay) == (3, 1, 170.0, 45.0)
     assert (read.co2, read.fuel) == (4.0, 2.0)
-    row = simulate._trip_means(read)
+    row = simulate.trip_means(read)
     assert row["mean_trip_time_s"] == pytest.approx(170 / 3) and row["mean_departure_delay_s"] == 15.0
 
 

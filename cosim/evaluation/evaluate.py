@@ -11,7 +11,7 @@ import random
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 import pandas as pd
@@ -30,6 +30,8 @@ from nmfd.runs.run_many import TABLE, Run, read_manifest, run_many
 from nmfd.runs.tables import markdown_table
 from nmfd.types import HOST_TIMES
 
+Planned: TypeAlias = Sequence[tuple[Scenario, Sequence[float]]]  # with demand levels
+
 
 class Suite(TypedDict):
     """Content of a suite: seeds, and scenario -> demand levels."""
@@ -38,15 +40,10 @@ class Suite(TypedDict):
     scenarios: dict[str, Annotated[list[Annotated[float, Field(gt=0.0, le=10.0)]], Field(min_length=1)]]
 
 
-def read_suite(
-    file: Path, settings: Mapping[str, Any] | None = None
-) -> tuple[list[tuple[Scenario, Sequence[float]]], Sequence[int]]:
+def read_suite(file: Path, settings: Mapping[str, Any] | None = None) -> tuple[Planned, Sequence[int]]:
     """Read the scenarios with their demand levels, and the seeds, of a suite.
 
-    Scenarios are shipped names, or folders seen from that of the file.
-
-    Raises:
-        InputError: the file is no suite, or a scenario is missing
+    Scenarios are shipped names, or folders seen from that of the file. Raises InputError.
     """
     try:
         suite = TypeAdapter(Suite).validate_python(config.read(file))
@@ -55,13 +52,12 @@ def read_suite(
         raise InputError(f"{file}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
     beside = {name: file.parent / name for name in suite["scenarios"]}
     folders = {name: path if (path / "scenario.toml").is_file() else Path(name) for name, path in beside.items()}
-    return [(load_scenario(folders[name], settings), levels) for name, levels in suite["scenarios"].items()], suite[
-        "seeds"
-    ]
+    scenarios = [(load_scenario(folders[name], settings), levels) for name, levels in suite["scenarios"].items()]
+    return scenarios, suite["seeds"]
 
 
 def evaluate(
-    scenarios: Sequence[tuple[Scenario, Sequence[float]]],
+    scenarios: Planned,
     strategies: Sequence[Strategy],
     seeds: Sequence[int],
     *,
@@ -85,7 +81,7 @@ def evaluate(
 
 
 def plan(
-    scenarios: Sequence[tuple[Scenario, Sequence[float]]],
+    scenarios: Planned,
     strategies: Sequence[Strategy],
     seeds: Sequence[int],
     policies: Mapping[str, Path] | None = None,
@@ -119,10 +115,8 @@ def ranking(rows: pd.DataFrame) -> str:
         for row in statistics.statistics(part).to_dict("records"):
             same = row["controller"] == row["against"]
             changes.setdefault(row["controller"], []).append(0.0 if same else row["change_percent"])
-    order = sorted(changes, key=lambda name: float(np.mean(changes[name])))
-    table = [
-        [place, name, f"{np.mean(changes[name]):+.1f} %", len(changes[name])] for place, name in enumerate(order, 1)
-    ]
+    order = sorted(changes.items(), key=lambda item: float(np.mean(item[1])))
+    table = [[place, name, f"{np.mean(each):+.1f} %", len(each)] for place, (name, each) in enumerate(order, 1)]
     return markdown_table(["rank", "controller", "mean change of TTS", "scenarios and demand levels"], table)
 
 
@@ -131,14 +125,15 @@ def check(runs: Sequence[Run], out: Path, number: int, *, workers: int = 1) -> l
 
     out: folder with runs.csv and manifest.json, with or without the results
     """
-    kept, before = read_manifest(out)["folders"], results.finished_rows(pd.read_csv(out / TABLE))
-    rows = {(row["folder"], row["controller"], row["seed"]): row for row in before.to_dict("records")}
+    before = results.finished_rows(pd.read_csv(out / TABLE)).to_dict("records")
+    rows = {(row["folder"], row["controller"], row["seed"]): row for row in before}
+    keys = {folder: kept["key"] for folder, kept in read_manifest(out)["folders"].items()}
     chosen = random.Random(0).sample(list(runs), min(number, len(runs)))
     lines = [
-        f"{run.file}: {name} was {kept.get(run.folder, {}).get('key', {}).get(name)}, is {value}"
+        f"{run.file}: {name} was {keys.get(run.folder, {}).get(name)}, is {value}"
         for run in chosen
         for name, value in run.key.items()
-        if name != "controller" and kept.get(run.folder, {}).get("key", {}).get(name) != value
+        if name != "controller" and keys.get(run.folder, {}).get(name) != value
     ]
     with tempfile.TemporaryDirectory() as folder:
         again = run_many(chosen, folder, workers=workers)

@@ -1,7 +1,6 @@
 """Why a controller gains or loses against the reference: one paragraph from the numbers of the runs."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -21,21 +20,10 @@ INTERGREEN_SHARE = 0.03  # more time between two stages than in the original pro
 WAIT_S = 1.0  # before a trip begins
 
 
-class Load(NamedTuple):
-    """Peak accumulation over critical, share of time beyond it, and share of vehicles that start inside (R,)."""
-
-    peak: PerRegion
-    beyond: PerRegion
-    inside: PerRegion
-
-
-def load(network: RegionalModel, runs: Sequence[Result]) -> Load:
-    """Return the load of the regions, mean over runs."""
+def load(network: RegionalModel, runs: Sequence[Result]) -> tuple[PerRegion, PerRegion]:
+    """Return peak accumulation over critical (R,) and the share of time beyond critical (R,), mean over runs."""
     states = [run.accumulation.sum(axis=2) / network.critical for run in runs]
-    started = sum(run.departures.sum(axis=(0, 2)) for run in runs)
-    entered = sum(run.crossings.sum(axis=(0, 1, 3)) for run in runs)
-    peak, beyond = ([reduced(state) for state in states] for reduced in (lambda s: s.max(0), lambda s: (s > 1).mean(0)))
-    return Load(np.mean(peak, axis=0), np.mean(beyond, axis=0), started / np.maximum(started + entered, 1))
+    return np.mean([s.max(axis=0) for s in states], axis=0), np.mean([(s > 1).mean(axis=0) for s in states], axis=0)
 
 
 def text(level: Level, finished: Finished) -> str:
@@ -48,7 +36,7 @@ def text(level: Level, finished: Finished) -> str:
 def city(level: Level, finished: Finished) -> str:
     """Return two sentences about the city under the reference."""
     names, against = finished.scenario.network.region_names, statistics.compared_with(level.rows)
-    peak, beyond, _ = load(finished.scenario.network, _runs(level, against))
+    peak, beyond = load(finished.scenario.network, _runs(level, against))
     most = int(np.argmax(peak))
     state = f"no region exceeds its critical accumulation; {names[most]} is nearest, with {peak[most]:.1f} times"
     if hot := [
@@ -81,7 +69,8 @@ def paragraph(level: Level, finished: Finished, name: str) -> str:
 
 def _reasons(level: Level, network: RegionalModel, name: str, against: str, *, gains: bool) -> list[str]:
     """Return what the controller did, and what limits it if it does not gain."""
-    before, runs, strategy = load(network, _runs(level, against)), _runs(level, name), parse(name)
+    reference, runs, strategy = _runs(level, against), _runs(level, name), parse(name)
+    beyond = load(network, reference)[1]
     trips, acts = max(sum(run.departures.sum() for run in runs), 1), strategy.controller.name != ALONE
     limit = network.u_max - OPEN_SHARE * (network.u_max - network.u_min)
     held = float(np.mean([(run.perimeter[:, network.adjacency] < limit).mean() for run in runs]))
@@ -94,19 +83,18 @@ def _reasons(level: Level, network: RegionalModel, name: str, against: str, *, g
         f"its trips wait {waited:.0f} s before they begin": waited >= WAIT_S,
     }
     done = [words for words, true in deeds.items() if true] or ["it never holds back and never guides"] * acts
-    critical, region = np.flatnonzero(before.beyond > SMALL_SHARE), int(np.argmax(before.beyond))
+    critical, region = np.flatnonzero(beyond > SMALL_SHARE), int(np.argmax(beyond))
     if gains:
-        beyond = [f"{share:.0%}" for share in (load(network, runs).beyond[region], before.beyond[region])]
-        relief = f"{network.region_names[region]} is critical {beyond[0]} of the time instead of {beyond[1]}"
+        now = load(network, runs)[1][region]
+        relief = f"{network.region_names[region]} is critical {now:.0%} of the time instead of {beyond[region]:.0%}"
         return done + [relief] * bool(len(critical))
     mean = level.rows[level.rows["controller"] == name].mean(numeric_only=True)
     full = level.rows.groupby("controller")["gateway_full_share"].mean()
-    split, between = (
-        mean.get("split_lanes", 0),
-        [mean.get(f"{kind}intergreen_share", 0.0) for kind in ("", "programmed_")],
-    )
+    split, between = mean.get("split_lanes", 0), [mean.get(f"{k}intergreen_share", 0.0) for k in ("", "programmed_")]
     leaking, holds = _leaking(level), held >= SMALL_SHARE
-    inside = len(critical) > 0 and bool((before.inside[critical] > 0.5).all())
+    started = sum(run.departures.sum(axis=(0, 2)) for run in reference)
+    entered = sum(run.crossings.sum(axis=(0, 1, 3)) for run in reference)
+    inside = len(critical) > 0 and bool((started > entered)[critical].all())
     blocks = holds and full[name] - full[against] > FULL_SHARE
     slow = between[0] > between[1] + INTERGREEN_SHARE
     limits = {

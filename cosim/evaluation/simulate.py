@@ -9,14 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
 
 from cosim.evaluation import estimation_errors
 from cosim.plant.max_pressure import FACTS as PRESSURE_FACTS
 from cosim.plant.plant import Observer, SumoPlant
 from cosim.plant.record import RECORD, settled
 from cosim.plant.settings import settings
-from cosim.sumo.arrays import EdgesOverTime, RegionCounts
+from cosim.sumo.arrays import RegionCounts
 from cosim.sumo.net import City, Gateway, gateway_room_taken
 from cosim.sumo.outputs import TripFacts, check_whole
 from cosim.sumo.session import Window
@@ -119,7 +118,9 @@ def simulate(
         result = result.assign(controller=strategy.name, plant="sumo")
         plant_facts, leaks, trip_facts = plant.facts(), set(plant.leaks()), plant.trip_facts()
         result = settled(result.add({}, RECORD, **plant.record()))
-        backlog = result.backlog.sum(axis=(1, 2))
+        backlog, errors = result.backlog.sum(axis=(1, 2)), dict.fromkeys(("rmse_share", "cell_rmse_veh"), math.nan)
+        if result.estimated:
+            errors = estimation_errors.errors(scenario.network, result)[-1]  # of all regions
         facts = {
             "scenario": job.scenario.name,
             "scenario_folder": str(scenario.folder or ""),
@@ -129,13 +130,14 @@ def simulate(
             "final_backlog_veh": int(backlog[-1]),
             "total_backlog_veh_s": float(scenario.step * backlog[:-1].sum()),
             "teleports": int(result.teleports.sum()),
-            **_trip_means(trip_facts),
+            **trip_means(trip_facts),
             "delay_gini": delay_gini(result, plant.time_loss()),
             **queue_facts(result, plant.city),
             "notes": metrics.notes(result),
             "outside_training": strategy.outside_training(scenario, job.demand, job.policy),
             "leaking_share": leaking_share(result, plant.city, leaks),
-            **_estimate_errors(scenario, result),
+            "estimate_rmse_share": errors["rmse_share"],
+            "estimate_cell_rmse_veh": errors["cell_rmse_veh"],
             "overhead_share": 1.0 - plant_facts["sumo_time_s"] / result.wall_time,
             "setup_time_s": time.perf_counter() - begin - result.wall_time,
             "removed_veh": int(result.removals.sum() + result.given_up.sum()),
@@ -168,15 +170,12 @@ def delay_gini(result: Result, time_loss: PerRegion) -> float:
 
 def queue_facts(result: Result, city: City) -> dict[str, float]:
     """Return queues on the edges before gateways, every edge once."""
-    first: dict[str, int] = {}
-    for n, gateway in enumerate(city.gateways):
-        first.setdefault(gateway.from_edge, n)
-    upstream = list(first.values())
-    queue, longest = result.gateway_queue[:, upstream], result.gateway_queue_max[:, upstream]
-    full = _gateway_full(result.edge_vehicles, city)[:, upstream]
+    edges = [gateway.from_edge for gateway in city.gateways]
+    upstream = [edges.index(edge) for edge in dict.fromkeys(edges)]
+    full = gateway_room_taken(result.edge_vehicles.astype(float), city)[:, upstream] >= FULL_SHARE
     return {
-        "gateway_queue_mean_veh": float(queue.mean()),
-        "gateway_queue_max_veh": float(longest.max()),
+        "gateway_queue_mean_veh": float(result.gateway_queue[:, upstream].mean()),
+        "gateway_queue_max_veh": float(result.gateway_queue_max[:, upstream].max()),
         "gateway_full_share": float(full.mean()),
     }
 
@@ -188,12 +187,7 @@ def leaking_share(result: Result, city: City, leaks: Collection[Gateway]) -> flo
     return float(leaking / max(flow.sum(), 1))
 
 
-def _gateway_full(edge_vehicles: EdgesOverTime, city: City) -> Bool[np.ndarray, "T G"]:
-    """Return whether the edge before each gateway holds FULL_SHARE of its room (T, G)."""
-    return gateway_room_taken(edge_vehicles.astype(float), city) >= FULL_SHARE
-
-
-def _trip_means(facts: TripFacts) -> dict[str, float]:
+def trip_means(facts: TripFacts) -> dict[str, float]:
     """Return means over all trips due [s], and emissions of the whole run [kg]."""
     trips = max(facts.trips, 1)
     return {
@@ -203,11 +197,3 @@ def _trip_means(facts: TripFacts) -> dict[str, float]:
         "co2_kg": facts.co2,
         "fuel_kg": facts.fuel,
     }
-
-
-def _estimate_errors(scenario: Scenario, result: Result) -> dict[str, float]:
-    """Return errors of the estimate over all regions, NaN if the controller got the exact state."""
-    if not result.estimated:
-        return {"estimate_rmse_share": math.nan, "estimate_cell_rmse_veh": math.nan}
-    whole = estimation_errors.errors(scenario.network, result)[-1]
-    return {"estimate_rmse_share": whole["rmse_share"], "estimate_cell_rmse_veh": whole["cell_rmse_veh"]}

@@ -1,7 +1,7 @@
 """Tables of an evaluation: means over seeds and changes paired by seed, with 95 % intervals by Student's t."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,13 +35,11 @@ CAPTION = "; ".join(f"{heading}: {text}" for heading, text in COLUMNS.items())
 
 @dataclass(frozen=True, kw_only=True)
 class Paired:
-    """Difference of a and b on the seeds that both have: mean and half of the 95 % interval, NaN for one seed."""
+    """Change from b to a on the seeds that both have: mean and half of the 95 % interval, NaN for one seed."""
 
     seeds: int
     percent: float
     percent_half: float
-    difference: float
-    difference_half: float
 
     @property
     def excludes_zero(self) -> bool:
@@ -53,18 +51,8 @@ def paired(a: Mapping[int, float], b: Mapping[int, float]) -> Paired:
     """Compare values by seed; NaN without a common seed, and percentages NaN if a value of b is 0."""
     seeds = sorted(set(a) & set(b))
     percent = [percent_change(a[seed], b[seed]) for seed in seeds]
-    difference = [a[seed] - b[seed] for seed in seeds]
-    return Paired(
-        seeds=len(seeds),
-        percent=_mean(percent),
-        percent_half=interval(percent),
-        difference=_mean(difference),
-        difference_half=interval(difference),
-    )
-
-
-def _mean(values: Sequence[float]) -> float:
-    return float(np.mean(values)) if len(values) else math.nan
+    mean = float(np.mean(percent)) if seeds else math.nan
+    return Paired(seeds=len(seeds), percent=mean, percent_half=interval(percent))
 
 
 def by_seed(rows: pd.DataFrame, level: float, controller: str, column: str = TTS) -> dict[int, float]:
@@ -83,11 +71,6 @@ def compared_with(rows: pd.DataFrame) -> str:
     levels = groups(rows).values()
     names = list(dict.fromkeys(rows["controller"]))
     return benchmark.compared_with([name for name in names if all(name in level for level in levels)] or names)
-
-
-def than(reference: str) -> str:
-    """Return the words after "less time than" for a reference controller."""
-    return "without control" if reference == REFERENCE else f"under {reference}"
 
 
 def statistics(rows: pd.DataFrame) -> pd.DataFrame:
@@ -126,20 +109,9 @@ def pairs(rows: pd.DataFrame) -> pd.DataFrame:
     for level, names in groups(rows).items():
         for name, other in ((name, other) for name in names for other in names if other != name):
             pair = paired(by_seed(rows, level, name), by_seed(rows, level, other))
-            out.append(
-                {
-                    "demand": level,
-                    "controller": name,
-                    "against": other,
-                    "seeds": pair.seeds,
-                    "change_percent": pair.percent,
-                    "half_interval_percent": pair.percent_half,
-                    "difference_veh_s": pair.difference,
-                    "half_interval_veh_s": pair.difference_half,
-                    "excludes_zero": pair.excludes_zero,
-                }
-            )
-    return pd.DataFrame(out)
+            out.append((level, name, other, pair.seeds, pair.percent, pair.percent_half, pair.excludes_zero))
+    columns = ["demand", "controller", "against", "seeds", "change_percent", "half_interval_percent", "excludes_zero"]
+    return pd.DataFrame(out, columns=columns)
 
 
 def shown(table: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:

@@ -2,20 +2,18 @@
 
 import math
 from dataclasses import dataclass
+from statistics import mean
 from typing import Any
 
 import pandas as pd
 
 from cosim.evaluation import statistics
 from cosim.report.figures import ranked
+from nmfd.studies.benchmark import REFERENCE
 
 MINUTE, HOUR = 60.0, 3600.0  # s
 QUANTITIES = {  # label -> format of a value, sign of an improvement, meaning
-    "Time per trip": (
-        "{:.1f} min",
-        -1,
-        "mean of all trips, from the wanted departure to the arrival or end of run",
-    ),
+    "Time per trip": ("{:.1f} min", -1, "mean of all trips, from the wanted departure to the arrival or end of run"),
     "Trips served": ("{:,.0f}", 1, "completed trips, mean over seeds"),
     "CO2": ("{:.2f} t", -1, "of all vehicles while the run lasted, by SUMO's HBEFA4 petrol car"),
     "Total time spent": ("{:,.0f} h", -1, "of all drivers, on the road and waiting to enter, mean over seeds"),
@@ -24,11 +22,7 @@ QUANTITIES = {  # label -> format of a value, sign of an improvement, meaning
 
 @dataclass(frozen=True, kw_only=True)
 class Figure:
-    """One figure of the card.
-
-    value: of the strategy; before: of the reference; change: with its 95 % interval; better: True or False if that
-    excludes zero, else None; meaning: definition of the figure
-    """
+    """One figure of the card: of the strategy, before of the reference; better: None if the interval holds zero."""
 
     label: str
     value: str
@@ -45,17 +39,8 @@ def card(rows: pd.DataFrame) -> tuple[str, list[Figure], str]:
     """
     against, level = statistics.compared_with(rows), rows["demand"].iloc[0]
     name = next((name for name in ranked(rows) if name != against), against)
-    table = pd.DataFrame(
-        {
-            "demand": level,
-            "controller": rows["controller"],
-            "seed": rows["seed"],
-            "Time per trip": minutes_per_trip(rows),
-            "Trips served": rows["completed_veh"],
-            "CO2": rows["co2_kg"] / 1000.0,
-            "Total time spent": rows[statistics.TTS] / HOUR,
-        }
-    )
+    values = (minutes_per_trip(rows), rows["completed_veh"], rows["co2_kg"] / 1000.0, rows[statistics.TTS] / HOUR)
+    table = rows.assign(**dict(zip(QUANTITIES, values, strict=True)))
     figures = [_figure(table, level, name, against, label) for label in QUANTITIES]
     heading = name if name == against else f"{name} compared with {against.replace('-', ' ')}"
     return heading, [figure for figure in figures if figure is not None], name
@@ -71,7 +56,7 @@ def _figure(table: pd.DataFrame, level: float, name: str, against: str, label: s
     form, good, meaning = QUANTITIES[label]
     now, before = (statistics.by_seed(table, level, one, label) for one in (name, against))
     common = [seed for seed in now if seed in before]
-    value = _mean([now[seed] for seed in common or now])
+    value = mean([now[seed] for seed in common or now])
     if math.isnan(value):
         return None
     pair = statistics.paired(now, before)
@@ -79,15 +64,12 @@ def _figure(table: pd.DataFrame, level: float, name: str, against: str, label: s
         return Figure(label=label, value=form.format(value), meaning=meaning)
     single = math.isnan(pair.percent_half)
     spread = " on one seed" if single else f" ± {pair.percent_half:.0f} (95 %, {pair.seeds} seeds)"
+    than = "without control" if against == REFERENCE else f"under {against}"
     return Figure(
         label=label,
         value=form.format(value),
-        before=f"{form.format(_mean([before[seed] for seed in common]))} {statistics.than(against)}",
+        before=f"{form.format(mean([before[seed] for seed in common]))} {than}",
         change=f"{pair.percent:+.0f} %{spread}",
         better=pair.percent * good > 0 if pair.excludes_zero else None,
         meaning=meaning,
     )
-
-
-def _mean(values: list[float]) -> float:
-    return sum(values) / len(values)

@@ -40,7 +40,7 @@ def perimeter(ax: Axes, step: float, commanded: Series, green: Series, flow: Ser
     ):
         ax.stairs(values, time, color=tone, linewidth=width, label=label, baseline=None)
     ax.set_ylim(0.0, max(1.08, 1.05 * float(np.nanmax([green, flow], initial=1.0))))
-    return _finished(ax, None, "share [-]")
+    return _finished(ax, "share [-]")
 
 
 def splits(
@@ -57,7 +57,7 @@ def splits(
         ax.stairs(commanded[:, n], time, color=tone, linewidth=1.5, label=f"by {h}", baseline=None)
         ax.plot(time[:-1] + np.diff(time) / 2, realised[:, n], "o", color=tone, markersize=3)
     ax.set_ylim(-0.04, 1.04)
-    return _finished(ax, None, "share [-]")
+    return _finished(ax, "share [-]")
 
 
 def over_levels(ax: Axes, values: Mapping[str, Mapping[float, tuple[float, float]]], label: str) -> Axes:
@@ -71,7 +71,8 @@ def over_levels(ax: Axes, values: Mapping[str, Mapping[float, tuple[float, float
     ax.axhline(1.0, color="#777777", linestyle="--", linewidth=1.0)
     ax.set_xticks(levels, [f"{level:g}" for level in levels])
     ax.set_ylim(bottom=0.0)
-    return _finished(ax, "demand, multiple of the scenario's", label)
+    ax.set_xlabel("demand, multiple of the scenario's")
+    return _finished(ax, label)
 
 
 def ranked(rows: pd.DataFrame) -> list[str]:
@@ -121,7 +122,8 @@ def draw_level(out: Path, scenario: Scenario, city: City, rows: pd.DataFrame, re
     other = next((name for name in best_first if name != against), None)
     _draw_mfds(out / "mfd.png", network, [best_first[name] for name in (against, other) if name in best_first])
     results = list(best_first.values())
-    if gating := next((run for run in results if _gates(run, network)), None):
+    closing = (run for run in results if (run.perimeter[:, network.adjacency] < network.u_max - 1e-9).any())
+    if gating := next(closing, None):
         _draw_perimeter(out / "perimeter.png", city, network, gating, note)
     if guiding := next((run for run in results if run.guided.sum() > 0), None):
         _draw_splits(out / "splits.png", network, guiding, note)
@@ -151,19 +153,12 @@ def draw_levels(out: Path, rows: pd.DataFrame) -> None:
             _save(drawing, [ax], out / file, f"mean over seeds, 95 % intervals; {teleports(rows)}")
 
 
-def _gates(result: Result, network: RegionalModel) -> bool:
-    """Return True if a boundary was ever commanded below its original programme."""
-    return bool((result.perimeter[:, network.adjacency] < network.u_max - 1e-9).any())
-
-
 def _draw_mfds(path: Path, network: RegionalModel, results: Sequence[Result]) -> None:
-    samples = []
-    for region in range(network.regions):
-        clouds = {
-            run.controller: model_validation.outflow_samples([run], network.u_max, region, network.adjacency)
-            for run in results
-        }
-        samples.append({name: np.concatenate(list(parts.values())) for name, parts in clouds.items()})
+    def cloud(run: Result, region: int) -> np.ndarray:
+        parts = model_validation.outflow_samples([run], network.u_max, region, network.adjacency)
+        return np.concatenate(list(parts.values()))
+
+    samples = [{run.controller: cloud(run, region) for run in results} for region in range(network.regions)]
     plots.draw_mfds(path, network, samples)
 
 
@@ -222,10 +217,7 @@ def _save(drawing: Figure, axes: Sequence[Axes], path: Path, title: str) -> None
     plots.save(drawing, path)
 
 
-def _finished(ax: Axes, x: str | None, y: str) -> Axes:
-    """Label the axes and remove the frame; x: None if the axis has its label."""
-    if x is not None:
-        ax.set_xlabel(x)
+def _finished(ax: Axes, y: str) -> Axes:
     ax.set_ylabel(y)
     ax.spines[["top", "right"]].set_visible(False)
     return ax

@@ -46,21 +46,18 @@ def write_page(path: Path, runs: Sequence[Finished], *, seed: int | None = None)
         InputError: if there is no run with this seed.
     """
     title, script, div = _map(runs[0], seed)
-    environment = Environment(
-        loader=PackageLoader("cosim.report", "."), autoescape=True, trim_blocks=True, undefined=StrictUndefined
+    loader = PackageLoader("cosim.report", ".")
+    environment = Environment(loader=loader, autoescape=True, trim_blocks=True, undefined=StrictUndefined)
+    page = environment.get_template("report.html.j2").render(
+        name=", ".join(dict.fromkeys(run.scenario.name for run in runs)),
+        runs=[_run(run) for run in runs],
+        map_title=title,
+        map_div=div,
+        scripts=[*Resources(mode="inline", components=["bokeh", "bokeh-widgets"]).js_raw, script],
+        style=(Path(__file__).parent / "report.css").read_text(encoding="utf-8"),
+        caption=statistics.CAPTION,
     )
-    files.write_text(
-        path,
-        environment.get_template("report.html.j2").render(
-            name=", ".join(dict.fromkeys(run.scenario.name for run in runs)),
-            runs=[_run(run) for run in runs],
-            map_title=title,
-            map_div=div,
-            scripts=[*Resources(mode="inline", components=["bokeh", "bokeh-widgets"]).js_raw, script],
-            style=(Path(__file__).parent / "report.css").read_text(encoding="utf-8"),
-            caption=statistics.CAPTION,
-        ),
-    )
+    files.write_text(path, page)
     return path
 
 
@@ -88,6 +85,7 @@ def _run(run: Finished) -> dict:
     level, rows = run.level(), run.rows
     seeds = ", ".join(map(str, sorted(set(rows["seed"]))))
     heading, shown, name = card.card(level.rows)
+    manifest = {"runs": level.key, "controllers": level.controllers, "sessions": run.sessions}
     minutes = level.key["steps"] * level.key["step_s"] / 60
     pictures = _pictures(partial(figures.draw_levels, rows=rows), LEVEL_PICTURES) if len(run.levels) > 1 else []
     return {
@@ -99,26 +97,17 @@ def _run(run: Finished) -> dict:
         "strategy has the same trips.",
         "pictures": pictures,
         "levels": [_level(run, level) for level in run.levels],
-        "manifest": json.dumps(
-            {"runs": level.key, "controllers": level.controllers, "sessions": run.sessions}, indent=1
-        ),
+        "manifest": json.dumps(manifest, indent=1),
     }
 
 
 def _level(run: Finished, level: Level) -> dict:
     """Return what the page shows of a demand level."""
     rows = level.rows
-    outcome, how = statistics.shown(statistics.statistics(rows))
-    draw = partial(
-        figures.draw_level,
-        scenario=run.scenario,
-        city=run.map(),
-        rows=rows,
-        read=level.read,
-    )
+    draw = partial(figures.draw_level, scenario=run.scenario, city=run.map(), rows=rows, read=level.read)
     return {
         "title": f"Demand times {level.demand:g}",
-        "tables": [_html(outcome), _html(how)],
+        "tables": [_html(table) for table in statistics.shown(statistics.statistics(rows))],
         "pairs": _html(statistics.pairs(rows).drop(columns="demand")),
         "runs": _html(rows),
         "pictures": _pictures(draw, PICTURES),

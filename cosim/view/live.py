@@ -38,11 +38,7 @@ FOREVER = float("inf")
 
 @dataclass
 class Seen:
-    """One run as shown so far.
-
-    whole: the frames at the ends of control intervals; latest: the last frame; row: the summary of a finished run;
-    error: the failure of another
-    """
+    """One run as shown so far: frames at the ends of control intervals, the last frame, and summary or failure."""
 
     name: str
     whole: list[Frame] = field(default_factory=list)
@@ -56,7 +52,7 @@ class Seen:
         return self.row is not None or self.error is not None
 
     def at(self, time: float) -> Frame | None:
-        """Return the last frame until a time [s], None before the first."""
+        """Return the last frame until a time [s]."""
         if self.latest is not None and self.latest.time <= time:
             return self.latest
         return next((frame for frame in reversed(self.whole) if frame.time <= time), None)
@@ -132,10 +128,9 @@ class Reporter:
     """The observer of one run: it sends frames and holds the run to the pace; the run stays the same otherwise."""
 
     def __init__(self, n: int, scenario: Scenario, messages: Any, limit: Any, delay: Any):
-        """limit: time [s] at which the run waits; delay: least wall time per simulated second; both are shared"""
+        """limit, delay: shared values, as in `Show`"""
         self._n, self._messages, self._limit, self._delay = n, messages, limit, delay
-        self._scenario = scenario
-        self._begin = settings(self._scenario).begin
+        self._scenario, self._begin = scenario, settings(scenario).begin
         self._sent = self._time = 0.0
 
     def began(self, city: City, state: State) -> None:
@@ -157,8 +152,7 @@ class Reporter:
     def recorded(self, controls: Controls, state: State, row: Mapping[str, np.ndarray]) -> None:
         """Send the frame at the end of a control interval."""
         spent = float(self._state.unfinished.sum())
-        self._frame = after(self._picture, self._frame, spent, controls, state, row)
-        self._state = state
+        self._frame, self._state = after(self._picture, self._frame, spent, controls, state, row), state
         self._send(self._frame)
         self._wait(state.time)
 
@@ -183,7 +177,6 @@ class Viewer:
     """The page of one browser; pause and pace are common to all."""
 
     def __init__(self, show: Show, document: Document):
-        """show: has its picture already"""
         assert show.picture is not None
         self._show, self._page = show, Page(show.picture, [seen.name for seen in show.runs])
         self._traced: tuple[object, ...] = ()
@@ -204,8 +197,7 @@ class Viewer:
         self._pause.disabled = show.over
         self._page.show([seen.at(now) for seen in show.runs], now)
         runs = [[frame for frame in seen.whole if frame.time <= now] for seen in show.runs]
-        traced = (self._page.region, *map(len, runs))
-        if traced != self._traced:
+        if self._traced != (traced := (self._page.region, *map(len, runs))):
             self._page.trace(runs, now)
             self._traced = traced
 
@@ -245,9 +237,9 @@ def watch(
             _serve(show, port, browse, tell)
     finally:
         show.close()
-    errors = [seen.error for seen in show.runs if seen.error is not None]
-    if errors:
-        raise errors[0]
+    for seen in show.runs:
+        if seen.error is not None:
+            raise seen.error
     return show.runs
 
 
