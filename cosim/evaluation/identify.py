@@ -103,7 +103,13 @@ def identify(
     """
     target, own = loading.target(loaded), network_folder(loaded.network)
     _check_target(loading, loaded.name, target, own)
-    more = [run for folder in loading.runs for run in finished(folder, loaded)]
+    more: list[Result] = []
+    for folder in loading.runs:
+        found = results.read(folder)
+        if found.scenario.name != loaded.name:
+            raise InputError(f"--runs: {folder}: holds runs of {found.scenario.name}, not of {loaded.name}")
+        found.map()  # checks that the city is the same
+        more += [level.read(*run) for level in found.levels for run in level.runs]
 
     def load(stage: int, **options: object) -> list[Result]:
         """Do the loading runs of a stage at all levels that are not finished; return all of them."""
@@ -185,15 +191,6 @@ def _check_target(loading: Loading, name: str, target: Path, own: Path) -> None:
     there = next(folder for folder in (target, *target.absolute().parents) if folder.exists())
     if not there.is_dir() or not os.access(there, os.W_OK):
         raise InputError(f"--network: {there} is no folder that can be written to; choose another")
-
-
-def finished(folder: Path, scenario: Scenario) -> list[Result]:
-    """Read all runs of a folder of `cosim run` or `cosim evaluate`. Raises InputError for runs of another city."""
-    found = results.read(folder)
-    if found.scenario.name != scenario.name:
-        raise InputError(f"--runs: {folder}: holds runs of {found.scenario.name}, not of {scenario.name}")
-    found.map()
-    return [level.read(*run) for level in found.levels for run in level.runs]
 
 
 def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool) -> RegionalModel:

@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,18 +12,16 @@ from jaxtyping import Bool
 from cosim.evaluation.results import Finished
 from cosim.evaluation.simulate import regional_outflow
 from cosim.sumo.arrays import Points, RegionCounts
-from nmfd import closed_loop
 from nmfd.arrays import Adjacency
 from nmfd.controllers.strategy import parse
 from nmfd.model.dynamics import advance, parameters
 from nmfd.model.identification import Observed
-from nmfd.model.plant import NmfdPlant
 from nmfd.model.scenario import Scenario
 from nmfd.runs import files
 from nmfd.runs.tables import text_columns, text_table
 from nmfd.studies import plots
 from nmfd.studies.fit_quality import SPILLBACK, predictions
-from nmfd.types import Controls, Observation, Result
+from nmfd.types import Result
 
 COLLAPSED_SHARE = 0.7  # of the largest outflow so far, below which a denser region is collapsed
 FEWEST_VEHICLES = 5.0  # in a region during an interval that counts as a sample
@@ -40,22 +37,6 @@ OF_ALL_RUNS = (
 )
 
 
-class Replay:
-    """Controller that repeats the recorded controls of a run."""
-
-    def __init__(self, result: Result):
-        self.name, self._result = result.controller, result
-
-    def reset(self, seed: int = 0) -> None:
-        """Start a new run."""
-
-    def act(self, observation: Observation) -> Controls:
-        """Return the recorded controls of this step."""
-        return Controls(
-            perimeter=self._result.perimeter[observation.step], splits=self._result.splits[observation.step]
-        )
-
-
 def observed(result: Result) -> Observed:
     """Return a run as identification sees it; demand is what entered the streets."""
     return Observed(
@@ -69,14 +50,27 @@ def observed(result: Result) -> Observed:
 
 def predict(scenario: Scenario, result: Result) -> Result:
     """Run the regional model from the same start under the recorded departures and controls."""
-    same = replace(
-        scenario,
-        steps=len(result.perimeter),
-        demand=result["departures"] / scenario.step,
-        measurement_std=0.0,
-        faults=(),
+    states = [result.accumulation[0]]
+    for k in range(len(result.perimeter)):
+        states.append(_advanced(scenario, result, states[-1], k))
+    return result.assign(accumulation=np.stack(states), backlog=np.zeros_like(result.backlog), plant="nmfd")
+
+
+def _advanced(scenario: Scenario, result: Result, state: np.ndarray, intervals: int | slice) -> np.ndarray:
+    """Return the states (..., R, R) [veh] one interval later under the departures and controls of these intervals."""
+    recorded = (result["departures"] / scenario.step, result.perimeter, result.splits)
+    demand, perimeter, splits = (torch.from_numpy(values[intervals]) for values in recorded)
+    following = advance(
+        parameters(scenario.network),
+        torch.from_numpy(state),
+        demand,
+        perimeter,
+        splits,
+        scenario.step,
+        integrator=scenario.integrator,
+        substeps=scenario.substeps,
     )
-    return closed_loop.run(NmfdPlant(same), Replay(result), same, seed=result.seed).assign(plant="nmfd")
+    return following.numpy()
 
 
 def errors(scenario: Scenario, result: Result, predicted: Result) -> pd.DataFrame:
@@ -85,12 +79,9 @@ def errors(scenario: Scenario, result: Result, predicted: Result) -> pd.DataFram
     The next interval is predicted from every recorded state under the recorded departures and controls.
     """
     network, simulated = scenario.network, result.accumulation.sum(-1)
-    recorded = (result.accumulation[:-1], result["departures"] / scenario.step, result.perimeter, result.splits)
-    x, demand, perimeter, splits = map(torch.from_numpy, recorded)
-    p, step, integrator = parameters(network), scenario.step, scenario.integrator
-    following = advance(p, x, demand, perimeter, splits, step, integrator=integrator, substeps=scenario.substeps)
+    following = _advanced(scenario, result, result.accumulation[:-1], slice(None))
     off = _with_all(predicted.accumulation.sum(-1) - simulated)
-    next_off = _with_all(following.sum(-1).numpy() - simulated[1:])
+    next_off = _with_all(following.sum(-1) - simulated[1:])
     seen, critical = _with_all(simulated), np.append(network.critical, network.critical.sum())
     return pd.DataFrame(
         {

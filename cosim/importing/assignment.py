@@ -1,10 +1,8 @@
 """Routes of a generated demand: an iterated assignment by SUMO's duaIterate.py.
 
-All drivers start on a fastest route at free flow. Then, repeatedly, the city is simulated, every driver is offered the
-route that would have been fastest in it, and chooses among the known routes by Gawron's probabilities ("An iterative
-algorithm to determine the dynamic user equilibrium in a traffic simulation model", 1998). SUMO's mesoscopic model, a
-tenth of the cost, finds most of the equilibrium; a city in car-following gets more iterations in that model, as queues
-differ (streets of Bologna: routes with a gap of 18 % in the former had 36 % in the latter).
+All drivers start on a fastest route at free flow. Then, repeatedly, the city is simulated, and drivers choose among the
+routes that were fastest so far by Gawron's probabilities (1998). The mesoscopic model, a tenth of the cost, finds most
+of the equilibrium; a city in car-following gets more iterations in that model, as queues differ.
 """
 
 import gzip

@@ -4,6 +4,7 @@ import xml.etree.ElementTree as ElementTree
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +39,6 @@ class Baseline:
     presence: (K, E) [veh s] on every edge in intervals of INTERVAL_S
     ways: (edges that a vehicle drove to the end, last edge of its route) -> number of vehicles
     teleports; waiting: vehicles not inserted at the end; running: on the road at the end
-    delay: of departures, all vehicles [veh s]
     dropped: vehicles of the demand that SUMO gave up
     """
 
@@ -47,14 +47,7 @@ class Baseline:
     teleports: int
     waiting: int
     running: int
-    delay: float = 0.0
     dropped: int = 0
-
-    def pace(self, streets: Streets) -> float:
-        """Return the time spent, running and waiting to enter, over that at the speed limits [-]."""
-        free = streets.length / streets.speed
-        needed = sum(vehicles * free[list(way)].sum() for (way, _), vehicles in self.ways.items())
-        return float(self.presence.sum() + self.delay) / max(float(needed), 1.0)
 
     def density(self, streets: Streets) -> PerEdge:
         """Return the density (E,) [veh/m of lane] in the quarter of an hour with the most vehicles."""
@@ -67,7 +60,7 @@ class Baseline:
         """Count the vehicles that went from one edge to the next."""
         count: Counter[tuple[int, int]] = Counter()
         for (way, _), vehicles in self.ways.items():
-            for pair in zip(way, way[1:], strict=False):
+            for pair in pairwise(way):
                 count[pair] += vehicles
         return count
 
@@ -144,7 +137,7 @@ def averaged_runs(
 def _measured(folder: Path, streets: Streets, begin: float, end: float, vehicles: set[str]) -> Baseline:
     """Read the outputs of a run with these vehicles of the demand."""
     statistic = ElementTree.parse(folder / "statistic.xml").getroot()
-    counts, trips = child(statistic, "vehicles"), child(statistic, "vehicleTripStatistics")
+    counts = child(statistic, "vehicles")
     waiting = int(attribute(counts, "waiting"))
     ways, driven = _ways(folder / "ways.xml", streets)
     return Baseline(
@@ -154,8 +147,6 @@ def _measured(folder: Path, streets: Streets, begin: float, end: float, vehicles
         waiting=waiting,
         running=int(attribute(counts, "running")),
         dropped=max(len(vehicles - driven) - waiting, 0),
-        delay=float(attribute(trips, "totalDepartDelay"))
-        + waiting * max(float(attribute(trips, "departDelayWaiting")), 0.0),
     )
 
 

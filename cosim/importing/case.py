@@ -14,7 +14,7 @@ from typing import Protocol
 
 import sumo
 
-from cosim.sumo.xml_files import BROKEN, opened, read_xml
+from cosim.sumo.xml_files import BROKEN, file_list, opened, read_xml
 from nmfd.errors import InputError
 from nmfd.runs.files import temporary_folder
 
@@ -121,7 +121,11 @@ def sumo_input(source: Path | Box, progress: Progress, *, left_hand: bool = Fals
             progress("fetching OpenStreetMap")
             source = fetch_osm(source, folder)
         progress("netconvert")
-        yield SumoInput(source=source, net=_converted(source, folder, left_hand), notice=LICENCE)
+        net, types = folder / "osm.net.xml", Path(sumo.SUMO_HOME) / "data" / "typemap" / "osmNetconvert.typ.xml"
+        options = {"osm-files": file_list([source.resolve()]), "type-files": types, "output-file": net}
+        run_sumo("netconvert", options, *NETCONVERT, *(["--lefthand"] if left_hand else []), where=str(source))
+        net.write_bytes(re.sub(rb"<!--.*?-->\s*", b"", net.read_bytes(), count=1, flags=re.DOTALL))  # date and folder
+        yield SumoInput(source=source, net=net, notice=LICENCE)
 
 
 def read_sumo_input(path: Path) -> SumoInput:
@@ -204,18 +208,6 @@ def fetch_osm(box: Box, folder: Path) -> Path:
             f"--bbox: {where}: osmGet.py got nothing from OpenStreetMap ({' '.join(reason)}); without internet access "
             "give a file of the area, exported at https://www.openstreetmap.org/export"
         ) from None
-
-
-def _converted(osm: Path, folder: Path, left_hand: bool) -> Path:
-    """Build the network of a file of OpenStreetMap. Raises InputError with netconvert's own words."""
-    if "," in str(osm):
-        raise InputError(f"{osm}: SUMO reads no file with a comma in its path; rename it")
-    net = folder / "osm.net.xml"
-    types = Path(sumo.SUMO_HOME) / "data" / "typemap" / "osmNetconvert.typ.xml"
-    options = {"osm-files": osm.resolve(), "type-files": types, "output-file": net}
-    run_sumo("netconvert", options, *NETCONVERT, *(["--lefthand"] if left_hand else []), where=str(osm))
-    net.write_bytes(re.sub(rb"<!--.*?-->\s*", b"", net.read_bytes(), count=1, flags=re.DOTALL))  # date and folder
-    return net
 
 
 def run_sumo(program: str, options: Mapping[str, object], *flags: str, where: str) -> None:

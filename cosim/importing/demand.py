@@ -237,7 +237,11 @@ class _Reader:
         nested = element.find("routeDistribution")
         route = element.find("route") if nested is None else None
         if nested is not None:  # as marouter and duarouter write them: a vehicle keeps the route drawn for it here
-            edges = self._draw(self._distribution(nested, path))
+            routes = self._distribution(nested, path)
+            shares = np.cumsum([share for share, _ in routes])
+            edges = []
+            if routes and shares[-1] > 0:
+                edges = routes[int(np.searchsorted(shares, self._random.random() * shares[-1], side="right"))][1]
             element.remove(nested)
             element.append(Element("route", {"edges": " ".join(edges)}))
             for zone in ZONES:
@@ -251,13 +255,6 @@ class _Reader:
         if not element.get("from") or not element.get("to"):
             return [], False
         return [element.get("from", ""), *element.get("via", "").split(), element.get("to", "")], False
-
-    def _draw(self, routes: Sequence[tuple[float, list[str]]]) -> list[str]:
-        """Draw the edges of one of (probability, edges); none without any."""
-        shares = np.cumsum([share for share, _ in routes])
-        if not routes or shares[-1] <= 0:
-            return []
-        return routes[int(np.searchsorted(shares, self._random.random() * shares[-1], side="right"))][1]
 
     def _reachable(self, kept: list[Kept]) -> list[Kept]:
         """Leave out trips without a path from their first to their last edge."""

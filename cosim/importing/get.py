@@ -4,13 +4,13 @@ Addresses name a version that does not change: a commit of GitHub, or a release 
 """
 
 import os
+import shutil
 import subprocess
 import sys
 import urllib.request
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from nmfd.errors import InputError, did_you_mean
 from nmfd.runs.files import temporary_folder
@@ -86,34 +86,27 @@ def get(name: str, out: Path) -> str:
         raise InputError(f"--out: {out} exists; choose another folder, or remove it")
     city = CITIES[name]
     out.parent.mkdir(parents=True, exist_ok=True)
+    notice = f"{name}: {city.about}\nLicence: {city.licence}\nFetched from {city.source}\n"
     with temporary_folder(f".{out.name}-", where=out.parent) as folder:
-        archive = _fetched(city.source, folder)
-        try:
-            with zipfile.ZipFile(archive) as packed:
-                packed.extractall(folder)
-            city_folder = folder / PurePosixPath(city.folder)
-            notice = f"{name}: {city.about}\nLicence: {city.licence}\nFetched from {city.source}\n"
-            (city_folder / "NOTICE.cosim.txt").write_text(notice, encoding="utf-8")
-            os.replace(city_folder, out)
-        except (OSError, zipfile.BadZipFile) as error:
-            raise InputError(f"{name}: {city.source} is no archive with {city.folder} ({error})") from None
-    return f"{notice}Next: cosim import {out / city.start} --out networks/{name}"
-
-
-def _fetched(source: str, folder: Path) -> Path:
-    """Download an archive. Raises InputError."""
-    try:
-        if "://" in source:
-            archive = folder / "archive.zip"
-            with urllib.request.urlopen(source, timeout=SERVER_TIME_LIMIT_S) as answer:
-                archive.write_bytes(answer.read())
-            return archive
+        archive = folder / "archive.whl"
         pip = [sys.executable, "-m", "pip", "download", "--no-deps", "--only-binary", ":all:", "--dest", str(folder)]
-        subprocess.run([*pip, source], check=True, capture_output=True, text=True)
-        return next(folder.glob("*.whl"))  # a zip
-    except (OSError, StopIteration, subprocess.CalledProcessError) as error:
-        reason = (getattr(error, "stderr", "") or str(error)).strip().splitlines()[-1:]
-        raise InputError(f"{source} cannot be fetched ({' '.join(reason)}); try again with internet access") from None
+        try:
+            if "://" in city.source:
+                with urllib.request.urlopen(city.source, timeout=SERVER_TIME_LIMIT_S) as answer:
+                    archive.write_bytes(answer.read())
+            else:
+                subprocess.run([*pip, city.source], check=True, capture_output=True, text=True)
+                archive = next(folder.glob("*.whl"))
+            shutil.unpack_archive(archive, folder, "zip")
+            (folder / city.folder / "NOTICE.cosim.txt").write_text(notice, encoding="utf-8")
+            os.replace(folder / city.folder, out)
+        except (OSError, StopIteration, subprocess.CalledProcessError) as error:
+            reason = (getattr(error, "stderr", "") or str(error)).strip().splitlines()[-1:]
+            raise InputError(
+                f"{name}: {city.folder} of {city.source} cannot be fetched ({' '.join(reason)}); try again with "
+                "internet access"
+            ) from None
+    return f"{notice}Next: cosim import {out / city.start} --out networks/{name}"
 
 
 def listed() -> str:

@@ -265,9 +265,8 @@ def _report(
         + f"; {len(streets.logics):,} signals; {len(traffic.vehicles):,} vehicles in {clock.steps} intervals of "
         f"{clock.step:g} s{_notes(traffic)}",
         text_table(tables.quality, CAPTION),
-        f"without control: driving takes {baseline.pace(streets):.1f} times as long as at the speed limits; "
-        f"{baseline.teleports} teleports, {baseline.running} vehicles on the road and {baseline.waiting} waiting to "
-        f"enter at the end, {baseline.dropped:,} without a route or a free lane",
+        f"without control: {baseline.teleports} teleports; at the end {baseline.running} vehicles on the road and "
+        f"{baseline.waiting} waiting to enter; {baseline.dropped:,} without a route or a free lane",
     ]
     if assigned is not None:
         gap, iteration, count = assigned.gaps[assigned.best], assigned.best + 1, len(assigned.gaps)

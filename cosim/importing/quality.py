@@ -9,7 +9,7 @@ import pandas as pd
 
 from cosim.importing.baseline import INTERVAL_S, Baseline
 from cosim.importing.streets import Streets
-from cosim.sumo.arrays import EdgeMask, EdgeNumbers, PerEdge
+from cosim.sumo.arrays import EdgeMask, EdgeNumbers
 from cosim.sumo.net import City
 from cosim.sumo.signals import FIXED, HELD
 from nmfd.model import authority
@@ -60,41 +60,31 @@ def tables(
     density = np.zeros(len(regions)) if baseline is None else 1000.0 * baseline.density(streets)
     approaches = pd.Series({edge: regions[streets.number[edge]] for edge in city.signals}, dtype=int)
     main_region = approaches.groupby(city.signals).agg(lambda part: part.mode()[0])
-    signals = np.bincount(main_region, minlength=len(names))
-    rows = []
-    for region, name in enumerate(names):
-        own = [g for g in gateways if region in (g["source"], g["target"])]
-        rows.append(_row(streets, regions == region, str(region), name, signals[region], density, own))
-    rows.append(_row(streets, regions >= 0, "all", "all regions", signals.sum(), density, gateways))
-    return Tables(quality=rows, gateways=gateways)
 
+    def row(region: str, name: str, members: EdgeMask, own: Sequence[Mapping]) -> dict:
+        usable = members & streets.drivable
+        lanes = streets.lane_metres[usable]
+        mean = float(np.average(density[usable], weights=lanes))
+        flow = sum(g["flow_veh"] for g in own)
+        free = sum(g["flow_veh"] for g in own if g["control"] != CONTROLLED)
+        return {
+            "region": region,
+            "name": name,
+            "edges": int(usable.sum()),
+            "lane_km": round(float(lanes.sum()) / 1000.0, 2),
+            "signals": int(main_region.isin(regions[members]).sum()),
+            "density_veh_km": round(mean, 2),
+            "variance": round(float(np.average((density[usable] - mean) ** 2, weights=lanes)), 2),
+            "gateways": len(own),
+            "controlled_gateways": sum(g["control"] == CONTROLLED for g in own),
+            "uncontrolled_share": round(free / flow, 3) if flow else np.nan,
+        }
 
-def _row(
-    streets: Streets,
-    members: EdgeMask,
-    region: str,
-    name: str,
-    signals: int,
-    density: PerEdge,
-    gateways: Sequence[Mapping],
-) -> dict:
-    usable = members & streets.drivable
-    lanes = streets.lane_metres[usable]
-    mean = float(np.average(density[usable], weights=lanes))
-    flow = sum(g["flow_veh"] for g in gateways)
-    free = sum(g["flow_veh"] for g in gateways if g["control"] != CONTROLLED)
-    return {
-        "region": region,
-        "name": name,
-        "edges": int(usable.sum()),
-        "lane_km": round(float(lanes.sum()) / 1000.0, 2),
-        "signals": int(signals),
-        "density_veh_km": round(mean, 2),
-        "variance": round(float(np.average((density[usable] - mean) ** 2, weights=lanes)), 2),
-        "gateways": len(gateways),
-        "controlled_gateways": sum(g["control"] == CONTROLLED for g in gateways),
-        "uncontrolled_share": round(free / flow, 3) if flow else np.nan,
-    }
+    rows = [
+        row(str(n), name, regions == n, [g for g in gateways if n in (g["source"], g["target"])])
+        for n, name in enumerate(names)
+    ]
+    return Tables(quality=[*rows, row("all", "all regions", regions >= 0, gateways)], gateways=gateways)
 
 
 def left_alone(streets: Streets, switched: Sequence[str] = ()) -> dict[str, str]:
