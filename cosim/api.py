@@ -103,15 +103,11 @@ def run_controllers(
 ) -> str:
     """Run strategies on the same trips with a run folder, two at a time; return a report.
 
-    settings: see nmfd.load_scenario
-    demand: multiple of the scenario's demand
+    settings: see nmfd.load_scenario; other arguments as in `run`
     policy: policy file of the first controller, if not SCENARIO/NAME.pt
     sumo_output: kinds of SUMO's own outputs to write (cosim.sumo.outputs)
     out: run folder, runs/SCENARIO-TIME if None
-
-    Raises:
-        InputError: a file, name or value is wrong
-        RunFailed: a run failed
+    Raises: InputError, and RunFailed if a run failed
     """
     loaded = with_demand(load_scenario(scenario, settings), steps=steps)
     strategies = [parse(name) for name in dict.fromkeys(controllers)]
@@ -119,11 +115,8 @@ def run_controllers(
     if all(strategy.name != "no-control" for strategy in strategies):
         strategies.reverse()  # the other controllers are compared with the first one
     out = default_folder(loaded.name) if out is None else out
-    runs = runs_of(
-        loaded, strategies, [seed], demand=demand, policies=policies, sumo_output=tuple(sumo_output or ()), out=out
-    )
-    rows = run_many(runs, out, workers=2)
-    raise_failures(rows)
+    how = {"demand": demand, "policies": policies, "sumo_output": tuple(sumo_output or ()), "out": out}
+    raise_failures(run_many(runs_of(loaded, strategies, [seed], **how), out, workers=2))
     finished = results.read(out)
     there = [level.read(*name) for level in finished.levels for name in level.runs]
     draw_accumulations(out, loaded, there)
@@ -207,10 +200,7 @@ def evaluate(
     scheduler: address of a Dask scheduler that does the runs instead
     check: do only so many random runs of `out` again, and compare
     out: folder, runs/SCENARIO-evaluate if None
-
-    Raises:
-        InputError: a file, name or value is wrong
-        RunFailed: runs failed
+    Raises: InputError, and RunFailed if runs failed
     """
     if Path(scenario).suffix == ".toml":
         chosen, seeds = evaluation.read_suite(Path(scenario), settings)
@@ -226,9 +216,8 @@ def evaluate(
         runs = evaluation.plan(chosen, strategies, seeds, policies)
         lines = evaluation.check(runs, out, check, workers=workers)
         return "\n".join(lines) or f"{min(check, len(runs))} runs of {out} done again: no difference"
-    rows = evaluation.evaluate(
-        chosen, strategies, seeds, out=out, policies=policies, workers=workers, scheduler=scheduler
-    )
+    how = {"policies": policies, "workers": workers, "scheduler": scheduler}
+    rows = evaluation.evaluate(chosen, strategies, seeds, out=out, **how)
     text = []
     for each in dict.fromkeys(results.finished_rows(rows).get("scenario", ())):
         finished = results.read(out, each)
@@ -312,24 +301,18 @@ def import_city(
     *,
     out: Path,
     regions: int | str,
-    left_hand: bool = False,
-    routes: Sequence[Path] = (),
     demand: str | None = None,
-    level: float = 1.0,
-    mesoscopic: bool = False,
     begin: str | None = None,
     end: str | None = None,
-    seed: int = 0,
-    seeds: int = 3,
+    **options: Any,
 ) -> str:
     """Write network and scenario of a SUMO city; return a report.
 
     source: a sumocfg, a net, a file of OpenStreetMap, or a box "W,S,E,N" of it as text
     regions: number of regions to find, or the file of a table edge,region
     demand: "peak" generates a morning peak
-    level: factor on the vehicles, or on the peak
     begin, end: time window, in seconds or as h:m:s
-    seeds: runs without control whose densities are averaged
+    options: left_hand, routes, level, mesoscopic, seed, seeds (cosim.importing.importer.import_city)
     """
     number = int(regions) if str(regions).isdecimal() else None
     if number is not None and number < 2:
@@ -341,15 +324,10 @@ def import_city(
             out,
             scenario,
             regions=number or Path(str(regions)),
-            left_hand=left_hand,
-            routes=tuple(routes),
             peak=demand is not None,
-            level=level,
-            mesoscopic=mesoscopic,
             begin=None if begin is None else seconds(begin, "--begin"),
             end=None if end is None else seconds(end, "--end"),
-            seed=seed,
-            seeds=seeds,
+            **options,
             progress=lambda stage, share=0.0: show and show(round(100 * share), 100, stage),
         )
     return f"{text}\nWritten to {out} (see map.png, quality.csv, gateways.csv) and {scenario}"
@@ -389,10 +367,9 @@ def identify(
     report = []
     for guided in kinds or [strategy.guides]:
         loaded = load_scenario(scenario, settings)  # the second model takes the split ratios of the first
-        suffix = "-guided" if guided else ""
-        folder = Path("runs") / f"{file_name(loaded.name)}-identify{suffix}" if out is None else out
-        if out is not None and len(kinds) > 1 and guided:
-            folder = out / "guided"
+        folder = Path("runs") / f"{file_name(loaded.name)}-identify{'-guided' * guided}"
+        if out is not None:
+            folder = out / "guided" if len(kinds) > 1 and guided else out
         loading = identification.Loading(
             levels=levels,
             seeds=range(1000, 1000 + seeds),
@@ -403,11 +380,10 @@ def identify(
             runs=runs,
         )
         with watched("identify", None) as show:
-            text = identification.identify(
-                loaded, loading, out=folder, workers=workers, scheduler=scheduler, progress=show
-            )
+            how = {"workers": workers, "scheduler": scheduler, "progress": show}
+            report.append(identification.identify(loaded, loading, out=folder, **how))
         target = os.path.normpath(loading.target(loaded) / "network.toml")
-        report += [text, f"Written to {target}; samples and figures to {folder}"]
+        report.append(f"Written to {target}; samples and figures to {folder}")
     return "\n".join(report)
 
 

@@ -20,8 +20,7 @@ from nmfd.types import Result
 class Level:
     """Finished runs of one scenario at one demand level.
 
-    demand: multiple of the scenario's demand; folder: of the result files; rows: one per run
-    key: what all runs depend on; controllers: name -> what only its runs depend on
+    rows: one per run; key: what all runs depend on; controllers: name -> what only its runs depend on
     """
 
     demand: float
@@ -87,15 +86,12 @@ def read(path: Path, scenario: str | None = None) -> Finished:
     rows = rows[rows["scenario"] == (scenario or rows["scenario"].iloc[0])]
     levels = []
     for demand, part in rows.groupby("demand", sort=True):
-        folder = part["folder"].iloc[0]
-        part = part.reset_index(drop=True)
+        folder, part = part["folder"].iloc[0], part.reset_index(drop=True)
         levels.append(Level(demand=float(demand), folder=path / folder, rows=part, **manifest["folders"][folder]))
     run = levels[0].read(*levels[0].runs[0])
-    place = Path(run.scenario_folder)
-    if not (place / "scenario.toml").is_file():
-        place = Path(run.scenario)  # a shipped one, on another machine
-    sessions = tuple(manifest["sessions"])
-    return Finished(path=path, levels=tuple(levels), scenario=load_scenario(place), sessions=sessions)
+    here = (Path(run.scenario_folder) / "scenario.toml").is_file()
+    loaded = load_scenario(run.scenario_folder if here else run.scenario)  # a shipped one, on another machine
+    return Finished(path=path, levels=tuple(levels), scenario=loaded, sessions=tuple(manifest["sessions"]))
 
 
 def finished_rows(rows: pd.DataFrame) -> pd.DataFrame:

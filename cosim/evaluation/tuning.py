@@ -16,7 +16,8 @@ import re
 import warnings
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -38,7 +39,7 @@ from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
 from nmfd.runs import files
 from nmfd.runs.progress import Progress
-from nmfd.runs.run_many import TABLE, raise_failures, run_many
+from nmfd.runs.run_many import TABLE, Run, raise_failures, run_many
 from nmfd.runs.tables import text_table
 
 OPTION = re.compile(r"([a-z_]\w*)(?:\[([0-9])\])?")  # KEY, or KEY[N] for one number of a list
@@ -51,8 +52,10 @@ Range: TypeAlias = FloatDistribution | IntDistribution
 class Tuning:
     """Search for the options of a strategy.
 
-    options: KEY or KEY[N] -> (low, high); trials: number of candidates, the scenario's own options first; seeds,
-    levels: runs of every candidate; search_seed: of CMA-ES and of training
+    options: KEY or KEY[N] -> (low, high)
+    trials: number of candidates, the scenario's own options first
+    seeds, levels: runs of every candidate
+    search_seed: of CMA-ES and of training
     """
 
     scenario: Scenario
@@ -63,7 +66,6 @@ class Tuning:
     seeds: Sequence[int] = (1000, 1001)
     levels: Sequence[float] = (1.0,)
     search_seed: int = 0
-    space: Mapping[str, Range] = field(init=False)
 
     def __post_init__(self) -> None:
         """Check the options. Raise InputError."""
@@ -73,25 +75,19 @@ class Tuning:
                     "options: expected KEY=LOW:HIGH with LOW below HIGH, such as kp=0.1:10 or set_point[0]=200:600, "
                     f"got {name}={low:g}:{high:g} instead"
                 )
+        for end in ("low", "high"):
+            check_tables(self.tuned({name: getattr(span, end) for name, span in self.space.items()}))
+
+    @cached_property
+    def space(self) -> dict[str, Range]:
+        """Option -> its distribution."""
         declared = self.strategy.controller.options.model_fields
-        whole = {name for name in self.options if name in declared and declared[name].annotation is int}
-        space: dict[str, Range] = {
+        return {
             name: IntDistribution(math.ceil(low), math.floor(high))
-            if name in whole
+            if name in declared and declared[name].annotation is int
             else FloatDistribution(low, high, log=low > 0.0 and high / low > 10.0)
             for name, (low, high) in self.options.items()
         }
-        object.__setattr__(self, "space", space)
-        for end in ("low", "high"):
-            try:
-                check_tables(self.tuned({name: getattr(span, end) for name, span in space.items()}))
-            except KeyError as error:
-                raise InputError(f"options: {error.args[0]}: the numbers before it need a range, too") from None
-
-    @property
-    def trains(self) -> bool:
-        """True if every candidate trains a policy."""
-        return self.strategy.controller.options is training.Training
 
     def tuned(self, values: Mapping[str, float]) -> Scenario:
         """Return the scenario with one value per option; numbers of a list without a range keep their value."""
@@ -104,7 +100,7 @@ class Tuning:
             else:
                 numbers = table.setdefault(key, list(self.value(key) or ()))
                 if index > len(numbers):
-                    raise KeyError(name)
+                    raise InputError(f"options: {name}: the numbers before it need a range, too")
                 numbers[index : index + 1] = [rounded]
         name, tables = self.strategy.table(self.scenario), self.scenario.controller_options
         return replace(self.scenario, controller_options={**tables, name: {**tables.get(name, {}), **table}})
@@ -156,9 +152,10 @@ def tune(order: Tuning, *, workers: int = 1, scheduler: str | None = None, progr
         for _ in range(0 if running else min(left, generation if begun else 1)):
             number = len(study.get_trials(deepcopy=False))
             study.sampler = _sampler(order, number)
-            study.ask(dict(order.space))
+            study.ask(order.space)
         running = [trial for trial in study.get_trials(deepcopy=False) if trial.state == TrialState.RUNNING]
-        rows = _run(order, running, city, workers, scheduler, progress)
+        runs = _runs(order, running, city, workers)
+        rows = run_many(runs, order.out / "runs", workers=workers, scheduler=scheduler, progress=progress)
         for trial in running:
             totals = np.maximum(list(_totals(order, rows, trial.number).values()), 1.0)  # a city may be empty
             score = float(np.exp(np.log(totals).mean()))
@@ -227,30 +224,22 @@ def _sampler(order: Tuning, number: int) -> CmaEsSampler:
         )
 
 
-def _run(
-    order: Tuning,
-    trials: Sequence[FrozenTrial],
-    city: Mapping[str, object],
-    workers: int,
-    scheduler: str | None,
-    progress: Progress,
-) -> pd.DataFrame:
-    """Train and run some candidates; return the rows of their runs."""
+def _runs(order: Tuning, trials: Sequence[FrozenTrial], city: Mapping[str, object], workers: int) -> list[Run]:
+    """Train some candidates if their options train a policy; return their runs."""
     scenarios = {trial.number: order.tuned(trial.params) for trial in trials}
+    trains = order.strategy.controller.options is training.Training
     untrained = {number: scenario for number, scenario in scenarios.items() if not order.policy(number).is_file()}
-    if order.trains and untrained:
+    if trains and untrained:
         order.policy(0).parent.mkdir(exist_ok=True)
         with ProcessPoolExecutor(max(workers, 1), mp_context=multiprocessing.get_context("spawn")) as pool:
             list(pool.map(_train, [order] * len(untrained), untrained, untrained.values()))
     runs = []
     for number, scenario in scenarios.items():
         for level in order.levels:
-            policies = {order.strategy.name: order.policy(number)} if order.trains else {}
-            folder = f"candidate-{number:03d}/demand-{level:g}"
-            runs += runs_of(
-                scenario, [order.strategy], order.seeds, city=city, demand=level, policies=policies, folder=folder
-            )
-    return run_many(runs, order.out / "runs", workers=workers, scheduler=scheduler, progress=progress)
+            policies = {order.strategy.name: order.policy(number)} if trains else {}
+            how = {"city": city, "policies": policies, "folder": f"candidate-{number:03d}/demand-{level:g}"}
+            runs += runs_of(scenario, [order.strategy], order.seeds, demand=level, **how)
+    return runs
 
 
 def _train(order: Tuning, number: int, scenario: Scenario) -> None:
@@ -274,15 +263,10 @@ def _totals(order: Tuning, rows: pd.DataFrame, number: int) -> dict[str, float]:
 def _write(order: Tuning, study: optuna.Study) -> pd.DataFrame:
     """Write tune.csv and tune.toml, and return the table."""
     rows = pd.read_csv(order.out / "runs" / TABLE)
+    done = [trial for trial in study.get_trials(deepcopy=False) if trial.state.is_finished()]
+    scores = [{"candidate": one.number, SCORE: math.nan if one.value is None else one.value} for one in done]
     table = pd.DataFrame(
-        {
-            "candidate": trial.number,
-            SCORE: math.nan if trial.value is None else trial.value,
-            **trial.params,
-            **_totals(order, rows, trial.number),
-        }
-        for trial in study.get_trials(deepcopy=False)
-        if trial.state.is_finished()
+        score | one.params | _totals(order, rows, one.number) for score, one in zip(scores, done, strict=True)
     )
     files.write_table(order.out / "tune.csv", table)
     if table[SCORE].notna().any():
