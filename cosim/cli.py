@@ -1,7 +1,6 @@
 """Command line `cosim`: it parses options and calls cosim.api."""
 
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ from nmfd.cli import (
     Number,
     listed,
     out_option,
+    parsed,
     seed_option,
 )
 from nmfd.errors import InputError
@@ -49,19 +49,10 @@ LEVELS = click.option(
 )
 
 
-def parsed_ranges(
-    _ctx: click.Context, _param: click.Parameter, values: Sequence[str]
-) -> dict[str, tuple[float, float]]:
-    """Parse KEY=LOW:HIGH."""
-    ranges = {}
-    for text in values:
-        key, _, span = text.partition("=")
-        low, _, high = span.partition(":")
-        try:
-            ranges[key.strip()] = float(low), float(high)
-        except ValueError:
-            raise click.BadParameter(f"expected KEY=LOW:HIGH, such as kp=0.1:10, got {text!r} instead") from None
-    return ranges
+def span(text: str) -> tuple[float, float]:
+    """Parse LOW:HIGH. Raises ValueError."""
+    low, _, high = text.partition(":")
+    return float(low), float(high)
 
 
 @click.group(
@@ -223,7 +214,7 @@ def report(folders: tuple[Path, ...], **options: Any) -> None:
     required=True,
     multiple=True,
     metavar="KEY=LOW:HIGH",
-    callback=parsed_ranges,
+    callback=parsed("KEY=LOW:HIGH, such as kp=0.1:10", span),
     help="Option of the controller and its range; KEY[0], KEY[1] for numbers of a list. May be repeated.",
 )
 @click.option(

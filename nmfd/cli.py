@@ -84,29 +84,30 @@ def listed(kind: click.ParamType) -> Callable[[str], tuple]:
     return parse
 
 
-def parsed_settings(_ctx: click.Context, _param: click.Parameter, values: Sequence[str]) -> dict[str, Any]:
-    """Parse KEY=VALUE; a value that is not TOML is text."""
-    settings = {}
-    for text in values:
-        key, equals, value = text.partition("=")
-        if not key.strip() or not equals:
-            raise click.BadParameter(f"expected KEY=VALUE, such as steps=12, got {text!r} instead")
-        try:
-            settings[key.strip()] = tomllib.loads(f"value = {value}")["value"]
-        except tomllib.TOMLDecodeError:
-            settings[key.strip()] = value.strip()
-    return settings
+def parsed(form: str, convert: Callable[[str], Any]) -> Callable:
+    """Return the callback of a repeated option KEY=VALUE, which gives a dict; `form` begins with its metavar."""
+
+    def parse(_ctx: click.Context, _param: click.Parameter, values: Sequence[str]) -> dict[str, Any]:
+        result = {}
+        for text in values:
+            key, _, value = text.partition("=")
+            try:
+                if not key.strip() or not value:
+                    raise ValueError
+                result[key.strip()] = convert(value.strip())
+            except ValueError:
+                raise click.BadParameter(f"expected {form}, got {text!r} instead") from None
+        return result
+
+    return parse
 
 
-def parsed_policies(_ctx: click.Context, _param: click.Parameter, values: Sequence[str]) -> dict[str, Path]:
-    """Parse NAME=FILE."""
-    policies = {}
-    for text in values:
-        name, equals, file = text.partition("=")
-        if not name or not equals or not file:
-            raise click.BadParameter(f"expected NAME=FILE, such as dpc-pc=mine.pt, got {text!r} instead")
-        policies[name] = Path(file)
-    return policies
+def toml_or_text(value: str) -> Any:
+    """Return a value of TOML, or the text if it is none."""
+    try:
+        return tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return value
 
 
 def print_citation(ctx: click.Context, _param: click.Parameter, requested: bool) -> None:
@@ -126,7 +127,7 @@ SET = click.option(
     "settings",
     multiple=True,
     metavar="KEY=VALUE",
-    callback=parsed_settings,
+    callback=parsed("KEY=VALUE, such as steps=12", toml_or_text),
     help="Change a setting of the scenario, such as steps=12 or controllers.pi-gating.kp=2. May be repeated.",
 )
 SCENARIO = combined(click.argument("scenario", type=click.Path(path_type=Path)), SET)
@@ -142,7 +143,7 @@ POLICIES = click.option(
     "policies",
     multiple=True,
     metavar="NAME=FILE",
-    callback=parsed_policies,
+    callback=parsed("NAME=FILE, such as dpc-pc=mine.pt", Path),
     help="Policy or plan file of a controller. May be repeated. [default: SCENARIO/NAME.pt or .npz]",
 )
 WORKERS = click.option("--workers", type=COUNT, default=1, show_default=True, help="Runs at a time.")

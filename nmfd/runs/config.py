@@ -10,7 +10,6 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from nmfd.errors import InputError, did_you_mean
 
-MOST = 10**9  # default limit of a whole number
 SHOWN_CHARACTERS = 60  # of a wrong value in a message
 S = TypeVar("S", bound="Settings")
 
@@ -22,11 +21,9 @@ def setting(text: str, default: Any = ..., *, unit: str = "", **limits: Any) -> 
     return Field(default, description=text, **limits)
 
 
-def whole(
-    text: str, default: Any = ..., *, low: int = 0, high: int = MOST, unit: str = "", alias: str | None = None
-) -> Any:
+def whole(text: str, default: Any = ..., *, low: int = 0, high: int = 10**9, **more: Any) -> Any:
     """Return the field of a whole number from `low` to `high`."""
-    return setting(text, default, unit=unit, ge=low, le=high, alias=alias)
+    return setting(text, default, ge=low, le=high, **more)
 
 
 class Problem(ValueError):
@@ -102,20 +99,12 @@ def error(where: Path | str, key: str, problem: str) -> InputError:
 
 def got(allowed: str, value: Any) -> str:
     """Return what a value should have been and what it is."""
-    return f"expected {allowed}, got {_shown(value)} instead"
+    return f"expected {allowed}, got {repr(value)[:SHOWN_CHARACTERS]} instead"
 
 
 def quoted(text: str) -> str:
     """Return a text without line breaks as TOML writes it."""
     return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
-
-
-def _shown(value: Any) -> str:
-    try:
-        text = repr(value)
-    except ValueError:  # Python prints no whole numbers of thousands of digits
-        text = "a number of thousands of digits"
-    return text if len(text) <= SHOWN_CHARACTERS else text[:SHOWN_CHARACTERS] + "..."
 
 
 def _first_problem(declaration: type[Settings], invalid: ValidationError) -> str:
@@ -134,7 +123,7 @@ def _first_problem(declaration: type[Settings], invalid: ValidationError) -> str
         return f"{path}: unknown key{hint}; allowed here: {', '.join(keys)}; remove or correct it"
     text = re.sub(r"^(Value error, |(Input|String|Tuple|List|Value) (?=should))", "", first["msg"])
     text = re.sub("dictionary( or instance of .*)?", "table", text)
-    return f"{path}: {text}, got {_shown(first['input'])}"
+    return f"{path}: {text}, got {repr(first['input'])[:SHOWN_CHARACTERS]}"
 
 
 def _table(declaration: type[BaseModel], path: tuple[int | str, ...]) -> type[BaseModel]:
