@@ -221,7 +221,7 @@ def test_options_and_includes_of_the_user_count(config, tmp_path):
         '<mesosim v="true"/><max-depart-delay value="60"/><tripinfo-output value="trips.xml"/></configuration>'
     )
     case = read_sumo_input(tmp_path / "city.sumocfg")
-    assert case.scale == 2.5 and case.mesoscopic and case.left_out == ["max-depart-delay = 60"]
+    assert case.scale == 2.5 and case.mesoscopic and case.left_out == ("max-depart-delay = 60",)
     text = good(
         cosim(
             "import",

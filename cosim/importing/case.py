@@ -8,7 +8,7 @@ import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -19,7 +19,6 @@ from nmfd.errors import InputError
 from nmfd.runs.files import temporary_folder
 
 ENDLESS_S = 1e9  # a later end is none
-TAKEN = ("step-length", "time-to-teleport", "scale", "mesosim")
 # Options that change what is written or shown, or how fast, but not the traffic.
 IDLE = re.compile(
     r".*output.*|.*log.*|.*threads|(verbose|no-warnings|quit|start|delay|seed|random|precision|version|remote|xml|gui|"
@@ -54,7 +53,9 @@ class SumoInput:
 
     source: the given file; net; routes and additional in SUMO's order
     begin, end: [s]; end is None if it is open
-    options: all other options of the sumocfg
+    scale: factor of the demand [-]; step_length [s]; mesoscopic: by SUMO's queue model
+    time_to_teleport: waiting time before a teleport [s], -1 for never
+    left_out: options that may change the traffic and are not taken over, as NAME = VALUE
     notice: required by the licence of the data
     """
 
@@ -64,38 +65,12 @@ class SumoInput:
     additional: tuple[Path, ...] = ()
     begin: float = 0.0
     end: float | None = None
-    options: Mapping[str, str] = field(default_factory=dict)
+    scale: float = 1.0
+    step_length: float = 1.0
+    time_to_teleport: float = 300.0
+    mesoscopic: bool = False
+    left_out: tuple[str, ...] = ()
     notice: str = ""
-
-    @property
-    def scale(self) -> float:
-        """SUMO's factor of the demand [-]. Raises InputError."""
-        try:
-            return float(text := self.options.get("scale", "1"))
-        except ValueError:
-            raise InputError(f"{self.source}: scale: expected a number, got {text!r} instead") from None
-
-    @property
-    def step_length(self) -> float:
-        """Length of SUMO's steps [s]. Raises InputError."""
-        return seconds(self.options.get("step-length", "1"), f"{self.source}: step-length")
-
-    @property
-    def time_to_teleport(self) -> float:
-        """Waiting time before a teleport [s], -1 for never. Raises InputError."""
-        given = seconds(self.options.get("time-to-teleport", "300"), f"{self.source}: time-to-teleport")
-        return given if given > 0 else -1.0
-
-    @property
-    def mesoscopic(self) -> bool:
-        """True if SUMO's queue model is set."""
-        return self.options.get("mesosim", "false").lower() in ("true", "1", "yes", "on", "x")
-
-    @property
-    def left_out(self) -> list[str]:
-        """Options that may change the traffic and are not taken over, as NAME = VALUE."""
-        options = sorted(self.options.items())
-        return [f"{name} = {value}" for name, value in options if name not in TAKEN and not IDLE.fullmatch(name)]
 
 
 @contextmanager
@@ -146,15 +121,23 @@ def read_sumo_input(path: Path) -> SumoInput:
                 raise InputError(f"{path}: {key}: no such file: {file}; correct the name or add the file")
     if not files["net-file"]:
         raise InputError(f'{path}: net-file: missing; add <net-file value="city.net.xml"/> to its <input>')
-    end = seconds(options.pop("end", "-1"), f"{path}: end")
+
+    def number(name: str, default: str) -> float:
+        return seconds(options.pop(name, default), f"{path}: {name}")
+
+    end, teleport = number("end", "-1"), number("time-to-teleport", "300")
     return SumoInput(
         source=path,
         net=files["net-file"][0],
         routes=files["route-files"],
         additional=files["additional-files"],
-        begin=seconds(options.pop("begin", "0"), f"{path}: begin"),
+        begin=number("begin", "0"),
         end=end if 0 < end < ENDLESS_S else None,
-        options=options,
+        scale=number("scale", "1"),
+        step_length=number("step-length", "1"),
+        time_to_teleport=teleport if teleport > 0 else -1.0,
+        mesoscopic=options.pop("mesosim", "false").lower() in ("true", "1", "yes", "on", "x"),
+        left_out=tuple(f"{name} = {value}" for name, value in sorted(options.items()) if not IDLE.fullmatch(name)),
     )
 
 
