@@ -115,8 +115,9 @@ def run_controllers(
     if all(strategy.name != "no-control" for strategy in strategies):
         strategies.reverse()  # the other controllers are compared with the first one
     out = default_folder(loaded.name) if out is None else out
-    how = {"demand": demand, "policies": policies, "sumo_output": tuple(sumo_output or ()), "out": out}
-    raise_failures(run_many(runs_of(loaded, strategies, [seed], **how), out, workers=2))
+    sumo_files = tuple(sumo_output or ())
+    runs = runs_of(loaded, strategies, [seed], demand=demand, policies=policies, sumo_output=sumo_files, out=out)
+    raise_failures(run_many(runs, out, workers=2))
     finished = results.read(out)
     there = [level.read(*name) for level in finished.levels for name in level.runs]
     draw_accumulations(out, loaded, there)
@@ -216,8 +217,9 @@ def evaluate(
         runs = evaluation.plan(chosen, strategies, seeds, policies)
         lines = evaluation.check(runs, out, check, workers=workers)
         return "\n".join(lines) or f"{min(check, len(runs))} runs of {out} done again: no difference"
-    how = {"policies": policies, "workers": workers, "scheduler": scheduler}
-    rows = evaluation.evaluate(chosen, strategies, seeds, out=out, **how)
+    rows = evaluation.evaluate(
+        chosen, strategies, seeds, out=out, policies=policies, workers=workers, scheduler=scheduler
+    )
     text = []
     for each in dict.fromkeys(results.finished_rows(rows).get("scenario", ())):
         finished = results.read(out, each)
@@ -380,8 +382,10 @@ def identify(
             runs=runs,
         )
         with watched("identify", None) as show:
-            how = {"workers": workers, "scheduler": scheduler, "progress": show}
-            report.append(identification.identify(loaded, loading, out=folder, **how))
+            text = identification.identify(
+                loaded, loading, out=folder, workers=workers, scheduler=scheduler, progress=show
+            )
+        report.append(text)
         target = os.path.normpath(loading.target(loaded) / "network.toml")
         report.append(f"Written to {target}; samples and figures to {folder}")
     return "\n".join(report)

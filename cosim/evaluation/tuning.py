@@ -237,8 +237,10 @@ def _runs(order: Tuning, trials: Sequence[FrozenTrial], city: Mapping[str, objec
     for number, scenario in scenarios.items():
         for level in order.levels:
             policies = {order.strategy.name: order.policy(number)} if trains else {}
-            how = {"city": city, "policies": policies, "folder": f"candidate-{number:03d}/demand-{level:g}"}
-            runs += runs_of(scenario, [order.strategy], order.seeds, demand=level, **how)
+            folder = f"candidate-{number:03d}/demand-{level:g}"
+            runs += runs_of(
+                scenario, [order.strategy], order.seeds, demand=level, city=city, policies=policies, folder=folder
+            )
     return runs
 
 

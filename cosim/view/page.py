@@ -132,7 +132,8 @@ def with_slider(picture: CityPicture, runs: Mapping[str, Sequence[Frame]]) -> La
         [[source, ColumnDataSource({name: [] for name in names}), names] for source, names in sources]
         for sources in (moving, of_region)
     )
-    words, first, texts = [], page.region, [[] for _ in page.curves.titles]
+    words, first = [], page.region
+    texts: list[list[str]] = [[] for _ in page.curves.titles]
     for k in range(last + 1):
         page.show([frames[min(k, len(frames) - 1)] for frames in whole], k * picture.step)
         _add_row(film)

@@ -18,8 +18,10 @@ CURVE_POINTS = 60  # of an MFD
 CURVE_END = 2.0  # critical accumulations, or the jam accumulation if that is less
 REGION_REACH = 0.08  # of the map's extent: places farther from all streets belong to no region
 GATE_SETBACK = 0.015  # of the map's extent: distance of a gate from the end of its street
-ROW = ("gateway_green", "gateway_original_green", "gateway_queue")  # variables of a result that `after` reads
-ROW += ("arrivals", "crossings", "edge_vehicles", "guided")
+ROW = (  # variables of a result that `after` reads
+    *("gateway_green", "gateway_original_green", "gateway_queue"),
+    *("arrivals", "crossings", "edge_vehicles", "guided"),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
