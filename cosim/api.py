@@ -136,10 +136,10 @@ def demo(out: Path, *, seed: int = 1000) -> str:
         f"{card.minutes_per_trip(row):.1f} minutes per trip"
         for row in rows[rows["seed"] == seed].to_dict("records")
     ]
-    page = html.write_page(out / "report.html", [results.read(out)], seed=seed)
+    page = html.write_page(out / "report.html", [results.read(out)], seed=seed).resolve()
     if _has_screen():
-        webbrowser.open(page.resolve().as_uri())
-    return "\n".join([*lines, f"Both side by side: {page.resolve()}"])
+        webbrowser.open(page.as_uri())
+    return "\n".join([*lines, f"Both side by side: {page}"])
 
 
 def watch(
@@ -166,7 +166,7 @@ def watch(
         except LOST:
             return "The window was closed before the end."
     else:
-        runs = live.watch(jobs, port=port, browse=_has_screen(), tell=_say)
+        runs = live.watch(jobs, port=port, browse=_has_screen())
         rows = {run.name: run.row for run in runs if run.row is not None}
     return "\n".join(
         f"{name}, seed {seed}: total time spent {row['total_time_spent_veh_s']:.4g} veh s, "
@@ -391,12 +391,7 @@ def identify(
     return "\n".join(report)
 
 
-def _say(line: str) -> None:
-    """Print a line on stderr, apart from results."""
-    print(f"cosim: {line}", file=sys.stderr)
-
-
 def _has_screen() -> bool:
-    """Return whether a browser may be opened: there is a screen and a terminal."""
+    """Return True if a browser may be opened: there is a screen and a terminal."""
     screen = not sys.platform.startswith("linux") or "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
     return screen and sys.stdout.isatty()

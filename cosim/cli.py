@@ -87,7 +87,7 @@ def demo(out: Path) -> None:
 @SCENARIO
 @CONTROLLER
 @AGAINST
-@seed_option(text="Seed of trips, drivers and guidance.")
+@seed_option("Seed of trips, drivers and guidance.")
 @STEPS
 @DEMAND
 @click.option("--policy", type=FILE, metavar="FILE", help="Policy file of --controller. [default: SCENARIO/NAME.pt]")
@@ -117,7 +117,7 @@ def run(scenario: Path, controller: str, against: str | None, **options: Any) ->
 @SCENARIO
 @CONTROLLER
 @AGAINST
-@seed_option(text="Seed of trips, drivers and guidance.")
+@seed_option("Seed of trips, drivers and guidance.")
 @DEMAND
 @click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port of the page. [default: any that is free]")
 @click.option("--gui", is_flag=True, help="Open sumo-gui instead of a page, with one run.")
@@ -140,13 +140,7 @@ def watch(scenario: Path, controller: str, against: str | None, gui: bool, **opt
 @SCENARIO
 @CONTROLLERS
 @click.option("--seeds", type=COUNT, default=10, show_default=True, help="Runs per controller and demand level.")
-@click.option(
-    "--first-seed",
-    type=SEED,
-    default=2000,
-    show_default=True,
-    help="First seed; development uses seeds below 2000.",
-)
+@click.option("--first-seed", type=SEED, default=2000, show_default=True, help="Development uses seeds below 2000.")
 @LEVELS
 @STEPS
 @POLICIES

@@ -149,9 +149,9 @@ POLICIES = click.option(
 WORKERS = click.option("--workers", type=COUNT, default=1, show_default=True, help="Runs at a time.")
 
 
-def seed_option(default: int = 0, text: str = "Random seed.") -> Callable:
+def seed_option(text: str = "Random seed.") -> Callable:
     """Return the option --seed."""
-    return click.option("--seed", type=SEED, default=default, show_default=True, help=text)
+    return click.option("--seed", type=SEED, default=0, show_default=True, help=text)
 
 
 def out_option(default: str, text: str = "Run folder; finished runs in it are kept.") -> Callable:
@@ -255,7 +255,7 @@ def robustness(scenario: Path, settings: dict, out: Path | None, **options: Any)
 @main.command()
 @SCENARIO
 @click.option("--controller", required=True, metavar="NAME", help="dpc-pc or dpc-pcrg.")
-@seed_option(text="Seed of the initial weights and the training states.")
+@seed_option("Seed of the initial weights and the training states.")
 @click.option("--steps", type=COUNT, help="Adam steps. [default: the scenario's, else 400]")
 @click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True)
 @click.option("--resume", is_flag=True, help="Continue an interrupted training.")

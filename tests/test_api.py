@@ -61,13 +61,6 @@ def test_every_public_name_is_there_with_help_and_types(package):
         package.nothing  # noqa: B018
 
 
-def test_the_wheel_takes_py_typed_along():
-    import tomllib
-
-    setting = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
-    assert "py.typed" in setting["*"]
-
-
 def test_run_and_benchmark_agree_with_the_command_line(tmp_path):
     folder, out = tiny.write(tmp_path), tmp_path / "out"
     done = CliRunner().invoke(

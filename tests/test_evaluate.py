@@ -9,7 +9,7 @@ import made_up
 import pandas as pd
 import pytest
 import trajectories
-from commands import cosim, error_line, good
+from commands import cosim, good
 
 from cosim.evaluation import evaluate, results
 from cosim.report import figures
@@ -117,18 +117,6 @@ def test_check_does_runs_again_and_names_what_differs(city, tmp_path, ran):
     change(tmp_path / "out" / "runs.csv", r"pi-gating,2000,sumo,900.0", "pi-gating,2000,sumo,901.0")
     lines = evaluate.check(runs, tmp_path / "out", 2)
     assert lines == ["pi-gating, seed 2000: total_time_spent_veh_s was 901.0, is 900.0"]
-
-
-@pytest.mark.parametrize(
-    "arguments, expected",
-    [
-        (("--controllers", "no-control,nobody"), "controller 'nobody' is unknown"),
-        (("--controllers", "no-control,no-control"), "no-control,no-control"),
-        (("--controllers", "no-control", "--policy", "dpc-pc=x.pt"), "dpc-pc"),
-    ],
-)
-def test_command_line_errors(arguments, expected):
-    assert expected in error_line(cosim("evaluate", ROOT / "scenarios" / "grid7_peak", *arguments))
 
 
 @pytest.mark.slow

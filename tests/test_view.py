@@ -14,7 +14,6 @@ from bokeh.document import Document
 from bokeh.embed import components, file_html
 from bokeh.models import Button
 from bokeh.resources import CDN
-from commands import cosim, error_line
 
 from cosim.evaluation.simulate import Simulation, simulate
 from cosim.sumo.net import city_of
@@ -178,21 +177,13 @@ def test_a_process_that_dies_is_an_error(scenario, strategy):
         show.close()
 
 
-def test_watching_ends_when_the_runs_have_ended_and_nobody_looks(scenario, strategy, monkeypatch):
+def test_watching_ends_when_the_runs_have_ended_and_nobody_looks(scenario, strategy, monkeypatch, capsys):
     monkeypatch.setattr(live, "OPENING_S", 0.0)
-    lines = []
     jobs = [Simulation(scenario, strategy, seed=3)]
-    [run] = live.watch(jobs, tell=lines.append)
-    assert run.row["completed_veh"] > 0 and lines[0].startswith("Watch it at http://localhost:")
+    [run] = live.watch(jobs)
+    assert run.row["completed_veh"] > 0 and "Watch it at http://localhost:" in capsys.readouterr().err
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         with pytest.raises(InputError, match="choose another"):
-            live.watch(jobs, port=taken.getsockname()[1], tell=lines.append)
-
-
-def test_wrong_ways_to_watch(scenario):
-    base = ("watch", scenario.folder, "--controller", "no-control")
-    assert "--gui: shows one run" in error_line(cosim(*base, "--gui", "--against", "pi-gating"))
-    assert cosim(*base, "--port", 70000).exit_code == 2
-    assert "nobody" in error_line(cosim(*base, "--against", "nobody"))
+            live.watch(jobs, port=taken.getsockname()[1])

@@ -1,5 +1,6 @@
 """Figures of an evaluation in SUMO: functions that draw into `ax`, and the files of one demand level."""
 
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -132,17 +133,16 @@ def draw_level(out: Path, scenario: Scenario, city: City, rows: pd.DataFrame, re
 def draw_levels(out: Path, rows: pd.DataFrame) -> None:
     """Draw trips served (the frontier) and time spent over several demand levels into the folder `out`."""
     against = statistics.compared_with(rows)
-    ratios: dict[str, dict[float, tuple[float, float]]] = {}
-    shares: dict[str, dict[float, tuple[float, float]]] = {}
+    ratios, shares = defaultdict(dict), defaultdict(dict)
     for level, names in statistics.groups(rows).items():
         reference = statistics.by_seed(rows, level, against)
         for name in names:
             part = rows[(rows["demand"] == level) & (rows["controller"] == name)]
             served = part["completed_veh"] / part["trips"].clip(lower=1)
-            shares.setdefault(name, {})[level] = served.mean(), interval(list(served))
+            shares[name][level] = served.mean(), interval(list(served))
             pair = statistics.paired(statistics.by_seed(rows, level, name), reference)
             if name != against and not np.isnan(pair.percent):
-                ratios.setdefault(name, {})[level] = 1.0 + pair.percent / 100.0, pair.percent_half / 100.0
+                ratios[name][level] = 1.0 + pair.percent / 100.0, pair.percent_half / 100.0
     for file, values, label in (
         ("frontier.png", shares, "trips served / trips due [-]"),
         ("demand.png", ratios, f"total time spent / that of {against} [-]"),

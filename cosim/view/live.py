@@ -4,9 +4,10 @@ import logging
 import multiprocessing
 import queue
 import signal
+import sys
 import time
 import webbrowser
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
@@ -215,13 +216,11 @@ def watch(
     *,
     port: int = 0,
     browse: bool = False,
-    tell: Callable[[str], None] = print,
 ) -> list[Seen]:
     """Do simulations side by side with a live page until they have ended and the page is closed.
 
     port: of the page on this machine; 0 for a free one
     browse: open the page in a browser
-    tell: called with a line that has the address
 
     Raises:
         InputError: a port in use, or a strategy that cannot run in the city
@@ -234,7 +233,7 @@ def watch(
             show.update()
             time.sleep(0.05)
         if show.picture is not None:
-            _serve(show, port, browse, tell)
+            _serve(show, port, browse)
     finally:
         show.close()
     for seen in show.runs:
@@ -243,7 +242,7 @@ def watch(
     return show.runs
 
 
-def _serve(show: Show, port: int, browse: bool, tell: Callable[[str], None]) -> None:
+def _serve(show: Show, port: int, browse: bool) -> None:
     """Serve the page until all runs have ended and no browser is connected."""
     try:
         server = Server(
@@ -267,7 +266,7 @@ def _serve(show: Show, port: int, browse: bool, tell: Callable[[str], None]) -> 
                 server.io_loop.stop()
 
     address = f"http://localhost:{server.port}/"
-    tell(f"Watch it at {address}")
+    print(f"cosim: Watch it at {address}", file=sys.stderr)
     if browse:
         webbrowser.open(address)
     server.start()
