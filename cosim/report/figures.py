@@ -22,6 +22,7 @@ from nmfd.studies.benchmark import draw_accumulations, interval
 from nmfd.types import Result
 
 Read = Callable[[str, int], Result]  # controller, seed -> run
+Points = dict[str, dict[float, tuple[float, float]]]  # controller -> level -> mean and half of the interval
 
 SATURATION_FLOW = 0.5  # veh/s and lane
 COMMANDED, GREEN_SHOWN, FLOWED = "#333333", "#009e73", "#0059a8"
@@ -133,7 +134,8 @@ def draw_level(out: Path, scenario: Scenario, city: City, rows: pd.DataFrame, re
 def draw_levels(out: Path, rows: pd.DataFrame) -> None:
     """Draw trips served (the frontier) and time spent over several demand levels into the folder `out`."""
     against = statistics.compared_with(rows)
-    ratios, shares = defaultdict(dict), defaultdict(dict)
+    ratios: Points = defaultdict(dict)
+    shares: Points = defaultdict(dict)
     for level, names in statistics.groups(rows).items():
         reference = statistics.by_seed(rows, level, against)
         for name in names:
