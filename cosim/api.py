@@ -289,8 +289,9 @@ def tune(
         search_seed=search_seed,
         out=Path("runs") / f"{file_name(loaded.name)}-tune" if out is None else out,
     )
-    table = tuning.tune(order, workers=workers, scheduler=scheduler)
-    return f"{tuning.text(order, table)}\nWritten to {order.out}: see tune.toml and tune.csv"
+    tuning.tune(order, workers=workers, scheduler=scheduler)
+    best = (order.out / "tune.toml").read_text(encoding="utf-8")
+    return f"{best}Written to {order.out}: see tune.toml and tune.csv"
 
 
 def get(name: str | None, out: Path | None = None) -> str:

@@ -147,7 +147,11 @@ def test_one_line_for_what_cannot_be_tuned(city, tmp_path, arguments, expected):
 def test_the_command(city, tmp_path, runs):
     options = ("--option", "set_point[0]=200:600", "--option", "kp=0.1:10", "--candidates", 3, "--seeds", 1)
     said = good(cosim("tune", city.folder, "--controller", "pi-gating", *options, "--out", tmp_path / "out"))
-    assert "best" in said and len(pd.read_csv(tmp_path / "out" / "tune.csv")) == 3
+    assert (
+        "# Best of 3 candidates: " in said
+        and "set_point = [" in said
+        and len(pd.read_csv(tmp_path / "out" / "tune.csv")) == 3
+    )
 
 
 def test_options_that_train_a_policy_train_one_for_every_candidate(city, tmp_path, monkeypatch):

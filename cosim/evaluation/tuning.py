@@ -40,7 +40,6 @@ from nmfd.model.scenario import Scenario
 from nmfd.runs import files
 from nmfd.runs.progress import Progress
 from nmfd.runs.run_many import TABLE, Run, raise_failures, run_many
-from nmfd.runs.tables import text_table
 
 OPTION = re.compile(r"([a-z_]\w*)(?:\[([0-9])\])?")  # KEY, or KEY[N] for one number of a list
 INITIAL_DEVIATION = 0.25  # standard deviation of the first generation, as a share of every range
@@ -169,17 +168,6 @@ def tune(order: Tuning, *, workers: int = 1, scheduler: str | None = None, progr
 def best(table: pd.DataFrame) -> pd.Series:
     """Return the row with the lowest score."""
     return table.loc[table[SCORE].idxmin()]
-
-
-def text(order: Tuning, table: pd.DataFrame) -> str:
-    """Return the first and the best candidate as a table."""
-    rows = {"first": table.iloc[0], f"best: {best(table)['candidate']:.0f}": best(table)}
-    columns = {option: option for option in order.options} | {SCORE: "score [veh s]"}
-    lines = [
-        {"candidate": name, **{heading: f"{row[column]:.4g}" for column, heading in columns.items()}}
-        for name, row in rows.items()
-    ]
-    return text_table(lines, "score: geometric mean of total time spent over all seeds and demand levels")
 
 
 def _key_and_index(name: str) -> tuple[str, int | None]:

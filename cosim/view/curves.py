@@ -10,7 +10,6 @@ from cosim.view import colours
 from cosim.view.city_map import colour_bar, mean
 from cosim.view.picture import CityPicture, Frame
 
-TRAIL_INTERVALS = 30  # behind the present point in the MFD plane
 CURVE_HEIGHT = 230  # pixels
 DARKEST_LOAD = 2.0  # critical accumulations
 HOUR = 3600.0  # s
@@ -51,7 +50,7 @@ class Load:
 class Curves:
     """All runs in one set of axes, for one region and for the whole city.
 
-    lines: one source per run, a row per whole frame; past, present: the filters of the MFD plane
+    lines: one source per run, a row per whole frame; present: filters for the large point in the MFD plane
     """
 
     def __init__(self, picture: CityPicture, names: Sequence[str]):
@@ -69,7 +68,6 @@ class Curves:
         self.region.line("x", "y", source=self.critical, color=colours.INK, line_dash="dotted", legend_label="critical")
         self.plane.line("x", "y", source=self.mfd, color=colours.FAINT, line_width=2, legend_label="MFD of the model")
         self.lines: list[ColumnDataSource] = []
-        self.past: list[IndexFilter] = []
         self.present: list[IndexFilter] = []
         for n, name in enumerate(names):
             self._add_run(n, name)
@@ -108,7 +106,6 @@ class Curves:
             }
             self.lines[n].data = {name: np.array(column, np.float32) for name, column in values.items()}
             last = sum(frame.time <= time for frame in whole) - 1
-            self.past[n].indices = list(range(max(1, last - TRAIL_INTERVALS + 1), last))
             self.present[n].indices = [last] if last > 0 else []
 
     def mark(self, time: float) -> None:
@@ -124,14 +121,13 @@ class Curves:
         for plot, column in ((self.region, "accumulation"), (self.trips, "completed"), (self.spent, "spent")):
             plot.line("time", column, legend_label=name, **style)
         self.gates.step("time", "u", mode="before", legend_label=f"u, {name}", **style)
-        past, present = IndexFilter(indices=[]), IndexFilter(indices=[])
+        present = IndexFilter(indices=[])
         points = {"source": source, "marker": marker, "line_color": colour}
         self.gates.scatter("time", "green", size=5, fill_color=colours.PAPER, legend_label=f"green, {name}", **points)
         points |= {"x": "accumulation", "y": "outflow", "fill_color": colour}
-        self.plane.scatter(view=CDSView(filter=past), size=4, alpha=0.5, **points)
+        self.plane.scatter(size=4, alpha=0.4, **points)
         self.plane.scatter(view=CDSView(filter=present), size=12, legend_label=name, **points)
         self.lines.append(source)
-        self.past.append(past)
         self.present.append(present)
 
 

@@ -10,7 +10,7 @@ from bokeh.models import ColumnDataSource, CustomJS, Div, LayoutDOM, Select, Sli
 
 from cosim.view import colours
 from cosim.view.city_map import CityMap
-from cosim.view.curves import HOUR, MINUTE, OF_REGION, TRAIL_INTERVALS, Curves, Load
+from cosim.view.curves import HOUR, MINUTE, OF_REGION, Curves, Load
 from cosim.view.picture import CityPicture, Frame
 
 PLAY_PERIOD_MS = 150  # wall time per control interval
@@ -36,8 +36,6 @@ if (cb_obj === region) {
 put(film, k)
 numbers.text = words[k]
 for (const span of spans) span.location = slider.value
-const begin = Math.max(1, k - trail + 1)
-for (const one of past) one.indices = [...Array(Math.max(0, k - begin)).keys()].map(n => n + begin)
 for (const one of present) one.indices = k > 0 ? [k] : []
 """
 PLAY_JS = """
@@ -160,9 +158,7 @@ def with_slider(picture: CityPicture, runs: Mapping[str, Sequence[Frame]]) -> La
             "texts": texts,
             "numbers": page.numbers,
             "words": words,
-            "past": page.curves.past,
             "present": page.curves.present,
-            "trail": TRAIL_INTERVALS,
             "spans": [*(load.now for load in page.loads), *page.curves.now],
         },
         code=SLIDER_JS,

@@ -104,16 +104,16 @@ class Frame:
     NaN without control; queue: (G,) halting vehicles; guided: (R, R) reroutes from i to h [veh]; note: a warning
     """
 
-    time: float
-    intervals: int
-    whole: bool
+    time: float = 0.0
+    intervals: int = 0
+    whole: bool = True
     density: PerEdge
     accumulation: PerRegion
     outflow: PerRegion
     waiting: float
-    completed: float
-    removed: float
-    time_spent: float
+    completed: float = 0.0
+    removed: float = 0.0
+    time_spent: float = 0.0
     perimeter: PerPair
     green: PerGateway
     queue: PerGateway
@@ -123,18 +123,12 @@ class Frame:
 
 def first(picture: CityPicture, gateways: int, state: State) -> Frame:
     """Return the frame at the start of a run in a city with so many gateways."""
-    edges, regions = len(picture.edges), picture.regions
+    regions = picture.regions
     return Frame(
-        time=0.0,
-        intervals=0,
-        whole=True,
-        density=np.zeros(edges, np.float16),
+        density=np.zeros(len(picture.edges), np.float16),
         accumulation=state.accumulation.sum(axis=1),
         outflow=np.zeros(regions),
         waiting=float(state.backlog.sum()),
-        completed=0.0,
-        removed=0.0,
-        time_spent=0.0,
         perimeter=np.full((regions, regions), np.nan),
         green=np.full(gateways, np.nan),
         queue=np.zeros(gateways),
@@ -163,7 +157,6 @@ def after(
     return Frame(
         time=state.time,
         intervals=state.step,
-        whole=True,
         density=(row["edge_vehicles"].astype(float) / picture.lane_km).astype(np.float16),
         accumulation=state.accumulation.sum(axis=1),
         outflow=regional_outflow(flows, picture.step)[0],

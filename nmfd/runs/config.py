@@ -4,9 +4,9 @@ import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, get_args
+from typing import Annotated, Any, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from nmfd.errors import InputError, did_you_mean
 
@@ -38,6 +38,16 @@ class Settings(BaseModel):
     """Table of settings; unknown keys, texts for numbers and numbers that are not finite are errors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _known_keys(cls, values: Any) -> Any:
+        keys = [field.alias or name for name, field in cls.model_fields.items()]
+        for key in values if isinstance(values, Mapping) else ():
+            if key not in keys:
+                hint = did_you_mean(str(key), keys)
+                raise Problem(key, f"unknown key{hint}; allowed here: {', '.join(keys)}; remove or correct it")
+        return values
 
     def changed(self: S, **changes: Any) -> S:
         """Return a checked copy with other values. Raise InputError."""
@@ -89,7 +99,7 @@ def checked(declaration: type[S], values: Mapping[str, Any], where: Path | str, 
     try:
         return declaration.model_validate(values)
     except ValidationError as invalid:
-        raise InputError(f"{where}: {prefix}{_first_problem(declaration, invalid)}") from None
+        raise InputError(f"{where}: {prefix}{_first_problem(invalid)}") from None
 
 
 def error(where: Path | str, key: str, problem: str) -> InputError:
@@ -107,36 +117,14 @@ def quoted(text: str) -> str:
     return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
 
 
-def _first_problem(declaration: type[Settings], invalid: ValidationError) -> str:
-    """Return "key: problem"; a misspelt key comes before the missing one that it was meant for."""
-    first = min(invalid.errors(include_url=False), key=lambda problem: problem["type"] != "extra_forbidden")
+def _first_problem(invalid: ValidationError) -> str:
+    first = invalid.errors(include_url=False)[0]
     path = "".join(f"[{place}]" if isinstance(place, int) else f".{place}" for place in first["loc"]).lstrip(".")
     problem = first.get("ctx", {}).get("error")
     if isinstance(problem, Problem):
         return f"{'.'.join(filter(None, (path, problem.key)))}: {problem}"
     if first["type"] == "missing":
         return f"{path}: missing; add it"
-    if first["type"] == "extra_forbidden":
-        fields = _table(declaration, first["loc"][:-1]).model_fields
-        keys = [field.alias or name for name, field in fields.items()]
-        hint = did_you_mean(str(first["loc"][-1]), keys)
-        return f"{path}: unknown key{hint}; allowed here: {', '.join(keys)}; remove or correct it"
     text = re.sub(r"^(Value error, |(Input|String|Tuple|List|Value) (?=should))", "", first["msg"])
     text = re.sub("dictionary( or instance of .*)?", "table", text)
     return f"{path}: {text}, got {repr(first['input'])[:SHOWN_CHARACTERS]}"
-
-
-def _table(declaration: type[BaseModel], path: tuple[int | str, ...]) -> type[BaseModel]:
-    """Return the declaration of the table at `path` inside a declaration."""
-    for place in path:
-        for name, field in declaration.model_fields.items():
-            if place in (name, field.alias):
-                declaration = _declaration_in(field.annotation) or declaration
-    return declaration
-
-
-def _declaration_in(kind: Any) -> type[BaseModel] | None:
-    """Return the declaration in a type such as tuple[DemandTable, ...] | None."""
-    if isinstance(kind, type) and issubclass(kind, BaseModel):
-        return kind
-    return next(filter(None, map(_declaration_in, get_args(kind))), None)
