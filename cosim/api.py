@@ -212,7 +212,7 @@ def evaluate(
     check_policies(policies or {}, strategies)
     seeds = list(range(2000, 2010) if seeds is None else seeds)
     name = Path(scenario).stem if len(chosen) > 1 else chosen[0][0].name
-    out = Path("runs") / f"{file_name(name)}-evaluate" if out is None else out
+    out = out or Path("runs") / f"{file_name(name)}-evaluate"
     if check is not None:
         runs = evaluation.plan(chosen, strategies, seeds, policies)
         lines = evaluation.check(runs, out, check, workers=workers)
@@ -230,9 +230,8 @@ def evaluate(
 
 
 def compare(folder: Path, *, controller: str | None = None, seed: int | None = None, model: Path | None = None) -> str:
-    """Compare finished runs with what the regional model predicts; write tables and figures beside them.
+    """Compare finished runs, or one, with what the regional model predicts; write tables and figures beside them.
 
-    controller, seed: of one run; all runs of the folder if None
     model: folder of the network that predicts, the controller's model if None
     """
     finished = results.read(folder)
@@ -249,10 +248,7 @@ def compare(folder: Path, *, controller: str | None = None, seed: int | None = N
 
 
 def report(folders: Sequence[Path], *, seed: int | None = None, out: Path | None = None) -> Path:
-    """Write one HTML page about finished runs and return its path.
-
-    seed: of the runs on the map, the first of both if None
-    """
+    """Write one HTML page about finished runs and return its path; seed: of the runs on the map."""
     runs = [results.read(folder) for folder in folders]
     return html.write_page(out or folders[0] / "report.html", runs, seed=seed)
 
@@ -287,7 +283,7 @@ def tune(
         seeds=range(1000, 1000 + seeds) if isinstance(seeds, int) else list(seeds),
         levels=levels,
         search_seed=search_seed,
-        out=Path("runs") / f"{file_name(loaded.name)}-tune" if out is None else out,
+        out=out or Path("runs") / f"{file_name(loaded.name)}-tune",
     )
     tuning.tune(order, workers=workers, scheduler=scheduler)
     best = (order.out / "tune.toml").read_text(encoding="utf-8")

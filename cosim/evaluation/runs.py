@@ -38,13 +38,10 @@ def runs_of(
     """Return the runs of strategies x seeds at one demand level, seed by seed.
 
     city: result of `city_key`, computed if None
-    demand: multiple of the scenario's demand
     policies: strategy name -> file instead of the scenario's
     folder: below that of all runs, `out`
     sumo_output: kinds of SUMO's own outputs to write to `out` (cosim.sumo.outputs)
-
-    Raises:
-        InputError: a strategy cannot run in this city
+    Raises: InputError if a strategy cannot run in this city
     """
     flows = np.ascontiguousarray(with_demand(scenario, factor=demand).demand)
     shared = {
@@ -59,23 +56,13 @@ def runs_of(
     if sumo_output:
         shared["sumo_output"] = list(sumo_output)
     keys = {s.name: {**shared, "controller": s.fingerprint(scenario, policies.get(s.name))} for s in strategies}
-    return [
-        Run(
-            run_name(strategy.name, seed),
-            keys[strategy.name],
-            Simulation(
-                scenario,
-                strategy,
-                seed,
-                demand,
-                policies.get(strategy.name),
-                dict(outputs.paths(tuple(sumo_output), out, strategy.name, seed)),
-            ),
-            folder,
-        )
-        for seed in seeds
-        for strategy in strategies
-    ]
+    runs = []
+    for seed in seeds:
+        for strategy in strategies:
+            name, files = strategy.name, dict(outputs.paths(tuple(sumo_output), out, strategy.name, seed))
+            job = Simulation(scenario, strategy, seed, demand, policies.get(name), files)
+            runs.append(Run(run_name(name, seed), keys[name], job, folder))
+    return runs
 
 
 def city_key(scenario: Scenario, strategies: Sequence[Strategy]) -> dict[str, object]:

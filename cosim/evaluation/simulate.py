@@ -157,9 +157,8 @@ def regional_outflow(record: Mapping[str, np.ndarray] | Result, step: float) -> 
 
 
 def delay_gini(result: Result, time_loss: PerRegion) -> float:
-    """Return the Gini coefficient of the mean delays of regions of origin, weighted by their trips.
+    """Return the Gini coefficient of the mean delays (on the road and to enter) of regions, weighted by their trips.
 
-    The delay of a trip is its time loss on the road and its wait to enter. Unfinished trips count until the end.
     time_loss: SUMO's timeLoss of all trips that began in a region (R,) [s]
     """
     begun = result.departures.sum(axis=(0, 2)) + result.backlog[-1].sum(axis=1)

@@ -8,12 +8,11 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from cosim.importing import maps, quality
-from cosim.importing.streets import Streets, read_streets
+from cosim.importing.streets import read_streets
 from cosim.plant.settings import own_files, settings
 from cosim.sumo import net
 from cosim.sumo.build import ensure_built
 from nmfd.api import load_scenario
-from nmfd.arrays import Positions
 from nmfd.model.regional_model import RegionalModel, load_network
 from nmfd.model.scenario import Scenario
 from nmfd.studies import plots
@@ -39,7 +38,19 @@ class City:
         self.scenario = city if isinstance(city, Scenario) else None
         self.network = city.network if isinstance(city, Scenario) else city
         self.name = city.name
-        self._files = ensure_built(self.network)
+        additional: tuple[Path, ...] = ()
+        left: tuple[str, ...] = ()
+        if self.scenario is not None:
+            setup = settings(self.scenario)
+            additional, left = tuple(own_files(self.scenario, setup.additional)), tuple(setup.leave_signals)
+        self._streets = read_streets(ensure_built(self.network).net_file, additional)
+        built = net.city_of(self.network)
+        self._regions = np.array([built.region_of.get(edge, -1) for edge in self._streets.edges])
+        of_region = [self._streets.drivable & (self._regions == r) for r in range(self.network.regions)]
+        self._places = np.stack([self._streets.centre[members].mean(axis=0) for members in of_region])
+        reasons = quality.left_alone(self._streets) | dict.fromkeys(left, "left alone by the scenario")
+        names = self.network.region_names
+        self._tables = quality.tables(self._streets, self._regions, names, built, None, reasons)
 
     @cached_property
     def regions(self) -> pd.DataFrame:
@@ -70,29 +81,3 @@ class City:
 
     def _repr_html_(self) -> str:
         return self.regions.to_html(index=False)
-
-    @cached_property
-    def _city(self) -> net.City:
-        return net.city_of(self.network)
-
-    @cached_property
-    def _streets(self) -> Streets:
-        own = own_files(self.scenario, settings(self.scenario).additional) if self.scenario else ()
-        return read_streets(self._files.net_file, own)
-
-    @cached_property
-    def _regions(self) -> np.ndarray:
-        return np.array([self._city.region_of.get(edge, -1) for edge in self._streets.edges])
-
-    @cached_property
-    def _places(self) -> Positions:
-        streets = self._streets
-        of_region = [streets.drivable & (self._regions == r) for r in range(self.network.regions)]
-        return np.stack([streets.centre[members].mean(axis=0) for members in of_region])
-
-    @cached_property
-    def _tables(self) -> quality.Tables:
-        alone = quality.left_alone(self._streets)
-        if self.scenario is not None:
-            alone |= dict.fromkeys(settings(self.scenario).leave_signals, "left alone by the scenario")
-        return quality.tables(self._streets, self._regions, self.network.region_names, self._city, None, alone)

@@ -114,7 +114,8 @@ def with_slider(picture: CityPicture, runs: Mapping[str, Sequence[Frame]]) -> La
     """
     page, whole = Page(picture, list(runs)), list(runs.values())
     last, step = max(map(len, whole)) - 1, picture.step / MINUTE
-    inside = [[frames[min(k, len(frames) - 1)].accumulation.sum() for k in range(last + 1)] for frames in whole]
+    padded = [[*frames, *[frames[-1]] * (last + 1 - len(frames))] for frames in whole]
+    inside = [[frame.accumulation.sum() for frame in frames] for frames in padded]
     begin = int(np.argmax(np.abs(np.subtract(inside[0], inside[-1]) if len(inside) > 1 else inside[0])))
     moving = [
         *((one.streets, ["density"]) for one in page.maps),
@@ -133,7 +134,7 @@ def with_slider(picture: CityPicture, runs: Mapping[str, Sequence[Frame]]) -> La
     words, first = [], page.region
     texts: list[list[str]] = [[] for _ in page.curves.titles]
     for k in range(last + 1):
-        page.show([frames[min(k, len(frames) - 1)] for frames in whole], k * picture.step)
+        page.show([frames[k] for frames in padded], k * picture.step)
         _add_row(film)
         words.append(page.numbers.text)
     for region in range(picture.regions):
@@ -144,7 +145,7 @@ def with_slider(picture: CityPicture, runs: Mapping[str, Sequence[Frame]]) -> La
             text.append(title.text)
     page.choose(first)
     page.trace(whole, begin * picture.step)
-    page.show([frames[min(begin, len(frames) - 1)] for frames in whole], begin * picture.step)
+    page.show([frames[begin] for frames in padded], begin * picture.step)
     wide = {"sizing_mode": "stretch_width", "styles": {"flex": "1 1 240px"}}
     slider = Slider(start=0.0, end=last * step, value=begin * step, step=step, title="time [min]", name="time", **wide)
     play = Toggle(label="Play", name="play", width=90, button_type="primary")
