@@ -60,14 +60,11 @@ def run(
     progress: None for a bar, False for none, or a function of done and total control intervals
 
     The result has the arrays of cosim.plant.record.RECORD, and the facts of cosim.evaluation.simulate as attributes.
+    Raises: InputError for a wrong name, file or value, RuntimeError if another simulation is open in this process
 
         >>> result = cosim.run("grid7_peak", "pi-gating+rerouting-30", seed=3, steps=2)
         >>> result.accumulation.shape, result.crossings.shape
         ((3, 7, 7), (2, 7, 7, 7))
-
-    Raises:
-        InputError: a name, file or value is wrong
-        RuntimeError: another simulation is open in this process
     """
     strategy = parse(controller, city)
     scenario = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)

@@ -67,11 +67,7 @@ def evaluate(
     scheduler: str | None = None,
     progress: Progress = None,
 ) -> pd.DataFrame:
-    """Do the runs that are not in `out`, write the tables, and return one row per run (nmfd.runs.run_many).
-
-    scenarios: each with its demand levels
-    policies: strategy name -> file instead of the scenario's
-    """
+    """Do the runs that are not in `out`, write the tables, and return one row per run (nmfd.runs.run_many)."""
     runs = plan(scenarios, strategies, seeds, policies)
     rows = run_many(runs, out, workers=workers, scheduler=scheduler, progress=progress)
     done = results.finished_rows(rows)
@@ -86,7 +82,7 @@ def plan(
     seeds: Sequence[int],
     policies: Mapping[str, Path] | None = None,
 ) -> list[Run]:
-    """Return all runs of an evaluation, seed by seed, so that what is finished compares like with like."""
+    """Return all runs of an evaluation, seed by seed; policies: strategy name -> file instead of the scenario's."""
     runs = []
     for scenario, levels in scenarios:
         city = city_key(scenario, strategies)

@@ -72,12 +72,9 @@ class Finished:
 
 
 def read(path: Path, scenario: str | None = None) -> Finished:
-    """Read the finished runs of a folder.
+    """Read the finished runs of a folder. Raises InputError if it holds none in SUMO.
 
     scenario: name of one of several scenarios, the first if None
-
-    Raises:
-        InputError: the folder holds no finished runs in SUMO
     """
     rows = finished_rows(pd.read_csv(path / TABLE)) if (path / TABLE).is_file() else pd.DataFrame()
     if rows.empty or "scenario" not in rows:

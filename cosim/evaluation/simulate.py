@@ -6,7 +6,6 @@ from collections.abc import Callable, Collection, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -79,9 +78,9 @@ class Simulation:
     policy: Path | None = None
     outputs: Mapping[str, Path] = field(default_factory=dict)
 
-    def __call__(self, **how: Any) -> Result:
+    def __call__(self) -> Result:
         """Return `simulate` of it."""
-        return simulate(self, **how)
+        return simulate(self)
 
 
 def simulate(
@@ -96,9 +95,7 @@ def simulate(
     progress: called as progress(done, steps) after every control interval
     observer: gets the state of the run while it goes on
     window: options of sumo-gui
-
-    Raises:
-        InputError: the strategy cannot run in this city
+    Raises: InputError if the strategy cannot run in this city
     """
     begin = time.perf_counter()
     strategy, scenario = job.strategy, with_demand(job.scenario, factor=job.demand)

@@ -41,7 +41,7 @@ from nmfd.runs import files
 from nmfd.runs.progress import Progress
 from nmfd.runs.run_many import TABLE, Run, raise_failures, run_many
 
-OPTION = re.compile(r"([a-z_]\w*)(?:\[([0-9])\])?")  # KEY, or KEY[N] for one number of a list
+OPTION = re.compile(r"[a-z_]\w*(\[[0-9]\])?")  # KEY, or KEY[N] for one number of a list
 INITIAL_DEVIATION = 0.25  # standard deviation of the first generation, as a share of every range
 SCORE = "score_veh_s"
 Range: TypeAlias = FloatDistribution | IntDistribution
@@ -130,14 +130,10 @@ class Tuning:
 
 
 def tune(order: Tuning, *, workers: int = 1, scheduler: str | None = None, progress: Progress = None) -> pd.DataFrame:
-    """Run the candidates and return the table of tune.csv.
+    """Run the candidates and return the table of tune.csv; the same call resumes, and one with more trials continues.
 
-    Finished runs are kept: the same call resumes, and a call with more `trials` continues. A candidate with a failed
-    run has no score.
-
-    Raises:
-        InputError: the folder holds another search
-        RunFailed: no candidate of a generation has a score
+    A candidate with a failed run has no score.
+    Raises: InputError if the folder holds another search, RunFailed if no candidate of a generation has a score
     """
     city, study = city_key(order.scenario, [order.strategy]), _study(order)
     generation = 4 + math.floor(3 * math.log(len(order.options)))
@@ -171,9 +167,8 @@ def best(table: pd.DataFrame) -> pd.Series:
 
 
 def _key_and_index(name: str) -> tuple[str, int | None]:
-    match = OPTION.fullmatch(name)
-    assert match
-    return match[1], None if match[2] is None else int(match[2])
+    key, _, index = name.rstrip("]").partition("[")
+    return key, int(index) if index else None
 
 
 def _study(order: Tuning) -> optuna.Study:

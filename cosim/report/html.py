@@ -41,9 +41,7 @@ def write_page(path: Path, runs: Sequence[Finished], *, seed: int | None = None)
     """Write the page of the runs to `path`; the first folder has its map with a slider.
 
     seed: of the runs on the map; the first that both have if None
-
-    Raises:
-        InputError: if there is no run with this seed.
+    Raises: InputError if there is no run with this seed
     """
     title, script, div = _map(runs[0], seed)
     loader = PackageLoader("cosim.report", ".")

@@ -220,11 +220,7 @@ def watch(
     """Do simulations side by side with a live page until they have ended and the page is closed.
 
     port: of the page on this machine; 0 for a free one
-    browse: open the page in a browser
-
-    Raises:
-        InputError: a port in use, or a strategy that cannot run in the city
-        RunFailed: a run failed
+    Raises: InputError for a port in use or a strategy that cannot run in the city, RunFailed if a run failed
     """
     logging.getLogger("bokeh").setLevel(logging.ERROR)
     show = Show(jobs)
