@@ -1,4 +1,7 @@
-"""Python interface of `cosim`: a function for every command, and single runs."""
+"""Python interface of `cosim`: a function for every command, and single runs.
+
+Bokeh, Optuna and scikit-learn are imported in the functions that need them: they take a second.
+"""
 
 import os
 import sys
@@ -8,18 +11,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from cosim.evaluation import estimation_errors, model_validation, results, statistics, tuning
+from cosim.evaluation import estimation_errors, model_validation, results, statistics
 from cosim.evaluation import evaluate as evaluation
 from cosim.evaluation import identify as identification
 from cosim.evaluation.runs import runs_of
 from cosim.evaluation.simulate import Simulation, simulate
 from cosim.importing import get as cities
-from cosim.importing import importer
 from cosim.importing.case import parse_box, seconds
-from cosim.report import card, figures, html
+from cosim.report import card, figures
 from cosim.sumo.outputs import check
 from cosim.sumo.session import LOST, Window
-from cosim.view import live
 from nmfd.api import check_policies, load_scenario
 from nmfd.controllers.strategy import parse, parse_many
 from nmfd.errors import InputError
@@ -125,6 +126,8 @@ def run_controllers(
 
 def demo(out: Path, *, seed: int = 1000) -> str:
     """Run the demo city with and without gates, write a page and open it; return a report."""
+    from cosim.report import html
+
     scenario, strategies = load_scenario(DEMO), [parse("no-control"), parse("pi-gating")]
     rows = run_many(runs_of(scenario, strategies, [seed]), out, workers=2)
     raise_failures(rows)
@@ -153,6 +156,8 @@ def watch(
 
     port: of the page, any that is free if 0; the other arguments as in `run_controllers`
     """
+    from cosim.view import live
+
     loaded = load_scenario(scenario, settings)
     jobs = [Simulation(loaded, parse(name), seed, demand) for name in dict.fromkeys(controllers)]
     if gui:
@@ -246,6 +251,8 @@ def compare(folder: Path, *, controller: str | None = None, seed: int | None = N
 
 def report(folders: Sequence[Path], *, seed: int | None = None, out: Path | None = None) -> Path:
     """Write one HTML page about finished runs and return its path; seed: of the runs on the map."""
+    from cosim.report import html
+
     runs = [results.read(folder) for folder in folders]
     return html.write_page(out or folders[0] / "report.html", runs, seed=seed)
 
@@ -271,6 +278,8 @@ def tune(
     trials: number of candidates, the scenario's own options first
     seeds: runs per candidate and demand level, from seed 1000, or the seeds
     """
+    from cosim.evaluation import tuning
+
     loaded = with_demand(load_scenario(scenario, settings), steps=steps)
     order = tuning.Tuning(
         scenario=loaded,
@@ -310,6 +319,8 @@ def import_city(
     begin, end: time window, in seconds or as h:m:s
     options: left_hand, routes, level, mesoscopic, seed, seeds (cosim.importing.importer.import_city)
     """
+    from cosim.importing import importer
+
     number = int(regions) if str(regions).isdecimal() else None
     if number is not None and number < 2:
         raise InputError(f"--regions: expected 2 or more regions, or a file, got {regions} instead")
