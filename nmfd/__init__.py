@@ -38,32 +38,8 @@ _MODULES = {
     "studies.measured": ("Identified",),
     "types": ("Controller", "Controls", "Observation", "Plant", "Result", "State", "Status"),
 }
-__all__ = [
-    "AcyclicPlant",
-    "Controller",
-    "Controls",
-    "Identified",
-    "InputError",
-    "NmfdPlant",
-    "Observation",
-    "Plant",
-    "PlanningModel",
-    "RegionalModel",
-    "Result",
-    "Scenario",
-    "State",
-    "Status",
-    "benchmark",
-    "controller",
-    "identify",
-    "load_network",
-    "load_scenario",
-    "run",
-    "summary",
-    "total_time_spent",
-    "train",
-]
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
+__all__ = sorted(_MODULE_OF)
 
 
 def __getattr__(name: str) -> Any:

@@ -44,13 +44,6 @@ def parse(text: str, where: str, regions: int) -> Fault:
     return Fault(kind=kind, value=value, begin=begin, end=end)
 
 
-def without_city(faults: Sequence[Fault], where: str) -> None:
-    """Raise InputError for a fault that needs a city in SUMO."""
-    for fault in faults:
-        if fault.kind in CITY:
-            raise InputError(f"{where}: {fault.kind} is a fault of a city in SUMO, not of the regional model; omit it")
-
-
 class Sensors:
     """Observations with sensor faults; missing entries keep their last value, 0 at the start."""
 

@@ -145,7 +145,7 @@ def test_torch_and_casadi_agree(integrator, substeps, network):
             **kwargs,
         )
         twin = dynamics_casadi.advance(
-            p, twin, ca.DM(demand), ca.DM(perimeter), dynamics_casadi.splits_list(splits), STEP, **kwargs
+            p, twin, ca.DM(demand), ca.DM(perimeter), [ca.sparsify(ca.DM(rows)) for rows in splits], STEP, **kwargs
         )
         most = max(most, x.sum(-1).max().item())
         np.testing.assert_allclose(twin.full(), x.numpy(), rtol=0.0, atol=1e-9)

@@ -117,12 +117,12 @@ class Crowd:
 
 
 def watch(seed, known, *, steps=40, changed=lambda observation: observation, wrong=1.0):
-    """Truth and estimate (steps, R, R), what the detectors said (steps, R), and the surprises."""
+    """Truth and estimate (steps, R, R), and what the detectors said (steps, R)."""
     crowd, estimator, rows = Crowd(seed, known, wrong=wrong), Estimator(planning_model(SCENARIO), known), []
     for k in range(steps):
         observation = crowd.step(k)
         estimate = estimator.step(OPEN, changed(observation))
-        rows.append((crowd.accumulation, estimate, observation.accumulation, estimator.belief.surprise))
+        rows.append((crowd.accumulation, estimate, observation.accumulation))
     return tuple(np.array(column) for column in zip(*rows, strict=True))
 
 
@@ -170,8 +170,6 @@ def test_unbiased_and_consistent(runs):
     scale = np.mean([rmse((estimate - truth).sum(axis=(1, 2))) for truth, estimate, *_ in runs])
     assert abs(np.mean(bias)) < 0.6 * scale
     assert abs(np.mean(bias)) < 0.02 * np.mean([truth.sum(axis=(1, 2)).mean() for truth, *_ in runs])
-    surprise = [float(surprise[3:].mean()) for *_, surprise, _ in runs]
-    assert all(0.5 < value < 1.2 for value in surprise), surprise
 
 
 def test_never_negative_nor_fewer_than_the_probes(runs):
@@ -204,7 +202,6 @@ def test_without_readings_it_is_the_regional_model():
         exact = plant.step(OPEN).accumulation
         estimate = estimator.step(OPEN, nothing())
         assert np.abs(estimate - exact).max() < 1e-6
-        assert np.isnan(estimator.belief.surprise)
     assert exact.sum() > 500.0
 
 

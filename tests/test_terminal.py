@@ -18,7 +18,8 @@ from nmfd.model.plant import NmfdPlant
 
 NAME = "mpc-pc-terminal"
 SCRIPT = Path(__file__).parents[1] / "scenarios" / "economic_mpc" / "terminal_cost.py"
-learn = runpy.run_path(str(SCRIPT))["learn"]
+script = runpy.run_path(str(SCRIPT))
+learn, write = script["learn"], script["write"]
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +101,7 @@ def test_the_same_seed_learns_the_same_and_the_file_keeps_it(scenario, learned, 
     other = learn(scenario, NAME, seed=1, samples=256, rounds=1, steps=150)
     x, planning = crowded(scenario), planning_model(scenario)
     assert again(x, 50)[0] == learned(x, 50)[0] != other(x, 50)[0]
-    terminal.write(learned, tmp_path / "value.npz")
+    write(learned, tmp_path / "value.npz")
     read = terminal.read(tmp_path / "value.npz", planning, NAME)
     np.testing.assert_allclose(read(x, 50)[1], learned(x, 50)[1])
     for wrong, expected in (

@@ -12,7 +12,6 @@ from typing import TypeAlias
 import casadi as ca
 import numpy as np
 
-from nmfd.arrays import PerTurn
 from nmfd.model.dynamics import integrated
 from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, RegionalModel
 
@@ -56,11 +55,6 @@ def parameters(network: RegionalModel) -> Parameters:
         capacity=matrix(network.open_capacity),
         storage=None if network.storage is None else ca.DM(network.storage).T,
     )
-
-
-def splits_list(splits: PerTurn) -> list[ca.DM]:
-    """Return theta (R, R, R) [i, h, j] as R sparse matrices [h, j]."""
-    return [ca.sparsify(ca.DM(rows)) for rows in splits]
 
 
 def rate(p: Parameters, accumulation: Matrix) -> Matrix:

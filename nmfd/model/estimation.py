@@ -85,14 +85,11 @@ class Belief:
 
     mean: (3 R + R^2,), relative errors of outflow, demand and expansion, and x by rows
     probes: (R, R) [veh], at their last reading
-    surprise: normalised squared innovation of the last update per uncertain reading: 1 on average if the covariances
-        are right; NaN without a reading
     """
 
     mean: Vector
     covariance: Square
     probes: PerPair
-    surprise: float
 
 
 class Estimator:
@@ -142,7 +139,6 @@ class Estimator:
             mean=np.zeros(self._states),
             covariance=torch.diag(variance).numpy(),
             probes=np.zeros((self._regions, self._regions)),
-            surprise=np.nan,
         )
 
     @property
@@ -163,10 +159,8 @@ class Estimator:
         return self.accumulation
 
     def _effects(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return changes per event (rows, events) of (x | mean accumulations, crossings), and of (probes, departures).
-
-        Events: turns (i, h, j), completed trips in i, departures from i for j, in this order.
-        """
+        """Return changes per event (rows, events): (x, mean accumulations, crossings) and (probes, departures)."""
+        # Events: turns (i, h, j), completed trips in i, departures from i for j, in this order.
         regions, cells = self._regions, np.arange(self._cells)
         here, onward, bound = self._turns.T
         number, turns = np.arange(len(here)), len(here)
@@ -187,7 +181,7 @@ class Estimator:
     ) -> Belief:
         """Return the belief one control interval later; loops: (R,) [veh], valid detector readings."""
         z, covariance, leaving = self._predicted(belief, demand, perimeter, splits)
-        mean, posterior, surprise = z[: self._states], covariance[: self._states, : self._states], np.nan
+        mean, posterior = z[: self._states], covariance[: self._states, : self._states]
         reading, expected, noise = self._readings(z, leaving, readings, loops)
         there = np.flatnonzero(np.isfinite(reading))
         if len(there):
@@ -200,16 +194,13 @@ class Estimator:
             whitened = torch.linalg.solve_triangular(root, torch.cat([towards, innovation], dim=1), upper=False)
             mean = mean + (whitened[:, :-1].T @ whitened[:, -1]).numpy()
             posterior = posterior - whitened[:, :-1].T @ whitened[:, :-1]
-            measured = there < len(reading) - self._cells  # the last ones are pseudo-readings
-            uncertain = (spread.diagonal().numpy() > 10.0 * FLOOR)[measured].sum()
-            surprise = float((whitened[measured, -1] ** 2).sum()) / max(int(uncertain), 1)
         posterior = (0.5 * (posterior + posterior.T)).numpy()
         counted = np.isfinite(readings.probes)
         probes = np.where(counted, readings.probes, np.maximum(z[self._probes].reshape(counted.shape), 0.0))
         lower = np.concatenate([np.full(self._x.start, -0.95), np.where(counted, probes, 0.0).ravel()])
         mean = bounded(mean, posterior, lower)
         probes = np.minimum(probes, mean[self._x].reshape(counted.shape))
-        return Belief(mean=mean, covariance=posterior, probes=probes, surprise=surprise)
+        return Belief(mean=mean, covariance=posterior, probes=probes)
 
     def _predicted(
         self, belief: Belief, demand: PerPair, perimeter: PerPair, splits: PerTurn
@@ -234,8 +225,7 @@ class Estimator:
     def _rollout(
         self, points: torch.Tensor, probes: PerPair, demand: PerPair, perimeter: PerPair, splits: PerTurn
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return Z without the relative errors at `points` (B, 2 R + R^2), and the events (events,) [veh] of the first
-        point, of all vehicles and of probes."""
+        """Return Z without errors at `points` (B, 2 R + R^2), and the first one's events [veh], all and of probes."""
         regions, batch = self._regions, len(points)
         duration = self._step / self._substeps
         controls = [torch.tensor(values, dtype=torch.float64) for values in (perimeter, splits)]
@@ -273,8 +263,7 @@ class Estimator:
     def _flow_noise(
         self, belief: Belief, moves: torch.Tensor, of_probes: torch.Tensor, leaving: torch.Tensor
     ) -> torch.Tensor:
-        """Return the covariance of Z, without relative errors, due to the flows (events,) [veh], `of_probes` of them:
-        Poisson counts and errors of the modelled flows."""
+        """Return the covariance of Z, without relative errors, due to Poisson counts and errors of the flows [veh]."""
         x, turns = torch.from_numpy(belief.mean[self._x]), len(self._turns)
         cell = self._from[:turns]
         error = FLOW_ERROR * moves
@@ -293,11 +282,7 @@ class Estimator:
         return torch.cat([torch.cat(parts[:2], dim=1), torch.cat([parts[1].T, parts[2]], dim=1)])
 
     def _readings(self, z: np.ndarray, leaving: np.ndarray, readings: Readings, loops: np.ndarray) -> tuple:
-        """Return the readings (m,), NaN where there is none, their expectation and their noise variance (m,).
-
-        The last R^2 are pseudo-readings against model drift: probes are a fixed share of the vehicles. The same probes
-        count less each time, because they stay until they leave, MEMORY at most.
-        """
+        """Return the readings (m,), NaN where there is none, their expectation and their noise variance (m,)."""
         instruments = self._instruments
         here, to = self._boundaries.T
         mean, expansion, counts = z[self._mean], z[self._expansion], z[self._crossings]
@@ -306,6 +291,8 @@ class Estimator:
         gateways = np.maximum(instruments.counted_gateways[here, to], 1)
         cells, p = np.full(self._cells, FLOOR), self._probe_share
         there = np.maximum(z[self._x], 1.0)
+        # Pseudo-readings against model drift: probes are a fixed share of the vehicles. They count less each time,
+        # because they stay until they leave, MEMORY at most.
         kept = np.minimum(np.exp(-leaving / there), np.exp(-self._step / MEMORY))
         thinning = p * (1.0 - p) * there * (1.0 + kept) / (1.0 - kept) + FLOOR
         # The lasting part of the error of the detectors is a state.

@@ -100,13 +100,7 @@ class RegionalEnv(gymnasium.Env):
 
     metadata: dict[str, Any] = {"render_modes": []}
 
-    def __init__(
-        self,
-        scenario: Scenario | Path | str,
-        plant: Plant | None = None,
-        *,
-        guidance: bool = False,
-    ):
+    def __init__(self, scenario: Scenario | Path | str, plant: Plant | None = None, *, guidance: bool = False):
         self.scenario = scenario if isinstance(scenario, Scenario) else read_scenario(scenario)
         self.plant = NmfdPlant(self.scenario) if plant is None else plant
         self.interface = Interface(self.scenario.network, guidance=guidance)

@@ -311,16 +311,13 @@ def _versions() -> dict[str, str]:
 @cache
 def _checkout() -> tuple[str | None, bool | None]:
     """Return the commit of this package, and whether files differ from it, at the first call."""
-    # an installed copy may lie inside another checkout: the commit counts only if this file is tracked
-    if _git("ls-files", "--error-unmatch", Path(__file__).name) is None:
-        return None, None
-    return _git("rev-parse", "HEAD"), bool(_git("status", "--porcelain", "--untracked-files=no"))
 
-
-def _git(*arguments: str) -> str | None:
-    folder = Path(__file__).resolve().parent
-    try:
-        command = ["git", "--no-optional-locks", "-C", str(folder), *arguments]
+    def git(*arguments: str) -> str:
+        command = ["git", "--no-optional-locks", "-C", str(Path(__file__).resolve().parent), *arguments]
         return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
+
+    try:  # an installed copy may lie inside another checkout: the commit counts only if this file is tracked
+        git("ls-files", "--error-unmatch", Path(__file__).name)
+        return git("rev-parse", "HEAD"), bool(git("status", "--porcelain", "--untracked-files=no"))
     except (OSError, subprocess.SubprocessError):
-        return None
+        return None, None

@@ -11,6 +11,7 @@ from scipy.special import stdtrit
 
 from nmfd import closed_loop, faults
 from nmfd.controllers.strategy import Strategy
+from nmfd.errors import InputError
 from nmfd.metrics import COUNTED, percent_change
 from nmfd.model.plant import AcyclicPlant, NmfdPlant
 from nmfd.model.scenario import Scenario, perturbed
@@ -42,13 +43,7 @@ def compared_with(controllers: Iterable[str]) -> str:
 
 
 def closed_loop_of(
-    strategy: Strategy,
-    seed: int,
-    *,
-    scenario: Scenario,
-    plant: str,
-    policy: Path | None = None,
-    sigma: float = 0.0,
+    strategy: Strategy, seed: int, *, scenario: Scenario, plant: str, policy: Path | None = None, sigma: float = 0.0
 ) -> Result:
     """Run the controller of `strategy`, which is made for `scenario`, with noise on the demand.
 
@@ -108,7 +103,9 @@ def key_of(
     Raises:
         InputError: a controller cannot be made, or the regional model has no such fault
     """
-    faults.without_city(scenario.ordered_faults, f"{scenario.name}: faults")
+    for fault in scenario.ordered_faults:
+        if fault.kind in faults.CITY:
+            raise InputError(f"{scenario.name}: faults: {fault.kind} is a fault of a city in SUMO; omit it")
     own = {}
     for strategy in strategies:
         policy = policies.get(strategy.name)

@@ -26,12 +26,13 @@ from nmfd.controllers.dpc.policy import DpcController, Policy
 from nmfd.controllers.dpc.policy_file import load_policy
 from nmfd.controllers.dpc.rollout import Demands, Rollout
 from nmfd.controllers.mpc.controller import EconomicMpc
-from nmfd.controllers.mpc.terminal import LATE, OFFSET, Terminal, clock, write
+from nmfd.controllers.mpc.terminal import LATE, OFFSET, WEIGHTS, Terminal, clock
 from nmfd.controllers.rules import NoControl, PiGating
 from nmfd.controllers.strategy import TERMINAL, parse
 from nmfd.model.planning import PlanningModel, planning_model
 from nmfd.model.plant import NmfdPlant
 from nmfd.model.scenario import Scenario
+from nmfd.runs.files import atomic
 from nmfd.tensors import one_thread
 from nmfd.types import Controller
 
@@ -172,6 +173,17 @@ def _fitted(
         network_hash=planning.network.hash,
         controller=controller,
     )
+
+
+def write(terminal: Terminal, path: Path) -> None:
+    """Write an .npz file."""
+    layers = zip(WEIGHTS, terminal.weights, terminal.biases, strict=True)
+    arrays = {
+        f"{name}_{kind}": a.astype(np.float32) for name, w, b in layers for kind, a in (("weight", w), ("bias", b))
+    }
+    others = {name: getattr(terminal, name) for name in ("steps", "used", "scale", "network_hash", "controller")}
+    with atomic(path) as temporary:
+        np.savez_compressed(temporary, **others, **arrays)
 
 
 if __name__ == "__main__":

@@ -128,8 +128,7 @@ class Policy(nn.Module):
         return None
 
     def _around(self, x: PerPair) -> Float[torch.Tensor, "*#B R D F"]:
-        """Return the features of every boundary (i, h), in critical accumulations: n, the mean n of the neighbours,
-        and the vehicles with their destination there, for i and for h."""
+        """Return n, the neighbours' mean n, and the vehicles bound for it, in critical n, for i and h of boundaries."""
         critical = self.scale.squeeze(-1)
         full, ending = (n.to(critical.dtype) / critical for n in (x.sum(-1), torch.diagonal(x, dim1=-2, dim2=-1)))
         beside = (full[..., self.onward] * self.adjacency).sum(-1) / self.adjacency.sum(-1).clamp(min=1.0)

@@ -79,7 +79,7 @@ class Ipopt:
         """Return R matrices (R, R), and the constraints that are 0 if their shares have sum 1."""
         regions = self._network.regions
         if not self._guidance:
-            return [ca.SX(rows) for rows in model.splits_list(self._network.nominal_splits)], []
+            return [ca.SX(ca.sparsify(ca.DM(rows))) for rows in self._network.nominal_splits], []
         splits = [ca.SX(regions, regions) for _ in range(regions)]
         for n, (i, h, j) in enumerate(self._turns.tolist()):
             splits[i][h, j] = theta[n]

@@ -18,12 +18,10 @@ from scipy.special import erf
 from nmfd.controllers.mpc.edge_model import PerCell
 from nmfd.errors import InputError
 from nmfd.model.planning import PlanningModel
-from nmfd.runs.files import atomic
 
 WAVES = 8  # sines and cosines of the time
 OFFSET = 1e4  # veh intervals
 LATE = 2.5  # offset of s: initially vehicles leave soon
-MAKE = "make one with scenarios/economic_mpc/terminal_cost.py"
 WEIGHTS = ("first", "second", "last")
 
 
@@ -70,19 +68,8 @@ def _gelu(a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return a * below, below + a * np.exp(-0.5 * a * a) / math.sqrt(2.0 * math.pi)
 
 
-def write(terminal: Terminal, path: Path) -> None:
-    """Write an .npz file."""
-    layers = zip(WEIGHTS, terminal.weights, terminal.biases, strict=True)
-    arrays = {
-        f"{name}_{kind}": a.astype(np.float32) for name, w, b in layers for kind, a in (("weight", w), ("bias", b))
-    }
-    others = {name: getattr(terminal, name) for name in ("steps", "used", "scale", "network_hash", "controller")}
-    with atomic(path) as temporary:
-        np.savez_compressed(temporary, **others, **arrays)
-
-
 def read(path: Path, planning: PlanningModel, controller: str) -> Terminal:
-    """Read what `write` wrote. Raise InputError if it is of another regional model or controller."""
+    """Read an .npz file of terminal_cost.py. Raise InputError if it is of another regional model or controller."""
     try:
         with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             content = {name: file[name] for name in file.files}
