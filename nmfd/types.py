@@ -295,13 +295,7 @@ class Result:
         >>> table.columns.tolist()[3:]
         ['time_s', 'region', 'destination', 'accumulation_veh', 'backlog_veh']
         """
-        return self._table({"time": "time_s", "accumulation": "accumulation_veh", "backlog": "backlog_veh"})
-
-    def controls_frame(self) -> "pandas.DataFrame":
-        """Return the perimeter controls as a table: one row per interval and pair of regions, T R R rows."""
-        return self._table({"interval": "time_s", "perimeter": "perimeter"})
-
-    def _table(self, columns: dict[str, str]) -> "pandas.DataFrame":
+        columns = {"time": "time_s", "accumulation": "accumulation_veh", "backlog": "backlog_veh"}
         rows = self.data[list(columns)].to_dataframe().reset_index()
         for place, name in enumerate(("controller", "plant", "seed")):
             rows.insert(place, name, self.data.attrs[name])

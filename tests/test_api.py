@@ -108,9 +108,7 @@ def test_mistakes_are_input_errors(tmp_path, arguments, options, expected):
 
 def test_frames_hold_what_the_arrays_hold(tmp_path):
     trajectory = nmfd.run(tiny.write(tmp_path), "pi-gating")
-    frame, controls = trajectory.to_frame(), trajectory.controls_frame()
+    frame = trajectory.to_frame()
     assert frame["accumulation_veh"].sum() == pytest.approx(trajectory.accumulation.sum())
     row = frame[(frame["time_s"] == 90.0) & (frame["region"] == 0) & (frame["destination"] == 1)]
     assert row["accumulation_veh"].item() == trajectory.accumulation[3, 0, 1]
-    row = controls[(controls["time_s"] == 90.0) & (controls["region"] == 0) & (controls["next_region"] == 1)]
-    assert row["perimeter"].item() == trajectory.perimeter[3, 0, 1]

@@ -139,7 +139,7 @@ def runs():
 
 def test_beats_the_detectors_and_the_open_loop(runs):
     off = []
-    for truth, estimate, detectors, _, open_loop in runs:
+    for truth, estimate, detectors, open_loop in runs:
         total = truth.sum(axis=2)
         off.append([rmse(guess - total) for guess in (estimate.sum(axis=2), detectors, open_loop.sum(axis=2))])
         assert off[-1][0] < off[-1][1] and off[-1][0] < 0.5 * off[-1][2]
@@ -155,7 +155,7 @@ def test_the_whole_model_of_a_city_too(monkeypatch):
     monkeypatch.setattr(here, "NETWORK", _PEAK.network)
     assert NETWORK.exit_rates is not None and NETWORK.capacity is not None
     known = equipped()
-    truth, estimate, detectors, _ = watch(0, known)
+    truth, estimate, detectors = watch(0, known)
     open_loop = watch(0, known, changed=lambda observation: nothing())[1]
     total, seen = truth.sum(axis=2), estimate.sum(axis=2)
     assert rmse(seen - total) < 0.5 * min(rmse(detectors - total), rmse(open_loop.sum(axis=2) - total))

@@ -78,13 +78,11 @@ def test_removed_and_prices_are_zero_by_default():
 
 def test_the_tables_of_a_run_row_by_row():
     run = trajectory()
-    states, controls = run.to_frame(), run.controls_frame()
+    states = run.to_frame()
     assert list(states.columns[:5]) == ["controller", "plant", "seed", "time_s", "region"]
     assert list(states.columns[5:]) == ["destination", "accumulation_veh", "backlog_veh"]
-    assert list(controls.columns) == ["controller", "plant", "seed", "time_s", "region", "next_region", "perimeter"]
     for n, (k, i, j) in enumerate(np.ndindex(5, 2, 2)):
         assert tuple(states.loc[n]) == ("no-control", "nmfd", 0, 30.0 * k, i, j, run.accumulation[k, i, j], 0.0)
-    assert (controls["perimeter"] == run.perimeter.ravel()).all() and controls["time_s"].max() == 90.0
 
 
 def test_a_row_holds_the_figures_and_the_facts_of_a_run():

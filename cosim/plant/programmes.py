@@ -108,7 +108,6 @@ def optimised_plans(
     cycles, offsets = (folder / f"plan-{key[:16]}-{kind}.add.xml" for kind in ("cycles", "offsets"))
     if cycles.is_file() and offsets.is_file():
         return [cycles, offsets]
-    shipped.made(folder)
     unified = ("-u", "-y", "3", "-p", "webster", "--skip", ",".join(others))
     with temporary_folder() as scratch:
         (scratch / "routes.xml").write_bytes(routes)

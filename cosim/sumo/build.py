@@ -197,7 +197,6 @@ def _built(recipe_file: Path, network: RegionalModel) -> SumoFiles:
     built = all(file.is_file() for file in (stamp_file, files.net_file, files.regions_csv))
     if built and stamp_file.read_text(encoding="utf-8") == stamp:
         return files
-    shipped.made(folder)
     stamp_file.unlink(missing_ok=True)
     net, regions = build(recipe, str(recipe_file))
     # The stamp comes last: with it, all files are there.

@@ -260,14 +260,12 @@ def parse_many(given: str | Sequence[str], scenario: Scenario, *, regional: bool
 
     A pattern stands for all `ready` strategies that match and are not named besides.
     regional: for the regional model, without words for a city
-    Raises: InputError for an unknown or repeated name, none at all, or a pattern without a match
+    Raises: InputError for an unknown name, none at all, or a pattern without a match
     """
     names = [name.strip() for name in given.split(",")] if isinstance(given, str) else list(given)
     if not any(names):
         raise InputError("controllers: expected at least one controller, got none; name one, such as no-control")
-    plain = [name for name in names if not _is_pattern(name)]
-    if len(set(plain)) < len(plain):
-        raise InputError(f"controllers: {max(plain, key=plain.count)} is there twice; name every controller once")
+    plain = [name for name in names if not any(sign in name for sign in "*?[") or _own(name)]
     result: dict[str, Strategy] = {}
     for name in names:
         if name in plain:
@@ -343,10 +341,6 @@ def _own(name: str) -> ControllerType | None:
         return None
     make = partial(custom.OwnController, name)
     return ControllerType(name=name, text="controller of your own", make=make, guides=True, own=True)
-
-
-def _is_pattern(name: str) -> bool:
-    return any(sign in name for sign in "*?[") and _own(name) is None
 
 
 def _unknown(name: str, word: str, *, controllers: bool) -> InputError:

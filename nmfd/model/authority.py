@@ -101,9 +101,6 @@ def verdict(
     ]
     if network.placeholder:
         details.append("The critical accumulations are guesses from lanes and speed limits until cosim identify.")
-    elif any(network.doubts):
-        doubtful = ", ".join(name for name, doubts in zip(names, network.doubts, strict=True) if doubts)
-        details.append(f"The fit is doubtful in {doubtful}: see its warnings.")
     critical, nearest = np.flatnonzero(most >= 1.0), int(np.argmax(most))
     came, held = boundaries.flow.sum(axis=0), boundaries.controlled.sum(axis=0)
     holdable = held / np.maximum(came + started, 1.0)

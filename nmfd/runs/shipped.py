@@ -49,11 +49,7 @@ def found(name: Path | str, *kinds: str, beside: Path | None = None) -> Path:
             return folder
     if beside is not None or not kinds or len(word.parts) != 1 or word.suffix or os.path.exists(path):
         return path
-    near = [
-        folder.name
-        for kind in kinds
-        for folder in (*folders(kind), *(file.parent for file in Path().glob(f"*/{kind}.toml")))
-    ]
+    near = [folder.name for kind in kinds for folder in folders(kind)]
     raise InputError(
         f"{name}: no such folder here, and no {' or '.join(kinds)} of that name comes with the package"
         f"{did_you_mean(str(name), near)}; `nmfd show` lists them"
@@ -84,24 +80,16 @@ def beside(folder: Path, file: str, option: str, *, scenario: bool = False) -> P
 
 
 def build_folder(folder: Path) -> Path:
-    """Return the folder for files that are built of the city in `folder`; it may not exist yet.
+    """Make the folder for files that are built of the city in `folder`, and return it. Raises InputError.
 
     It is `folder`/build, or, if that cannot be written to, one in the user's cache ($COSIM_CACHE).
     """
-    if not installed(folder) and os.access(folder, os.W_OK):
-        return folder / "build"
-    where = os.environ.get(CACHE) or platformdirs.user_cache_dir("perimeter-cosim", appauthor=False)
-    fingerprint = hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:16]
-    return Path(where) / f"{folder.name}-{fingerprint}"
-
-
-def made(folder: Path) -> Path:
-    """Make a `build_folder` and return it. Raises InputError."""
+    where = folder / "build"
+    if installed(folder) or not os.access(folder, os.W_OK):
+        cache = os.environ.get(CACHE) or platformdirs.user_cache_dir("perimeter-cosim", appauthor=False)
+        where = Path(cache) / f"{folder.name}-{hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:16]}"
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        where.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(
-            f"{folder}: files built of a city cannot be kept there ({error.strerror}); name a folder that can be "
-            f"written to in the environment variable {CACHE}"
-        ) from None
-    return folder
+        raise InputError(f"{where}: {error.strerror}; name a folder for built cities in {CACHE}") from None
+    return where

@@ -21,13 +21,11 @@ FALL = 0.05  # of the largest outflow: a smaller fall up to the jam accumulation
 AHEAD_S = 900.0  # of the longer prediction
 FEW, POOR, SHORT, ENDLESS, ALONE = "few samples", "R2", "not reached", "no falling branch", "one seed"
 MEANINGS = {  # beginning of a doubt -> meaning and remedy
-    FEW: f"fewer than {SAMPLES} samples, the MFD is unchanged; higher --levels load the region",
-    POOR: f"below {EXPLAINED:g} the curve explains hardly anything of the outflow and misleads controllers; try more "
-    "--levels and --seeds, or other regions",
-    SHORT: "no loading run reached the critical accumulation, what lies beyond is a guess; give higher --levels, or "
-    "perimeter control has nothing to protect there",
-    ENDLESS: "the fitted outflow hardly falls up to the jam accumulation, so that the onset of congestion is unknown; "
-    "give higher --levels",
+    FEW: f"fewer than {SAMPLES} samples, the MFD is unchanged; give a higher demand (cosim: --levels)",
+    POOR: f"below {EXPLAINED:g} the curve explains hardly anything of the outflow and misleads controllers; give more "
+    "data (cosim: --levels, --seeds), or other regions",
+    SHORT: "no sample beyond the critical accumulation, the rest is a guess; give a higher demand (cosim: --levels)",
+    ENDLESS: "no falling branch: the onset of congestion is unknown; give a higher demand (cosim: --levels)",
     ALONE: "there is no held-out error; give --seeds 2 or more",
 }
 HELD_OUT = (

@@ -33,11 +33,7 @@ LEAST_COVERAGE, BIASED_SHARE, LEAST_DAYS = 0.3, 0.5, 3
 UNKNOWN, SMALL, LOOPS = "coverage unknown", "low coverage", "loops at stop lines"
 ASSUMED, SINGLE = "trip length assumed", "days"
 MEANINGS = {
-    fit_quality.FEW: f"fewer than {fit_quality.SAMPLES} intervals were measured",
-    fit_quality.POOR: f"below {fit_quality.EXPLAINED:g} the curve explains hardly anything of the outflow; other "
-    "regions may have an MFD",
-    fit_quality.SHORT: "the critical accumulation was never reached and is extrapolated",
-    fit_quality.ENDLESS: "no falling branch was measured, so the onset of congestion is unknown",
+    **fit_quality.MEANINGS,
     UNKNOWN: "accumulation and outflow are those of links with detectors; give lane_km with --about",
     SMALL: f"detectors stand for less than {100 * LEAST_COVERAGE:g} % of the lane-kilometres, usually the main roads",
     LOOPS: f"most loops lie within {1000 * STOP_LINE_KM:g} m of a junction, where standing queues bias the density",
@@ -101,7 +97,11 @@ def identify(
     rows, left = detector_tables.read_counts(counts, city=city, skip_bad=skip_bad)
     stations = detector_tables.read_detectors(paths[0], paths[1], rows, counts, city=city)
     base = _base_network(paths[3], stations)
-    names = _sorted(set(stations["region"])) if base is None else list(base.region_names)
+    names = (
+        list(base.region_names)
+        if base
+        else sorted(set(stations["region"]), key=lambda name: name.rjust(9) if name.isdecimal() else name)
+    )
     table = detector_tables.read_about(paths[2], names)
     lane_km, coverage = _lane_km(stations, table, paths[2] or counts)
     trip_km, assumed = _trip_lengths(stations, table, trip_length)
@@ -196,11 +196,6 @@ def _cloud(part: pd.DataFrame) -> dict[str, Points]:
     rising = part.groupby("day")["accumulation_veh"].diff().fillna(0.0) >= 0
     points, occupied = part[["accumulation_veh", "outflow_veh_s"]].to_numpy(dtype=float), part["accumulation_veh"] > 0
     return {"loading": points[occupied & rising], "unloading": points[occupied & ~rising]}
-
-
-def _sorted(names: set[str]) -> list[str]:
-    """Return numbers by their value, then names."""
-    return sorted(names, key=lambda name: (not name.isdecimal(), int(name) if name.isdecimal() else 0, name))
 
 
 def _base_network(path: Path | None, detectors: pd.DataFrame) -> RegionalModel | None:

@@ -94,51 +94,34 @@ def improvements(rows: "pd.DataFrame", controller: str) -> dict[float, tuple[flo
     return {sigma: (math.fsum(values) / len(values), interval(values)) for sigma, values in gains.items()}
 
 
-def trips(rows: "pd.DataFrame") -> dict[float, float]:
-    """Return sigma -> mean number of trips [veh]."""
-    rows = rows[(rows["controller"] == REFERENCE) & (rows["failure"] == "")]
-    return rows.groupby("sigma_veh_per_s")["trips_veh"].mean().to_dict()
-
-
 def draw(folder: Path, rows: "pd.DataFrame") -> None:
-    """Draw improvement and trips over sigma as robustness.png in `folder`."""
-    drawing = plots.figure(8.0, 6.4)
-    upper, lower = drawing.subplots(2, 1, sharex=True, height_ratios=(3, 1))
-    upper.axhline(0.0, color=plots.COLOURS[REFERENCE], linewidth=1.0)
+    """Draw the improvement over sigma as robustness.png in `folder`."""
+    drawing = plots.figure(8.0, 4.8)
+    ax = drawing.subplots()
+    ax.axhline(0.0, color=plots.COLOURS[REFERENCE], linewidth=1.0)
     names = _compared(rows)
     colours = plots.colours(names)
     for number, name in enumerate(names):
         gains = improvements(rows, name)
         mean, half = np.array(list(gains.values())).reshape(-1, 2).T
         style = dict(marker="o^sDv"[number % 5], markersize=4, capsize=3, linewidth=1.6, color=colours[name])
-        upper.errorbar(list(gains), mean, np.nan_to_num(half), label=name, **style)
-    count = trips(rows)
-    lower.plot(list(count), list(count.values()), color=plots.COLOURS[REFERENCE], marker="o", markersize=4)
-    upper.set_ylabel("total time spent saved\nagainst no-control [%]")
-    lower.set(xlabel="standard deviation of the noise on the demand [veh/s]", ylabel="trips [veh]", ylim=(0.0, None))
-    for ax in (upper, lower):
-        ax.spines[["top", "right"]].set_visible(False)
-    drawing.align_ylabels()
-    plots.legend_below(drawing, [upper], columns=4)
+        ax.errorbar(list(gains), mean, np.nan_to_num(half), label=name, **style)
+    ax.set(xlabel="standard deviation of the noise on the demand [veh/s]", ylabel="total time spent saved [%]")
+    ax.spines[["top", "right"]].set_visible(False)
+    plots.legend_below(drawing, [ax])
     plots.save(drawing, folder / "robustness.png")
 
 
 def improvement_table(rows: "pd.DataFrame") -> str:
     """Return the improvements as text: one line per controller, one column per sigma."""
-    count = trips(rows)
-    lines = [["trips", *(f"{total:,.0f}" for total in count.values())]]
+    reference = rows[(rows["controller"] == REFERENCE) & (rows["failure"] == "")]
+    trips = reference.groupby("sigma_veh_per_s")["trips_veh"].mean()
+    lines = [["trips", *(f"{total:,.0f}" for total in trips)]]
     for name in _compared(rows):
         gains = improvements(rows, name)
-        lines.append(
-            [
-                name,
-                *(
-                    "{:.1f} ± {:.1f}".format(*gains[s]) if s in gains and gains[s][0] == gains[s][0] else "-"
-                    for s in count
-                ),
-            ]
-        )
-    return text_columns(["sigma", *(f"{sigma:g}" for sigma in count)], lines, CAPTION)
+        cells = {sigma: f"{mean:.1f} ± {half:.1f}" for sigma, (mean, half) in gains.items() if not math.isnan(mean)}
+        lines.append([name, *(cells.get(sigma, "-") for sigma in trips.index)])
+    return text_columns(["sigma", *(f"{sigma:g}" for sigma in trips.index)], lines, CAPTION)
 
 
 def _compared(rows: "pd.DataFrame") -> list[str]:

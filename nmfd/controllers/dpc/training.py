@@ -116,11 +116,6 @@ class Training(Options):
         key = "compact" if self.compact else "from_gating"
         return Problem(key, "expected a scenario with protected regions; name them, or omit it")
 
-    @property
-    def levels(self) -> tuple[float, float]:
-        """Range of the factor of all demand."""
-        return self.demand_low, self.demand_high
-
 
 def settings(scenario: Scenario, strategy: "Strategy", steps: int | None = None) -> Training:
     """Return the training settings of a strategy; `steps` overrides. Raise InputError."""
@@ -252,7 +247,8 @@ def _descend(
 ) -> None:
     """Do one Adam step."""
     rollout.draw_model(BATCH, setup.mfd_spread, generator, setup.mfd_scale)
-    x, demand = rollout.random_start(BATCH, DEMAND_SPREAD, RANDOM_START_SHARE, generator, setup.levels)
+    levels = setup.demand_low, setup.demand_high
+    x, demand = rollout.random_start(BATCH, DEMAND_SPREAD, RANDOM_START_SHARE, generator, levels)
     demand = rollout.perturb(demand, torch.rand(BATCH, generator=generator), setup.noise, generator)
     # The logarithm, because a rollout that is heavily loaded must not count for more than the others.
     loss = torch.log(rollout.total_time_spent(policy, x, demand, generator, advance).clamp(min=1.0)).mean()
@@ -312,8 +308,10 @@ def validate(policy: Policy, rollout: Rollout, seed: int, setup: Training) -> fl
     nominal = rollout.demand.unsqueeze(1).expand(-1, count, -1, -1)
     demand = rollout.perturb(nominal, level, setup.noise, generator)
     if setup.demand_low < setup.demand_high:
-        low, high = setup.levels
-        factor = low + (high - low) * level[torch.randperm(count, generator=generator)]
+        factor = (
+            setup.demand_low
+            + (setup.demand_high - setup.demand_low) * level[torch.randperm(count, generator=generator)]
+        )
         demand = demand * factor.to(demand)[:, None, None]
     with torch.no_grad():
         total = rollout.total_time_spent(policy, rollout.start.expand_as(demand[0]), demand, generator)

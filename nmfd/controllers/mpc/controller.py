@@ -260,7 +260,7 @@ class EconomicMpc:
         rows = [self.admissible.decision(u, theta) for u, theta in zip(perimeter, splits, strict=True)]
         plan = self.admissible.project(np.stack(rows[: self._moves]))
         value, gradient = self._rounded(start, demand, plan)
-        return Minimum(point=plan, value=value, gap=self.admissible.gap(plan, gradient), evaluations=1, reason=reason)
+        return Minimum(point=plan, value=value, gap=self.admissible.gap(plan, gradient), reason=reason)
 
 
 def load(path: Path, planning: PlanningModel, *, guidance: bool) -> EconomicMpc:

@@ -29,13 +29,11 @@ class Minimum:
     point, value: the best
     gap: bound on value minus minimum if the function is convex; else to first order, at a point that is no better
     reason: why the search stopped short of its tolerance, or None
-    evaluations: of the function and its gradient
     """
 
     point: np.ndarray
     value: float
     gap: float
-    evaluations: int
     reason: str | None
 
 
@@ -64,19 +62,19 @@ def minimise(
     try:
         value, gradient = function(point)
     except Late:
-        return Minimum(point=start, value=np.inf, gap=np.inf, evaluations=1, reason=TIME_LIMIT)
+        return Minimum(point=start, value=np.inf, gap=np.inf, reason=TIME_LIMIT)
     if not (np.isfinite(value) and np.isfinite(gradient).all()):
-        return Minimum(point=start, value=value, gap=np.inf, evaluations=1, reason="not a number")
-    recent, evaluations = deque([value], MEMORY), 1
+        return Minimum(point=start, value=value, gap=np.inf, reason="not a number")
+    recent = deque([value], MEMORY)
     length = 1.0 / max(np.abs(gradient / metric).max(initial=0.0), 1.0 / MAX_STEP)
     best, least = (point, np.inf), np.inf
 
     def stopped(reason: str) -> Minimum:
-        return Minimum(point=best[0], value=best[1], gap=least, evaluations=evaluations, reason=reason)
+        return Minimum(point=best[0], value=best[1], gap=least, reason=reason)
 
     for iteration in range(iterations + 1):
         if (now := gap(point, gradient)) <= tolerance * abs(value):
-            return Minimum(point=point, value=value, gap=now, evaluations=evaluations, reason=None)
+            return Minimum(point=point, value=value, gap=now, reason=None)
         least = min(least, now)
         if value < best[1]:
             best = point, value
@@ -87,7 +85,6 @@ def minimise(
         slope, share, limit = float((gradient * direction).sum()), 1.0, max(recent)
         while True:
             other = point + share * direction
-            evaluations += 1
             try:
                 other_value, other_gradient = function(other)
             except Late:
