@@ -49,7 +49,8 @@ def found(name: Path | str, *kinds: str, beside: Path | None = None) -> Path:
             return folder
     if beside is not None or not kinds or len(word.parts) != 1 or word.suffix or os.path.exists(path):
         return path
-    near = [folder.name for kind in kinds for folder in folders(kind)]
+    places = [(place, kind) for kind in kinds for place in (root() / f"{kind}s", Path())]
+    near = [file.parent.name for place, kind in places for file in place.glob(f"*/{kind}.toml")]
     raise InputError(
         f"{name}: no such folder here, and no {' or '.join(kinds)} of that name comes with the package"
         f"{did_you_mean(str(name), near)}; `nmfd show` lists them"
