@@ -20,10 +20,9 @@ from cosim.importing import get as cities
 from cosim.importing.case import parse_box, seconds
 from cosim.report import card, figures
 from cosim.sumo.outputs import check
-from cosim.sumo.session import LOST, Window
 from nmfd.api import check_policies, load_scenario
 from nmfd.controllers.strategy import parse, parse_many
-from nmfd.errors import InputError
+from nmfd.errors import InputError, RunFailed
 from nmfd.metrics import summary
 from nmfd.model.scenario import Scenario, with_demand
 from nmfd.runs import shipped
@@ -161,11 +160,10 @@ def watch(
     loaded = load_scenario(scenario, settings)
     jobs = [Simulation(loaded, parse(name), seed, demand) for name in dict.fromkeys(controllers)]
     if gui:
-        window = Window(options=("--start", "true", "--quit-on-end", "true", "--delay", "20"))
         try:
             with watched("watch", None) as show:
-                rows = {jobs[0].strategy.name: summary(simulate(jobs[0], progress=show, window=window))}
-        except LOST:
+                rows = {jobs[0].strategy.name: summary(simulate(jobs[0], progress=show, gui=True))}
+        except RunFailed:
             return "The window was closed before the end."
     else:
         runs = live.watch(jobs, port=port, browse=_has_screen())

@@ -245,7 +245,7 @@ def trips(city, case: Case, seed: int) -> str:
     )
 
 
-def run(folder: Path, city, case: Case, *, mesoscopic: bool, seed: int, prompt: bool = True):
+def run(folder: Path, city, case: Case, *, mesoscopic: bool, seed: int):
     """The meter after the run, its states, and the elements of SUMO's tripinfo."""
     (folder / "trips.rou.xml").write_text(trips(city, case, seed))
     (folder / "more.add.xml").write_text(f"<additional>{case.additional}</additional>")
@@ -267,7 +267,7 @@ def run(folder: Path, city, case: Case, *, mesoscopic: bool, seed: int, prompt: 
     )
     states = []
     try:
-        reader = TripReader(out, session.flush if prompt else lambda: False)
+        reader = TripReader(out, session.flush)
         meter = Meter(session, city, trips=reader)
         for step in range(STEPS):
             if case.script and not case.late:
@@ -337,32 +337,17 @@ def test_nobody_goes_unnoticed(city, tmp_path, name, mesoscopic):
         assert getattr(meter, what).any(), what
 
 
-@pytest.mark.parametrize(
-    "name, mesoscopic",
-    [
-        ("removed-as-anything", False),
-        pytest.param("everything", False, marks=pytest.mark.slow),
-        pytest.param("everything", True, marks=pytest.mark.slow),
-    ],
-)
-def test_where_sumo_writes_late_the_books_are_right_in_the_end(city, tmp_path, name, mesoscopic):
-    """As in the window, which nobody can ask to write at once: about ten trips are not told of until then."""
-    meter, _, infos, count = run(tmp_path, city, CASES[name], mesoscopic=mesoscopic, seed=1, prompt=False)
-    check(city, meter, [], infos, count)
-
-
 def test_a_vehicle_that_sumo_tells_nothing_of_is_an_error(city, tmp_path):
     silent = Case(
         vehicles='<vType id="s"><param key="has.tripinfo.device" value="false"/></vType>'
         '<flow id="f" type="s" begin="0" end="50" period="5" from="A1B1" to="B1C1"/>',
         trips=5,
     )
-    for prompt in (True, False):
-        with pytest.raises(
-            LedgerError,
-            match=(r"such as f\.\d\): is the disk full\? Or does their type have has\.tripinfo\.device = false"),
-        ):
-            run(tmp_path, city, silent, mesoscopic=False, seed=1, prompt=prompt)
+    with pytest.raises(
+        LedgerError,
+        match=(r"such as f\.\d\): is the disk full\? Or does their type have has\.tripinfo\.device = false"),
+    ):
+        run(tmp_path, city, silent, mesoscopic=False, seed=1)
 
 
 MEDDLER = """

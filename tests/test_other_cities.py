@@ -286,7 +286,7 @@ def test_a_vehicle_that_sumo_gives_up_at_once(net, city):
                 return ("ghost",)
 
             def route(self, vehicle):
-                raise REFUSALS[0](f"Vehicle '{vehicle}' is not known.")
+                raise REFUSALS(f"Vehicle '{vehicle}' is not known.")
 
             def __getattr__(self, name):
                 return lambda *_: ()

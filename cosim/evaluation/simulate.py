@@ -17,7 +17,6 @@ from cosim.plant.settings import settings
 from cosim.sumo.arrays import RegionCounts
 from cosim.sumo.net import City, Gateway, gateway_room_taken
 from cosim.sumo.outputs import TripFacts, check_whole
-from cosim.sumo.session import Window
 from nmfd import closed_loop, metrics
 from nmfd.arrays import PerRegion
 from nmfd.controllers.strategy import Strategy
@@ -88,13 +87,13 @@ def simulate(
     *,
     progress: Callable[[int, int], None] | None = None,
     observer: Observer | None = None,
-    window: Window | None = None,
+    gui: bool = False,
 ) -> Result:
     """Do a simulation in this process, which may hold no other SUMO session.
 
     progress: called as progress(done, steps) after every control interval
     observer: gets the state of the run while it goes on
-    window: options of sumo-gui
+    gui: show it in sumo-gui, and leave out the facts, for which the window would have to close
     Raises: InputError if the strategy cannot run in this city
     """
     begin = time.perf_counter()
@@ -108,11 +107,13 @@ def simulate(
             outputs=files,
             planning=strategy.planning(scenario),
             observer=observer,
-            window=window,
+            gui=gui,
         )
         stack.callback(plant.close)
         result = closed_loop.run(plant, controller, scenario, seed=job.seed, progress=progress)
         result = result.assign(controller=strategy.name, plant="sumo")
+        if gui:
+            return result
         plant_facts, leaks, trip_facts = plant.facts(), set(plant.leaks()), plant.trip_facts()
         result = settled(result.add({}, RECORD, **plant.record()))
         backlog, errors = result.backlog.sum(axis=(1, 2)), dict.fromkeys(("rmse_share", "cell_rmse_veh"), math.nan)

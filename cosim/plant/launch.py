@@ -23,7 +23,7 @@ from cosim.sumo.recorded_trips import (
     write_held_trips,
     write_recorded_trips,
 )
-from cosim.sumo.session import Session, Window
+from cosim.sumo.session import Session
 from cosim.sumo.trips import PLANNING_SEEDS, HeldTrips, held, make_trips, turning_flows, write_trips
 from cosim.sumo.xml_files import file_list
 from nmfd.errors import InputError
@@ -60,11 +60,11 @@ class Launch:
         layout: Layout,
         *,
         outputs: Mapping[str, Path],
-        window: Window | None,
+        gui: bool,
     ):
-        """outputs: kind (cosim.sumo.outputs) -> file; layout: of the loop detectors"""
+        """outputs: kind (cosim.sumo.outputs) -> file; layout: of the loop detectors; gui: in the window of sumo-gui"""
         self._scenario, self._settings, self._city, self._signals = scenario, settings, city, signals
-        self._layout, self._outputs, self._window = layout, outputs, window
+        self._layout, self._outputs, self._gui = layout, outputs, gui
         self._temporary = tempfile.TemporaryDirectory(prefix="cosim-", ignore_cleanup_errors=True)
         self._folder = Path(self._temporary.name)
         self._originals: RecordedTrips | None = None
@@ -83,7 +83,7 @@ class Launch:
             step_length=settings.step_length,
             time_to_teleport=settings.time_to_teleport,
             options=tuple(self._options()),
-            window=self._window,
+            gui=self._gui,
         )
 
     def turning_flows(self) -> Mapping[tuple[str, str], float]:

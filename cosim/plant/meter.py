@@ -1,8 +1,7 @@
 """The exact vehicle ledger of a run: accumulations x_ij, and every crossing of a boundary.
 
 SUMO's tripinfo says what became of vehicles that have left (cosim.sumo.outputs): an arrival at the last edge of the
-final route, else a removal. If SUMO cannot be made to write it at once (in its window), a vehicle that has left is
-booked as an arrival, and again when tripinfo has it; `close_books` has the last word.
+final route, else a removal.
 """
 
 from collections import Counter
@@ -47,15 +46,6 @@ class _Vehicle:
         return self.region
 
 
-@dataclass
-class _Gone:
-    """A vehicle that has left from `region`; guess: how it is booked until tripinfo has it."""
-
-    vehicle: _Vehicle
-    region: int
-    guess: End | None = None
-
-
 @dataclass(frozen=True, kw_only=True)
 class Event:
     """A departure (source None), or the entry of a vehicle into another region.
@@ -95,12 +85,14 @@ class Meter:
         trips: TripReader | None = None,
         metering: Metering | None = None,
     ):
-        """probes: vehicles that are also counted apart; trips: ends of trips, None if all are arrivals; metering: trips
-        that wait outside"""
+        """probes: vehicles that are also counted apart; metering: trips that wait outside
+
+        trips: ends of trips; None if SUMO cannot write them at once: all are arrivals then
+        """
         self._metering = metering
         self._session, self._city, self._probes, self._trips = session, city, probes, trips
         self._vehicles: dict[str, _Vehicle] = {}
-        self._gone: dict[str, list[_Gone]] = {}  # not in tripinfo yet; several if an id is used again
+        self._gone: dict[str, list[_Vehicle]] = {}  # not in tripinfo yet; several if an id is used again
         self._teleporting: set[str] = set()
         self._joined = {(g.source, g.target) for g in city.gateways}
         entries = sorted({g.to_edge for g in city.gateways})
@@ -194,7 +186,8 @@ class Meter:
         for vehicle in away:
             known = self._vehicles[vehicle]
             counted[known.region, known.destination] += 1
-        self._guess(step)
+        if self._gone:
+            raise LedgerError(f"vehicle ledger broken at control step {step}{self._unknown_ends()}")
         balance = int(self.departures.sum() - self.arrivals.sum() - self.removals.sum())
         if counted.sum() != balance or (counted != self._running).any():
             i, j = np.unravel_index(int(np.abs(counted - self._running).argmax()), counted.shape)
@@ -261,11 +254,7 @@ class Meter:
         """Return vehicles that the mesoscopic model holds off a jammed road; the others off the road have left."""
         under_way = {vehicle for vehicle, known in self._vehicles.items() if known.region is not None}
         lost = under_way.difference(on_road, self._teleporting)
-        held = lost.intersection(self._session.known())
-        if self._trips is not None and not self._trips.prompt:
-            for vehicle in lost - held:
-                self._leave(vehicle, End(vehicle=vehicle, reason="unknown"))
-        return held
+        return lost.intersection(self._session.known())
 
     def _settle(self, ends: Iterable[End]) -> None:
         """Book ends of trips."""
@@ -276,24 +265,10 @@ class Meter:
                 self._under_way(end.vehicle)
                 self._leave(end.vehicle)
             gone = self._gone[end.vehicle].pop(0)
-            self.time_loss[gone.vehicle.origin] += end.time_loss
+            self.time_loss[gone.origin] += end.time_loss
             if not self._gone[end.vehicle]:
                 del self._gone[end.vehicle]
-            if gone.guess is not None:
-                self._book(gone, gone.guess, -1)
             self._book(gone, end)
-
-    def _guess(self, step: int) -> None:
-        """Book vehicles without an end as arrivals. Raises LedgerError if tripinfo was up to date."""
-        if self._gone and self._trips is not None and self._trips.prompt:
-            raise LedgerError(f"vehicle ledger broken at control step {step}{self._unknown_ends()}")
-        for vehicle, left in self._gone.items():
-            for gone in left:
-                if gone.guess is None:
-                    gone.guess = End(vehicle=vehicle)
-                    self._book(gone, gone.guess)
-        if self._trips is None:
-            self._gone.clear()
 
     def _unknown_ends(self) -> str:
         if not self._gone:
@@ -303,19 +278,19 @@ class Meter:
             f"{min(self._gone)}): is the disk full? Or does their type have has.tripinfo.device = false? Remove that"
         )
 
-    def _book(self, gone: _Gone, end: End, sign: int = 1) -> None:
-        """Book the end of a vehicle; sign: -1 to take it back."""
-        i, j = gone.region, gone.vehicle.destination
+    def _book(self, gone: _Vehicle, end: End) -> None:
+        """Book the end of a vehicle."""
+        i, j = gone.here, gone.destination
         if not end.reason and (to := self._city.region_of.get(end.edge, j)) != j:
-            self.redirected[i, j, to] += sign
+            self.redirected[i, j, to] += 1
             j = to
         h = self._city.region_of.get(end.edge, i if end.reason else j)
         if h != i:
-            (self.crossings if (i, h) in self._joined else self.jumps)[i, h, j] += sign
+            (self.crossings if (i, h) in self._joined else self.jumps)[i, h, j] += 1
         if end.reason:
-            self.removals[h, j] += sign
+            self.removals[h, j] += 1
         else:
-            self.arrivals[h] += sign
+            self.arrivals[h] += 1
 
     def _load(self, vehicle: str) -> _Vehicle:
         if vehicle not in self._vehicles:
@@ -333,7 +308,7 @@ class Meter:
     def _depart(self, vehicle: str) -> _Vehicle:
         """Book a departure where the vehicle is first seen, for where its route leads by now."""
         known = self._load(vehicle)
-        with suppress(*REFUSALS):  # gone already
+        with suppress(REFUSALS):  # gone already
             self._follow(vehicle, known)
             known.origin = self._city.region_of.get(self._session.road(vehicle), known.origin)
         known.region = known.announced = known.origin
@@ -358,7 +333,7 @@ class Meter:
             self._running[known.region, before] -= 1
             self._running[known.region, known.destination] += 1
 
-    def _leave(self, vehicle: str, guess: End | None = None) -> None:
+    def _leave(self, vehicle: str) -> None:
         """Take a vehicle out; its end is booked when tripinfo has it."""
         self._teleporting.discard(vehicle)
         known = self._vehicles.pop(vehicle)
@@ -366,10 +341,10 @@ class Meter:
             self.given_up[known.origin, known.destination] += 1
             return
         self._running[known.region, known.destination] -= 1
-        gone = _Gone(known, known.region, guess)
-        self._gone.setdefault(vehicle, []).append(gone)
-        if guess is not None:
-            self._book(gone, guess)
+        if self._trips is None:
+            self._book(known, End(vehicle=vehicle))
+        else:
+            self._gone.setdefault(vehicle, []).append(known)
 
     def _enter(self, vehicle: str, edge: str, region: int) -> Event | None:
         known = self._under_way(vehicle)

@@ -23,7 +23,7 @@ from cosim.plant.stuck import Junctions
 from cosim.sumo.arrays import PerEdge
 from cosim.sumo.net import City, Gateway, check_adjacency, city_of
 from cosim.sumo.outputs import TripFacts, TripReader
-from cosim.sumo.session import Session, Window
+from cosim.sumo.session import Session
 from nmfd.arrays import PerRegion, PerTurn
 from nmfd.model.planning import PlanningModel, planning_model
 from nmfd.model.scenario import Scenario
@@ -58,14 +58,14 @@ class SumoPlant:
         *,
         settings: Settings | None = None,
         outputs: Mapping[str, Path] | None = None,
-        window: Window | None = None,
+        gui: bool = False,
         planning: PlanningModel | None = None,
         observer: Observer | None = None,
     ):
         """Build the network if need be.
 
         settings: instead of the table [sumo]; outputs: kind (cosim.sumo.outputs) -> file, complete after `trip_facts`
-        window: shows the run in sumo-gui; planning: model of the estimator, that of the scenario if None
+        gui: show the run in sumo-gui; planning: model of the estimator, that of the scenario if None
         Raises InputError for a city that does not fit the scenario's network or the settings.
         """
         self._scenario, self._planning = scenario, planning or planning_model(scenario)
@@ -79,7 +79,7 @@ class SumoPlant:
         self._signals = city_signals(self.city, scenario, settings)
         self.simple_signals, self.other_signals = self._signals.simple, self._signals.others
         self._launch = Launch(
-            scenario, settings, self.city, self._signals, self._layout, outputs=dict(outputs or {}), window=window
+            scenario, settings, self.city, self._signals, self._layout, outputs=dict(outputs or {}), gui=gui
         )
         self._session: Session | None = None
 
@@ -89,7 +89,7 @@ class SumoPlant:
         scenario, settings, city = self._scenario, self._settings, self.city
         self._k, self._session = 0, self._launch.start(seed)
         session = self._session
-        self._trips, self._facts = TripReader(self._launch.trip_file, session.flush), TripFacts()
+        self._trips, self._facts = TripReader(self._launch.trip_file, session.flush or (lambda: None)), TripFacts()
         self._incidents = Incidents(scenario.ordered_faults, session, city)
         held, critical = self._launch.held, self._planning.network.critical
         self._metering = None
@@ -97,7 +97,7 @@ class SumoPlant:
             self._metering = Metering(session, held, critical, level=settings.metering, step=scenario.step)
         estimated = settings.measurement == ESTIMATE
         known = probes(self._launch.vehicles, settings.probe_share if estimated else 0.0, seed)
-        self._meter = meter = Meter(session, city, known, self._trips, self._metering)
+        self._meter = meter = Meter(session, city, known, self._trips if session.flush else None, self._metering)
         self._estimation = None
         if estimated:
             self._estimation = Estimation(session, city, self._layout, meter, self._instruments, self._planning)
@@ -200,8 +200,12 @@ class SumoPlant:
         Raises LedgerError if SUMO's tripinfo differs from the books.
         """
         if self._session is not None:
+            followed = self._session.flush is not None
             self._end_session()
-            self._meter.close_books()
+            if followed:
+                self._meter.close_books()
+            else:
+                self._trips.finish()
             self._recorder.close()
             self._facts = facts = self._trips.facts
             if self._metering is not None:

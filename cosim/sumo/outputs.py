@@ -59,20 +59,19 @@ class End:
 class TripReader:
     """Reader of SUMO's tripinfo output while SUMO writes it.
 
-    facts: of all trips so far; prompt: the last reading had all that SUMO knew; under_way: vehicle -> time loss [s], of
-    those on the road at the end of the simulation
+    facts: of all trips so far; under_way: vehicle -> time loss [s], of those on the road at the end of the simulation
     """
 
-    def __init__(self, path: Path, flush: Callable[[], bool] = lambda: False):
-        """flush: makes SUMO write what it buffers (about ten trips); False if it cannot"""
+    def __init__(self, path: Path, flush: Callable[[], None] = lambda: None):
+        """flush: makes SUMO write what it buffers (about ten trips)"""
         self._path, self._flush, self._offset = path, flush, 0
         self._parser: ElementTree.XMLPullParser[Element] = ElementTree.XMLPullParser()
-        self.facts, self.prompt = TripFacts(), False
+        self.facts = TripFacts()
         self.under_way: dict[str, float] = {}
 
     def ends(self) -> list[End]:
         """Return the trips that ended since the last call. Raises RunFailed for a broken file."""
-        self.prompt = self._flush()
+        self._flush()
         return self._read(lambda vehicle: True)
 
     def finish(self, gone: Container[str] = ()) -> list[End]:

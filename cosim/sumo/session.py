@@ -1,42 +1,26 @@
-"""The SUMO session: the only module that imports libsumo. At most one simulation per process.
-
-libsumo has no window: with one, sumo-gui runs beside this process, controlled by traci, which has the same functions.
-"""
+"""The SUMO session: the only module that imports libsumo. At most one simulation per process."""
 
 import ctypes
-import io
 import os
-import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import redirect_stdout, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import libsumo
-import sumo
-import traci
-from sumolib.miscutils import getFreeSocketPort
 
 from cosim.sumo.recorded_trips import BOUND
 from cosim.sumo.xml_files import file_list
 from nmfd.errors import InputError, RunFailed
 
-REFUSALS = (libsumo.TraCIException, traci.TraCIException)  # of one order: the simulation goes on
-FATAL = (libsumo.FatalTraCIError, traci.FatalTraCIError)
-LOST = (traci.FatalTraCIError, ConnectionError)  # errors of every order after the window was closed
+REFUSALS = libsumo.TraCIException  # of one order: the simulation goes on
+ERRORS = (REFUSALS, libsumo.FatalTraCIError)
 KEPT_BYTES = {-1: 64 << 20, -3: 32 << 20}  # by M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of malloc.h: see _keep_freed
-GUI_TIMEOUT_S = 600  # to read the files
-
-
-@dataclass(frozen=True, kw_only=True)
-class Window:
-    """A window of sumo-gui. options: of its command line"""
-
-    options: tuple[str, ...] = ()
+GUI_OPTIONS = ("--start", "true", "--delay", "20")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,9 +71,9 @@ class Session:
         time_to_teleport: float = -1.0,
         collision_action: str = "warn",
         options: tuple[str, ...] = (),
-        window: Window | None = None,
+        gui: bool = False,
     ):
-        """Start the simulation.
+        """Start the simulation, in the window of sumo-gui if `gui`.
 
         Raises RuntimeError if another session is open in this process, InputError if SUMO refuses to start.
         """
@@ -111,26 +95,22 @@ class Session:
         }
         self.command = ["sumo", *(part for key, value in settings.items() for part in (f"--{key}", str(value)))]
         self.command += options
-        self._sumo = libsumo if window is None else traci
+        self._gui, self.flush = gui, _flush_all()  # the latter makes SUMO write its output buffers
         try:
-            if window is None:
-                _start_quietly(self.command)
+            if gui:
+                libsumo.start(["sumo-gui", *self.command[1:], *GUI_OPTIONS])
             else:
-                _start_window(window, self.command)
-        except (*REFUSALS, *FATAL) as error:
-            words = _one_line(error)
-            if window is not None:
-                raise InputError(f"sumo-gui cannot show {net_file}: {words}; check DISPLAY, or omit --gui") from None
-            raise InputError(f"{net_file}: SUMO cannot run it with {routes}: {words}") from None
+                _start_quietly(self.command)
+        except ERRORS as error:
+            raise InputError(f"{net_file}: SUMO cannot run it with {routes}: {_one_line(error)}") from None
         Session._open = True
-        self._flush = _flush_all() if window is None else None
-        self.time = self._sumo.simulation.getTime()
+        self.time = libsumo.simulation.getTime()
         self._lanes_of: dict[str, tuple[str, ...]] = {}  # edge -> its lanes
         self._bind()
 
     def _bind(self) -> None:
         """Bind SUMO's functions that need no translation; a Python call around them would cost as much as they do."""
-        simulation, vehicle, edge, lane = (self._sumo.simulation, self._sumo.vehicle, self._sumo.edge, self._sumo.lane)
+        simulation, vehicle, edge, lane = libsumo.simulation, libsumo.vehicle, libsumo.edge, libsumo.lane
         # Vehicles in the last step: read from files; inserted; ended as SUMO says, which tripinfo may deny, without
         # those that a program removed; taken off the road to be moved on; back on the road, or gone for good.
         self.loaded, self.departed = simulation.getLoadedIDList, simulation.getDepartedIDList
@@ -147,34 +127,31 @@ class Session:
         self.vehicles_on, self.vehicle_count = edge.getLastStepVehicleIDs, edge.getLastStepVehicleNumber
         self.halting, self.lane_vehicles = edge.getLastStepHaltingNumber, lane.getLastStepVehicleNumber
         # One loop detector: share of the last step in which a vehicle was on it [%].
-        self.loop_occupancy = self._sumo.inductionloop.getLastStepOccupancy
+        self.loop_occupancy = libsumo.inductionloop.getLastStepOccupancy
         # Signals: all of the network; state of one, a character per link; id of its programme; run one of its own.
-        light = self._sumo.trafficlight
+        light = libsumo.trafficlight
         self.signals, self.signal_state = light.getIDList, light.getRedYellowGreenState
         self.programme_id, self.restart_programme = light.getProgram, light.setProgram
 
     def close(self) -> None:
-        """End the simulation, which completes SUMO's own outputs; a second call does nothing."""
+        """End the simulation, which completes SUMO's own outputs; a second call does nothing.
+
+        libsumo cannot close a window, which stays until this process ends.
+        """
         if Session._open:
             Session._open = False
-            with suppress(*LOST):
-                self._sumo.close()
+            if not self._gui:
+                libsumo.close()
 
     def step(self) -> None:
         """Advance by one simulation step. Raises RunFailed with SUMO's words if it gives up."""
         before = time.perf_counter()
         try:
-            self._sumo.simulationStep()
-        except (libsumo.FatalTraCIError, *REFUSALS) as error:
+            libsumo.simulationStep()
+        except ERRORS as error:
             raise RunFailed(f"SUMO stopped at {self.time:g} s: {_one_line(error)}") from None
         self.sumo_time += time.perf_counter() - before
-        self.time = self._sumo.simulation.getTime()
-
-    def flush(self) -> bool:
-        """Make SUMO write its output buffers; return False if it cannot be asked to."""
-        if self._flush is not None:
-            self._flush()
-        return self._flush is not None
+        self.time = libsumo.simulation.getTime()
 
     def speeds(self, edge: str) -> tuple[float, float]:
         """Return two mean speeds [m/s] of an edge, the limit if it is empty: of its vehicles, and of SUMO's routing.
@@ -182,68 +159,68 @@ class Session:
         In the second one, an empty lane counts as one vehicle at the limit, so that a queue for one turn does not deter
         drivers with another lane.
         """
-        routing = self._sumo.edge.getLastStepMeanSpeed(edge)
+        routing = libsumo.edge.getLastStepMeanSpeed(edge)
         if edge not in self._lanes_of:
             self._lanes_of[edge] = self._lanes(edge)
         lanes = self._lanes_of[edge]
         if len(lanes) > 1:
-            counts = [self._sumo.lane.getLastStepVehicleNumber(lane) for lane in lanes]
+            counts = [libsumo.lane.getLastStepVehicleNumber(lane) for lane in lanes]
             if total := sum(counts):  # 0 in the mesoscopic model, which has no lanes
-                speed = self._sumo.lane.getLastStepMeanSpeed
+                speed = libsumo.lane.getLastStepMeanSpeed
                 return sum(n * speed(lane) for n, lane in zip(counts, lanes, strict=True) if n) / total, routing
         return routing, routing
 
     def teleports(self) -> int:
         """Return SUMO's own count so far: the mesoscopic model has no events for them."""
-        return int(self._sumo.simulation.getParameter("", "stats.teleports.total"))
+        return int(libsumo.simulation.getParameter("", "stats.teleports.total"))
 
     def is_free(self, vehicle: str) -> bool:
         """Return True if the driver may take another route: no public transport, no stops."""
         return (
-            self._sumo.vehicle.getVehicleClass(vehicle) not in BOUND
-            and not self._sumo.vehicle.getLine(vehicle)
-            and not self._sumo.vehicle.getStops(vehicle, 1)
+            libsumo.vehicle.getVehicleClass(vehicle) not in BOUND
+            and not libsumo.vehicle.getLine(vehicle)
+            and not libsumo.vehicle.getStops(vehicle, 1)
         )
 
     def place(self, vehicle: str) -> tuple[str, float]:
         """Return the lane of a vehicle, and the position on it [m]."""
-        return self._sumo.vehicle.getLaneID(vehicle), self._sumo.vehicle.getLanePosition(vehicle)
+        return libsumo.vehicle.getLaneID(vehicle), libsumo.vehicle.getLanePosition(vehicle)
 
     def lane(self, lane: str) -> tuple[float, frozenset[str]]:
         """Return the length of a lane [m], and the edges that it leads to."""
-        onward = {self._sumo.lane.getEdgeID(link[0]) for link in self._sumo.lane.getLinks(lane)}
-        return self._sumo.lane.getLength(lane), frozenset(onward)
+        onward = {libsumo.lane.getEdgeID(link[0]) for link in libsumo.lane.getLinks(lane)}
+        return libsumo.lane.getLength(lane), frozenset(onward)
 
     def next_lane(self, lane: str) -> str:
         """Return the lane that a lane on a junction leads to, of a street or on the junction."""
-        return self._sumo.lane.getLinks(lane)[0][0]
+        return libsumo.lane.getLinks(lane)[0][0]
 
     def room(self, lane: str) -> float:
         """Return the free length at the beginning of a lane [m]."""
-        position, length = self._sumo.vehicle.getLanePosition, self._sumo.vehicle.getLength
-        vehicles = self._sumo.lane.getLastStepVehicleIDs(lane)
-        return min((position(v) - length(v) for v in vehicles), default=self._sumo.lane.getLength(lane))
+        position, length = libsumo.vehicle.getLanePosition, libsumo.vehicle.getLength
+        vehicles = libsumo.lane.getLastStepVehicleIDs(lane)
+        return min((position(v) - length(v) for v in vehicles), default=libsumo.lane.getLength(lane))
 
     def set_down(self, vehicle: str, lane: str, position: float) -> bool:
         """Put a vehicle at `position` [m] on a lane of its route; return False if SUMO refuses."""
-        return _accepted(self._sumo.vehicle.moveTo, vehicle, lane, position)
+        return _accepted(libsumo.vehicle.moveTo, vehicle, lane, position)
 
     def fastest(self, edge: str, target: str) -> tuple[float, tuple[str, ...]]:
         """Return time [s] and edges of a car's fastest way on empty streets, () if there is none."""
-        stage = self._sumo.simulation.findRoute(edge, target)
+        stage = libsumo.simulation.findRoute(edge, target)
         return stage.travelTime, tuple(stage.edges)
 
     def set_route(self, vehicle: str, edges: list[str]) -> bool:
         """Give a vehicle on edges[0] a new route; return False if SUMO refuses it and keeps the old one."""
-        return _accepted(self._sumo.vehicle.setRoute, vehicle, edges)
+        return _accepted(libsumo.vehicle.setRoute, vehicle, edges)
 
     def begin_trip(self, order: Mapping[str, str]) -> None:
         """Let a vehicle depart now. order: arguments of libsumo.vehicle.add, with a route that SUMO knows"""
-        self._sumo.vehicle.add(**order, depart="now")
+        libsumo.vehicle.add(**order, depart="now")
 
     def programme(self, signal: str) -> Programme:
         """Return the programme that runs on `signal` now."""
-        light, types = self._sumo.trafficlight, self._sumo.constants
+        light, types = libsumo.trafficlight, libsumo.constants
         active = light.getProgram(signal)
         logic = self._logic(signal, active)
         elapsed = sum(phase.duration for phase in logic.phases[: light.getPhase(signal) + 1])
@@ -251,7 +228,7 @@ class Session:
             signal=signal,
             id=active,
             phases=tuple(Phase(duration=p.duration, state=p.state) for p in logic.phases),
-            position=elapsed - (light.getNextSwitch(signal) - self._sumo.simulation.getTime()),
+            position=elapsed - (light.getNextSwitch(signal) - libsumo.simulation.getTime()),
             static=logic.type == types.TRAFFICLIGHT_TYPE_STATIC and not any(phase.next for phase in logic.phases),
             actuated=logic.type in (types.TRAFFICLIGHT_TYPE_ACTUATED, types.TRAFFICLIGHT_TYPE_DELAYBASED),
         )
@@ -263,21 +240,21 @@ class Session:
 
     def set_signal_state(self, signal: str, state: str) -> bool:
         """Set the state of a signal; return False if SUMO refuses it."""
-        return _accepted(self._sumo.trafficlight.setRedYellowGreenState, signal, state)
+        return _accepted(libsumo.trafficlight.setRedYellowGreenState, signal, state)
 
     def limit_speed(self, edge: str, limits: list[float]) -> list[float]:
         """Set the speed limits [m/s] of an edge, one per lane or one for all; return those before."""
         lanes = self._lanes(edge)
-        before = [self._sumo.lane.getMaxSpeed(lane) for lane in lanes]
+        before = [libsumo.lane.getMaxSpeed(lane) for lane in lanes]
         for lane, limit in zip(lanes, limits * len(lanes) if len(limits) == 1 else limits, strict=True):
-            self._sumo.lane.setMaxSpeed(lane, limit)
+            libsumo.lane.setMaxSpeed(lane, limit)
         return before
 
     def _lanes(self, edge: str) -> tuple[str, ...]:
-        return tuple(f"{edge}_{n}" for n in range(self._sumo.edge.getLaneNumber(edge)))
+        return tuple(f"{edge}_{n}" for n in range(libsumo.edge.getLaneNumber(edge)))
 
     def _logic(self, signal: str, programme: str) -> Any:
-        logics = self._sumo.trafficlight.getAllProgramLogics(signal)
+        logics = libsumo.trafficlight.getAllProgramLogics(signal)
         return next(logic for logic in logics if logic.programID == programme)
 
 
@@ -291,7 +268,7 @@ def _accepted(order: Callable, *arguments: object) -> bool:
 
 
 def _flush_all() -> Callable[[], None] | None:
-    """Return OutputDevice::flushAll of SUMO, which is not in its API, by its name in the library (Linux, macOS)."""
+    """Return OutputDevice::flushAll of SUMO, which is not in its API, by its name in the library of Linux and macOS."""
     try:
         flush = ctypes.CDLL(libsumo._libsumo.__file__)["_ZN12OutputDevice8flushAllEv"]
     except (AttributeError, OSError):
@@ -316,7 +293,7 @@ def _start_quietly(command: list[str]) -> None:
         try:
             libsumo.start(command)
             failure = None
-        except (*REFUSALS, *FATAL) as error:
+        except ERRORS as error:
             failure = error
         finally:
             os.dup2(stderr, 2)
@@ -328,27 +305,6 @@ def _start_quietly(command: list[str]) -> None:
         return
     lines = [line.removeprefix("Error: ") for line in words.splitlines() if line.startswith("Error: ")]
     raise libsumo.FatalTraCIError(lines[0] if lines else _one_line(failure))
-
-
-def _start_window(window: Window, command: list[str]) -> None:
-    """Start sumo-gui. Raises FatalTraCIError with its last words."""
-    program = str(Path(sumo.SUMO_HOME) / "bin" / "sumo-gui")
-    with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as said:
-        port = getFreeSocketPort()
-        process = subprocess.Popen(
-            [program, *command[1:], *window.options, "--remote-port", str(port)], stdout=said, stderr=said
-        )
-        try:
-            with redirect_stdout(io.StringIO()):  # traci prints every attempt to connect, one a second
-                traci.init(port, numRetries=GUI_TIMEOUT_S, proc=process)
-        except BaseException as error:
-            process.kill()
-            process.wait()
-            if not isinstance(error, (*REFUSALS, *FATAL)):
-                raise
-            said.seek(0)
-            words = [line for line in said.read().splitlines() if line.strip()]
-            raise traci.FatalTraCIError(words[-1] if words else _one_line(error)) from None
 
 
 def _one_line(error: Exception) -> str:
