@@ -17,6 +17,7 @@ is open to all drivers and counts for the region that it enters when it leaves i
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import groupby, pairwise
 
 import numpy as np
@@ -134,14 +135,9 @@ class Guide:
         spread = SPREAD if lanes else MESO_SPREAD
         self._taste = np.exp(spread * random.standard_normal((DRIVER_CLASSES, len(city.edges))))
         self._prices: PerRegion | None = None
-        self._told: dict[int | None, PerEdge] = {}  # region without a price, None for all with theirs -> (E,) [s]
-        self._leading: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # region -> from where to gateways, and to where
-        self._ahead: dict[tuple[int, int], np.ndarray] = {}  # by region and taste
-        self._back: dict[tuple[int, int], np.ndarray] = {}
-        # By region, taste and region without a price.
-        self._ways: dict[tuple[int, int, int | None], Ways] = {}
-        self._homes: dict[tuple[int, int, int | None], Home] = {}
-        self._everywhere: dict[tuple[int, int | None], Trees] = {}  # by the last two
+        # Results of the run; then those of one control interval, which `command` clears.
+        self._leading, self._ahead, self._back = cache(self._to_gateways), cache(self._to_nearest), cache(self._behind)
+        self._home, self._ways, self._everywhere = cache(self._home_from), cache(self._ways_from), cache(self._all_ways)
         self._searches = Searches()
         self._guides, self._splits = False, own
         self._assigned, self._wished = np.zeros((2, *(city.regions,) * 3))
@@ -161,8 +157,9 @@ class Guide:
         self._interval += 1
         if seen is not None:
             self._times.learn(seen)
-        self._told, self._prices = {}, prices
-        self._ways, self._homes, self._everywhere, self._searches = {}, {}, {}, Searches()
+        self._prices, self._searches = prices, Searches()
+        for kept in (self._home, self._ways, self._everywhere):
+            kept.cache_clear()
         self._assigned *= MEMORY
         self._wished *= MEMORY
 
@@ -206,7 +203,8 @@ class Guide:
 
     def _guide_home(self, visit: _Visit, here: int, target: int) -> None:
         """Give the fastest way inside the region of destination; if ways may return, the fastest of all."""
-        event, home = visit.event, self._home(visit.event.region, visit.taste, visit.event.destination)
+        event, region = visit.event, 0 if self._ways_return else visit.event.region
+        home = self._home(region, visit.taste, self._free(event.destination))
         present = self._present(event.vehicle, here, home.time)
         cost = home.cost(here, target, self._worth(present) + 1.0)
         if here == target or not np.isfinite(cost) or self._keeps(present, cost):
@@ -215,7 +213,8 @@ class Guide:
 
     def _guide_on(self, visit: _Visit, here: int, target: int) -> None:
         """Give the next region, and the fastest way through it."""
-        event, ways = visit.event, self._ways_from(visit.event.region, visit.taste, visit.event.destination)
+        event = visit.event
+        ways = self._ways(event.region, visit.taste, self._free(event.destination))
         present = self._present(event.vehicle, here, ways.time)
         cost, reached = ways.cost(here, target, self._most_detour + present.takes + 1.0 if present.bound else np.inf)
         # Plain numbers from here on: a handful of next regions is too few for arrays to pay.
@@ -322,64 +321,58 @@ class Guide:
             return False
         return self._session.set_route(vehicle, edges)
 
-    def _bound_for(self, destination: int) -> tuple[int | None, PerEdge]:
-        """Return the region without a price for drivers to `destination`, and the times (E,) [s] that they are told."""
-        free = destination if self._prices is not None and self._prices[destination] > 0.0 else None
-        if free not in self._told:
-            prices = np.zeros(self._city.regions) if self._prices is None else self._prices.copy()
-            prices[[] if free is None else free] = 0.0
-            self._told[free] = self._times.edges * (1.0 + prices)[self._region]
-        return free, self._told[free]
+    def _free(self, destination: int) -> int | None:
+        """Return the region without a price for drivers to `destination`, None if all have theirs."""
+        return destination if self._prices is not None and self._prices[destination] > 0.0 else None
 
-    def _home(self, region: int, taste: int, destination: int) -> Home:
-        free, time = self._bound_for(destination)
-        key = 0 if self._ways_return else region, taste, free
-        if key not in self._homes:
-            moves, tastes = self._homeward[key[0]], self._taste[taste]
-            self._homes[key] = Home(moves, time * tastes, self._times.turns, self._searches)
-        return self._homes[key]
+    def _seen(self, taste: int, free: int | None) -> PerEdge:
+        """Return the times (E,) [s] that a class of drivers sees, with the prices of all regions but `free`."""
+        prices = np.zeros(self._city.regions) if self._prices is None else self._prices.copy()
+        prices[[] if free is None else free] = 0.0
+        return self._times.edges * (1.0 + prices)[self._region] * self._taste[taste]
 
-    def _ways_from(self, region: int, taste: int, destination: int) -> Ways:
-        free, time = self._bound_for(destination)
-        key = region, taste, free
-        if key not in self._ways:
-            inside, outside, tastes = self._within[region], self._without_back[region], self._taste[taste]
-            first, second, move, following = self._gateways[region]
-            times = self._times
-            if region not in self._leading:
-                nodes = inside.number[first], outside.number[second]
-                self._leading[region] = inside.leading_to(nodes[0]), outside.leading_to(nodes[1])
-            if (region, taste) not in self._ahead:
-                nodes = outside.number[second]
-                self._ahead[region, taste] = outside.ahead(nodes, times.free * tastes, times.free_turns)
-            leading, reached = self._leading[region]
-            self._ways[key] = Ways(
-                first,
-                second,
-                following,
-                inside=inside,
-                outside=outside,
-                crossing=times.turns[move] if self._lanes else np.zeros(len(move)),
-                leading=leading,
-                reached=reached,
-                ahead=self._ahead[region, taste],
-                time=time * tastes,
-                turns=times.turns,
-                searches=self._searches,
-                everywhere=self._by_all_moves(region, taste, free, time),
-            )
-        return self._ways[key]
+    def _home_from(self, region: int, taste: int, free: int | None) -> Home:
+        return Home(self._homeward[region], self._seen(taste, free), self._times.turns, self._searches)
 
-    def _by_all_moves(
-        self, region: int, taste: int, free: int | None, time: PerEdge
-    ) -> tuple[Trees, PerGateway, PerGateway] | None:
-        if self._anywhere is None:
-            return None
-        first, second, move, _ = self._gateways[region]
-        times, tastes = self._times, self._taste[taste]
-        if (region, taste) not in self._back:
-            ahead = self._homeward[0].ahead(second, times.free * tastes, times.free_turns)
-            self._back[region, taste] = ahead[first]
-        if (taste, free) not in self._everywhere:
-            self._everywhere[taste, free] = Trees(self._anywhere, time * tastes, times.turns, self._searches)
-        return self._everywhere[taste, free], times.turns[move], self._back[region, taste]
+    def _ways_from(self, region: int, taste: int, free: int | None) -> Ways:
+        first, second, move, following = self._gateways[region]
+        leading, reached = self._leading(region)
+        turns, everywhere = self._times.turns, None
+        if self._anywhere is not None:
+            everywhere = self._everywhere(taste, free), turns[move], self._back(region, taste)
+        return Ways(
+            first,
+            second,
+            following,
+            inside=self._within[region],
+            outside=self._without_back[region],
+            crossing=turns[move] if self._lanes else np.zeros(len(move)),
+            leading=leading,
+            reached=reached,
+            ahead=self._ahead(region, taste),
+            time=self._seen(taste, free),
+            turns=turns,
+            searches=self._searches,
+            everywhere=everywhere,
+        )
+
+    def _all_ways(self, taste: int, free: int | None) -> Trees:
+        assert self._anywhere is not None
+        return Trees(self._anywhere, self._seen(taste, free), self._times.turns, self._searches)
+
+    def _to_gateways(self, region: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return from where in the region its gateways can be reached, and what from behind them."""
+        inside, outside = self._within[region], self._without_back[region]
+        first, second, _, _ = self._gateways[region]
+        return inside.leading_to(inside.number[first]), outside.leading_to(outside.number[second])
+
+    def _to_nearest(self, region: int, taste: int) -> np.ndarray:
+        """Return the time [s] in free flow from behind the nearest gateway of the region."""
+        times, outside = self._times, self._without_back[region]
+        nodes = outside.number[self._gateways[region][1]]
+        return outside.ahead(nodes, times.free * self._taste[taste], times.free_turns)
+
+    def _behind(self, region: int, taste: int) -> PerGateway:
+        """Return the time [s] in free flow from behind the nearest gateway back to each one."""
+        times, (first, second, _, _) = self._times, self._gateways[region]
+        return self._homeward[0].ahead(second, times.free * self._taste[taste], times.free_turns)[first]
