@@ -16,6 +16,7 @@ COUNTED = {
     "sensor_faults": ("sensor", "decisions on a wrong or missing measurement"),
     "plant_faults": ("plant", "intervals in which the city could not do what was commanded"),
 }
+KINDS = Status.SOLVER_FAILURE, Status.FALLBACK, Status.LATE, Status.SENSOR_FAULT, Status.PLANT_FAULT  # of COUNTED
 
 # Attributes of a Result that are no column of a table of runs.
 NO_COLUMNS = {"step", "estimated", "wall_time", "key", "scenario_folder"}
@@ -76,11 +77,6 @@ def gini(values: PerRegion, weights: PerRegion) -> float:
     return float(weights @ apart @ weights / (2.0 * people * total))
 
 
-def decisions(result: Result, kind: Status) -> int:
-    """Return the number of decisions with `kind` in their status."""
-    return int(((result.status & kind.value) != 0).sum())
-
-
 def notes(result: Result, most: int = 3) -> str:
     """Return the `most` frequent notes of decisions that were not OK, such as "2 x solver failed: ..."."""
     counted = Counter(note for note, status in zip(result.note, result.status, strict=True) if status)
@@ -107,11 +103,7 @@ def summary(result: Result) -> dict[str, float | int | str]:
         "evaluation_time_s": float(result.decision_time.sum()),
         "control_step_ms_median": float(np.median(decision_ms)),
         "control_step_ms_max": float(decision_ms.max()),
-        "solver_failures": decisions(result, Status.SOLVER_FAILURE),
-        "fallbacks": decisions(result, Status.FALLBACK),
-        "late_decisions": decisions(result, Status.LATE),
-        "sensor_faults": decisions(result, Status.SENSOR_FAULT),
-        "plant_faults": decisions(result, Status.PLANT_FAULT),
+        **{name: int(((result.status & kind.value) != 0).sum()) for name, kind in zip(COUNTED, KINDS, strict=True)},
         "wall_time_s": float(result.wall_time),
         **facts,
     }

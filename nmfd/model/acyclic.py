@@ -65,28 +65,25 @@ class Acyclic:
 
 def build(network: RegionalModel) -> Acyclic:
     """Return all cells reachable from x_iiij, and their moves."""
-    neighbours = [np.flatnonzero(row) for row in network.adjacency]
-    pairs = np.ndindex(network.adjacency.shape)
-    cells: dict[tuple[int, int, int, int], int] = {(i, i, i, j): n for n, (i, j) in enumerate(pairs)}
     start = np.arange(network.regions**2).reshape(network.regions, network.regions)
+    cells: dict[tuple[int, int, int, int], int] = {(i, i, i, j): int(n) for (i, j), n in np.ndenumerate(start)}
     queue, fallback = list(cells), {}
     moves: list[tuple[int, int, int, bool]] = []
-    for cell in queue:  # grows during the loop
-        o, g, i, j = cell
+    for o, g, i, j in queue:  # grows during the loop
         if i == j:
             continue
-        allowed = [h for h in neighbours[i] if h not in (o, g)]
+        cell, neighbours = cells[o, g, i, j], np.flatnonzero(network.adjacency[i]).tolist()
+        allowed = [h for h in neighbours if h not in (o, g)]
         # In a dead end turning back is the least-bad move, counted like every forced move.
-        options = allowed or list(neighbours[i])
-        best = min(options, key=lambda h: (not network.split_mask[i, h, j], network.hops[h, j], h))
+        best = min(allowed or neighbours, key=lambda h: (not network.split_mask[i, h, j], network.hops[h, j], h))
         for h in allowed or [best]:
-            target = (o, i, int(h), j)
+            target = o, i, h, j
             if target not in cells:
                 cells[target] = len(cells)
                 queue.append(target)
             if h == best:
-                fallback[cells[cell]] = len(moves)
-            moves.append((cells[cell], cells[target], h, bool(allowed)))
+                fallback[cell] = len(moves)
+            moves.append((cell, cells[target], h, bool(allowed)))
     table = np.array(moves, dtype=int).reshape(-1, 4)
     index = np.array(list(cells), dtype=int)
     mfds = {name: np.array([getattr(m, name) for m in network.mfds]) for name in ("a", "b", "c", "jam")}

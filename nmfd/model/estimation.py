@@ -24,7 +24,6 @@ import torch
 from jaxtyping import Float, Real
 from scipy.optimize import nnls
 
-from nmfd import tensors
 from nmfd.arrays import PerPair, PerRegion, PerTurn
 from nmfd.model import dynamics
 from nmfd.model.planning import PlanningModel
@@ -248,7 +247,8 @@ class Estimator:
             crossings = crossings + transfers.sum(3)
             before, arrived = x.sum(2), self._probe_share * entering
             x = x + entering - torch.diag_embed(completions) - transfers.sum(2) + transfers.sum(1)
-            n = n + arrived + _moved(share, completions, transfers)
+            moved, ended = share.unsqueeze(2) * transfers, torch.diagonal(share, dim1=1, dim2=2) * completions
+            n = n + arrived + (moved.sum(1) - moved.sum(2) - torch.diag_embed(ended))
             mean = mean + 0.5 * (before + x.sum(2)) / self._substeps
         departed = self._substeps * self._probe_share * entering
         crossings = crossings[:, *self._boundaries.T]
@@ -321,12 +321,6 @@ def _pairs(left: torch.Tensor, right: torch.Tensor) -> tuple:
     product = left[:, None] * right[None]
     index = product.nonzero(as_tuple=True)
     return product.shape[:2], index, product[index]
-
-
-def _moved(share: tensors.PerPair, completions: tensors.PerRegion, transfers: tensors.PerTurn) -> tensors.PerPair:
-    """Return the net change (B, R, R) of the `share` of the vehicles of each cell."""
-    out = share.unsqueeze(2) * transfers
-    return out.sum(1) - out.sum(2) - torch.diag_embed(torch.diagonal(share, dim1=1, dim2=2) * completions)
 
 
 def bounded(mean: Vector, covariance: Square, lower: Vector) -> Vector:

@@ -225,9 +225,3 @@ def prediction_errors(
     with torch.no_grad():
         *_, last = _rollout(dynamics.parameters(network, dtype=torch.float32), data, scheme)
     return (last - data[0][:, -1]).sum(-1).numpy()
-
-
-def persistence_errors(runs: Sequence[Observed], intervals: int) -> Float[np.ndarray, "N R"]:
-    """Return `prediction_errors` of the prediction that no accumulation changes."""
-    states = [run.accumulation.sum(axis=2) for run in runs]
-    return np.concatenate([state[:-intervals] - state[intervals:] for state in states])

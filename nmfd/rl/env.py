@@ -108,8 +108,10 @@ class RegionalEnv(gymnasium.Env):
         self.observation_space = self.interface.observation_space(self.scenario)
         self.action_space = self.interface.action_space
 
-    def begin(self, seed: int) -> Observation:
-        """Reset the plant; return what a controller observes."""
+    def begin(self, seed: int | None) -> Observation:
+        """Reset the plant, without a seed by the next of the sequence; return what a controller observes."""
+        super().reset(seed=seed)
+        seed = int(self.np_random.integers(2**31)) if seed is None else seed
         self._random, self._k, self._spent = noise_of(seed), 0, 0.0
         self._state = self.plant.reset(seed)
         return self._observe()
@@ -123,9 +125,7 @@ class RegionalEnv(gymnasium.Env):
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[Vector, dict]:
         """Begin an episode; without a seed, the next one of the sequence begun by the last seed."""
-        super().reset(seed=seed)
-        observation = self.begin(int(self.np_random.integers(2**31)) if seed is None else seed)
-        return self._clipped(observation), self._info()
+        return self._clipped(self.begin(seed)), self._info()
 
     def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict]:
         """Advance by one control interval."""
@@ -174,7 +174,6 @@ class RegionsEnv(ParallelEnv):
             agent: Interface(loaded.network, guidance=guidance, regions=[region])
             for region, agent in enumerate(self.possible_agents)
         }
-        self._random = np.random.default_rng()
         self.observation_spaces = {agent: part.observation_space(loaded) for agent, part in self.interfaces.items()}
         self.action_spaces = {agent: part.action_space for agent, part in self.interfaces.items()}
         self.observation_space, self.action_space = self.observation_spaces.get, self.action_spaces.get
@@ -182,10 +181,8 @@ class RegionsEnv(ParallelEnv):
 
     def reset(self, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
         """Begin an episode; without a seed, the next one of the sequence begun by the last seed."""
-        if seed is not None:
-            self._random = np.random.default_rng(seed)
         self.agents = list(self.possible_agents)
-        self._seen = self._env.begin(int(self._random.integers(2**31)) if seed is None else seed)
+        self._seen = self._env.begin(seed)
         return self._observations(), {agent: {} for agent in self.agents}
 
     def step(self, actions: dict) -> tuple[dict, dict, dict, dict, dict]:

@@ -290,22 +290,17 @@ def _table(rows: Sequence[dict]) -> "pd.DataFrame":
 def provenance() -> dict:
     """Return date, command, versions, and the commit of the checkout, None outside one."""
     commit, dirty = _checkout()
+    versions = {"python": platform.python_version(), "perimeter-cosim": __version__}
+    for package in PACKAGES:
+        with suppress(metadata.PackageNotFoundError):
+            versions[package] = metadata.version(package)
     return {
         "date": datetime.now().astimezone().isoformat(timespec="seconds"),
         "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
         "commit": commit,
         "dirty": dirty,
-        "versions": _versions(),
+        "versions": versions,
     }
-
-
-@cache
-def _versions() -> dict[str, str]:
-    versions = {"python": platform.python_version(), "perimeter-cosim": __version__}
-    for package in PACKAGES:
-        with suppress(metadata.PackageNotFoundError):
-            versions[package] = metadata.version(package)
-    return versions
 
 
 @cache

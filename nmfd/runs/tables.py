@@ -3,6 +3,7 @@
 import re
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 
 from tabulate import tabulate
 
@@ -33,14 +34,6 @@ def markdown_table(headings: Sequence[str], lines: Iterable[Iterable[object]]) -
 
 def wrapped(caption: str) -> list[str]:
     """Return the caption in lines of at most WIDTH characters, with the indentation of its lines."""
-    return [
-        part
-        for line in caption.splitlines()
-        for part in textwrap.wrap(
-            line,
-            WIDTH,
-            subsequent_indent=" " * (len(line) - len(line.lstrip())),
-            break_long_words=False,
-            break_on_hyphens=False,
-        )
-    ]
+    wrap = partial(textwrap.wrap, width=WIDTH, break_long_words=False, break_on_hyphens=False)
+    indents = [(line, " " * (len(line) - len(line.lstrip()))) for line in caption.splitlines()]
+    return [part for line, indent in indents for part in wrap(line, subsequent_indent=indent)]

@@ -84,7 +84,6 @@ def solve(
     """
     network = scenario.network
     parameters = dynamics.parameters(network)
-    demand = torch.from_numpy(scenario.demand)
     controls = _Controls(network, scenario.steps, starts.values(), guidance=guidance)
     optimizer = torch.optim.Adam(controls.logits, lr=LEARNING_RATE)
     best = np.full(len(starts), math.inf)
@@ -95,7 +94,7 @@ def solve(
             for group in optimizer.param_groups:
                 group["lr"] = LEARNING_RATE * 0.5 * (1.0 + math.cos(math.pi * iteration / (iterations + 1)))
             perimeter, splits = controls()
-            totals = _total_time_spent(scenario, parameters, demand, perimeter, splits)
+            totals = _total_time_spent(scenario, parameters, perimeter, splits)
             for n in np.flatnonzero(totals.detach().numpy() < best):
                 best[n] = totals[n].item()
                 kept[n] = tuple(logits[:, n].detach().clone() for logits in controls.logits)
@@ -154,25 +153,14 @@ class _Controls:
 
 
 def _total_time_spent(
-    scenario: Scenario,
-    parameters: dynamics.Parameters,
-    demand: Float[torch.Tensor, "T R R"],
-    perimeter: Float[torch.Tensor, "T B R R"],
-    splits: Float[torch.Tensor, "T b R R R"],  # b: B or 1
+    scenario: Scenario, parameters: dynamics.Parameters, perimeter: torch.Tensor, splits: torch.Tensor
 ) -> Float[torch.Tensor, " B"]:
-    """Return the total time spent (B,) [veh s] of plans."""
-    x = torch.from_numpy(scenario.start).expand(perimeter.shape[1], -1, -1)
-    states = [x]
+    """Return the total time spent [veh s] of plans: perimeter (T, B, R, R), splits (T, B or 1, R, R, R)."""
+    x, demand = torch.from_numpy(scenario.start).expand(perimeter.shape[1], -1, -1), torch.from_numpy(scenario.demand)
+    states, integrator, substeps = [x], scenario.integrator, scenario.substeps
     for k in range(scenario.steps - 1):
-        controls = perimeter[k], splits[k]
         x = dynamics.advance(
-            parameters,
-            x,
-            demand[k],
-            *controls,
-            scenario.step,
-            integrator=scenario.integrator,
-            substeps=scenario.substeps,
+            parameters, x, demand[k], perimeter[k], splits[k], scenario.step, integrator=integrator, substeps=substeps
         )
         states.append(x)
     return scenario.step * torch.stack(states).sum((0, -2, -1))

@@ -149,7 +149,8 @@ def predictions(network: RegionalModel, runs: Sequence[Observed], scheme: dict) 
     columns = {}
     for when, intervals in (("next_interval", 1), ("ahead", ahead)):
         errors = identification.prediction_errors(network, runs, intervals, **scheme)
-        unchanged = identification.persistence_errors(runs, intervals)
+        states = [run.accumulation.sum(axis=2) for run in runs]
+        unchanged = np.concatenate([state[:-intervals] - state[intervals:] for state in states])
         for name, part in (("rmse_share", errors), ("persistence_rmse_share", unchanged)):
             columns[f"{when}_{name}"] = np.sqrt((part**2).mean(axis=0)) / network.critical
     return pd.DataFrame({**columns, "ahead_s": ahead * scheme["step"]})

@@ -110,7 +110,12 @@ def identify(
     for column, per_lane in (("accumulation_veh", "density_veh_km"), ("production_veh_km_h", "flow_veh_h")):
         intervals[column] = intervals[per_lane] * lane_km[number]
     intervals["outflow_veh_s"] = intervals["production_veh_km_h"] / trip_km[number] / 3600.0
-    _check_units(intervals, counts)
+    speed = intervals["production_veh_km_h"].sum() / max(intervals["accumulation_veh"].sum(), 1e-9) / 3.6
+    if not detector_tables.SPEEDS_M_S[0] <= speed <= detector_tables.SPEEDS_M_S[1]:
+        raise InputError(
+            f"{counts}: flow and occ give a mean speed of {speed:.3g} m/s, with {VEHICLE_LENGTH_M:g} m for a vehicle "
+            "over a loop; expected flow in veh/h per lane, not per interval, and occ as a share, not percent"
+        )
     samples = [_cloud(intervals[intervals["region"] == region]) for region in names]
     for region in fit_quality.nearly_empty(samples):
         raise InputError(
@@ -178,17 +183,6 @@ def _intervals(rows: pd.DataFrame, detectors: pd.DataFrame) -> pd.DataFrame:
     table["flow_veh_h"] = table["flow"] / table["weight"]
     table = table[table["reporting"] >= LEAST_REPORTING].sort_values(["region", "day", "interval"], ignore_index=True)
     return table[["region", "day", "interval", "density_veh_km", "flow_veh_h", "reporting"]]
-
-
-def _check_units(intervals: pd.DataFrame, path: Path) -> None:
-    """Raise InputError if flow and occupancy give an implausible speed."""
-    total = intervals[["production_veh_km_h", "accumulation_veh"]].sum()
-    speed, (low, high) = total.iloc[0] / max(total.iloc[1], 1e-9) / 3.6, detector_tables.SPEEDS_M_S
-    if not low <= speed <= high:
-        raise InputError(
-            f"{path}: flow and occ give a mean speed of {speed:.3g} m/s, with {VEHICLE_LENGTH_M:g} m for a vehicle "
-            "over a loop; expected flow in veh/h per lane, not per interval, and occ as a share, not percent"
-        )
 
 
 def _cloud(part: pd.DataFrame) -> dict[str, Points]:

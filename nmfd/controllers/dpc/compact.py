@@ -30,7 +30,6 @@ t_hj the mean time to leave h on the way to j, so that e_hj is what the prices a
 differentiable and is trained like a network.
 """
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -74,11 +73,6 @@ class CompactPolicy(Policy):
         self.register_buffer("own", torch.tensor(network.nominal_splits, dtype=torch.float32), persistent=False)
         self._model = dynamics.parameters(network, dtype=torch.float32)
         self._hops = int(network.hops.max())
-
-    def begin_with(self, numbers: Sequence[float]) -> None:
-        """Set the first of `Numbers` to these, and the others to their defaults."""
-        with torch.no_grad():
-            self.numbers.copy_(torch.tensor(Numbers(*numbers)))
 
     def listed(self, x: PerPair, memory: Memory | None = None) -> tuple[PerPair, PerTurn | None]:
         """Return perimeter and splits of the states x; memory: what `remember` returned for them."""

@@ -42,7 +42,6 @@ class Rollout:
         self.parameters = self._nominal = dynamics.parameters(network, dtype=dtype, device=device)
         self.demand = tensor(planning.forecast)
         self.nominal_splits = tensor(network.nominal_splits)
-        self.jam = tensor([m.jam for m in network.mfds])
         self.bound = tensor(planning.destinations)
         self.start = torch.zeros_like(self.demand[0]) if planning.initial is None else tensor(planning.initial)
 
@@ -73,7 +72,7 @@ class Rollout:
         padded = torch.cat([self.demand, torch.zeros_like(self.demand)])
         demand = padded[index] * factor
         weight = uniform(batch, regions, regions) ** 2 * self.bound
-        total = uniform(batch, regions) * uniform(batch, 1) * 0.8 * self.jam
+        total = uniform(batch, regions) * uniform(batch, 1) * 0.8 * self._nominal.jam
         x = total.unsqueeze(-1) * weight / weight.sum(-1, keepdim=True).clamp(min=1e-6)
         if levels[0] < levels[1]:
             demand = demand * (levels[0] + (levels[1] - levels[0]) * uniform(batch, 1, 1))
@@ -86,7 +85,7 @@ class Rollout:
             storage), and half of that for its outflow and capacities (-)
         scale: factor of all accumulation axes (-)
         """
-        p, regions = self._nominal, len(self.jam)
+        p, regions = self._nominal, len(self._nominal.jam)
         if spread or scale != 1.0:
 
             def factor(*shape: int, share: float = 1.0) -> torch.Tensor:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from pydantic import Field, model_validator
 
-from nmfd.controllers.dpc.compact import CompactPolicy
+from nmfd.controllers.dpc.compact import CompactPolicy, Numbers
 from nmfd.controllers.dpc.policy import Architecture, Policy
 from nmfd.controllers.dpc.policy_file import checkpoint, new_policy, read_file
 from nmfd.controllers.dpc.rollout import Rollout, compiled_step
@@ -23,7 +23,8 @@ from nmfd.model.authority import NO_GATEWAY
 from nmfd.model.planning import Options, PlanningModel, options, planning_model
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
-from nmfd.runs.config import Flow, Numbers, Problem, Share, error, setting, whole
+from nmfd.runs import config
+from nmfd.runs.config import Flow, Problem, Share, error, setting, whole
 from nmfd.runs.files import atomic
 from nmfd.tensors import one_thread
 
@@ -56,7 +57,7 @@ class Training(Options):
         "ways through crowded regions that guide drivers; trained on the CPU",
         False,
     )
-    numbers: Annotated[Numbers, Field(min_length=8, max_length=11)] | None = setting(
+    numbers: Annotated[config.Numbers, Field(min_length=8, max_length=11)] | None = setting(
         "initial numbers of a compact policy: set_point, gain, relief, price, price_from, elsewhere, elsewhere_from, "
         "metering, integral (0), metering_protected (0), metering_gain (1); see nmfd/controllers/dpc/compact.py",
         None,
@@ -194,7 +195,7 @@ def train(
         )
         policy = new_policy(planning.network, architecture)
         if setup.numbers and isinstance(policy, CompactPolicy):
-            policy.begin_with(setup.numbers)
+            policy.numbers.data.copy_(torch.tensor(Numbers(*setup.numbers)))
         if setup.from_no_control:
             begin_as_no_control(policy, planning.network)
         device = "cpu" if setup.compact else device

@@ -37,8 +37,11 @@ class Ipopt:
         for k in range(horizon):
             u, theta = ca.SX.sym(f"u{k}", len(self._edges)), ca.SX.sym(f"theta{k}", len(self._turns))
             splits, sums = self._splits(theta)
+            perimeter = ca.SX(regions, regions)
+            for n, (i, h) in enumerate(self._edges.tolist()):
+                perimeter[i, h] = u[n]
             after = ca.SX.sym(f"x{k}", regions, regions)
-            flows = demand[:, k * regions : (k + 1) * regions], self._perimeter(u), splits
+            flows = demand[:, k * regions : (k + 1) * regions], perimeter, splits
             moved = model.advance(p, UNIT * x, *flows, planning.step, **scheme)
             constraints += [*sums, ca.vec(ca.densify(moved) / UNIT - after)]
             total, x = total + ca.sum1(ca.vec(after)), after
@@ -68,12 +71,6 @@ class Ipopt:
         perimeter[:, edges[:, 0], edges[:, 1]] = answer[:, : len(edges)]
         splits[:, turns[:, 0], turns[:, 1], turns[:, 2]] = answer[:, len(edges) : len(edges) + len(turns)]
         return perimeter, splits, None if stats["success"] else f"IPOPT: {stats['return_status']}"
-
-    def _perimeter(self, u: ca.SX) -> ca.SX:
-        perimeter = ca.SX(*self._network.adjacency.shape)
-        for n, (i, h) in enumerate(self._edges.tolist()):
-            perimeter[i, h] = u[n]
-        return perimeter
 
     def _splits(self, theta: ca.SX) -> tuple[list[ca.SX], list[ca.SX]]:
         """Return R matrices (R, R), and the constraints that are 0 if their shares have sum 1."""
