@@ -244,7 +244,7 @@ def bound(
     open_loop.write(plan, scenario, file)
     totals = sorted(plan.totals.items(), key=lambda item: item[1])
     lines = [f"from {name}: {total:.5g} veh s" + (" (kept)" if name == plan.start else "") for name, total in totals]
-    return "\n".join([*lines, f"{plan.iterations} Adam steps", f"Written to {file}"])
+    return "\n".join([*lines, f"Written to {file}"])
 
 
 def show(scenario: Scenario | Path | str, *, out: Path | str | None = None) -> str:

@@ -1,5 +1,6 @@
 """The closed loop of any plant and any controller."""
 
+import copy
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -49,7 +50,7 @@ def run(
     if isinstance(own, int | float) and own > 0:
         deadline = min(own, deadline)
     for k in range(scenario.steps):
-        given = observed.copy()
+        given = copy.deepcopy(observed)
         before = time.perf_counter()
         command = controller.act(given)
         decision_time.append(time.perf_counter() - before)

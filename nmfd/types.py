@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Flag
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
@@ -82,10 +82,6 @@ class Observation:
     time: float
     accumulation: PerPair
     backlog: PerPair
-
-    def copy(self) -> "Observation":
-        """Return a copy with its own arrays."""
-        return replace(self, accumulation=self.accumulation.copy(), backlog=self.backlog.copy())
 
 
 @dataclass(frozen=True, kw_only=True)

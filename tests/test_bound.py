@@ -77,13 +77,12 @@ def test_an_interrupted_descent_keeps_the_best_so_far(scenario):
     start = bound.neutral_starts(scenario.network, scenario.steps, guidance=False)
     short = bound.solve(scenario, start, guidance=False, iterations=50, progress=interrupt)
     first = bound.solve(scenario, start, guidance=False, iterations=1)
-    assert short.iterations == 2
     assert all(short.totals[name] < first.totals[name] for name in start)
 
 
 def test_a_plan_that_benchmark_replays(folder, tmp_path):
     text = api.bound(folder, "bound-pcrg", iterations=20)
-    assert "20 Adam steps" in text and "(kept)" in text and "from pi-gating:" in text
+    assert "(kept)" in text and "from pi-gating:" in text
     text = good(nmfd("benchmark", folder, "--controllers", "no-control,bound-pcrg", "--out", tmp_path / "out"))
     assert "above bound" in text and any(line.startswith("bound-pcrg ") for line in text.splitlines())
 

@@ -21,14 +21,12 @@ class Plan:
 
     perimeter: (-, (T, R, R)); splits: (-, (T, R, R, R)), None without route guidance
     start: initial plan of the best descent; totals: initial plan -> total time spent after its descent (veh s)
-    iterations: number of Adam steps
     """
 
     perimeter: PairsOverTime
     splits: TurnsOverTime | None
     start: str
     totals: Mapping[str, float]
-    iterations: int
 
     @property
     def name(self) -> str:
@@ -50,7 +48,7 @@ def model_hash(scenario: Scenario) -> str:
 
 def write(plan: Plan, scenario: Scenario, path: Path) -> None:
     """Write `plan` and the hash of its scenario to an .npz file."""
-    content = {"perimeter": plan.perimeter, "start": plan.start, "iterations": plan.iterations}
+    content = {"perimeter": plan.perimeter, "start": plan.start}
     content |= {"scenario": scenario.name, "model": model_hash(scenario)}
     content |= {"names": list(plan.totals), "totals": list(plan.totals.values())}
     content |= {} if plan.splits is None else {"splits": plan.splits}
@@ -67,7 +65,6 @@ def read(path: Path, scenario: Scenario, *, guidance: bool) -> Plan:
                 splits=file["splits"] if "splits" in file else None,
                 start=str(file["start"]),
                 totals=dict(zip(file["names"].tolist(), file["totals"].tolist(), strict=True)),
-                iterations=int(file["iterations"]),
             )
             model = str(file["model"])
     except Exception:

@@ -88,7 +88,6 @@ def solve(
     optimizer = torch.optim.Adam(controls.logits, lr=LEARNING_RATE)
     best = np.full(len(starts), math.inf)
     kept: list[tuple] = [()] * len(starts)
-    iteration = 0
     try:
         for iteration in range(iterations + 1):  # the last only evaluates
             for group in optimizer.param_groups:
@@ -118,7 +117,6 @@ def solve(
         splits=splits if guidance else None,
         start=names[winner],
         totals={name: float(total) for name, total in zip(names, best, strict=True)},
-        iterations=iteration,
     )
 
 
