@@ -166,7 +166,6 @@ def test_policies_are_trained_and_bounds_sought_from_the_same_start(begun):
     (total,) = bound._total_time_spent(
         quiet,
         dynamics.parameters(quiet.network),
-        torch.from_numpy(quiet.demand),
         torch.tensor(gates).unsqueeze(1),
         torch.tensor(splits).unsqueeze(1),
     )
