@@ -11,9 +11,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from cosim.evaluation import estimation_errors, model_validation, results, statistics
 from cosim.evaluation import evaluate as evaluation
 from cosim.evaluation import identify as identification
+from cosim.evaluation import model_validation, results, statistics
 from cosim.evaluation.runs import runs_of
 from cosim.evaluation.simulate import Simulation, simulate
 from cosim.importing import get as cities
@@ -118,9 +118,7 @@ def run_controllers(
     finished = results.read(out)
     there = [level.read(*name) for level in finished.levels for name in level.runs]
     draw_accumulations(out, loaded, there)
-    errors = estimation_errors.write_errors(out, loaded.network, there)
-    lines = [statistics.text(finished.rows), *([estimation_errors.error_table(errors)] if len(errors) else [])]
-    return "\n".join([*lines, f"Written to {out}"])
+    return f"{statistics.text(finished.rows)}\nWritten to {out}"
 
 
 def demo(out: Path, *, seed: int = 1000) -> str:

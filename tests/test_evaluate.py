@@ -12,7 +12,6 @@ import trajectories
 from commands import cosim, good
 
 from cosim.evaluation import evaluate, results
-from cosim.report import figures
 from nmfd.api import load_scenario
 from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
@@ -144,26 +143,3 @@ def test_cosim_run_compares_with_what_against_names(tmp_path, monkeypatch):
     said = good(cosim(*arguments, "--out", tmp_path / "out"))
     assert "against pi-gating" in said and re.search(r"^dpc-pcrg +1 +\S+ +-\d", said, re.M)
     assert (tmp_path / "out" / "total_accumulation.png").is_file()
-
-
-def test_titles_name_the_most_teleports():
-    rows = pd.DataFrame(
-        [{"controller": name, "teleports": count} for name, count in (("a", 1), ("b", 9), ("c", 4), ("d", 0), ("b", 2))]
-    )
-    assert figures.teleports(rows) == "teleports: b 11, c 4, others fewer"
-    assert figures.teleports(rows.assign(teleports=0)) == "no teleport in any run"
-
-
-@pytest.mark.parametrize(
-    "name, level, said",
-    [
-        ("dpc-pc", 1.3, ""),
-        ("dpc-pc", 1.31, "1.31"),
-        ("dpc-pc+rerouting-30", 1.6, ""),
-        ("dpc-pcrg+max-pressure", 0.7, "0.7"),
-        ("pi-gating", 9.0, ""),
-    ],
-)
-def test_a_run_outside_of_what_its_policy_was_trained_on_says_so(name, level, said):
-    found = parse(name).outside_training(load_scenario(ROOT / "scenarios" / "grid7_peak"), level)
-    assert said in found and bool(said) == bool(found)

@@ -53,11 +53,6 @@ class Finished:
         """One row per run of all levels."""
         return pd.concat([level.rows for level in self.levels], ignore_index=True)
 
-    @property
-    def name(self) -> str:
-        """Name of the folder."""
-        return self.path.resolve().name
-
     def map(self) -> City:
         """Return the city. Raise InputError if it has changed since the runs."""
         files = ensure_built(self.scenario.network)

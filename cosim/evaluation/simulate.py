@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from cosim.evaluation import estimation_errors
 from cosim.plant.max_pressure import FACTS as PRESSURE_FACTS
 from cosim.plant.plant import Observer, SumoPlant
 from cosim.plant.record import RECORD, settled
@@ -116,9 +116,8 @@ def simulate(
             return result
         plant_facts, leaks, trip_facts = plant.facts(), set(plant.leaks()), plant.trip_facts()
         result = settled(result.add({}, RECORD, **plant.record()))
-        backlog, errors = result.backlog.sum(axis=(1, 2)), dict.fromkeys(("rmse_share", "cell_rmse_veh"), math.nan)
-        if result.estimated:
-            errors = estimation_errors.errors(scenario.network, result)[-1]  # of all regions
+        backlog = result.backlog.sum(axis=(1, 2))
+        rmse_share, cell_rmse = estimation_errors(result, scenario.network.critical)
         facts = {
             "scenario": job.scenario.name,
             "scenario_folder": str(scenario.folder or ""),
@@ -134,8 +133,8 @@ def simulate(
             "notes": metrics.notes(result),
             "outside_training": strategy.outside_training(scenario, job.demand, job.policy),
             "leaking_share": leaking_share(result, plant.city, leaks),
-            "estimate_rmse_share": errors["rmse_share"],
-            "estimate_cell_rmse_veh": errors["cell_rmse_veh"],
+            "estimate_rmse_share": rmse_share,
+            "estimate_cell_rmse_veh": cell_rmse,
             "overhead_share": 1.0 - plant_facts["sumo_time_s"] / result.wall_time,
             "setup_time_s": time.perf_counter() - begin - result.wall_time,
             "removed_veh": int(result.removals.sum() + result.given_up.sum()),
@@ -175,6 +174,22 @@ def queue_facts(result: Result, city: City) -> dict[str, float]:
         "gateway_queue_max_veh": float(result.gateway_queue_max[:, upstream].max()),
         "gateway_full_share": float(full.mean()),
     }
+
+
+def estimation_errors(result: Result, critical: PerRegion) -> tuple[float, float]:
+    """Return the root mean square errors of estimated states, NaN if they were exact.
+
+    Of the accumulation of a region as a share of critical (R,) [veh], and of its parts with vehicles [veh].
+    """
+    if not result.estimated:
+        return math.nan, math.nan
+    off, used = result.observed - result.accumulation, (result.accumulation > 0).any(axis=0)
+    shares = [_rms(off[:, i].sum(axis=1)) / limit for i, limit in enumerate(critical)]
+    return _rms(shares), _rms(off[:, used])
+
+
+def _rms(values: ArrayLike) -> float:
+    return float(np.sqrt(np.mean(np.square(values)))) if np.size(values) else 0.0
 
 
 def leaking_share(result: Result, city: City, leaks: Collection[Gateway]) -> float:

@@ -17,7 +17,8 @@ from pathlib import Path
 import numpy as np
 import sumo
 
-from cosim.importing.case import Progress, run_sumo
+from cosim.importing.case import Progress
+from cosim.sumo.build import run_sumo
 from cosim.sumo.xml_files import attribute, child, file_list, read_xml
 from nmfd.errors import InputError
 from nmfd.runs.files import temporary_folder
@@ -113,10 +114,7 @@ def _iterate(folder: Path, n: int, options: Sequence[str], *, where: str) -> Non
 
 
 def _relative_gap(folder: Path, net: Path, n: int, *, begin: float, seed: int) -> float:
-    """Return the relative gap [-] of iteration n, estimated from at most GAP_SAMPLE drivers.
-
-    It is the time that drivers would have saved on the fastest routes, over the time on these.
-    """
+    """Return the relative gap [-] of iteration n: what a sample of drivers could save, over their least time."""
     (weights,) = (folder / f"{n:03d}").glob("dump_*.xml.gz")
     root = read_xml(_routes(folder, n))
     vehicles = root.findall("vehicle")

@@ -6,7 +6,7 @@ import re
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +14,7 @@ from typing import Protocol
 
 import sumo
 
+from cosim.sumo.build import run_sumo
 from cosim.sumo.xml_files import BROKEN, file_list, opened, read_xml
 from nmfd.errors import InputError
 from nmfd.runs.files import temporary_folder
@@ -191,16 +192,6 @@ def fetch_osm(box: Box, folder: Path) -> Path:
             f"--bbox: {where}: osmGet.py got nothing from OpenStreetMap ({' '.join(reason)}); without internet access "
             "give a file of the area, exported at https://www.openstreetmap.org/export"
         ) from None
-
-
-def run_sumo(program: str, options: Mapping[str, object], *flags: str, where: str) -> None:
-    """Run one of SUMO's programs. Raises InputError with its first error line and the file `where`."""
-    arguments = [text for name, value in options.items() for text in (f"--{name}", str(value))]
-    command = [str(Path(sumo.SUMO_HOME) / "bin" / program), *arguments, *flags]
-    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace")
-    if done.returncode:
-        error = next((line for line in done.stdout.splitlines() if "rror" in line), "no reason given")
-        raise InputError(f"{where}: {program} cannot run it: {' '.join(error.split())}; correct the input")
 
 
 def _root(path: Path) -> ElementTree.Element:

@@ -53,15 +53,12 @@ def region_map(
     return ax
 
 
-def rings_round(
-    shapes: Sequence[Points], members: np.ndarray, regions: EdgeNumbers, blocks: float = 0.0
-) -> list[list[Points]]:
+def rings_round(shapes: Sequence[Points], regions: EdgeNumbers, blocks: float) -> list[list[Points]]:
     """Return the outlines of every region, the largest first: rings (n, 2) [m] round the places nearest to its edges.
 
-    shapes: of E edges, (n, 2) [m]; members: (E,) bool, edges that count
-    blocks: share of the map's extent between streets that is still no hole
+    shapes: of E edges, (n, 2) [m]; blocks: share of the map's extent between streets that is still no hole
     """
-    points, of = _sampled(shapes, members)
+    points, of = _sampled(shapes)
     low, high = points.min(axis=0), points.max(axis=0)
     cell = max(float((high - low).max()) / CELLS, 1.0)
     # Beyond this distance a place belongs to no street; the map must end there, or rings stay open.
@@ -79,11 +76,10 @@ def rings_round(
     return outlines
 
 
-def _sampled(shapes: Sequence[Points], members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return points (n, 2) along the shapes of some edges, and the edge (n,) of each point."""
+def _sampled(shapes: Sequence[Points]) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (n, 2) along the shapes of the edges, and the edge (n,) of each point."""
     points, of = [], []
-    for n in np.flatnonzero(members):
-        shape = shapes[n]
+    for n, shape in enumerate(shapes):
         steps = np.hypot(*np.diff(shape, axis=0).T) if len(shape) > 1 else np.zeros(0)
         along = np.concatenate([[0.0], np.cumsum(steps)])
         marks = np.linspace(0.0, along[-1], max(2, int(along[-1] / POINT_SPACING_M) + 1))

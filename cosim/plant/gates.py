@@ -297,10 +297,8 @@ class ResponsiveSignal:
         return {link: ration.green_time(self._session.time) for link, ration in self._rations.items()}
 
     def _hold(self, state: str, now: float) -> None:
-        """Show `state` from the first limit on, and give the signal back to SUMO after the last one.
-
-        It is given back in the midst of a stage: one that just began could end, one step behind SUMO, too early.
-        """
+        """Show `state` from the first limit on; give the signal back to SUMO in the midst of a stage after the last."""
+        # A stage that has just begun could end too early, one step behind SUMO.
         limited = self._limited or any(ration.limited for ration in self._rations.values())
         again = NEVER if limited or state != self._base or not is_stage(state) else self._since + MIN_GREEN_S
         self._held = now < again - 1e-6

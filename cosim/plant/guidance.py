@@ -291,10 +291,7 @@ class Guide:
         return [region for region, _ in groupby(map(self._region.__getitem__, way))]
 
     def _keeps(self, present: _Present, cost: float, following: int | None = None) -> bool:
-        """Return True if the present way is about as good as one of `cost` [s], and leads into `following` next.
-
-        A way on roads closed to cars is always kept.
-        """
+        """Return True if the way is about as good as `cost` [s] and leads into `following`, or is closed to cars."""
         if present.way is None:
             return True
         if math.isinf(present.takes) or following is not None and self._next_region(present.way) != following:

@@ -417,10 +417,7 @@ class Roads:
         return own
 
     def _arriving(self, edge: str, length: float) -> dict[str, float]:
-        """Return edge without a signal that leads to `edge`, within REACH_M -> share of its vehicles that take it.
-
-        length: from the beginning of `edge` to the signal [m]
-        """
+        """Return edge without a signal, within REACH_M of one -> share of its vehicles that take `edge`."""
         shares, todo = {edge: 1.0}, [(edge, length)]
         for onward, there in todo:
             for before in self._before[onward] if there < REACH_M else ():

@@ -25,18 +25,14 @@ POLL_PERIOD_S = 3.0  # longest time between two looks at the entry edges
 
 @dataclass
 class _Vehicle:
-    """A vehicle that SUMO has loaded.
-
-    origin, destination: regions; edge: last one of its route; announced: region of its last Event, perhaps ahead
-    free: guidance may reroute it; region: the present one, None before the departure
-    """
+    """A vehicle that SUMO has loaded."""
 
     origin: int
     destination: int
-    edge: str
-    announced: int
-    free: bool = True
-    region: int | None = None
+    edge: str  # last one of its route
+    announced: int  # region of its last Event, perhaps ahead
+    free: bool = True  # guidance may reroute it
+    region: int | None = None  # the present one, None before the departure
 
     @property
     def here(self) -> int:

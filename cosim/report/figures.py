@@ -28,7 +28,6 @@ SATURATION_FLOW = 0.5  # veh/s and lane
 COMMANDED, GREEN_SHOWN, FLOWED = "#333333", "#009e73", "#0059a8"
 SHOWN_PANELS = 12  # boundaries, or pairs of region and destination, that are shown one by one
 SHARE_WINDOW = 3  # control intervals over which realised shares are taken
-NAMED_CONTROLLERS = 2  # with the most teleports, in a title
 MARKERS = "o^sDvPX"
 
 
@@ -94,15 +93,6 @@ def shown_seed(rows: pd.DataFrame) -> int:
     return int(rows["seed"].value_counts().sort_index().idxmax())
 
 
-def teleports(rows: pd.DataFrame) -> str:
-    """Return how many vehicles were teleported, with the controllers that have most of them."""
-    counts = rows.groupby("controller", sort=False)["teleports"].sum()
-    counts = counts[counts > 0].sort_values(ascending=False, kind="stable")
-    named = [f"{name} {count:.0f}" for name, count in counts.iloc[:NAMED_CONTROLLERS].items()]
-    more = ["others fewer"] * (len(counts) > NAMED_CONTROLLERS)
-    return "teleports: " + ", ".join(named + more) if named else "no teleport in any run"
-
-
 def draw_all(finished: Finished) -> None:
     """Draw the pictures of every demand level into its folder, and those of several levels beside them."""
     for level in finished.levels:
@@ -113,10 +103,9 @@ def draw_all(finished: Finished) -> None:
 
 def draw_level(out: Path, scenario: Scenario, city: City, rows: pd.DataFrame, read: Read) -> None:
     """Draw all pictures of one demand level into the folder `out`; rows: one per run; read: returns a run."""
-    seed, note, network = shown_seed(rows), teleports(rows), scenario.network
+    seed, network = shown_seed(rows), scenario.network
     runs = [read(row.controller, row.seed) for row in rows.itertuples()]
-    shaded = ", shaded: all seeds" if rows["seed"].nunique() > 1 else ""
-    title = f"seed {seed}{shaded}; {note}"
+    title = f"seed {seed}{', shaded: all seeds' if rows['seed'].nunique() > 1 else ''}"
     draw_accumulations(out, scenario, runs, seed=seed, title=title)
     best_first = {run.controller: run for run in runs if run.seed == seed}
     best_first = {name: best_first[name] for name in ranked(rows) if name in best_first}
@@ -126,9 +115,9 @@ def draw_level(out: Path, scenario: Scenario, city: City, rows: pd.DataFrame, re
     results = list(best_first.values())
     closing = (run for run in results if (run.perimeter[:, network.adjacency] < network.u_max - 1e-9).any())
     if gating := next(closing, None):
-        _draw_perimeter(out / "perimeter.png", city, network, gating, note)
+        _draw_perimeter(out / "perimeter.png", city, network, gating)
     if guiding := next((run for run in results if run.guided.sum() > 0), None):
-        _draw_splits(out / "splits.png", network, guiding, note)
+        _draw_splits(out / "splits.png", network, guiding)
 
 
 def draw_levels(out: Path, rows: pd.DataFrame) -> None:
@@ -152,7 +141,7 @@ def draw_levels(out: Path, rows: pd.DataFrame) -> None:
         if values:
             drawing = plots.figure(7.5, 4.8)
             ax = over_levels(drawing.subplots(), values, label)
-            _save(drawing, [ax], out / file, f"mean over seeds, 95 % intervals; {teleports(rows)}")
+            _save(drawing, [ax], out / file, "mean over seeds, 95 % intervals")
 
 
 def _draw_mfds(path: Path, network: RegionalModel, results: Sequence[Result]) -> None:
@@ -164,7 +153,7 @@ def _draw_mfds(path: Path, network: RegionalModel, results: Sequence[Result]) ->
     plots.draw_mfds(path, network, samples)
 
 
-def _draw_perimeter(path: Path, city: City, network: RegionalModel, run: Result, note: str) -> None:
+def _draw_perimeter(path: Path, city: City, network: RegionalModel, run: Result) -> None:
     """Draw the boundaries that were closed most over time."""
     pairs = {}
     for pair in map(tuple, np.argwhere(network.adjacency)):
@@ -185,10 +174,10 @@ def _draw_perimeter(path: Path, city: City, network: RegionalModel, run: Result,
     drawing, axes = plots.panels(len(shown_pairs))
     for ax, pair in zip(axes, shown_pairs, strict=True):
         perimeter(ax, run.step, *pairs[pair]).set_title(f"{pair[0]} > {pair[1]}", fontsize="medium")
-    _save(drawing, axes, path, f"{run.controller}, seed {run.seed}; {note}")
+    _save(drawing, axes, path, f"{run.controller}, seed {run.seed}")
 
 
-def _draw_splits(path: Path, network: RegionalModel, run: Result, note: str) -> None:
+def _draw_splits(path: Path, network: RegionalModel, run: Result) -> None:
     """Draw the busiest choices between neighbours over time."""
     crossings = run.crossings.astype(float)
     leaving = crossings.sum(axis=2)  # (T, R, R), from i bound for j
@@ -210,7 +199,7 @@ def _draw_splits(path: Path, network: RegionalModel, run: Result, note: str) -> 
         splits(ax, run.step, run.splits[:, i, neighbours, j], realised, neighbours)
         ax.set_title(f"in {i}, bound for {j}", fontsize="medium")
     how = f"commanded θ (lines), shares over {SHARE_WINDOW} intervals (dots)"
-    _save(drawing, axes, path, f"{run.controller}, seed {run.seed}: {how}; {note}")
+    _save(drawing, axes, path, f"{run.controller}, seed {run.seed}: {how}")
 
 
 def _save(drawing: Figure, axes: Sequence[Axes], path: Path, title: str) -> None:

@@ -87,7 +87,7 @@ def _run(run: Finished) -> dict:
     minutes = level.key["steps"] * level.key["step_s"] / 60
     pictures = _pictures(partial(figures.draw_levels, rows=rows), LEVEL_PICTURES) if len(run.levels) > 1 else []
     return {
-        "name": run.name,
+        "name": run.path.resolve().name,
         "heading": heading + (f", demand times {level.demand:g}" if len(run.levels) > 1 else ""),
         "figures": shown,
         "why": explain.paragraph(level, run, name),

@@ -4,12 +4,11 @@ city.toml -> plain XML -> netconvert -> <network>/build/<name>.net.xml and regio
 can be written beside the network (nmfd.runs.shipped.build_folder).
 """
 
-import csv
 import hashlib
-import io
 import os
 import re
 import subprocess
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from itertools import pairwise
@@ -241,10 +240,8 @@ def read_recipe(path: Path, regions: int) -> Recipe:
 
 
 def _movements(recipe: Recipe, start: str, end: str) -> dict[str, str]:
-    """Return {"r", "s" or "l": next node} at the end of a street, without turning back.
-
-    A radial into the centre is entered straight ahead only, so that no queue before it stands on the ring around it.
-    """
+    """Return {"r", "s" or "l": next node} at the end of a street, without turning back."""
+    # A radial is entered straight ahead only, so that no queue before it stands on the ring round the centre.
     nodes = recipe.nodes
     heading = _heading(nodes[start], nodes[end])
     turns = {}
@@ -309,10 +306,8 @@ def _leads_in(recipe: Recipe, a: str, b: str) -> bool:
 
 
 def _into(turn: str, lanes: int, target_lanes: int) -> list[range]:
-    """Return the lanes that each lane of a movement leads into.
-
-    A vehicle chooses its next lane while it turns: in a queue two vehicles that want each other's lane wait forever.
-    """
+    """Return the lanes that each lane of a movement leads into: one each, or all for a single lane that turns."""
+    # Two vehicles in a queue that want each other's lane would wait forever.
     if turn == "s" or lanes > 1:
         cuts = [target_lanes * n // lanes for n in range(lanes + 1)]
         return [range(a, b) for a, b in pairwise(cuts)]
@@ -345,17 +340,20 @@ def build(recipe: Recipe, where: str) -> tuple[bytes, bytes]:
         for kind, content in files.items():
             (folder / f"{kind}.xml").write_text(content, encoding="utf-8")
             options[f"{kind}-files"] = f"{kind}.xml"
-        program = str(Path(sumo.SUMO_HOME) / "bin" / "netconvert")
-        command = [program, *(part for key, value in options.items() for part in (f"--{key}", str(value)))]
-        environment = {**os.environ, "SUMO_HOME": sumo.SUMO_HOME}
-        result = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, env=environment)
-        if result.returncode:
-            lines = [line for line in result.stderr.splitlines() if line.startswith("Error")] or ["unknown error"]
-            raise InputError(f"{where}: netconvert cannot build it: {lines[0]}; correct the recipe")
+        run_sumo("netconvert", options, where=where, folder=folder)
         net = (folder / "net.xml").read_bytes()
-    table = io.StringIO()
-    writer = csv.writer(table, lineterminator="\n")
-    writer.writerow(["edge", "region"])
-    writer.writerows(sorted(region_of.items()))
+    table = "".join(["edge,region\n", *(f"{edge},{region}\n" for edge, region in sorted(region_of.items()))])
     # The comment holds the date and the temporary folder.
-    return re.sub(rb"<!--.*?-->\s*", b"", net, count=1, flags=re.DOTALL), table.getvalue().encode()
+    return re.sub(rb"<!--.*?-->\s*", b"", net, count=1, flags=re.DOTALL), table.encode()
+
+
+def run_sumo(program: str, options: Mapping[str, object], *flags: str, where: str, folder: Path | None = None) -> None:
+    """Run one of SUMO's programs in a folder. Raises InputError with its first error line and the file `where`."""
+    arguments = [text for name, value in options.items() for text in (f"--{name}", str(value))]
+    command = [str(Path(sumo.SUMO_HOME) / "bin" / program), *arguments, *flags]
+    environment = os.environ | {"SUMO_HOME": sumo.SUMO_HOME}
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, errors="replace", env=environment)
+    if done.returncode:
+        lines = (done.stderr + done.stdout).splitlines()
+        error = next((line for line in lines if "rror" in line), "no reason given")
+        raise InputError(f"{where}: {program} cannot run it: {' '.join(error.split())}; correct the input")

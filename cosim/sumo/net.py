@@ -171,8 +171,7 @@ def _read_net(
 ) -> tuple[
     dict[str, list[tuple[float, float, str]]], set[tuple[str, int]], dict[str, tuple[float, float]], list[_Connection]
 ]:
-    """Return edge -> (length, speed, id) of its car lanes; the car lanes; internal edge -> (free-flow time [s], length
-    [m]); and the connections."""
+    """Return edge -> (length, speed, id) of car lanes; these; internal edge -> (time [s], length [m]); connections."""
     cars: set[tuple[str, int]] = set()
     lanes_of: dict[str, list[tuple[float, float, str]]] = {}
     internal: dict[str, tuple[float, float]] = {}
@@ -264,10 +263,7 @@ def _internal_regions(
 def _turns_over_junctions(
     links: Sequence[_Connection], connections: Sequence[_Connection]
 ) -> dict[tuple[str, str], tuple[str, ...]]:
-    """Return (from_edge, to_edge) -> internal edges in between, of the last of several links.
-
-    A turn that waits in the middle of a junction goes over two.
-    """
+    """Return (from_edge, to_edge) -> internal edges in between; two if the turn waits in the middle of a junction."""
     onward = {(c.source, c.lane): c.via for c in connections if c.source.startswith(":")}
     over: dict[tuple[str, str], tuple[str, ...]] = {}
     for link in links:

@@ -177,10 +177,7 @@ def _departures(
 
 
 def _ends(city: City, region: int, *, departing: bool) -> tuple[list[str], np.ndarray]:
-    """Return the edges of a region where trips start or end, and their cumulated weights.
-
-    Edges from which a trip leaves the region at once, turn pockets and short pieces count only if nothing else is left.
-    """
+    """Return the edges where trips of a region start or end, with cumulated weights: if there are any, good ones."""
     edges = [edge for edge in city.edges if city.region_of[edge] == region]
     before: dict[str, list[str]] = {edge: [] for edge in city.edges}
     for edge, after in city.successors.items():

@@ -83,7 +83,7 @@ class CityPicture:
             lane_km=np.array([city.length[edge] * city.lanes[edge] for edge in city.edges]) / 1000.0,
             lanes=np.array([city.lanes[edge] for edge in city.edges]),
             region=region,
-            outlines=rings_round(shapes, np.ones(len(shapes), dtype=bool), region, REGION_REACH),
+            outlines=rings_round(shapes, region, REGION_REACH),
             places=np.stack([middles[region == r].mean(axis=0) for r in range(city.regions)]),
             gates=_gates(city, dict(zip(city.edges, shapes, strict=True))),
             critical=network.critical,
