@@ -7,12 +7,10 @@ a longer one for a signal, as one of DRIVER_CLASSES groups of drivers perceives 
 from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra
 
 from cosim.importing.demand import Traffic
 from cosim.importing.streets import Streets
-from cosim.sumo.trips import CLASS_SPREAD, DRIVER_CLASSES, SHORT_EDGE_M
+from cosim.sumo.trips import DRIVER_CLASSES, SHORT_EDGE_M, fastest_routes, perception
 from nmfd.errors import InputError
 
 RAMP_UP_S, FLAT_S, RAMP_DOWN_S = 1800.0, 1800.0, 1800.0
@@ -35,14 +33,22 @@ def morning_peak(streets: Streets, *, level: float, begin: float, seed: int) -> 
         raise InputError(f"{streets.path}: only {count} streets can be reached from each other; give vehicles instead")
     random = np.random.default_rng([seed, 0x7065616B])
     ends = _Ends(streets, random)
-    ways = _Ways(streets, random)
-    pilot = ways.routes(*ends.draw(PILOT_TRIPS))
-    mean = float(np.mean([ways.time[list(route)].sum() for route in pilot if route]))
+    signalled = np.array([signal is not None for signal in streets.link_signals])
+    turn = np.where(signalled, SIGNAL_DELAY_S, JUNCTION_DELAY_S)
+    time = streets.length / streets.speed + JUNCTION_DELAY_S  # with the junction before it
+    noise = perception(len(time), random)
+
+    def routed(ends: tuple[np.ndarray, np.ndarray]) -> list[tuple[int, ...]]:
+        tastes = random.integers(DRIVER_CLASSES, size=len(ends[0]))
+        return fastest_routes(ends, tastes, noise, time=time, links=streets.links, turn=turn)
+
+    pilot = routed(ends.draw(PILOT_TRIPS))
+    mean = float(np.mean([time[list(route)].sum() for route in pilot if route]))
     inside = level * PEAK_DENSITY * float(streets.lane_metres[streets.core].sum())
     count = max(1, round(inside / mean * (RAMP_UP_S / 2 + FLAT_S + RAMP_DOWN_S / 2)))
     first, last = ends.draw(count)
     depart = begin + np.sort(_times(random.random(count)))
-    routes = ways.routes(first, last)
+    routes = routed((first, last))
     kept = np.array([bool(route) for route in routes])
     free = {"departLane": "best", "departSpeed": "max", "departPos": "random_free", "arrivalPos": "random"}
     vehicles = []
@@ -105,41 +111,6 @@ class _Ends:
         turned = np.cos(self._angle[self._rim] - self._angle[n]) < 0.0
         options = self._rim[turned] if turned.any() else self._rim
         return int(self._pick(options, self._fast[options], 1)[0])
-
-
-class _Ways:
-    """Fastest routes; time (E,) [s] of every edge with the junction before it."""
-
-    def __init__(self, streets: Streets, random: np.random.Generator):
-        self._size, self._links, self._random = len(streets.edges), streets.links, random
-        signalled = np.array([signal is not None for signal in streets.link_signals])
-        self._turn = np.where(signalled, SIGNAL_DELAY_S, JUNCTION_DELAY_S)
-        self.time = streets.length / streets.speed + JUNCTION_DELAY_S
-        self._taste = np.exp(CLASS_SPREAD * random.standard_normal((DRIVER_CLASSES, self._size)))
-
-    def routes(self, first: np.ndarray, last: np.ndarray) -> list[tuple[int, ...]]:
-        """Return the route of every trip; empty if there is none."""
-        routes: list[tuple[int, ...]] = [()] * len(first)
-        tastes = self._random.integers(DRIVER_CLASSES, size=len(first))
-        for taste in range(DRIVER_CLASSES):
-            cost = self._turn + (self.time * self._taste[taste])[self._links[:, 1]]
-            graph = csr_array((cost, (self._links[:, 0], self._links[:, 1])), shape=(self._size,) * 2)
-            origins = np.unique(first[tastes == taste])
-            for chunk in np.array_split(origins, max(1, len(origins) // 128)):
-                if len(chunk):
-                    _, before = dijkstra(graph, indices=chunk, return_predecessors=True)
-                    for n in np.flatnonzero((tastes == taste) & np.isin(first, chunk)):
-                        routes[n] = _walk(before[np.searchsorted(chunk, first[n])], int(first[n]), int(last[n]))
-        return routes
-
-
-def _walk(before: np.ndarray, first: int, last: int) -> tuple[int, ...]:
-    way = [last]
-    while way[-1] != first:
-        way.append(int(before[way[-1]]))
-        if way[-1] < 0:
-            return ()
-    return tuple(reversed(way))
 
 
 def _times(uniform: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ import numpy as np
 
 from cosim.sumo.arrays import PerTrip
 from cosim.sumo.net import City
-from cosim.sumo.trips import DRIVER_CLASSES, PEAK_S, PLANNING_SEEDS, HeldTrips, Ways, busiest
+from cosim.sumo.trips import DRIVER_CLASSES, PEAK_S, PLANNING_SEEDS, HeldTrips, busiest, perception, routes_in
 from cosim.sumo.xml_files import attribute, read_xml
 from nmfd.errors import InputError
 from nmfd.runs import files
@@ -139,7 +139,8 @@ def own_flows(
         number = {edge: n for n, edge in enumerate(city.edges)}
         random = np.random.default_rng(PLANNING_SEEDS[0])
         begin, end = np.array([[number[edge] for edge in leg] for leg in legs]).T
-        for route in Ways(city, random).routes(begin, end, random.integers(DRIVER_CLASSES, size=len(legs))):
+        noise = perception(len(city.edges), random)
+        for route in routes_in(city, (begin, end), random.integers(DRIVER_CLASSES, size=len(legs)), noise):
             turns.update(pairwise(route))
     return {turn: factor * count / PEAK_S for turn, count in turns.items()}
 

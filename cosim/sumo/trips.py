@@ -8,10 +8,11 @@ from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
+from jaxtyping import Float, Int
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from cosim.sumo.arrays import PerTrip, TripNumbers
+from cosim.sumo.arrays import PerEdge, PerMove, PerTrip, TripNumbers
 from cosim.sumo.net import City
 from nmfd.arrays import PairsOverTime
 from nmfd.errors import InputError
@@ -127,7 +128,7 @@ def make_trips(city: City, demand: PairsOverTime, step: float, seed: int) -> Tri
     draws = rng.random((len(depart), 2))
     tastes = rng.integers(DRIVER_CLASSES, size=len(depart))
     positions = rng.random(len(depart))
-    trees = Ways(city, rng)
+    noise = perception(len(city.edges), rng)
     number = {edge: n for n, edge in enumerate(city.edges)}
     first, last = np.empty((2, len(depart)), dtype=int)
     for n, (i, j) in enumerate(zip(origin, destination, strict=True)):
@@ -136,7 +137,7 @@ def make_trips(city: City, demand: PairsOverTime, step: float, seed: int) -> Tri
     for n in np.flatnonzero(first == last):  # to the next edge instead
         edges, _ = goals[destination[n]]
         last[n] = number[edges[(edges.index(city.edges[first[n]]) + 1) % len(edges)]]
-    routes = trees.routes(first, last, tastes)
+    routes = routes_in(city, (first, last), tastes, noise)
     for n, route in enumerate(routes):
         if len(route) < 2:
             raise InputError(
@@ -220,40 +221,61 @@ def _draw(ends: tuple[list[str], np.ndarray], uniform: float) -> str:
     return edges[min(int(np.searchsorted(weights, uniform, side="right")), len(edges) - 1)]
 
 
-class Ways:
-    """Fastest routes in free flow for several groups of drivers: a move costs the junction and the edge after it."""
+def perception(edges: int, rng: np.random.Generator) -> Float[np.ndarray, "classes E"]:
+    """Draw the factors [-] with which each class of drivers sees the travel times of the edges."""
+    return np.exp(CLASS_SPREAD * rng.standard_normal((DRIVER_CLASSES, edges)))
 
-    def __init__(self, city: City, rng: np.random.Generator):
-        """rng: draws the travel times that each group of drivers sees"""
-        self.city = city
-        number = {edge: n for n, edge in enumerate(city.edges)}
-        arcs = [(number[a], number[b], city.turn_time[a, b]) for a, after in city.successors.items() for b in after]
-        self._from, self._to = (np.array([arc[n] for arc in arcs], dtype=int) for n in (0, 1))
-        self._turn = np.array([arc[2] for arc in arcs])
-        self._time = np.array([city.length[edge] / city.speed[edge] for edge in city.edges])
-        self._noise = np.exp(CLASS_SPREAD * rng.standard_normal((DRIVER_CLASSES, len(city.edges))))
 
-    def routes(self, first: TripNumbers, last: TripNumbers, tastes: TripNumbers) -> list[tuple[str, ...]]:
-        """Return the route of every trip, () if there is none."""
-        routes: list[tuple[str, ...]] = [()] * len(first)
-        count = len(self.city.edges)
-        for taste in range(DRIVER_CLASSES):
-            cost = self._turn + (self._time * self._noise[taste])[self._to]
-            graph = csr_matrix((np.maximum(cost, 1e-6), (self._from, self._to)), shape=(count, count))
-            members = np.flatnonzero(tastes == taste)
-            origins = np.unique(first[members])
-            for chunk in np.array_split(origins, max(1, len(origins) // 256)):
-                if not len(chunk):
-                    continue
+def routes_in(
+    city: City, ends: tuple[TripNumbers, TripNumbers], tastes: TripNumbers, noise: Float[np.ndarray, "classes E"]
+) -> list[tuple[str, ...]]:
+    """Return `fastest_routes` in a city, as ids of edges."""
+    number = {edge: n for n, edge in enumerate(city.edges)}
+    moves = [(a, b) for a, after in city.successors.items() for b in after]
+    routes = fastest_routes(
+        ends,
+        tastes,
+        noise,
+        time=np.array([city.length[edge] / city.speed[edge] for edge in city.edges]),
+        links=np.array([(number[a], number[b]) for a, b in moves], dtype=int).reshape(-1, 2),
+        turn=np.array([city.turn_time[move] for move in moves]),
+    )
+    return [tuple(city.edges[edge] for edge in route) for route in routes]
+
+
+def fastest_routes(
+    ends: tuple[TripNumbers, TripNumbers],
+    tastes: TripNumbers,
+    noise: Float[np.ndarray, "classes E"],
+    *,
+    time: PerEdge,
+    links: Int[np.ndarray, "M 2"],
+    turn: PerMove,
+) -> list[tuple[int, ...]]:
+    """Return the fastest route in free flow of every trip as numbers of edges, () if there is none.
+
+    ends: first and last edge (N,) of the trips; tastes: (N,), class of each driver
+    noise: [-], factor of every class of drivers on time [s] of the edges; turn: [s] over the junction of each link
+    """
+    first, last = ends
+    routes: list[tuple[int, ...]] = [()] * len(first)
+    for taste, factor in enumerate(noise):
+        cost = np.maximum(turn + (time * factor)[links[:, 1]], 1e-6)
+        graph = csr_matrix((cost, (links[:, 0], links[:, 1])), shape=(len(time),) * 2)
+        members = np.flatnonzero(tastes == taste)
+        origins = np.unique(first[members])
+        for chunk in np.array_split(origins, max(1, len(origins) // 256)):
+            if len(chunk):
                 _, before = dijkstra(graph, indices=chunk, return_predecessors=True)
                 for n in members[np.isin(first[members], chunk)]:
-                    routes[n] = self._walk(before[np.searchsorted(chunk, first[n])], first[n], last[n])
-        return routes
+                    routes[n] = _walk(before[np.searchsorted(chunk, first[n])], int(first[n]), int(last[n]))
+    return routes
 
-    def _walk(self, before: np.ndarray, first: int, last: int) -> tuple[str, ...]:
-        way = [last]
-        while way[-1] != first:
-            way.append(before[way[-1]])
-            if way[-1] < 0:
-                return ()
-        return tuple(self.city.edges[n] for n in reversed(way))
+
+def _walk(before: np.ndarray, first: int, last: int) -> tuple[int, ...]:
+    way = [last]
+    while way[-1] != first:
+        way.append(int(before[way[-1]]))
+        if way[-1] < 0:
+            return ()
+    return tuple(reversed(way))
