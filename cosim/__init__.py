@@ -14,44 +14,33 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from cosim import api as api
-    from cosim.api import evaluate, read_run, run, tune
+    from cosim.api import evaluate, run, tune
+    from cosim.evaluation.results import read_run
     from cosim.plant.plant import SumoPlant
     from cosim.plant.settings import Settings, settings
     from cosim.report.city import City
     from nmfd.types import Result
 
-__all__ = [
-    "City",
-    "Result",
-    "Settings",
-    "SumoPlant",
-    "evaluate",
-    "read_run",
-    "run",
-    "settings",
-    "tune",
-]
+__all__ = ["City", "Result", "Settings", "SumoPlant", "evaluate", "read_run", "run", "settings", "tune"]
 _PLACES = {
-    "City": "report.city.City",
-    "Settings": "plant.settings.Settings",
-    "SumoPlant": "plant.plant.SumoPlant",
-    "read_run": "api.read_run",
-    "run": "api.run",
-    "evaluate": "api.evaluate",
-    "tune": "api.tune",
-    "settings": "plant.settings.settings",
+    "City": "cosim.report.city",
+    "Result": "nmfd.types",
+    "Settings": "cosim.plant.settings",
+    "SumoPlant": "cosim.plant.plant",
+    "evaluate": "cosim.api",
+    "read_run": "cosim.evaluation.results",
+    "run": "cosim.api",
+    "settings": "cosim.plant.settings",
+    "tune": "cosim.api",
 }
 
 
 def __getattr__(name: str) -> Any:
     if name == "api":
         return import_module("cosim.api")
-    if name == "Result":
-        return import_module("nmfd.types").Result
     if name not in _PLACES:
         raise AttributeError(f"module 'cosim' has no attribute {name!r}")
-    module, _, attribute = _PLACES[name].rpartition(".")
-    return getattr(import_module(f"cosim.{module}"), attribute)
+    return getattr(import_module(_PLACES[name]), name)
 
 
 def __dir__() -> list[str]:

@@ -81,11 +81,6 @@ def run(
         )
 
 
-def read_run(folder: Path | str, controller: str, seed: int) -> Result:
-    """Return a finished run of a run folder. Raises InputError."""
-    return results.read_run(Path(folder), controller, seed)
-
-
 def run_controllers(
     scenario: Path | str,
     controllers: Sequence[str],

@@ -38,11 +38,7 @@ AGAINST = click.option("--against", metavar="NAME[+...]", help="Second controlle
 STEPS = click.option("--steps", type=COUNT, help="Control intervals. [default: the scenario's]")
 DEMAND = click.option("--demand", type=LEVEL, default=1.0, show_default=True, help="Factor on the demand.")
 WORKERS = click.option(
-    "--workers",
-    type=COUNT,
-    default=lambda: os.cpu_count() or 1,
-    show_default="one per core",
-    help="Runs at a time.",
+    "--workers", type=COUNT, default=lambda: os.cpu_count() or 1, show_default="one per core", help="Runs at a time."
 )
 LEVELS = click.option(
     "--demand", "levels", type=listed(LEVEL), default="1", show_default=True, help="Factors on the demand."

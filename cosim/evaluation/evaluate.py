@@ -77,10 +77,7 @@ def evaluate(
 
 
 def plan(
-    scenarios: Planned,
-    strategies: Sequence[Strategy],
-    seeds: Sequence[int],
-    policies: Mapping[str, Path] | None = None,
+    scenarios: Planned, strategies: Sequence[Strategy], seeds: Sequence[int], policies: Mapping[str, Path] | None = None
 ) -> list[Run]:
     """Return all runs of an evaluation, seed by seed; policies: strategy name -> file instead of the scenario's."""
     runs = []

@@ -99,6 +99,6 @@ def finished_rows(rows: pd.DataFrame) -> pd.DataFrame:
     )
 
 
-def read_run(folder: Path, controller: str, seed: int) -> Result:
-    """Return a finished run. Raise InputError if it is missing."""
-    return Result.read(folder / f"{run_name(controller, seed)}.nc")
+def read_run(folder: Path | str, controller: str, seed: int) -> Result:
+    """Return a finished run of a run folder. Raise InputError if it is missing."""
+    return Result.read(Path(folder) / f"{run_name(controller, seed)}.nc")

@@ -3,7 +3,7 @@
 import gzip
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -20,11 +20,10 @@ from cosim.importing.generated import morning_peak
 from cosim.importing.partition import partition, read_regions
 from cosim.importing.regions import finish
 from cosim.importing.streets import Streets, read_streets
-from cosim.sumo.arrays import EdgeNumbers
 from cosim.sumo.net import load_city
 from nmfd.errors import InputError
 from nmfd.model import authority
-from nmfd.model.regional_model import RegionalModel, network_toml
+from nmfd.model.regional_model import network_toml
 from nmfd.runs.files import temporary_folder
 from nmfd.runs.tables import text_table
 from nmfd.studies import plots
@@ -127,7 +126,7 @@ def import_city(
         tables = quality.tables(streets, labels, network.region_names, city, baseline, left)
         verdict = quality.import_verdict(network, tables.gateways, labels, baseline)
         network = replace(network, controllable=verdict.boundaries.shares)
-        report = _report(case, streets, traffic, clock, tables, left, baseline, assigned)
+        report = _report(case, streets, traffic, clock, tables, baseline, assigned)
         if isinstance(regions, int) and network.regions < regions:
             report.append(f"{network.regions} regions instead of {regions}: others could not be reached, or fell apart")
         elif own is not None and (moved := int((own != labels)[streets.drivable & (own >= 0)].sum())):
@@ -162,7 +161,9 @@ def import_city(
         demand = model.region_demand(traffic, labels, clock)
         rows = [(k, i, j, f"{demand[k, i, j]:.6g}") for k, i, j in np.argwhere(demand > 0)]
         pd.DataFrame(rows, columns=["interval", "from", "to", "veh_s"]).to_csv(folder / "demand.csv", index=False)
-        _draw(net_folder / "map.png", streets, labels, network, tables)
+        drawing = plots.figure(6.2, 6.0)
+        maps.region_map(drawing.subplots(), streets, labels, network.region_names, network.positions, tables)
+        plots.save(drawing, net_folder / "map.png")
         for temporary, place in ((net_folder, out), (folder, scenario)):
             place.parent.mkdir(parents=True, exist_ok=True)
             shutil.move(temporary, place)
@@ -232,13 +233,6 @@ def _write_traffic(folder: Path, traffic: Traffic) -> dict[str, list[str]]:
     return {key: [FILES[key]] if elements else [] for key, (elements, _) in contents.items()}
 
 
-def _draw(path: Path, streets: Streets, regions: EdgeNumbers, network: RegionalModel, tables: quality.Tables) -> None:
-    width, height = np.ptp(streets.centre, axis=0) + 1.0
-    drawing = plots.figure(6.2, float(np.clip(6.2 * height / width, 3.0, 8.0)) + 0.8)
-    maps.region_map(drawing.subplots(), streets, regions, network.region_names, network.positions, tables)
-    drawing.savefig(path, dpi=130, metadata={"Software": None})
-
-
 def _zip(path: Path, content: bytes) -> None:
     """Write a gzip file without a date: the same content gives the same bytes."""
     path.write_bytes(gzip.compress(content, mtime=0))
@@ -254,7 +248,6 @@ def _report(
     traffic: Traffic,
     clock: model.Clock,
     tables: quality.Tables,
-    left: Mapping[str, str],
     baseline: Baseline,
     assigned: Assigned | None,
 ) -> list[str]:
@@ -273,8 +266,6 @@ def _report(
         lines.append(f"routes by duaIterate.py: relative gap {100 * gap:.1f} % in iteration {iteration} of {count}")
         if gap > GAP:
             lines.append(f"WARNING: a relative gap above {100 * GAP:g} %: rerouting gains what drivers know already")
-    if skipped := sorted({g["signal"] for g in tables.gateways}.intersection(left)):
-        lines.append(f"{len(skipped)} signals at boundaries left alone, such as {skipped[0]} ({left[skipped[0]]})")
     changed = list(case.left_out)
     if case.scale != 1.0:
         changed.append(f"scale = {case.scale:g}, vehicles are multiplied instead")

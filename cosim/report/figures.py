@@ -88,11 +88,6 @@ def ranked(rows: pd.DataFrame) -> list[str]:
     return sorted(score, key=score.__getitem__)
 
 
-def shown_seed(rows: pd.DataFrame) -> int:
-    """Return the first seed that most controllers have."""
-    return int(rows["seed"].value_counts().sort_index().idxmax())
-
-
 def draw_all(finished: Finished) -> None:
     """Draw the pictures of every demand level into its folder, and those of several levels beside them."""
     for level in finished.levels:
@@ -103,7 +98,8 @@ def draw_all(finished: Finished) -> None:
 
 def draw_level(out: Path, scenario: Scenario, city: City, rows: pd.DataFrame, read: Read) -> None:
     """Draw all pictures of one demand level into the folder `out`; rows: one per run; read: returns a run."""
-    seed, network = shown_seed(rows), scenario.network
+    network = scenario.network
+    seed = int(rows["seed"].value_counts().sort_index().idxmax())  # the first one that most controllers have
     runs = [read(row.controller, row.seed) for row in rows.itertuples()]
     title = f"seed {seed}{', shaded: all seeds' if rows['seed'].nunique() > 1 else ''}"
     draw_accumulations(out, scenario, runs, seed=seed, title=title)

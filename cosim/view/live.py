@@ -211,12 +211,7 @@ class Viewer:
         self.refresh()
 
 
-def watch(
-    jobs: Sequence[Simulation],
-    *,
-    port: int = 0,
-    browse: bool = False,
-) -> list[Seen]:
+def watch(jobs: Sequence[Simulation], *, port: int = 0, browse: bool = False) -> list[Seen]:
     """Do simulations side by side with a live page until they have ended and the page is closed.
 
     port: of the page on this machine; 0 for a free one
