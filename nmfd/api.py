@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nmfd import closed_loop
-from nmfd.controllers import open_loop
-from nmfd.controllers.dpc import rollout, training
+from nmfd.controllers import open_loop, training
+from nmfd.controllers.dpc import rollout
 from nmfd.controllers.strategy import CONTROLLERS, Strategy, check_tables, city_words, parse, parse_many
 from nmfd.errors import InputError, did_you_mean
 from nmfd.model.scenario import Scenario, read_scenario, with_demand

@@ -13,7 +13,8 @@ from commands import MAINS, call, error_line, good, nmfd
 
 from nmfd import closed_loop
 from nmfd.api import load_scenario
-from nmfd.controllers.dpc import rollout, training
+from nmfd.controllers import training
+from nmfd.controllers.dpc import rollout
 from nmfd.controllers.rules import PiGating
 from nmfd.controllers.strategy import CONTROLLERS
 from nmfd.runs.run_many import run_many

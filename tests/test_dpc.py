@@ -9,7 +9,7 @@ import tiny
 import torch
 
 from nmfd.api import load_scenario
-from nmfd.controllers.dpc import training
+from nmfd.controllers import training
 from nmfd.controllers.dpc.policy import Architecture, DpcController, Policy
 from nmfd.controllers.dpc.policy_file import checkpoint, load, load_policy
 from nmfd.controllers.rules import PiGating

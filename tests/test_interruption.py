@@ -12,7 +12,7 @@ import tiny_city
 import torch
 from commands import call, error_line, good, nmfd
 
-from nmfd.controllers.dpc import training
+from nmfd.controllers import training
 from nmfd.types import Result
 
 

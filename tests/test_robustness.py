@@ -9,7 +9,7 @@ import tiny
 import torch
 
 from nmfd.api import load_scenario, robustness
-from nmfd.controllers.dpc import training
+from nmfd.controllers import training
 from nmfd.model.planning import planning_model
 from nmfd.model.scenario import pairs_with_demand, perturbed
 from nmfd.studies import robustness as study

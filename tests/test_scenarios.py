@@ -8,7 +8,7 @@ import tiny
 
 from nmfd.api import controller as make_controller
 from nmfd.api import load_scenario
-from nmfd.controllers.dpc import training
+from nmfd.controllers import training
 from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
 from nmfd.model.planning import planning_model

@@ -10,8 +10,8 @@ import tiny
 import torch
 
 from nmfd.api import load_scenario
+from nmfd.controllers import training
 from nmfd.controllers.dpc import rollout as rollout_module
-from nmfd.controllers.dpc import training
 from nmfd.controllers.dpc.policy import Architecture, Policy
 from nmfd.controllers.dpc.policy_file import load_policy
 from nmfd.controllers.dpc.rollout import Rollout

@@ -33,7 +33,7 @@ from optuna.trial import FrozenTrial, TrialState
 from cosim.evaluation.results import finished_rows
 from cosim.evaluation.runs import city_key, runs_of
 from cosim.evaluation.statistics import TTS
-from nmfd.controllers.dpc import training
+from nmfd.controllers import training
 from nmfd.controllers.strategy import Strategy, check_tables
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario

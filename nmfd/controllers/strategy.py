@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from nmfd.controllers import custom, open_loop
-from nmfd.controllers.dpc import policy_file, training
+from nmfd.controllers.dpc import policy_file
+from nmfd.controllers.dpc.options import Training
 from nmfd.controllers.excitation import Probing
 from nmfd.controllers.mpc import controller as mpc
 from nmfd.controllers.rules import Gating, Greedy, NoControl, PiGating, RouteGuidance, SetPoint
@@ -76,7 +77,7 @@ CONTROLLERS: Mapping[str, ControllerType] = {
         *_pair("mpc-{}", "economic MPC", mpc.EconomicMpc, options=mpc.Mpc),
         *_pair("mpc-{}-terminal", "economic MPC with terminal cost", mpc.load, reads=VALUE, options=mpc.Mpc),
         *_pair("probing-{}", "random excitation for cosim identify", Probing, options=SetPoint),
-        *_pair("dpc-{}", "trained policy", policy_file.load, reads=POLICY, options=training.Training),
+        *_pair("dpc-{}", "trained policy", policy_file.load, reads=POLICY, options=Training),
         *_pair("bound-{}", "best plan with all demand known (nmfd bound)", open_loop.read, reads=PLAN),
     )
 }

@@ -7,29 +7,26 @@ import io
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Any
 
 import numpy as np
 import torch
-from pydantic import Field, model_validator
 
 from nmfd.controllers.dpc.compact import CompactPolicy, Numbers
+from nmfd.controllers.dpc.options import Training
 from nmfd.controllers.dpc.policy import Architecture, Policy
 from nmfd.controllers.dpc.policy_file import checkpoint, new_policy, read_file
 from nmfd.controllers.dpc.rollout import Rollout, compiled_step
 from nmfd.controllers.rules import PiGating
+from nmfd.controllers.strategy import Strategy
 from nmfd.errors import InputError, RunFailed
 from nmfd.model.authority import NO_GATEWAY
-from nmfd.model.planning import Options, PlanningModel, options, planning_model
+from nmfd.model.planning import options, planning_model
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
-from nmfd.runs import config
-from nmfd.runs.config import Flow, Problem, Share, error, setting, whole
+from nmfd.runs.config import error
 from nmfd.runs.files import atomic
 from nmfd.tensors import one_thread
-
-if TYPE_CHECKING:
-    from nmfd.controllers.strategy import Strategy
 
 BATCH = 16  # rollouts per Adam step
 DEMAND_SPREAD = 0.2  # every flow is scaled by a factor drawn from 1 - this to 1 + this
@@ -44,81 +41,7 @@ GATE_STEPS, GATE_BATCH, GATE_RATE, GATE_WIDTH, GATE_FULLEST, GATE_OPEN = 1000, 2
 NO_CONTROL_WEIGHT, NO_CONTROL_LOGIT, NO_CONTROL_SPLIT = 0.1, 3.0, 1e-3
 
 
-class Training(Options):
-    """Options of a DPC policy and of its training, `nmfd train SCENARIO --controller NAME`."""
-
-    local: bool = setting(
-        "one small network for every boundary, whose inputs are the regions around it: perimeter control of many "
-        "regions, also by a policy that was trained in another city",
-        False,
-    )
-    compact: bool = setting(
-        "a policy of a few readable numbers instead of a network: gates of the protected regions, and prices of the "
-        "ways through crowded regions that guide drivers; trained on the CPU",
-        False,
-    )
-    numbers: Annotated[config.Numbers, Field(min_length=8, max_length=11)] | None = setting(
-        "initial numbers of a compact policy: set_point, gain, relief, price, price_from, elsewhere, elsewhere_from, "
-        "metering, integral (0), metering_protected (0), metering_gain (1); see nmfd/controllers/dpc/compact.py",
-        None,
-        unit="-",
-    )
-    metering: bool = setting(
-        "a compact policy makes trips wait while regions are full; for cities with +metering", False
-    )
-    descend: bool = setting("false leaves a compact policy at its initial numbers, such as those of cosim tune", True)
-    steps: int = whole("Adam steps", 400, low=1, high=10**7)
-    learning_rate: float = setting(
-        "initial learning rate of Adam; falls to a tenth along a cosine", 1e-3, unit="-", gt=0.0, le=1.0
-    )
-    demand_low: float = setting(
-        "least factor of all demand; one factor is drawn per rollout", 1.0, unit="-", gt=0.0, le=1.0
-    )
-    demand_high: float = setting("largest factor of all demand", 1.0, unit="-", ge=1.0, le=100.0)
-    noise: Flow = setting(
-        "largest standard deviation of the Gaussian noise on the demand of the pairs with demand; every rollout draws "
-        "its own from 0 to this",
-        0.0,
-    )
-    mfd_spread: Share = setting("standard deviation of the logarithm of the MFD of every region, per rollout", 0.0)
-    mfd_scale: float = setting(
-        "factor of the accumulation axes of the MFDs; below 1 for a city that may lock before its mean outflow falls",
-        1.0,
-        unit="-",
-        ge=0.1,
-        le=1.0,
-    )
-    detour_cost: float = setting(
-        "time that a vehicle loses off the nominal split ratios, in the objective", 0.0, unit="s", ge=0.0, le=1e6
-    )
-    from_no_control: bool = setting("the initial policy is nearly no control", False)
-    from_gating: bool = setting(
-        "the initial policy is nearly a gate at the set point of pi-gating, which descent does not find by itself "
-        "where the regional model locks",
-        False,
-    )
-
-    @model_validator(mode="after")
-    def _fits_together(self) -> "Training":
-        if self.from_gating and self.from_no_control:
-            raise Problem("from_gating", "a policy cannot begin as a gate and as no control; omit one")
-        if self.compact and (self.local or self.from_gating or self.from_no_control):
-            raise Problem("compact", "begins with its numbers; omit local, from_gating, from_no_control")
-        if self.numbers and not (self.compact and min(self.numbers) >= 0.0):
-            raise Problem("numbers", "expected 8 to 11 numbers >= 0 of a compact policy; add compact = true")
-        if (self.metering or not self.descend) and not self.compact:
-            raise Problem("metering" if self.metering else "descend", "only for compact policies; add compact = true")
-        return self
-
-    def misfit(self, planning: PlanningModel) -> Problem | None:
-        """Return a gate without a protected region as a problem."""
-        if not (self.from_gating or self.compact) or planning.protected:
-            return None
-        key = "compact" if self.compact else "from_gating"
-        return Problem(key, "expected a scenario with protected regions; name them, or omit it")
-
-
-def settings(scenario: Scenario, strategy: "Strategy", steps: int | None = None) -> Training:
+def settings(scenario: Scenario, strategy: Strategy, steps: int | None = None) -> Training:
     """Return the training settings of a strategy; `steps` overrides. Raise InputError."""
     kind, table = strategy.controller, strategy.table(scenario)
     if kind.options is not Training:
@@ -135,7 +58,7 @@ def settings(scenario: Scenario, strategy: "Strategy", steps: int | None = None)
     return setup if steps is None else setup.changed(steps=steps)
 
 
-def check(scenario: Scenario, strategy: "Strategy") -> RegionalModel:
+def check(scenario: Scenario, strategy: Strategy) -> RegionalModel:
     """Return the model to train on. Raise InputError without gateways, or for placeholder MFDs."""
     city, believed = scenario.network, strategy.planning(scenario).network
     file = city.name if city.folder is None else city.folder / "network.toml"
@@ -159,7 +82,7 @@ def available(device: str) -> str:
 
 def train(
     scenario: Scenario,
-    strategy: "Strategy",
+    strategy: Strategy,
     *,
     seed: int,
     out: Path,
