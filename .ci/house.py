@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from collections import defaultdict
 from itertools import chain
 from pathlib import Path
 
@@ -123,13 +124,23 @@ def room(module: str) -> str:
 
 
 def arrows() -> set[tuple[str, str]]:
-    """Return the imports between rooms."""
+    """Return the imports between rooms, without those that a longer way implies (the transitive reduction)."""
     graph = grimp.build_graph("nmfd", "cosim", exclude_type_checking_imports=True, cache_dir=None)
-    inside = floors()
-    found = (
-        (room(one), room(other)) for one in graph.modules for other in graph.find_modules_directly_imported_by(one)
-    )
-    return {(one, other) for one, other in found if one != other and one in inside and other in inside}
+    inside, below = floors(), defaultdict(set)
+    for one in graph.modules:
+        for other in graph.find_modules_directly_imported_by(one):
+            if room(one) != room(other) and room(one) in inside and room(other) in inside:
+                below[room(one)].add(room(other))
+
+    def reached(start: str) -> set[str]:
+        return {start}.union(*(reached(other) for other in below[start]))
+
+    return {
+        (one, other)
+        for one in list(below)
+        for other in below[one]
+        if not any(other in reached(third) for third in below[one] if third != other)
+    }
 
 
 def floors() -> dict[str, int]:
@@ -151,7 +162,7 @@ def edges_in(picture: str) -> set[tuple[str, str]]:
 def drawn() -> str:
     """Return the rooms and the imports between them as SVG, the highest floor on top."""
     place = floors()
-    figure, axes = plt.subplots(figsize=(9, 9))
+    figure, axes = plt.subplots(figsize=(7, 7))
     position = {}
     for floor in sorted(set(place.values())):
         rooms = [name for name, there in place.items() if there == floor]
@@ -161,8 +172,8 @@ def drawn() -> str:
             box = {"boxstyle": "round,pad=0.35", "facecolor": colour, "edgecolor": "#555555"}
             axes.text(*position[name], name, ha="center", va="center", fontsize=9, bbox=box, zorder=3)
     for index, (one, other) in enumerate(sorted(arrows())):
-        bend = 0.08 * (-1) ** index * min(place[one] - place[other], 3)
-        style = {"arrowstyle": "->", "color": "#888888", "lw": 0.7, "connectionstyle": f"arc3,rad={bend}"}
+        bend = 0.05 * (-1) ** index * min(abs(place[one] - place[other]) - 1, 4)
+        style = {"arrowstyle": "->", "color": "#888888", "lw": 0.9, "connectionstyle": f"arc3,rad={bend}"}
         arrow = axes.annotate("", position[other], position[one], arrowprops=style, zorder=1)
         arrow.arrow_patch.set_gid(f"arrow {one} {other}")
     axes.set(xlim=(0, 1), ylim=(-0.7, max(place.values()) + 0.7))
