@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from signal_rules import MIN_GREEN, PHASES, SINGLE, check, runs
 
-from cosim.plant.gates import DEFAULT_YELLOW_S, GatewaySignal, _apportion, yellow_time
+from cosim.plant.gates import DEFAULT_YELLOW_S, GatewaySignal, Ration, _apportion, yellow_time
 from cosim.plant.settings import MODES, REDISTRIBUTE
 from cosim.sumo.session import Phase, Programme
 
@@ -139,3 +139,37 @@ def test_seconds_are_shared_out_whole_and_all(total, weights, shares):
 )
 def test_the_longest_yellow_after_a_green(states, expected):
     assert yellow_time(programme(states).phases, 0) == expected
+
+
+def lit(*spans):
+    """Return one light per second from spans such as "30G"."""
+    return "".join(int(span[:-1]) * span[-1] for span in spans)
+
+
+USUAL, TWICE, ALWAYS = 2 * lit("30G", "3y", "27r"), lit("10G", "3y", "7r", "20G", "3y", "17r"), lit("130G")
+
+
+@pytest.mark.parametrize(
+    "lights, share, full, expected",
+    [
+        (USUAL, 1.0, 30.0, USUAL),
+        (USUAL, 0.4, 30.0, 2 * lit("15G", "3y", "42r")),  # 5 s and two fifths of the other 25 s
+        (USUAL, 0.0, 4.0, 2 * lit("4G", "3y", "53r")),  # less than the minimum green to begin with
+        (TWICE, 0.4, 30.0, lit("10G", "3y", "7r", "5G", "3y", "32r")),
+        (TWICE, 0.3, 30.0, lit("10G", "3y", "47r")),  # the remaining 2.5 s are below the minimum green
+        (lit("20r", "40G"), 0.4, 30.0, lit("20r", "15G", "3y", "22r")),
+        (ALWAYS, 0.4, None, lit("27G", "3y", "30r", "27G", "3y", "30r", "10G")),
+        (ALWAYS, 53 / 55, None, lit("58G", "3y", "58G", "3y", "8G")),  # a yellow ends before the next green begins
+    ],
+)
+def test_a_ration_of_green_is_spent_in_every_cycle(lights, share, full, expected):
+    """Compare each second with the green worked out by hand; `show` is called only when the ration asks for it."""
+    ration, shown, again = Ration((0, 1), cycle=60.0, yellow=3.0, start=0.0, full=full), "", 0.0
+    ration.share = share
+    for second, light in enumerate(lights):
+        if second >= again or light != lights[second - 1]:
+            last, again = ration.show(light, float(second))
+        shown += last
+        assert ration.opened(second) == (last == "G" and shown[-2:-1] != "G")
+    assert shown == expected and ration.green_time(float(len(lights))) == shown.count("G")
+    assert ration.limited == (share < 1.0)

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,8 +18,9 @@ from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
 from nmfd.model import dynamics
 from nmfd.model.planning import planning_model
+from nmfd.model.plant import NmfdPlant
 from nmfd.model.regional_model import load_network
-from nmfd.types import Observation, Status
+from nmfd.types import Controls, Observation, Status
 
 NETWORK = load_network(Path(__file__).parents[1] / "networks" / "hexagon7")
 
@@ -288,6 +290,7 @@ def test_every_rollout_has_a_model_of_its_own(scenario):
     rollout.draw_model(4000, 0.2, torch.Generator().manual_seed(0))
     p = rollout.parameters
     assert torch.log(p.jam / nominal.jam).std().item() == pytest.approx(0.2, rel=0.15)  # cut at two deviations
+    assert torch.log(p.jam / nominal.jam).abs().max().item() == pytest.approx(0.4, rel=1e-3)
     assert torch.log(p.capacity / nominal.capacity)[:, 0, 1].std().item() == pytest.approx(0.1, rel=0.15)
     torch.testing.assert_close(p.storage / nominal.storage, p.jam / nominal.jam)
     fastest = (p.c.unsqueeze(-1) * p.exit_rates).max().item()
@@ -332,24 +335,58 @@ def test_a_gate_needs_a_protected_region(scenario):
         training.settings(both, parse("dpc-pc"))
 
 
-def test_detours_cost_what_they_divert(scenario):
-    """Everybody who leaves a region by another way than usual loses the time that a detour costs."""
-    torch.manual_seed(0)
-    made = Policy(scenario.network, Architecture(width=8, guidance=True))
-    plain, costly = (
-        training.Rollout(planning_model(scenario), dtype=torch.float32, detour_cost=cost) for cost in (0.0, 50.0)
-    )
-    generator = torch.Generator()
-    x, demand = plain.random_start(2, 0.2, 1.0, generator.manual_seed(0))
-    demand = demand[:3]
+PEAK = load_scenario(Path(__file__).parents[1] / "scenarios" / "grid7_peak")
+PEAK = replace(PEAK, steps=12, demand=PEAK.demand[20:32], measurement_std=0.0)
 
-    def total(rollout):
-        return rollout.total_time_spent(made, x, demand, generator.manual_seed(1))
 
-    exact, seen, _ = plain.states(made, x, demand, generator.manual_seed(1))
-    _, splits = made(seen)
-    leaving = dynamics.rate(plain.parameters, exact.sum(-1)).unsqueeze(-1) * exact
-    diverted = 0.5 * (splits - plain.nominal_splits).abs().sum(-2) * leaving
-    torch.testing.assert_close(
-        total(costly) - total(plain), 50.0 * scenario.step * diverted.sum((0, -2, -1)), rtol=1e-3, atol=1.0
-    )
+class Gated:
+    """Policy with gates and metering that depend on the state; a third of the nominal split ratios are exchanged."""
+
+    architecture = SimpleNamespace(metering=True, guidance=True)
+    usual, gates = torch.from_numpy(PEAK.network.nominal_splits), torch.from_numpy(PEAK.network.adjacency)
+
+    def __call__(self, x):
+        perimeter = self.gates * (0.2 + 0.5 * torch.exp(-x.sum(-1, keepdim=True) / 50.0))
+        return perimeter, self.usual.lerp(self.usual.roll(1, -1), 1.0 / 3.0)
+
+    def metering(self, x):
+        return torch.tensor([0.4, 2.0, 0.3, 0.5, 0.6, 0.8, 0.1]) / (1.0 + x.sum(-1) / 99.0)
+
+
+def test_a_rollout_with_metering_and_detours_is_the_plant():
+    """Compare states, backlog, and TTS with detours step by step."""
+    network, made, plant = PEAK.network, Gated(), NmfdPlant(PEAK)
+    rollout = training.Rollout(planning_model(PEAK), dtype=torch.float64, detour_cost=40.0)
+    start, demand = rollout.start.expand(2, 7, 7), rollout.demand[:, None] * torch.tensor([1.0, 0.5]).reshape(2, 1, 1)
+    exact, seen, waiting = rollout.states(made, start, demand, torch.Generator())
+    state, spent = plant.reset(0), 0.0
+    assert torch.equal(exact, seen) and waiting[-1, 0] > 2.0 * waiting[-1, 1] > 10.0
+    for k in range(PEAK.steps):
+        x = state.accumulation
+        np.testing.assert_allclose(exact[k, 0], x, rtol=1e-9, atol=1e-9)
+        assert waiting[k, 0].item() == pytest.approx(state.backlog.sum())
+        perimeter, splits = (part.numpy() for part in made(torch.from_numpy(x)))
+        rate = np.array([mfd.rate(n) for mfd, n in zip(network.mfds, x.sum(axis=1), strict=True)])
+        off = 0.5 * np.abs(splits - network.nominal_splits).sum(axis=1) * rate[:, None] * x * network.exit_rates
+        spent += x.sum() + state.backlog.sum() + 40.0 * off.sum()
+        metering = made.metering(torch.from_numpy(x)).numpy()
+        state = plant.step(Controls(perimeter=perimeter, splits=splits, metering=metering))
+    total = rollout.total_time_spent(made, start, demand, torch.Generator())
+    assert total.shape == (2,) and total[0].item() == pytest.approx(PEAK.step * spent)
+
+
+def test_random_starts_and_demands():
+    """Three quarters start late from random states; demand has one factor per rollout, or one per flow."""
+    rollout, due = training.Rollout(planning_model(PEAK), dtype=torch.float64), PEAK.demand > 0
+    x, demand = rollout.random_start(200, 0.0, 0.75, torch.Generator().manual_seed(0))
+    totals, jam = x[:150].sum(-1), rollout.parameters.jam
+    assert (totals <= 0.8 * jam).all() and (totals.amax(0) > 0.5 * jam).all() and x.min() >= 0.0
+    assert torch.equal(x[150:], rollout.start.expand(50, 7, 7))
+    later = [torch.cat([rollout.demand[k:], torch.zeros(k, 7, 7)]) for k in range(12)]
+    shifts = [[torch.equal(demand[:, n], shifted) for shifted in later].index(True) for n in range(200)]
+    assert set(shifts) == set(range(6)) and not any(shifts[150:])  # at most half of the time
+    for spread, low, high, levels in ((0.2, 0.8, 1.2, (1.0, 1.0)), (0.0, 0.5, 2.0, (0.5, 2.0))):
+        _, demand = rollout.random_start(300, spread, 0.0, torch.Generator().manual_seed(0), levels)
+        factor = demand.numpy().swapaxes(0, 1)[:, due] / PEAK.demand[due]
+        assert low <= factor.min() < low + 0.02 and high - 0.02 < factor.max() <= high
+        assert (np.ptp(factor, axis=1).min() > 0.2) if spread else (np.ptp(factor, axis=1).max() < 1e-9)

@@ -290,3 +290,43 @@ def test_a_detector_is_stuck_at_its_third_same_reading():
         model.step(OPEN, replace(nothing(), accumulation=accumulation))
     assert [np.isnan(first) for first, _, _ in taken] == [False, False, True, True, False]
     assert [rest for _, *rest in taken] == [[0.0, 10.0 + k] for k in range(5)]
+
+
+def test_the_covariance_of_one_step_by_finite_differences():
+    """Compare the covariance of an error and each cell with what the error does to the estimate."""
+    model = Estimator(planning_model(SCENARIO), equipped())
+
+    def stepped(shift=()):
+        model.reset()
+        model._k, model.belief.mean[model._x] = 20, 30.0
+        model.belief.mean[list(shift)] = 1e-4
+        model.step(OPEN, nothing())
+        return model.belief
+
+    plain = stepped()
+    for error, sigma, memory in ((0, 0.3, 900.0), (REGIONS, 0.3, 900.0), (2 * REGIONS, 0.15, 3600.0)):
+        moved, kept = stepped([error]), np.exp(-SCENARIO.step / memory)
+        np.testing.assert_allclose([moved.mean[error], plain.covariance[error, error]], [1e-4 * kept, sigma**2])
+        slope = (moved.mean - plain.mean)[model._x] / 1e-4
+        np.testing.assert_allclose(plain.covariance[error, model._x], kept * sigma**2 * slope, rtol=1e-3, atol=1e-3)
+        assert (np.abs(slope).max() > 1.0) == (error < 2 * REGIONS)
+
+
+def test_the_noise_of_one_flow_by_hand():
+    """9 vehicles cross, a quarter of them probes: half of each counts in the mean, its square by a third."""
+    model = Estimator(planning_model(SCENARIO), equipped())
+    moves = torch.zeros(len(model._turns) + REGIONS + REGIONS**2, dtype=torch.float64)
+    here, onward, bound = (int(n) for n in model._turns[0])
+    crossing = int(np.flatnonzero((model._boundaries == [here, onward]).all(axis=1))[0])
+    moves[0], left, before = 9.0, REGIONS * here + bound, REGIONS**2 + here
+    came, after, passed = REGIONS * onward + bound, REGIONS**2 + onward, REGIONS**2 + REGIONS + crossing
+    probe, kept = REGIONS**2 + REGIONS + len(model._boundaries), np.exp(-SCENARIO.step / 900.0)
+    for leaving in (0.0, 50.0):  # turns stray by a share of what leaves the cell
+        out = torch.zeros(REGIONS**2, dtype=torch.float64).index_fill(0, torch.tensor([left]), leaving)
+        wrong = (1.0 + kept) / (1.0 - kept) * (0.2 * 9.0 + 0.02 * leaving) ** 2
+        noise = model._flow_noise(model.belief, moves, 0.25 * moves, out).numpy()
+        np.testing.assert_allclose(noise[came, [came, left, passed]], [9.0 + wrong, -9.0 - wrong, 9.0 + wrong])
+        np.testing.assert_allclose(noise[after, [after, before]], [3.0 + wrong / 4, -2.25 - wrong / 4])
+        np.testing.assert_allclose(noise[came, [probe + came, after]], [2.25 + wrong / 4, 4.5 + wrong / 2])
+        np.testing.assert_allclose(noise[probe + came, probe + came], 2.25 + wrong / 16)
+        assert (noise == noise.T).all()

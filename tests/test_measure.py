@@ -7,6 +7,7 @@ import pytest
 import streets
 
 from cosim.plant.meter import Event, Meter
+from cosim.sumo.outputs import End, TripFacts
 from nmfd.ledger import LedgerError
 
 # a0 -> b0 -> b1 -> c0 in a row, regions 0, 1, 1, 2, and a way back c0 -> a0. Entries: b0, c0 and a0.
@@ -81,7 +82,7 @@ def play():
     session = Streets()
     meter = Meter(session, CITY, probes=frozenset({"p"}))
 
-    def step(*, new=(), move=None, gone=(), loads=(), jumps=(), lands=(), waiting=None):
+    def step(*, new=(), move=None, gone=(), loads=(), jumps=(), lands=(), waiting=None, observed=meter):
         session.clear()
         session.time += 1.0
         for vehicle in loads:
@@ -94,7 +95,7 @@ def play():
             session.places.pop(vehicle, None)
         session.gone, session.jumps, session.lands = list(gone), list(jumps), list(lands)
         session.waiting = session.waiting if waiting is None else list(waiting)
-        return meter.observe()
+        return observed.observe()
 
     return SimpleNamespace(session=session, meter=meter, step=step)
 
@@ -237,3 +238,50 @@ def test_the_ledger_names_step_and_numbers(play, break_it, numbers):
     break_it(play)
     with pytest.raises(LedgerError, match=f"vehicle ledger broken at control step 7, 1 s: .*{numbers}"):
         play.meter.accumulation(7)
+
+
+def test_the_ends_that_sumo_tells_are_booked_by_hand(play):
+    """Start all in 0, bound for 2 or 1; one ends in 1 instead, others are removed in 0, 1 and 2."""
+    play.session.routes = {vehicle: ("a0", "b0", "b1", "c0") for vehicle in "vwkju"} | {"l": ("a0", "b0")}
+    told, trips = [], SimpleNamespace(under_way={"u": 7.0}, facts=TripFacts(completed=2, removed=3))
+    trips.ends, trips.finish = (lambda: [told.pop() for _ in list(told)]), lambda gone: []
+    meter = Meter(play.session, CITY, trips=trips)
+    play.step(new=[*play.session.routes], observed=meter)
+    play.step(gone="vwkl", observed=meter)
+    assert (meter._running == x((0, 2), (0, 2))).all()
+    with pytest.raises(LedgerError, match=r"step 3: .* how the trips of 4 vehicles ended \(such as k\)"):
+        meter.accumulation(3)
+    told += [
+        End(vehicle="v", edge="b1", time_loss=5.0),
+        End(vehicle="w", edge="b0", reason="traci", time_loss=11.0),
+        End(vehicle="k", reason="traci"),
+        End(vehicle="l"),
+        End(vehicle="j", edge="c0", reason="collision"),  # not called arrived
+    ]
+    play.session.places.pop("j")
+    assert (meter.accumulation() == x((0, 2))).all()
+    assert meter.arrivals.tolist() == [0, 2, 0] and (meter.removals == x((1, 2), (0, 2), (2, 2))).all()
+    assert np.argwhere(meter.redirected).tolist() == [[0, 2, 1]] and np.argwhere(meter.jumps).tolist() == [[0, 2, 2]]
+    assert meter.crossings[0, 1].tolist() == [0, 2, 1] and meter.crossings.sum() == 3
+    state = meter.state(4, 9.0)
+    assert (state.step, state.time, state.completed) == (4, 9.0, 2.0) and (state.removed == meter.removals).all()
+    meter.close_books()
+    assert meter.time_loss.tolist() == [23.0, 0.0, 0.0]
+    trips.facts = TripFacts(completed=2, removed=4)
+    with pytest.raises(LedgerError, match="2 completed trips and 3 removed vehicles were booked, .* has 2 and 4"):
+        meter.close_books()
+
+
+def test_trips_dropped_rerouted_and_begun_again(play):
+    """Book a trip that SUMO drops, a change of destination, and the second trip of one id."""
+    play.session.routes = {"v": ("a0", "b0", "b1", "c0"), "w": ("b0", "b1"), "k": ("b0", "c0")}
+    play.step(loads=["w", "k"], waiting=["w", "k"])
+    play.step(new=["v"], move={"k": "b0"}, waiting=[])  # SUMO does not know w any more; a program moved k
+    assert (play.meter.backlog() == 0).all() and (play.meter.given_up == x((1, 1))).all()
+    play.session.routes["v"] = ("a0", "b0")
+    assert (play.meter.accumulation() == x((0, 1), (1, 2))).all()
+    assert np.argwhere(play.meter.redirected).tolist() == [[0, 2, 1]]
+    play.session.routes["v"] = ("c0", "a0")
+    assert [event.region for event in play.step(new=["v"])] == [2]  # the id is used again
+    assert (play.meter.accumulation() == x((2, 0), (1, 2))).all() and play.meter.arrivals.tolist() == [0, 1, 0]
+    assert (play.meter.departures == x((0, 2), (2, 0), (1, 2))).all()

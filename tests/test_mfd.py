@@ -92,3 +92,11 @@ def test_the_most_that_is_allowed_binds():
     """Samples of 0.01 x with at most half of that: the line 0.005 x is as near as a curve may come."""
     curve = fit(X, 0.01 * X, max_rate=0.005)
     np.testing.assert_allclose(curve.outflow(X), 0.005 * X, rtol=1e-3)
+
+
+def test_the_largest_samples_share_a_bin():
+    """Of three in the last one the median counts: the largest of all is no bin of its own."""
+    x, g = np.append(X[:-1], [980.0, 990.0, 1000.0]), TRUTH.outflow(np.append(X[:-1], [990.0, 990.0, 990.0]))
+    g[-1] *= 9.0
+    curve = fit(x, g)
+    np.testing.assert_allclose(curve.outflow(X[:-1]), TRUTH.outflow(X[:-1]), rtol=2e-3)
