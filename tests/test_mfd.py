@@ -1,8 +1,11 @@
 """Outflow curves: what they say in closed form, and fits to samples of a curve that is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from nmfd.errors import InputError
 from nmfd.model.mfd import Mfd, fit
 
 # The published curve with a tenth of its jam accumulation: the coefficients span nine orders of magnitude.
@@ -37,6 +40,13 @@ def test_beyond_the_jam_the_outflow_is_constant():
 def test_what_is_no_curve():
     assert TRUTH.problem() is None
     assert "is not positive at" in Mfd(a=TRUTH.a, b=-9e-6, c=TRUTH.c, jam=TRUTH.jam).problem()
+
+
+@pytest.mark.parametrize("name, value", [("jam", np.inf), ("jam", 0.0), ("a", np.nan), ("b", -np.inf), ("c", np.inf)])
+def test_numbers_that_give_no_outflow_are_refused(name, value):
+    """A cubic with jam = inf gave NaN in every plant."""
+    with pytest.raises(InputError, match=f"^Mfd: {name}: expected a number.*got {value:g} instead; give a finite one$"):
+        replace(TRUTH, **{name: value})
 
 
 def test_a_fit_to_exact_samples_gives_the_coefficients_back():

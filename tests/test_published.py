@@ -38,6 +38,22 @@ def begun(tmp_path):
     return load_scenario(tiny.write(tmp_path, scenario=INITIAL + tiny.SCENARIO))
 
 
+@pytest.mark.parametrize("plant", [NmfdPlant, AcyclicPlant])
+def test_the_noise_of_the_benchmark_is_a_standard_deviation_of_the_measurement_or_of_the_state(plant):
+    scenario = replace(load_scenario("economic_mpc"), steps=30, initial=np.full((7, 7), 100.0))
+    assert (scenario.measurement_std, scenario.process_std) == (0.25, 0.0)
+    moved = replace(scenario, measurement_std=0.0, process_std=0.25)
+    quiet, first, again, noisy = (
+        run(plant(s), make_controller("no-control", s), s, seed=seed)
+        for s, seed in ((scenario, 0), (moved, 0), (moved, 0), (moved, 1))
+    )
+    assert (quiet.observed - quiet.accumulation).std() == pytest.approx(0.25, rel=0.05)
+    assert (first.observed == first.accumulation).all() and (first.accumulation == again.accumulation).all()
+    assert (first.accumulation != noisy.accumulation).any() and first.accumulation.min() >= 0.0
+    assert (first.accumulation - quiet.accumulation)[1].std() == pytest.approx(0.25, rel=0.3)
+    assert scenario.hash != moved.hash != replace(moved, process_std=0.0).hash
+
+
 def seen(inside):
     """A measurement with so many vehicles in every region."""
     return Observation(

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Real
 
+from nmfd.errors import InputError
+
 Values = Float[np.ndarray | np.floating, "*B"]
 Samples = Real[np.ndarray, " N"]
 
@@ -19,6 +21,7 @@ class Mfd:
 
     a [veh^-2 s^-1], b [veh^-1 s^-1], c [s^-1]: coefficients of the cubic.
     jam [veh]: the accumulation beyond which the outflow stays at g(jam).
+    Raises InputError for a number that is not finite, and for jam <= 0.
 
         >>> curve = Mfd(a=4.133e-11, b=-8.282e-7, c=0.0042, jam=10000.0)  # the benchmark's
         >>> round(curve.critical), round(curve.capacity, 2)
@@ -31,6 +34,12 @@ class Mfd:
     b: float
     c: float
     jam: float
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not np.isfinite(value) or (name == "jam" and value <= 0):
+                allowed = "a number above 0, beyond which the outflow is constant" if name == "jam" else "a number"
+                raise InputError(f"Mfd: {name}: expected {allowed}, got {value:g} instead; give a finite one")
 
     def rate(self, accumulation: Values | float) -> Values:
         """Return the outflow per vehicle q(x) = g(x)/x [1/s] of `accumulation` (...) [veh]; c at x = 0."""

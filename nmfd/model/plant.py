@@ -13,7 +13,7 @@ from nmfd.types import Controls, Observation, State
 
 
 class NmfdPlant:
-    """The regional model as a plant; deterministic, so that seeds change nothing.
+    """The regional model as a plant; deterministic but for `process_std`, so that without it seeds change nothing.
 
     >>> scenario = nmfd.load_scenario("economic_mpc")
     >>> plant, network = nmfd.NmfdPlant(scenario), scenario.network
@@ -31,6 +31,7 @@ class NmfdPlant:
     def reset(self, seed: int) -> State:
         """Return to the start of the scenario."""
         self._k, self._entered, self._ended = 0, float(self._scenario.start.sum()), 0.0
+        self._random = np.random.default_rng([seed, 0x70726F63])
         self._backlog = torch.zeros(self._scenario.demand.shape[1:], dtype=torch.float64)
         self._begin(self._scenario.start)
         return self._state()
@@ -43,7 +44,7 @@ class NmfdPlant:
         )
         splits = self._scenario.network.nominal_splits if controls.splits is None else controls.splits
         ended = self._advance(demand.numpy(), controls.perimeter, splits)
-        self._entered += float(demand.sum()) * self._scenario.step
+        self._entered += float(demand.sum()) * self._scenario.step + self._disturb()
         self._ended += ended
         self._k += 1
         state = self._state()
@@ -63,6 +64,16 @@ class NmfdPlant:
     def close(self) -> None:
         """Do nothing."""
 
+    def _disturb(self) -> float:
+        """Add the process noise to each x_ij that is not empty; return the vehicles that it adds in all [veh]."""
+        if not self._scenario.process_std:
+            return 0.0
+        before = self._accumulation()
+        noise = self._scenario.process_std * self._random.standard_normal(before.shape)
+        after = np.where(before > 0, np.maximum(before + noise, 0.0), 0.0)
+        self._scale(after / np.where(before > 0, before, 1.0))
+        return float(after.sum() - before.sum())
+
     def _state(self) -> State:
         return State(
             step=self._k,
@@ -80,6 +91,9 @@ class NmfdPlant:
 
     def _accumulation(self) -> PerPair:
         return self._x.numpy()
+
+    def _scale(self, factor: PerPair) -> None:
+        self._x = self._x * torch.from_numpy(factor)
 
     def _advance(self, demand: PerPair, perimeter: PerPair, splits: PerTurn) -> float:
         """Advance `_x` by one control interval; return the completed trips [veh]."""
@@ -108,6 +122,9 @@ class AcyclicPlant(NmfdPlant):
 
     def _accumulation(self) -> PerPair:
         return acyclic.translate(self._model, self._x)
+
+    def _scale(self, factor: PerPair) -> None:
+        self._x = self._x * factor[self._model.region, self._model.destination]
 
     def _advance(self, demand: PerPair, perimeter: PerPair, splits: PerTurn) -> float:
         model, step = self._model, self._scenario.step

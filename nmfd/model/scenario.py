@@ -24,7 +24,7 @@ LONGEST_STEP_S = 86_400.0
 MOST_STEPS = 10**6
 MOST_FLOW_VEH_S = 1e6
 COPIED = (  # from file to scenario
-    *("name", "step", "steps", "measurement_std", "integrator", "substeps", "protected"),
+    *("name", "step", "steps", "measurement_std", "process_std", "integrator", "substeps", "protected"),
     *("demand_factor", "forecast_error", "faults", "sumo"),
 )
 
@@ -67,6 +67,7 @@ class Scenario(Horizon):
     """T control intervals of a simulated network.
 
     demand: (T, R, R) [veh/s], [k, i, j]: vehicles that start in i bound for j during interval k
+    process_std: standard deviation of the Gaussian noise on each x_ij of the regional plants after an interval [veh]
     demand_factor: factor already applied to the demand, for a city with vehicles of its own
     forecast_error: standard deviation of the logarithm of forecast over demand [-]
     faults: injected into every run (nmfd.faults)
@@ -74,6 +75,7 @@ class Scenario(Horizon):
     """
 
     demand: PairsOverTime
+    process_std: float = 0.0
     demand_factor: float = 1.0
     forecast_error: float = 0.0
     faults: tuple[str, ...] = ()
@@ -104,6 +106,7 @@ class Scenario(Horizon):
         content += [self.protected, self.controller_options]
         content += [[self.forecast_error, 0]] if self.forecast_error else []
         content += [self.faults] if self.faults else []
+        content += [["process_std", self.process_std]] if self.process_std else []
         content += [self.initial.tolist()] if self.initial is not None else []
         text = json.dumps(content, sort_keys=True, default=str)
         return hashlib.sha256(text.encode() + np.ascontiguousarray(self.demand).tobytes()).hexdigest()[:16]
@@ -175,6 +178,14 @@ class ScenarioTable(Settings):
     demand_factor: float = setting("factor of the whole demand", 1.0, unit="-", ge=0.0, le=1000.0)
     measurement_std: float = setting(
         "standard deviation of the noise on each observed accumulation by destination", 0.0, unit="veh", ge=0.0, le=1e6
+    )
+    process_std: float = setting(
+        "standard deviation of the noise on each accumulation by destination after every control interval, regional "
+        "model only; clipped at 0",
+        0.0,
+        unit="veh",
+        ge=0.0,
+        le=1e6,
     )
     forecast_error: float = setting(
         "standard deviation of the logarithm of forecast over demand", 0.0, unit="-", ge=0.0, le=2.0
