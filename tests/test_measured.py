@@ -175,7 +175,11 @@ MISTAKES = {
     "no day": (changed(day=np.nan), {}, "line 5: day is missing"),
     "per interval": (lambda c, d: (c.assign(flow=c["flow"] / 60), d), {}, "m/s, with 6.5 m for a vehicle over a loop"),
     "all percent": (lambda c, d: (c.assign(occ=c["occ"] * 100), d), {"skip_bad": True}, "occ a share?"),
-    "twice": (lambda c, d: (pd.concat([c, c[:1]]), d), {}, "has two rows of 2019-05-01, 0 s"),
+    "twice": (
+        lambda c, d: (pd.concat([c, c[:1]]), d),
+        {},
+        "has two rows of 2019-05-01, 0 s (1 such rows; do clocks go back?)",
+    ),
     "two cities": (changed(city="elsewhere"), {}, "choose one of elsewhere, made up with --city"),
     "no such city": (lambda c, d: (c, d), {"city": "madeup"}, "did you mean made up?"),
     "a detector without a row": (lambda c, d: (c, d[1:]), {}, "detector north0, which"),
@@ -243,3 +247,55 @@ def test_bad_rows_and_silent_detectors_are_left_out_and_counted(tmp_path, made):
     assert not ((frame["region"] == "north") & (frame["interval"] == 900)).any() and frame["reporting"].min() >= 0.5
     with pytest.raises(nmfd.InputError, match="exists; choose another"):
         nmfd.identify(**options)
+
+
+def faulty(counts, where, **values):
+    """The counts with other values where `where` is true."""
+    return counts.assign(**{name: counts[name].where(~where, value) for name, value in values.items()})
+
+
+def total(counts, one):
+    """The counts with a detector that counts the lanes of three others again."""
+    rows = counts[counts["detid"].isin(["north1", "north2", "north3"])]
+    rows = rows.groupby(["day", "interval"], as_index=False).agg({"flow": "sum", "occ": "mean"})
+    return pd.concat([counts, rows.assign(detid="north0")])
+
+
+NOISE = np.random.default_rng(3).uniform(0.0, 0.4, 10000)
+FAULTS = {  # change of the counts, reason
+    "no occupancy": (lambda c, one: faulty(c, one, occ=0.0), "flow without occupancy"),
+    "dead": (lambda c, one: faulty(c, one, flow=0.0, occ=0.0), "zero while others count"),
+    "dead on a day": (
+        lambda c, one: faulty(c, one & (c["day"] == "2019-05-02"), flow=0.0, occ=0.0),
+        "zero while others count: north0 (1 of 3 days)",
+    ),
+    "parked on": (lambda c, one: faulty(c, one, flow=0.0, occ=1.0), "occupancy without flow"),
+    "frozen": (lambda c, one: faulty(c, one & (c["interval"] > 5000), flow=321.0, occ=0.07), "constant"),
+    "wrong unit": (lambda c, one: faulty(c, one, occ=c["occ"] / 3.0), "unlike its neighbours"),
+    "noise": (lambda c, one: faulty(c, one, flow=1500 * NOISE[: len(c)], occ=NOISE[: len(c)]), "unlike its neighbours"),
+    "lanes twice": (lambda c, one: total(c[~one], one), "sum of others"),
+}
+
+
+@pytest.mark.usefixtures("without_pictures")
+@pytest.mark.parametrize("fault, reason", FAULTS.values(), ids=FAULTS)
+def test_detectors_that_cannot_be_right_are_left_out_and_named(tmp_path, made, fault, reason):
+    """The curve is that of all others, and of all streets; no other detector is suspected."""
+    counts, detectors = made
+    files = written(tmp_path, fault(counts, counts["detid"] == "north0"), detectors)
+    found = nmfd.identify(**files, trip_length=TRIP, out=tmp_path / "city")
+    (line,) = (line for line in found.text.splitlines() if line.startswith("WARNING, detectors left out, "))
+    assert line.startswith(f"WARNING, detectors left out, {reason}") and "north0" in line and line.count("north") == 1
+    lanes = 1.0 if reason != "sum of others" else 1.0 - detectors["length"][0] * 2.0 / LANE_KM
+    assert found.fits["critical_veh"][0] == pytest.approx(lanes * CURVE.critical, rel=0.05)
+    assert (len(found.fits["doubts"][0]) == 2) == ("day" not in reason) or reason == "sum of others"
+
+
+@pytest.mark.usefixtures("without_pictures")
+def test_the_hour_when_clocks_go_back(tmp_path, made):
+    counts, detectors = made
+    hour = counts[(counts["day"] == "2019-05-02") & counts["interval"].between(3000, 4800)]
+    files = written(tmp_path, pd.concat([counts, hour.assign(flow=hour["flow"] + 30.0)]), detectors)
+    found = nmfd.identify(**files, trip_length=TRIP, out=tmp_path / "city", skip_bad=True)
+    assert f"left out: {len(hour)} rows doubled" in found.text
+    assert found.fits["critical_veh"][0] == pytest.approx(CURVE.critical, rel=0.03)

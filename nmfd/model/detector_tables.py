@@ -25,7 +25,18 @@ EARTH_RADIUS_M = 6371000.0
 STATION_DECIMALS = 2  # of km: detectors of a link within 10 m form a station
 SPEEDS_M_S = 0.5, 50.0  # range of plausible mean speeds
 COUNTS = ("day", "interval", "detid", "flow", "occ")
-MARKED, BAD = "marked as errors", "with a missing or impossible number"
+MARKED, BAD, DOUBLED = "marked as errors", "with a missing or impossible number", "doubled"
+SUM = "sum of others"
+VEHICLE_LENGTH_M = 6.5  # of a vehicle and a loop together
+# Screening of single detectors by day, after Chen, Kwon, Rice, Skabardonis and Varaiya, "Detecting errors and imputing
+# missing data for single-loop surveillance systems", Transportation Research Record 1855, 2003 (PeMS).
+FAULTY_SHARE = 0.25  # of the rows of a day to which a test applies, beyond which the day is left out
+HELD_ROWS = 12  # with one value in a row: an hour of 5 min
+LEAST_FLOW, LEAST_OCC = 100.0, 0.03  # veh/h and share: coarse numbers below repeat themselves without a fault
+FEWEST_NEIGHBOURS = 5
+FAR_OFF = {"flow": 8.0, "speed": 2.5}  # factor on the median of a region's detectors
+FAR_OFF_SPREADS = 6.0  # the same in median absolute deviations of the logarithms
+ODD, ALIKE = 0.2, 0.6  # correlation with the region's mean: of one detector at least, of the median one
 Limits = Mapping[str, tuple[float, float, str, str]]  # column -> least, most, meaning, likely mistake beyond
 COUNT_LIMITS: Limits = {
     "interval": (0, 86400, "seconds since midnight", "is it milliseconds?"),
@@ -47,10 +58,10 @@ ABOUT_LIMITS: Limits = {
 def read_counts(path: Path, *, city: str | None = None, skip_bad: bool = False) -> tuple[pd.DataFrame, dict[str, int]]:
     """Return COUNTS, and region if present, of all good rows, and the number of rows left out by reason.
 
-    city: of several in the file; skip_bad: leave out rows with a missing or impossible number instead of raising
-    InputError; rows marked as errors are always left out
+    city: of several in the file; skip_bad: leave out rows with a missing or impossible number, and all but the first of
+    one detector and interval, instead of raising InputError; rows marked as errors are always left out
     """
-    parts, left, cities = [], {MARKED: 0, BAD: 0}, set[str]()
+    parts, left, cities = [], {MARKED: 0, BAD: 0, DOUBLED: 0}, set[str]()
     for chunk in _chunks(path, COUNTS, ("error", "city", "region")):
         for name in ("day", "detid"):
             if chunk[name].isna().any():
@@ -77,8 +88,80 @@ def read_counts(path: Path, *, city: str | None = None, skip_bad: bool = False) 
         raise InputError(f"{path}: {len(rows)} good rows, and left out: {omitted(left)}; {units}")
     if (doubled := rows.duplicated(["day", "interval", "detid"])).any():
         day, interval, detid = rows.loc[doubled.idxmax(), ["day", "interval", "detid"]]
-        raise InputError(f"{path}: detector {detid} has two rows of {day}, {interval:g} s; keep one")
-    return rows, left
+        if not skip_bad:
+            raise InputError(
+                f"{path}: detector {detid} has two rows of {day}, {interval:g} s ({doubled.sum():,} such rows; do "
+                "clocks go back?); keep one, or leave the second ones out with --skip-bad"
+            )
+        left[DOUBLED] = int(doubled.sum())
+    return rows[~doubled].reset_index(drop=True), left
+
+
+def screened(rows: pd.DataFrame, region: pd.Series) -> tuple[pd.DataFrame, dict[str, dict[str, int]]]:
+    """Return the rows of plausible detectors, and reason -> detector -> days of what is left out.
+
+    A detector that fails on half of its days or more is left out altogether. region: by detid
+    """
+    rows = rows.sort_values(["detid", "day", "interval"])
+    keys, flow, occ = ["detid", "day"], rows["flow"], rows["occ"]
+    mean = rows.groupby([rows["detid"].map(region), "day", "interval"])["flow"].transform("mean")
+    busy = mean >= 0.5 * mean.groupby([rows["detid"].map(region), rows["day"]]).transform("max").clip(lower=1e-9)
+    speed = flow * VEHICLE_LENGTH_M / 3600.0 / occ.where(occ > 0, 1e-9)
+    values = rows.groupby(keys)[["flow", "occ"]].transform("nunique").min(axis=1)
+    constant = (_held(rows, "flow") & (flow >= LEAST_FLOW)) | (_held(rows, "occ") & (occ >= LEAST_OCC)) | (values == 1)
+    tests = {  # NaN where a test does not apply
+        "flow without occupancy": (speed > SPEEDS_M_S[1]).where(flow >= LEAST_FLOW),
+        "occupancy without flow": (speed < SPEEDS_M_S[0]).where((occ > 0) & busy),
+        "zero while others count": (_held(rows, "flow") & (flow == 0)).where(busy),
+        "constant": constant & (flow + occ > 0),
+    }
+    shares = pd.DataFrame(tests).astype(float).groupby([rows[key] for key in keys]).mean()
+    failed = (shares > FAULTY_SHARE) & (rows.groupby(keys).size().to_numpy() >= HELD_ROWS)[:, None]
+    reasons = failed.idxmax(axis=1)[failed.any(axis=1)].reset_index(name="reason")
+    bad = reasons.groupby("detid").agg(reason=("reason", lambda part: part.mode()[0]), days=("day", "size"))
+    whole = bad[bad["days"] >= 0.5 * rows.groupby("detid")["day"].nunique()[bad.index]].index
+    wrong_days = pd.MultiIndex.from_frame(reasons[keys])
+    rows = rows[~rows["detid"].isin(whole) & ~pd.MultiIndex.from_frame(rows[keys]).isin(wrong_days)]
+    left = {reason: part["days"].to_dict() for reason, part in bad.groupby("reason")}
+    for part in [part for _, part in rows.groupby(rows["detid"].map(region))]:
+        for reason, names in _against_neighbours(part):
+            left.setdefault(reason, {}).update(part.groupby("detid")["day"].nunique()[names].to_dict())
+            rows = rows[~rows["detid"].isin(names)]
+    return rows.sort_index(), left
+
+
+def _held(rows: pd.DataFrame, column: str) -> pd.Series:
+    """Mark the rows of HELD_ROWS or more in a row with one value of a detector and day."""
+    columns = rows[["detid", "day", column]]
+    run = (columns != columns.shift()).any(axis=1).cumsum()
+    return run.groupby(run).transform("size") >= HELD_ROWS
+
+
+def _against_neighbours(rows: pd.DataFrame) -> Iterator[tuple[str, list[str]]]:
+    """Yield reasons and the detectors of one region that differ from its others, or count what others count."""
+    wide = rows.pivot(index=["day", "interval"], columns="detid", values=["flow", "occ"])
+    flow, names = wide["flow"], wide["flow"].columns
+    if len(names) < FEWEST_NEIGHBOURS:
+        return
+    full, total = flow.dropna().to_numpy(), np.zeros(len(names), dtype=bool)
+    if len(full) >= 2 * len(names):
+        # Regression of each detector on all others: 1 / inverse[i, i] is what remains of the sum of squares.
+        gram = full.T @ full
+        inverse = np.linalg.inv(gram + 1e-9 * np.trace(gram) * np.eye(len(names)))
+        own = np.diag(inverse)
+        weights = np.eye(len(names)) - inverse / own[:, None]
+        terms = weights > 0.5
+        total = (np.abs(weights - terms).max(axis=1) < 0.05) & (terms.sum(axis=1) > 1)
+        total &= 1.0 / own < 1e-4 * np.diag(gram)
+    with np.errstate(divide="ignore"):
+        size = np.log(pd.DataFrame({"flow": flow.mean(), "speed": flow.mean() / wide["occ"].mean()}))
+    off = (size - size.median()).abs()
+    like = flow.corrwith(flow.mean(axis=1))
+    far = (off > np.maximum(np.log(pd.Series(FAR_OFF)), FAR_OFF_SPREADS * off.median())).any(axis=1)
+    far |= (like < ODD) & (like.median() > ALIKE)
+    for reason, wrong in ((SUM, total), ("unlike its neighbours", far.to_numpy() & ~total)):
+        if wrong.any():
+            yield reason, list(names[wrong])
 
 
 def read_detectors(

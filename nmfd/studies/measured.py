@@ -19,25 +19,26 @@ from scipy.spatial import ConvexHull, Delaunay, QhullError
 from nmfd.arrays import Adjacency, Points
 from nmfd.errors import InputError
 from nmfd.model import detector_tables, mfd
+from nmfd.model.detector_tables import VEHICLE_LENGTH_M
 from nmfd.model.regional_model import NetworkTable, RegionalModel, load_network, network_toml
 from nmfd.runs import config, files
 from nmfd.runs.tables import wrapped
 from nmfd.studies import fit_quality, plots
 
 U_MIN, U_MAX = 0.1, 0.9  # bounds of the control
-VEHICLE_LENGTH_M = 6.5  # of a vehicle and a loop together
 LEAST_REPORTING = 0.5  # share of a region's detectors, by lane-kilometres, that must report in an interval
 STOP_LINE_KM = 0.03  # before a junction, where queues stand
 FAR = 3.0  # times the median distance between neighbouring detectors: no boundary lies between
 LEAST_COVERAGE, BIASED_SHARE, LEAST_DAYS = 0.3, 0.5, 3
 UNKNOWN, SMALL, LOOPS = "coverage unknown", "low coverage", "loops at stop lines"
-ASSUMED, SINGLE = "trip length assumed", "days"
+ASSUMED, SINGLE, LEFT = "trip length assumed", "days", "detectors left out"
 MEANINGS = {
     **fit_quality.MEANINGS,
     UNKNOWN: "accumulation and outflow are those of links with detectors; give lane_km with --about",
     SMALL: f"detectors stand for less than {100 * LEAST_COVERAGE:g} % of the lane-kilometres, usually the main roads",
     LOOPS: f"most loops lie within {1000 * STOP_LINE_KM:g} m of a junction, where standing queues bias the density",
     ASSUMED: "two thirds of the side of a square as large as the region; give it with --trip-length or --about",
+    LEFT: "their counts cannot be right, see below; lane-kilometres stand for the links of the others",
     SINGLE: f"fewer than {LEAST_DAYS} days: the difference between days is unknown",
 }
 UNKNOWN_PARTS = (
@@ -102,25 +103,35 @@ def identify(
         if base
         else sorted(set(stations["region"]), key=lambda name: name.rjust(9) if name.isdecimal() else name)
     )
-    table = detector_tables.read_about(paths[2], names)
-    lane_km, coverage = _lane_km(stations, table, paths[2] or counts)
-    trip_km, assumed = _trip_lengths(stations, table, trip_length)
-    intervals = _intervals(rows, stations)
-    number = intervals["region"].map(names.index)
-    for column, per_lane in (("accumulation_veh", "density_veh_km"), ("production_veh_km_h", "flow_veh_h")):
-        intervals[column] = intervals[per_lane] * lane_km[number]
-    intervals["outflow_veh_s"] = intervals["production_veh_km_h"] / trip_km[number] / 3600.0
-    speed = intervals["production_veh_km_h"].sum() / max(intervals["accumulation_veh"].sum(), 1e-9) / 3.6
+    speed = rows["flow"].sum() * VEHICLE_LENGTH_M / 3600.0 / max(rows["occ"].sum(), 1e-9)
     if not detector_tables.SPEEDS_M_S[0] <= speed <= detector_tables.SPEEDS_M_S[1]:
         raise InputError(
             f"{counts}: flow and occ give a mean speed of {speed:.3g} m/s, with {VEHICLE_LENGTH_M:g} m for a vehicle "
             "over a loop; expected flow in veh/h per lane, not per interval, and occ as a share, not percent"
         )
+    read, days, count = len(rows), rows["day"].nunique(), rows["detid"].nunique()
+    rows, faulty = detector_tables.screened(rows, stations["region"])
+    stations = stations.drop(list(faulty.get(detector_tables.SUM, ())))  # its lanes are those of the others
+    used = stations[stations.index.isin(rows["detid"])]
+    broken = [
+        f"detectors left out, {reason}: "
+        + ", ".join(name if name not in used.index else f"{name} ({n} of {days} days)" for name, n in of.items())
+        for reason, of in faulty.items()
+    ]
+    table = detector_tables.read_about(paths[2], names)
+    lane_km, coverage = _lane_km(stations, used, table, paths[2] or counts)
+    trip_km, assumed = _trip_lengths(stations, table, trip_length)
+    intervals = _intervals(rows, used)
+    number = intervals["region"].map(names.index)
+    for column, per_lane in (("accumulation_veh", "density_veh_km"), ("production_veh_km_h", "flow_veh_h")):
+        intervals[column] = intervals[per_lane] * lane_km[number]
+    intervals["outflow_veh_s"] = intervals["production_veh_km_h"] / trip_km[number] / 3600.0
     samples = [_cloud(intervals[intervals["region"] == region]) for region in names]
     for region in fit_quality.nearly_empty(samples):
         raise InputError(
             f"{counts}: region {names[region]} was measured in fewer than {fit_quality.SAMPLES} intervals with "
             f"{100 * LEAST_REPORTING:g} % of its detectors reporting; give more data, or join it to another region"
+            + "".join(f"; {line}" for line in broken)
         )
     network = base or RegionalModel(
         name="",
@@ -146,21 +157,25 @@ def identify(
             f"{adjacency or counts}: region {names[j]} cannot be reached from {names[i]}; give all pairs of "
             "neighbours, region,neighbour, with --adjacency"
         )
-    days = rows["day"].nunique()
     fits = fit_quality.region_fits(network, samples)
     lengths = np.where(assumed, trip_km, np.nan)
     fits["doubts"] = [
-        (*doubts, *_doubts(stations[stations["region"] == region], coverage[n], lengths[n], days))
+        (*doubts, *_doubts(stations[stations["region"] == region], used, coverage[n], lengths[n], days))
         for n, (region, doubts) in enumerate(zip(names, fits["doubts"], strict=True))
     ]
     network = replace(network, doubts=tuple(fits["doubts"]))
     share = "unknown" if np.isnan(coverage).all() else f"{np.nanmin(coverage):.0%} to {np.nanmax(coverage):.0%}"
     facts = (
-        f"{len(rows):,} rows of {rows['detid'].nunique()} detectors on {days} days; left out: "
+        f"{read:,} rows of {count} detectors on {days} days; left out: "
         f"{detector_tables.omitted(left)}; share of the lane-km with detectors: {share}; trip length within a region: "
         f"{1000 * trip_km.min():,.0f} to {1000 * trip_km.max():,.0f} m"
     )
-    report = "\n".join([fit_quality.fit_table(network, fits, MEANINGS), *wrapped(facts), *wrapped(UNKNOWN_PARTS)])
+    report = "\n".join(
+        [
+            fit_quality.fit_table(network, fits, MEANINGS),
+            *wrapped("\n".join([*(f"WARNING, {line}" for line in broken), facts, UNKNOWN_PARTS])),
+        ]
+    )
     text = network_toml(network, {}, f"Regional model: written by nmfd identify from {counts.name}; see identify.txt.")
     config.checked(NetworkTable, tomllib.loads(text), out / "network.toml")
     out.mkdir(parents=True, exist_ok=True)
@@ -214,8 +229,11 @@ def _positions(detectors: pd.DataFrame, about: pd.DataFrame) -> np.ndarray:
     return places if not np.isnan(places).any() else 1000.0 * np.stack([np.sin(angle), np.cos(angle)], axis=1)
 
 
-def _lane_km(detectors: pd.DataFrame, about: pd.DataFrame, where: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return lane-kilometres (R,) and the share of them with detectors (R,), NaN where unknown."""
+def _lane_km(
+    detectors: pd.DataFrame, used: pd.DataFrame, about: pd.DataFrame, where: Path
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return lane-kilometres (R,) and the share of them with detectors in use (R,), NaN where unknown."""
+    in_use = used["lane_km"].groupby(used["region"]).sum().reindex(about.index, fill_value=0.0).to_numpy()
     covered = detectors["lane_km"].groupby(detectors["region"]).sum(min_count=1).reindex(about.index).to_numpy()
     total = about["lane_km"].to_numpy()
     if (unknown := np.isnan(covered) & np.isnan(total)).any():
@@ -229,7 +247,7 @@ def _lane_km(detectors: pd.DataFrame, about: pd.DataFrame, where: Path) -> tuple
             f"{where}: region {about.index[n]}: lane_km: {total[n]:g} is less than the {covered[n]:.4g} km of its "
             "detectors; correct it, or length and lanes in the detectors' table"
         )
-    return np.where(np.isnan(total), covered, total), covered / total
+    return np.where(np.isnan(total), covered, total), in_use / total
 
 
 def _trip_lengths(
@@ -273,8 +291,9 @@ def _adjacency(path: Path | None, detectors: pd.DataFrame, regions: Sequence[str
     return adjacency
 
 
-def _doubts(detectors: pd.DataFrame, coverage: float, assumed_km: float, days: int) -> list[str]:
+def _doubts(detectors: pd.DataFrame, used: pd.DataFrame, coverage: float, assumed_km: float, days: int) -> list[str]:
     """Return the doubts about a region beside those of its fit; assumed_km: NaN unless assumed."""
+    broken = (~detectors.index.isin(used.index)).sum()
     near = (detectors["pos_km"] <= STOP_LINE_KM).mean()
     doubts: Mapping[str, bool] = {
         UNKNOWN: np.isnan(coverage),
@@ -282,5 +301,6 @@ def _doubts(detectors: pd.DataFrame, coverage: float, assumed_km: float, days: i
         f"{LOOPS} ({100 * near:.0f} %)": near > BIASED_SHARE,
         f"{ASSUMED} ({1000 * assumed_km:,.0f} m)": not np.isnan(assumed_km),
         f"{SINGLE}: {days}": days < LEAST_DAYS,
+        f"{LEFT}: {broken} of {len(detectors)}": broken > 0,
     }
     return [text for text, there in doubts.items() if there]
