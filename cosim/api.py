@@ -308,7 +308,7 @@ def import_city(
     regions: number of regions to find, or the file of a table edge,region
     demand: "peak" generates a morning peak
     begin, end: time window, in seconds or as h:m:s
-    options: left_hand, routes, level, mesoscopic, seed, seeds (cosim.importing.importer.import_city)
+    options: routes, level, mesoscopic, seed, seeds (cosim.importing.importer.import_city)
     """
     from cosim.importing import importer
 

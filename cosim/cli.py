@@ -246,7 +246,6 @@ def get(name: str | None) -> None:
 @main.command(name="import")
 @click.argument("source", type=FILE, required=False, metavar="SUMOCFG|NET|OSM")
 @click.option("--bbox", metavar="W,S,E,N", help="Box of OpenStreetMap in degrees to download, instead of a file.")
-@click.option("--left-hand", is_flag=True, help="OpenStreetMap: traffic drives on the left.")
 @click.option("--regions", required=True, metavar="N|CSV", help="Number of regions to find, or a table edge,region.")
 @click.option("--routes", type=FILE, multiple=True, metavar="FILE", help="Vehicles, trips or flows. May be repeated.")
 @click.option("--demand", type=click.Choice(["peak"]), help="Generate a morning peak for a city without demand.")

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+import numpy as np
 import sumo
 
 from cosim.sumo.build import run_sumo
@@ -37,6 +38,7 @@ LICENCE = (
     "The streets are those of OpenStreetMap: (c) OpenStreetMap contributors, Open Database License 1.0\n"
     "(SPDX ODbL-1.0, https://opendatacommons.org/licenses/odbl/1-0/), https://www.openstreetmap.org/copyright\n"
 )
+LEFT_HAND = Path(__file__).with_name("left_hand.csv")
 SERVERS = "hpi,oapi,pcoffee"  # osmGet.py's names of public ones
 SERVER_TIME_LIMIT_S = 600.0
 Box = tuple[float, float, float, float]  # west, south, east, north [degrees]
@@ -75,11 +77,10 @@ class SumoInput:
 
 
 @contextmanager
-def sumo_input(source: Path | Box, progress: Progress, *, left_hand: bool = False) -> Iterator[SumoInput]:
+def sumo_input(source: Path | Box, progress: Progress) -> Iterator[SumoInput]:
     """Provide the simulation of a source; a network that is built for it goes at the end of the block.
 
     source: a sumocfg, a net.xml(.gz), a file of OpenStreetMap, or a box of it
-    left_hand: of OpenStreetMap, which does not say on which side of its streets vehicles drive
 
     Raises:
         InputError: for a source that cannot be read, or no answer for a box.
@@ -88,8 +89,6 @@ def sumo_input(source: Path | Box, progress: Progress, *, left_hand: bool = Fals
         osm = source.stem.removesuffix(".osm")
         raise InputError(f"{source}: convert pbf first: osmium cat {source.name} -o {osm}.osm")
     if isinstance(source, Path) and _root(source).tag != "osm":
-        if left_hand:
-            raise InputError(f"--left-hand: {source} says itself on which side vehicles drive; omit it")
         yield read_sumo_input(source)
         return
     with temporary_folder() as folder:
@@ -99,7 +98,10 @@ def sumo_input(source: Path | Box, progress: Progress, *, left_hand: bool = Fals
         progress("netconvert")
         net, types = folder / "osm.net.xml", Path(sumo.SUMO_HOME) / "data" / "typemap" / "osmNetconvert.typ.xml"
         options = {"osm-files": file_list([source.resolve()]), "type-files": types, "output-file": net}
-        run_sumo("netconvert", options, *NETCONVERT, *(["--lefthand"] if left_hand else []), where=str(source))
+        run_sumo("netconvert", options, *NETCONVERT, where=str(source))
+        west, south, east, north = map(float, _root(net, "location").attrib["origBoundary"].split(","))
+        if keeps_left((west + east) / 2, (south + north) / 2):
+            run_sumo("netconvert", options, *NETCONVERT, "--lefthand", where=str(source))
         net.write_bytes(re.sub(rb"<!--.*?-->\s*", b"", net.read_bytes(), count=1, flags=re.DOTALL))  # date and folder
         yield SumoInput(source=source, net=net, notice=LICENCE)
 
@@ -154,6 +156,18 @@ def seconds(text: str, where: str) -> float:
     return -size if text.startswith("-") else size
 
 
+def keeps_left(longitude: float, latitude: float) -> bool:
+    """Return True if traffic keeps left at a place [degrees], as in the nearest city of LEFT_HAND.
+
+    >>> keeps_left(100.5, 13.75), keeps_left(102.6, 17.97)  # Bangkok, Vientiane
+    (True, False)
+    """
+    east, north, left = np.loadtxt(LEFT_HAND, delimiter=",", skiprows=2, unpack=True)
+    a, b, turn = np.radians(latitude), np.radians(north), np.radians(east - longitude)
+    nearness = np.sin(a) * np.sin(b) + np.cos(a) * np.cos(b) * np.cos(turn)  # cosine of the angle between both
+    return bool(left[np.argmax(nearness)])
+
+
 def parse_box(text: str) -> Box:
     """Parse --bbox. Raises InputError."""
     try:
@@ -194,12 +208,12 @@ def fetch_osm(box: Box, folder: Path) -> Path:
         ) from None
 
 
-def _root(path: Path) -> ElementTree.Element:
-    """Read the root element of an XML file, with its attributes only. Raises InputError."""
+def _root(path: Path, tag: str | None = None) -> ElementTree.Element:
+    """Read the root of an XML file, or its first element `tag`, with its attributes only. Raises InputError."""
     try:
         with opened(path) as stream:
-            _, element = next(iter(ElementTree.iterparse(stream, events=("start",))))
-            return element
+            elements = (element for _, element in ElementTree.iterparse(stream, events=("start",)))
+            return next(element for element in elements if tag in (None, element.tag))
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; give the path of an existing one") from None
     except BROKEN as error:

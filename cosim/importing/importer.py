@@ -46,7 +46,6 @@ def import_city(
     scenario: Path,
     *,
     regions: int | Path,
-    left_hand: bool = False,
     routes: Sequence[Path] = (),
     peak: bool = False,
     level: float = 1.0,
@@ -63,7 +62,6 @@ def import_city(
     source: a sumocfg, a net.xml, a file of OpenStreetMap, or a box of it
     out, scenario: new folders of the network and the scenario
     regions: their number, or the user's own table edge,region
-    left_hand: side of OpenStreetMap's streets
     routes: files with vehicles beside those of the sumocfg
     peak: generate a morning peak instead
     level: multiplies the vehicles or the peak [-]
@@ -81,7 +79,7 @@ def import_city(
         if folder.exists():
             raise InputError(f"--out: {folder} exists; choose another name, or remove it")
     progress("reading")
-    with sumo_input(source, progress, left_hand=left_hand) as case, temporary_folder() as scratch:
+    with sumo_input(source, progress) as case, temporary_folder() as scratch:
         case = replace(case, routes=(*case.routes, *routes))
         case = replace(case, begin=case.begin if begin is None else begin, end=case.end if end is None else end)
         if case.begin < 0 or (case.end is not None and case.end <= case.begin):
@@ -253,9 +251,9 @@ def _report(
 ) -> list[str]:
     """Return what was imported, left alone and left out, in lines."""
     lines = [
-        f"{case.source.name}: {len(streets.edges):,} edges, {streets.drivable.sum():,} for cars"
-        + (", left-hand traffic" if streets.left_hand else "")
-        + f"; {len(streets.logics):,} signals; {len(traffic.vehicles):,} vehicles in {clock.steps} intervals of "
+        f"{case.source.name}: {len(streets.edges):,} edges, {streets.drivable.sum():,} for cars, "
+        f"{'left' if streets.left_hand else 'right'}-hand traffic; {len(streets.logics):,} signals; "
+        f"{len(traffic.vehicles):,} vehicles in {clock.steps} intervals of "
         f"{clock.step:g} s{_notes(traffic)}",
         text_table(tables.quality, CAPTION),
         f"without control: {baseline.teleports} teleports; at the end {baseline.running} vehicles on the road and "
