@@ -60,16 +60,15 @@ def test_the_plan_descends_on_both_sums(scenario, learned):
     """The gradient of edge_model with what lies beyond, by finite differences."""
     planning = planning_model(scenario, NAME)
     mpc = EconomicMpc(planning, guidance=False, terminal=learned)
-    model = edge_model.build(planning.network, np.flatnonzero(planning.destinations), guidance=False)
+    used = np.flatnonzero(planning.destinations)
+    model = edge_model.build(planning.network, used, guidance=False, step=planning.step)
     start, demand = crowded(scenario), planning.forecast[:8][:, :, planning.destinations].reshape(8, -1)
     plan = 0.8 * mpc.admissible.open(8)
 
     def total(plan, **chosen):
-        return edge_model.vehicle_steps(
-            model, start, demand, plan, planning.step, beyond=lambda x: learned(x, 100), **chosen
-        )
+        return edge_model.vehicle_steps(model, start, demand, plan, beyond=lambda x: learned(x, 100), **chosen)
 
-    without = edge_model.vehicle_steps(model, start, demand, plan, planning.step)[0]
+    without = edge_model.vehicle_steps(model, start, demand, plan)[0]
     value, slope = total(plan, gradient=True)
     assert value > without
     for k, edge in ((0, 0), (4, 7), (7, 11)):

@@ -66,33 +66,33 @@ def by_dynamics(network, model, start, demand, plan, *, step, substeps, integrat
     ],
 )
 def test_the_twin_of_dynamics_and_its_gradient(scheme, used, network, guidance):
-    model = edge_model.build(network, used, guidance=guidance)
+    model = edge_model.build(network, used, guidance=guidance, **scheme)
     start, demand, plan = problem(model, guidance=guidance)
     tensor = torch.tensor(plan, requires_grad=True)
     expected = by_dynamics(network, model, start, demand, tensor, **scheme)
     expected.backward()
-    value, gradient = edge_model.vehicle_steps(model, start, demand, plan, gradient=True, **scheme)
+    value, gradient = edge_model.vehicle_steps(model, start, demand, plan, gradient=True)
     assert value == pytest.approx(expected.item(), rel=1e-12)
     np.testing.assert_allclose(gradient, tensor.grad.numpy(), rtol=1e-9, atol=1e-9 * np.abs(gradient).max())
 
 
 def test_the_gradient_of_the_rounded_kink():
     """Central differences where a region crosses its jam accumulation."""
-    model = replace(edge_model.build(NETWORK, EVERY, guidance=True), rounding=50.0)
+    model = replace(edge_model.build(NETWORK, EVERY, guidance=True, step=30.0), rounding=50.0)
     start, demand, plan = problem(model)
     start *= 10_000.0 / start[:7].sum()
-    _, gradient = edge_model.vehicle_steps(model, start, demand, plan, 30.0, gradient=True)
+    _, gradient = edge_model.vehicle_steps(model, start, demand, plan, gradient=True)
     random = np.random.default_rng(1)
     for _ in range(5):
         way = random.standard_normal(plan.shape)
-        ahead, behind = (edge_model.vehicle_steps(model, start, demand, plan + s * way, 30.0)[0] for s in (1e-5, -1e-5))
+        ahead, behind = (edge_model.vehicle_steps(model, start, demand, plan + s * way)[0] for s in (1e-5, -1e-5))
         assert (ahead - behind) / 2e-5 == pytest.approx((gradient * way).sum(), rel=1e-5)
 
 
 def test_vehicles_at_stake():
-    model = edge_model.build(NETWORK, SOME, guidance=True)
+    model = edge_model.build(NETWORK, SOME, guidance=True, step=30.0)
     start, demand, plan = problem(model, moves=1, horizon=1)
-    stake = edge_model.affected_vehicles(model, start, demand, plan, 30.0)[0]
+    stake = edge_model.affected_vehicles(model, start, demand, plan)[0]
     q = edge_model.rate(model, start.reshape(7, -1).sum(axis=1))[0]
     leaving = 30.0 * q[model.region] * start
     edges = len(model.edges)
@@ -103,7 +103,7 @@ def test_vehicles_at_stake():
 
 @BOTH
 def test_projection_is_admissible_nearest_and_idempotent(guidance):
-    model = edge_model.build(NETWORK, EVERY, guidance=guidance)
+    model = edge_model.build(NETWORK, EVERY, guidance=guidance, step=30.0)
     admissible, random = Admissible(NETWORK, model, guidance=guidance), np.random.default_rng(0)
     edges = len(model.edges)
     for spread in (0.1, 3.0, 1e6):
@@ -124,7 +124,7 @@ def test_projection_is_admissible_nearest_and_idempotent(guidance):
 
 @BOTH
 def test_the_gap_is_what_the_best_plan_saves(guidance):
-    model = edge_model.build(NETWORK, EVERY, guidance=guidance)
+    model = edge_model.build(NETWORK, EVERY, guidance=guidance, step=30.0)
     admissible, random = Admissible(NETWORK, model, guidance=guidance), np.random.default_rng(0)
     plan = admissible.project(random.uniform(0.0, 1.0, (2, len(model.edges) + len(model.turns))))
     gradient = random.standard_normal(plan.shape)

@@ -15,12 +15,13 @@ the sum that translates back keeps o = j and g = j where i = j.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from nmfd.arrays import PerPair, PerRegion, PerTurn
-from nmfd.model.dynamics import SCHEMES
+from nmfd.model.dynamics import counted
 from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, RegionalModel
 
 LEAST_SHARE = 1e-6  # of theta left without h = g and h = o: less is the rounding of an optimiser, not a route
@@ -120,22 +121,28 @@ def shares(model: Acyclic, splits: PerTurn) -> tuple[PerMove, Bool[np.ndarray, "
     return theta, forced
 
 
-def rate(model: Acyclic, x: PerCell) -> PerRegion:
-    """Return q_i (R,) [1/s] of the state x (C,) [veh]."""
+def outflow(model: Acyclic, x: PerCell) -> PerCell:
+    """Return the desired outflow (C,) [veh/s] of the state x (C,) [veh]."""
     accumulation = np.bincount(model.region, x, minlength=len(model.jam))
     body = np.minimum(accumulation, model.jam)
-    return ((model.a * body + model.b) * body + model.c) * model.jam / np.maximum(accumulation, model.jam)
+    rate = ((model.a * body + model.b) * body + model.c) * model.jam / np.maximum(accumulation, model.jam)
+    return model.exit_rates * rate[model.region] * x
 
 
-def derivative(model: Acyclic, x: PerCell, demand: PerPair, perimeter: PerPair, theta: PerMove) -> PerCell:
-    """Return dx/dt (C,) [veh/s] of x (C,) [veh]; demand (R, R) [veh/s], perimeter (R, R) [-], theta (M,) [-]."""
-    leaving = model.exit_rates * rate(model, x)[model.region] * x
+def derivative(
+    model: Acyclic, x: PerCell, demand: PerPair, perimeter: PerPair, theta: PerMove
+) -> tuple[PerCell, float]:
+    """Return dx/dt (C,) and the completed trips [veh/s].
+
+    x (C,) [veh], demand (R, R) [veh/s], perimeter (R, R) [-], theta (M,) [-]
+    """
+    leaving, ends = outflow(model, x), model.region == model.destination
     passing = transfers(model, x, leaving, perimeter, theta)
-    change = -np.where(model.region == model.destination, leaving, 0.0)
+    change = -np.where(ends, leaving, 0.0)
     change[model.start] += demand
     change -= np.bincount(model.move_from, passing, minlength=len(x))
     change += np.bincount(model.move_to, passing, minlength=len(x))
-    return change
+    return change, float(leaving[ends].sum())
 
 
 def transfers(model: Acyclic, x: PerCell, leaving: PerCell, perimeter: PerPair, theta: PerMove) -> PerMove:
@@ -151,28 +158,10 @@ def transfers(model: Acyclic, x: PerCell, leaving: PerCell, perimeter: PerPair, 
 
 
 def advance_counted(
-    model: Acyclic,
-    x: PerCell,
-    demand: PerPair,
-    perimeter: PerPair,
-    theta: PerMove,
-    step: float,
-    *,
-    integrator: str = "euler",
-    substeps: int = 1,
+    model: Acyclic, x: PerCell, demand: PerPair, perimeter: PerPair, theta: PerMove, step: float, **scheme: Any
 ) -> tuple[PerCell, float]:
     """Return x after one control interval of `step` [s] under constant inputs, and the completed trips [veh]."""
-    step, ended, ends = step / substeps, 0.0, model.region == model.destination
-    for _ in range(substeps):
-        slope, total = np.zeros_like(x), np.zeros_like(x)
-        for weight, place in zip(*SCHEMES[integrator], strict=True):
-            at = x + place * step * slope
-            slope = derivative(model, at, demand, perimeter, theta)
-            total += weight * slope
-            leaving = model.exit_rates[ends] * rate(model, at)[model.region[ends]] * at[ends]
-            ended += step * weight * float(leaving.sum())
-        x = x + step * total
-    return x, ended
+    return counted(lambda x: derivative(model, x, demand, perimeter, theta), x, step, **scheme)
 
 
 def translate(model: Acyclic, x: PerCell) -> PerPair:

@@ -116,65 +116,66 @@ def admitted(backlog: PerPair, demand: PerPair, metering: PerRegion | None, step
     return share * due, (1.0 - share) * due * step
 
 
-def derivative(p: Parameters, x: PerPair, demand: PerPair, perimeter: PerPair, splits: PerTurn) -> PerPair:
-    """Return dx_ij/dt (..., R, R) [veh/s]."""
+def derivative(
+    p: Parameters, x: PerPair, demand: PerPair, perimeter: PerPair, splits: PerTurn
+) -> tuple[PerPair, PerRegion]:
+    """Return dx_ij/dt (..., R, R) and trip completions (..., R) [veh/s]."""
     completions, transfers = flows(p, x, perimeter, splits)
-    return demand - torch.diag_embed(completions) - transfers.sum(-2) + transfers.sum(-3)
+    return demand - torch.diag_embed(completions) - transfers.sum(-2) + transfers.sum(-3), completions
 
 
-def integrated(slope: Callable[[Any], Any], x: Any, step: float, integrator: str) -> Any:
-    """Return x after `step` [s] of dx/dt = slope(x), by forward Euler or the classical Runge-Kutta scheme.
+def integrated(
+    slope: Callable[[Any], Any], x: Any, step: float, *, integrator: str = "euler", substeps: int = 1
+) -> Any:
+    """Return x after `step` [s] of dx/dt = slope(x), in equal substeps of forward Euler or classical Runge-Kutta.
 
-    With Euler x stays >= 0 if step * q <= 1 and demand >= 0.
+    With Euler x stays >= 0 if step * q <= substeps and demand >= 0.
     """
-    k1 = slope(x)
-    if integrator == "euler":
-        return x + step * k1
-    k2 = slope(x + 0.5 * step * k1)
-    k3 = slope(x + 0.5 * step * k2)
-    k4 = slope(x + step * k3)
-    return x + step / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+    step = step / substeps
+    for _ in range(substeps):
+        k1 = slope(x)
+        if integrator == "euler":
+            x = x + step * k1
+            continue
+        k2 = slope(x + 0.5 * step * k1)
+        k3 = slope(x + 0.5 * step * k2)
+        k4 = slope(x + step * k3)
+        x = x + step / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+    return x
 
 
 # Weights of the slopes, and the point of each slope in steps along the previous one.
 SCHEMES = {"euler": ((1.0,), (0.0,)), "rk4": ((1 / 6, 1 / 3, 1 / 3, 1 / 6), (0.0, 0.5, 0.5, 1.0))}
 
 
-def advance(
-    p: Parameters,
-    x: PerPair,
-    demand: PerPair,
-    perimeter: PerPair,
-    splits: PerTurn,
-    step: float,
-    *,
-    integrator: str = "euler",
-    substeps: int = 1,
-) -> PerPair:
-    """Return x after one control interval of `step` [s], in `substeps` equal steps under constant inputs."""
+def counted(
+    slope: Callable[[Any], tuple[Any, Any]], x: Any, step: float, *, integrator: str = "euler", substeps: int = 1
+) -> tuple[Any, Any]:
+    """Return `integrated`, and the integral of the flow that `slope` gives beside dx/dt, for the ledger."""
+    step, ended = step / substeps, 0.0
     for _ in range(substeps):
-        x = integrated(lambda x: derivative(p, x, demand, perimeter, splits), x, step / substeps, integrator)
-    return x
+        change, total, completed = 0.0 * x, 0.0 * x, 0.0
+        for weight, place in zip(*SCHEMES[integrator], strict=True):
+            change, flow = slope(x + place * step * change)
+            total, completed = total + weight * change, completed + weight * flow
+        x, ended = x + step * total, ended + step * completed
+    return x, ended
+
+
+def advance(
+    p: Parameters, x: PerPair, demand: PerPair, perimeter: PerPair, splits: PerTurn, step: float, **scheme: Any
+) -> PerPair:
+    """Return x after one control interval of `step` [s] under constant inputs; scheme: see `integrated`."""
+    return integrated(lambda x: derivative(p, x, demand, perimeter, splits)[0], x, step, **scheme)
 
 
 def advance_counted(
-    p: Parameters,
-    x: PerPair,
-    demand: PerPair,
-    perimeter: PerPair,
-    splits: PerTurn,
-    step: float,
-    *,
-    integrator: str = "euler",
-    substeps: int = 1,
+    p: Parameters, x: PerPair, demand: PerPair, perimeter: PerPair, splits: PerTurn, step: float, **scheme: Any
 ) -> tuple[PerPair, PerRollout]:
-    """Return `advance` and the trips (...) [veh] completed meanwhile, for the ledger."""
-    step, ended = step / substeps, torch.zeros(x.shape[:-2], dtype=x.dtype)
-    for _ in range(substeps):
-        slope, total, completed = torch.zeros_like(x), torch.zeros_like(x), torch.zeros_like(ended)
-        for weight, place in zip(*SCHEMES[integrator], strict=True):
-            completions, transfers = flows(p, x + place * step * slope, perimeter, splits)
-            slope = demand - torch.diag_embed(completions) - transfers.sum(-2) + transfers.sum(-3)
-            total, completed = total + weight * slope, completed + weight * completions.sum(-1)
-        x, ended = x + step * total, ended + step * completed
-    return x, ended
+    """Return `advance` and the trips (...) [veh] completed meanwhile."""
+
+    def slope(x: PerPair) -> tuple[PerPair, PerRollout]:
+        change, completions = derivative(p, x, demand, perimeter, splits)
+        return change, completions.sum(-1)
+
+    return counted(slope, x, step, **scheme)

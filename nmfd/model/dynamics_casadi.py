@@ -6,55 +6,25 @@ Structural zeros of x, perimeter and splits are kept.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TypeAlias
+from types import SimpleNamespace
+from typing import Any, TypeAlias
 
 import casadi as ca
-import numpy as np
 
-from nmfd.model.dynamics import integrated
+from nmfd.model import dynamics
 from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, RegionalModel
 
 Matrix: TypeAlias = ca.SX | ca.MX | ca.DM
 Turns: TypeAlias = Sequence[Matrix]  # R of them
-
-
-@dataclass(frozen=True, kw_only=True)
-class Parameters:
-    """Parameters as CasADi constants. a, b, c, jam: (R, 1) of the MFDs; adjacency: (R, R), 1 or structural zero.
-
-    exit_rates: (R, R) [-] or None; capacity: (R, R) [veh/s] under u = 1, or None; storage: (1, R) [veh]
-    """
-
-    a: ca.DM
-    b: ca.DM
-    c: ca.DM
-    jam: ca.DM
-    adjacency: ca.DM
-    exit_rates: ca.DM | None
-    capacity: ca.DM | None
-    storage: ca.DM | None
+Parameters: TypeAlias = SimpleNamespace
 
 
 def parameters(network: RegionalModel) -> Parameters:
-    """Return the parameters of `network`."""
-
-    def column(name: str) -> ca.DM:
-        return ca.DM([getattr(m, name) for m in network.mfds])
-
-    def matrix(values: np.ndarray | None) -> ca.DM | None:
-        return None if values is None else ca.DM(values)
-
-    return Parameters(
-        a=column("a"),
-        b=column("b"),
-        c=column("c"),
-        jam=column("jam"),
-        adjacency=ca.sparsify(ca.DM(network.adjacency.astype(float))),
-        exit_rates=matrix(network.exit_rates),
-        capacity=matrix(network.open_capacity),
-        storage=None if network.storage is None else ca.DM(network.storage).T,
-    )
+    """Return `dynamics.parameters` as constants: vectors (R, 1), but storage (1, R); adjacency 1 or structural zero."""
+    known = vars(dynamics.parameters(network)).items()
+    p = Parameters(**{name: None if values is None else ca.DM(values.numpy()) for name, values in known})
+    p.adjacency, p.storage = ca.sparsify(p.adjacency), None if p.storage is None else p.storage.T
+    return p
 
 
 def rate(p: Parameters, accumulation: Matrix) -> Matrix:
@@ -96,17 +66,7 @@ def derivative(p: Parameters, x: Matrix, demand: Matrix, perimeter: Matrix, spli
 
 
 def advance(
-    p: Parameters,
-    x: Matrix,
-    demand: Matrix,
-    perimeter: Matrix,
-    splits: Turns,
-    step: float,
-    *,
-    integrator: str = "euler",
-    substeps: int = 1,
+    p: Parameters, x: Matrix, demand: Matrix, perimeter: Matrix, splits: Turns, step: float, **scheme: Any
 ) -> Matrix:
-    """Return x after one control interval of `step` [s], in `substeps` equal steps under constant inputs."""
-    for _ in range(substeps):
-        x = integrated(lambda x: derivative(p, x, demand, perimeter, splits), x, step / substeps, integrator)
-    return x
+    """Return x after one control interval of `step` [s] under constant inputs; scheme: see `dynamics.integrated`."""
+    return dynamics.integrated(lambda x: derivative(p, x, demand, perimeter, splits), x, step, **scheme)

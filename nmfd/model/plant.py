@@ -130,8 +130,7 @@ class AcyclicPlant(NmfdPlant):
         model, step = self._model, self._scenario.step
         theta, forced = acyclic.shares(model, splits)
         if forced.any():
-            leaving = model.exit_rates * acyclic.rate(model, self._x)[model.region] * self._x
-            passing = acyclic.transfers(model, self._x, leaving, perimeter, theta)
+            passing = acyclic.transfers(model, self._x, acyclic.outflow(model, self._x), perimeter, theta)
             self.forced_moves += step * float(passing[model.fallback[forced]].sum())
         self._x, ended = acyclic.advance_counted(model, self._x, demand, perimeter, theta, step, **self._scheme)
         return ended

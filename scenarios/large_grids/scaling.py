@@ -80,7 +80,8 @@ def measure(family: str, load: str, regions: int, name: str) -> dict:
         controller = DpcController(Policy(city, small if name.endswith("local") else sparse))
     controller.reset()
     row = dict(family=family, load=load, regions=regions, controller=name, set_up_s=time.perf_counter() - begin)
-    model, x = edge_model.build(city, np.arange(regions), guidance=True), initial_state(city, load)
+    model = edge_model.build(city, np.arange(regions), guidance=True, step=STEP_S)
+    x = initial_state(city, load)
     times, unsolved = [], 0
     for k in range(STEPS):
         seen, begin = nmfd.Observation(step=k, time=STEP_S * k, accumulation=x, backlog=0.0 * x), time.perf_counter()
@@ -89,7 +90,7 @@ def measure(family: str, load: str, regions: int, name: str) -> dict:
         unsolved += controls.status != nmfd.Status.OK
         theta = city.nominal_splits if controls.splits is None else controls.splits
         flows = controls.perimeter[tuple(model.edges.T)], theta[tuple(model.turns.T)]
-        x = edge_model.advance(model, x.ravel(), np.zeros(x.size), *flows, STEP_S)[0].reshape(x.shape)
+        x = edge_model.advance(model, x.ravel(), np.zeros(x.size), *flows)[0].reshape(x.shape)
     row |= dict(first_s=times[0], median_s=statistics.median(times[1:]), longest_s=max(times[1:]), unsolved=unsolved)
     return row | dict(peak_memory_mib=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10, failure="")
 

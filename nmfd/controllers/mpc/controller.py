@@ -18,7 +18,7 @@ from pydantic import model_validator
 
 from nmfd.arrays import PerPair, PerTurn
 from nmfd.controllers.mpc import edge_model
-from nmfd.controllers.mpc.edge_model import Decision, Demands, PerCell, Plan, Turns
+from nmfd.controllers.mpc.edge_model import Decision, Demands, PerCell, Plan, Turns, affected_vehicles
 from nmfd.controllers.mpc.ipopt import Ipopt
 from nmfd.controllers.mpc.projected_gradient import AT_REST, TIME_LIMIT, Late, Minimum, minimise
 from nmfd.controllers.mpc.terminal import Terminal, read
@@ -152,12 +152,11 @@ class EconomicMpc:
         # With one Euler step per interval, the last controls move vehicles that do not arrive within the horizon.
         blind = planning.integrator == "euler" and planning.substeps == 1 and terminal is None
         self._moves = min(horizon - 1 if blind else horizon, self.options.control_horizon or horizon)
-        self._model = edge_model.build(network, self._used, guidance=guidance)
+        scheme = {"step": planning.step, "substeps": planning.substeps, "integrator": planning.integrator}
+        self._model = edge_model.build(network, self._used, guidance=guidance, **scheme)
         rounded = replace(self._model, rounding=JAM_ROUNDING * min(mfd.jam for mfd in network.mfds))
-        scheme: dict = {"step": planning.step, "substeps": planning.substeps, "integrator": planning.integrator}
-        self._exact: Callable = partial(edge_model.vehicle_steps, self._model, **scheme)
-        self._rounded: Callable = partial(edge_model.vehicle_steps, rounded, gradient=True, **scheme)
-        self._affected: Callable = partial(edge_model.affected_vehicles, self._model, **scheme)
+        self._exact = partial(edge_model.vehicle_steps, self._model)
+        self._rounded: Callable = partial(edge_model.vehicle_steps, rounded, gradient=True)
         self.admissible = Admissible(network, self._model, guidance=guidance)
         self._open = self.admissible.open(self._moves)
         self._gating = PiGating(planning) if planning.protected else None
@@ -244,7 +243,7 @@ class EconomicMpc:
             self.admissible.project,
             self.admissible.gap,
             plan,
-            metric=(self._affected(start, demand, plan, deadline=deadline) + METRIC_OFFSET_VEH) ** 2,
+            metric=(affected_vehicles(self._model, start, demand, plan, deadline=deadline) + METRIC_OFFSET_VEH) ** 2,
             tolerance=self._tolerance,
             iterations=MAX_ITERATIONS,
             seconds=deadline - time.perf_counter(),

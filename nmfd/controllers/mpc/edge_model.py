@@ -7,18 +7,17 @@ gradient of the total time spent follows by the adjoint method, at about the cos
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from nmfd.arrays import PerRegion
 from nmfd.controllers.mpc.projected_gradient import Late
+from nmfd.model.dynamics import SCHEMES
 from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, RegionalModel
-
-# Explicit Runge-Kutta schemes: weights of the slopes, and nodes of all but the first, in steps along the one before.
-SCHEMES = {"euler": ((1.0,), ()), "rk4": ((1 / 6, 1 / 3, 1 / 3, 1 / 6), (0.5, 0.5, 1.0))}
 
 PerCell = Float[np.ndarray, " C"]
 PerEdge = Float[np.ndarray, " E"]
@@ -39,6 +38,7 @@ class Turns:
     region: (C,); ends: cells in which trips end (i = j), (C,)
     a, b, c, jam: of the MFDs, (R,)
     exit_rates: (-, (C,)); capacity: under u = 1 (veh/s, (E,)) or None; storage: (veh, (R,)) or None
+    step: control interval (s); substeps, integrator: integration steps in it, and their scheme (dynamics.SCHEMES)
     rounding: width of the rounded kink of the MFDs at the jam accumulation (veh); 0 for the exact model
     """
 
@@ -58,11 +58,17 @@ class Turns:
     exit_rates: PerCell
     capacity: PerEdge | None
     storage: PerRegion | None
-    rounding: float
+    step: float
+    substeps: int = 1
+    integrator: str = "euler"
+    rounding: float = 0.0
 
 
-def build(network: RegionalModel, destinations: Int[np.ndarray, " J"], *, guidance: bool) -> Turns:
-    """Return the turns of vehicles bound for `destinations` (J,): all with guidance, else the nominal ones."""
+def build(network: RegionalModel, destinations: Int[np.ndarray, " J"], *, guidance: bool, **scheme: Any) -> Turns:
+    """Return the turns of vehicles bound for `destinations` (J,): all with guidance, else the nominal ones.
+
+    scheme: step, substeps and integrator of `Turns`
+    """
     regions, count = network.regions, len(destinations)
     in_use = np.isin(np.arange(regions), destinations)
     turns = np.argwhere((network.split_mask if guidance else network.nominal_splits > 0) & in_use)
@@ -87,7 +93,7 @@ def build(network: RegionalModel, destinations: Int[np.ndarray, " J"], *, guidan
         region=cells // count,
         ends=cells // count == np.asarray(destinations)[cells % count],
         **{name: np.array([getattr(m, name) for m in network.mfds]) for name in ("a", "b", "c", "jam")},
-        rounding=0.0,
+        **scheme,
     )
 
 
@@ -162,45 +168,26 @@ def pull_derivative(
     return q * of_leaving + of_region[model.region], of_perimeter, of_wish * leaving[model.source]
 
 
-def advance(
-    model: Turns,
-    x: PerCell,
-    demand: PerCell,
-    perimeter: PerEdge,
-    splits: PerTurn,
-    step: float,
-    integrator: str = "euler",
-) -> tuple[PerCell, list]:
-    """Return x (C,) after one integration step of `step` (s), and the records for `pull_advance`."""
-    weights, nodes = SCHEMES[integrator]
-    total, records, at = np.zeros_like(x), [], x
-    for stage, weight in enumerate(weights):
-        slope, record = derivative(model, at, demand, perimeter, splits)
+def advance(model: Turns, x: PerCell, demand: PerCell, perimeter: PerEdge, splits: PerTurn) -> tuple[PerCell, list]:
+    """Return x (C,) after one integration step, and the records for `pull_advance`."""
+    step, total, slope, records = model.step / model.substeps, np.zeros_like(x), np.zeros_like(x), []
+    for weight, place in zip(*SCHEMES[model.integrator], strict=True):
+        slope, record = derivative(model, x + step * place * slope, demand, perimeter, splits)
         records.append(record)
         total += weight * slope
-        if stage < len(nodes):
-            at = x + step * nodes[stage] * slope
     return x + step * total, records
 
 
 def pull_advance(
-    model: Turns,
-    adjoint: PerCell,
-    perimeter: PerEdge,
-    splits: PerTurn,
-    records: list,
-    step: float,
-    integrator: str = "euler",
+    model: Turns, adjoint: PerCell, perimeter: PerEdge, splits: PerTurn, records: list
 ) -> tuple[PerCell, Decision]:
     """Return the gradients by x (C,) and decision (E + V,) before a step, if that by x after it is `adjoint`."""
-    weights, nodes = SCHEMES[integrator]
     of_x, of_decision, of_node = adjoint, np.zeros(len(perimeter) + len(splits)), np.zeros_like(adjoint)
-    for stage in reversed(range(len(weights))):
-        of_slope = step * weights[stage] * adjoint
-        if stage < len(nodes):
-            of_slope = of_slope + step * nodes[stage] * of_node
-        of_node, *more = pull_derivative(model, of_slope, perimeter, splits, records[stage])
-        of_x, of_decision = of_x + of_node, of_decision + np.concatenate(more)
+    step, ahead = model.step / model.substeps, 0.0  # ahead: from the node before to this one (s)
+    for record, weight, place in reversed(list(zip(records, *SCHEMES[model.integrator], strict=True))):
+        of_slope = step * weight * adjoint + ahead * of_node
+        of_node, *more = pull_derivative(model, of_slope, perimeter, splits, record)
+        of_x, of_decision, ahead = of_x + of_node, of_decision + np.concatenate(more), step * place
     return of_x, of_decision
 
 
@@ -209,10 +196,7 @@ def vehicle_steps(
     start: PerCell,
     demand: Demands,
     plan: Plan,
-    step: float,
     *,
-    substeps: int = 1,
-    integrator: str = "euler",
     gradient: bool = False,
     deadline: float = math.inf,
     beyond: Callable[[PerCell], tuple[float, PerCell]] | None = None,
@@ -221,67 +205,55 @@ def vehicle_steps(
 
     start: (veh, (C,)); demand: (veh/s, (H, C))
     plan: u of the edges and theta of the turns in every interval (-, (K, E + V)); the last stays in force
-    step: control interval (s)
     deadline: by time.perf_counter (s)
     beyond: terminal cost of the final state (veh intervals) and its gradient
     Raises: Late
     """
-    interval, edges = _intervals(plan, len(demand), substeps), len(model.edges)
     x, total, tape = start, 0.0, []
-    for node, k in enumerate(interval):
-        _look(deadline)
-        u, theta = plan[k, :edges], plan[k, edges:]
-        x, records = advance(model, x, demand[node // substeps], u, theta, step / substeps, integrator)
-        if gradient:
-            tape.append(records)
-        if (node + 1) % substeps == 0:
+    for step, (k, x, records) in enumerate(_steps(model, start, demand, plan, deadline), 1):
+        tape.append((k, records))
+        if step % model.substeps == 0:
             total += float(x.sum())
     more, adjoint = (0.0, np.zeros_like(x)) if beyond is None else beyond(x)
     total += more
     if not gradient:
         return total, None
-    of_plan = np.zeros_like(plan)
-    for node, k in reversed(list(enumerate(interval))):
+    of_plan, edges = np.zeros_like(plan), len(model.edges)
+    for step in range(len(tape), 0, -1):
         _look(deadline)
-        if (node + 1) % substeps == 0:
+        if step % model.substeps == 0:
             adjoint = adjoint + 1.0
-        u, theta = plan[k, :edges], plan[k, edges:]
-        adjoint, of_decision = pull_advance(model, adjoint, u, theta, tape.pop(), step / substeps, integrator)
+        k, records = tape[step - 1]
+        adjoint, of_decision = pull_advance(model, adjoint, plan[k, :edges], plan[k, edges:], records)
         of_plan[k] += of_decision
     return total, of_plan
 
 
-def affected_vehicles(
-    model: Turns,
-    start: PerCell,
-    demand: Demands,
-    plan: Plan,
-    step: float,
-    *,
-    substeps: int = 1,
-    integrator: str = "euler",
-    deadline: float = math.inf,
-) -> Plan:
+def affected_vehicles(model: Turns, start: PerCell, demand: Demands, plan: Plan, *, deadline: float = math.inf) -> Plan:
     """Return the vehicles that every number of the plan affects (veh, (K, E + V)); arguments as in `vehicle_steps`.
 
     For an edge, the vehicles that want to cross it in that interval; for a turn, those that leave its cell.
     """
-    edges, affected, x = len(model.edges), np.zeros_like(plan), start
-    for node, k in enumerate(_intervals(plan, len(demand), substeps)):
-        _look(deadline)
-        u, theta = plan[k, :edges], plan[k, edges:]
-        x, records = advance(model, x, demand[node // substeps], u, theta, step / substeps, integrator)
-        leaving = step / substeps * records[0][1][model.source]
-        affected[k, :edges] += np.bincount(model.edge, theta * leaving, edges)
+    edges, affected = len(model.edges), np.zeros_like(plan)
+    for k, _, records in _steps(model, start, demand, plan, deadline):
+        leaving = model.step / model.substeps * records[0][1][model.source]
+        affected[k, :edges] += np.bincount(model.edge, plan[k, edges:] * leaving, edges)
         affected[k, edges:] += leaving
     return affected
+
+
+def _steps(
+    model: Turns, x: PerCell, demand: Demands, plan: Plan, deadline: float
+) -> Iterator[tuple[int, PerCell, list]]:
+    """Yield the row of the plan in force, x after, and the records of every integration step. Raises: Late"""
+    edges = len(model.edges)
+    for interval in np.repeat(np.arange(len(demand)), model.substeps):
+        _look(deadline)
+        k = min(interval, len(plan) - 1)
+        x, records = advance(model, x, demand[interval], plan[k, :edges], plan[k, edges:])
+        yield k, x, records
 
 
 def _look(deadline: float) -> None:
     if time.perf_counter() > deadline:
         raise Late
-
-
-def _intervals(plan: Plan, horizon: int, substeps: int) -> Int[np.ndarray, " N"]:
-    """Return the row of the plan in force at every integration step."""
-    return np.minimum(np.arange(horizon * substeps) // substeps, len(plan) - 1)
