@@ -8,11 +8,11 @@ from documents import NOTEBOOKS
 
 from nmfd.runs import shipped
 
-MOST = 300_000  # bytes of a notebook with its outputs
+MOST = 200_000  # bytes of a notebook with its outputs
 
 
-def test_there_are_two_and_all_are_small_and_have_their_outputs():
-    assert [file.name[0] for file in NOTEBOOKS] == list("13")
+def test_there_are_four_and_all_are_small_and_have_their_outputs():
+    assert [file.name[0] for file in NOTEBOOKS] == list("1234")
     nbformat = pytest.importorskip("nbformat")
     for file in NOTEBOOKS:
         assert file.stat().st_size < MOST, file
@@ -31,8 +31,8 @@ def test_there_are_two_and_all_are_small_and_have_their_outputs():
 @pytest.mark.parametrize("file", NOTEBOOKS, ids=lambda file: file.stem)
 def test_it_runs(file, tmp_path, monkeypatch):
     nbclient, nbformat = pytest.importorskip("nbclient"), pytest.importorskip("nbformat")
-    if "reinforcement" in file.stem:
-        pytest.importorskip("stable_baselines3", reason="no extra rl")
+    if "agent" in file.stem:
+        pytest.importorskip("gymnasium", reason="no extra rl")
     monkeypatch.setenv("QUICK", "1")
     monkeypatch.setenv("PYTHONPATH", str(shipped.root()), prepend=os.pathsep)
     folder = tmp_path / "a folder"

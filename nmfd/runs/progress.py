@@ -1,9 +1,11 @@
 """Progress as a bar of tqdm, on a terminal and in a notebook."""
 
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from tqdm.auto import tqdm
+with warnings.catch_warnings(action="ignore"):  # of a notebook without ipywidgets, which gets no bar
+    from tqdm.auto import tqdm
 
 Progress = Callable[..., None] | bool | None
 
