@@ -18,7 +18,7 @@ from cosim.evaluation.runs import runs_of
 from cosim.evaluation.simulate import Simulation, simulate
 from cosim.importing import get as cities
 from cosim.importing.case import parse_box, seconds
-from cosim.report import card, figures
+from cosim.report import figures
 from cosim.sumo.outputs import check
 from nmfd.api import check_policies, load_scenario
 from nmfd.controllers.strategy import parse, parse_many
@@ -125,7 +125,7 @@ def demo(out: Path, *, seed: int = 1000) -> str:
     raise_failures(rows)
     lines = [
         f"{row['controller'] + ':':12} {row['completed_veh']:,.0f} of {row['trips']:,.0f} trips completed, "
-        f"{card.minutes_per_trip(row):.1f} minutes per trip"
+        f"{row['mean_trip_time_s'] / 60:.1f} minutes per trip"
         for row in rows[rows["seed"] == seed].to_dict("records")
     ]
     page = html.write_page(out / "report.html", [results.read(out)], seed=seed).resolve()

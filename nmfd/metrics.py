@@ -2,6 +2,7 @@
 
 import math
 from collections import Counter
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -25,12 +26,13 @@ SUMMARY: dict[str, str] = {
     "controller": "the strategy",
     "seed": "of trips, drivers and guidance",
     "plant": "what was driven: a regional model, or the city in SUMO",
-    "total_time_spent_veh_s": "running, waiting to enter, and as long as it could be of those removed",
+    "total_time_spent_veh_s": "on the road and waiting to enter; in SUMO of private vehicles, until they are removed",
     "final_accumulation_veh": "inside at the end",
     "max_accumulation_veh": "inside at the end of an interval, the most",
     "completed_veh": "trips that reached their end",
-    "evaluation_time_s": "wall time of all decisions",
-    "control_step_ms_median": "wall time of a decision",
+    "evaluation_time_s": "processor time of all decisions, of all threads",
+    "control_step_ms_first": "processor time of the first decision",
+    "control_step_ms_median": "of the median decision",
     "control_step_ms_max": "of the longest decision",
     **{column: text for column, (_, text) in COUNTED.items()},
     "wall_time_s": "wall time of the run",
@@ -40,13 +42,16 @@ SUMMARY: dict[str, str] = {
 def total_time_spent(result: Result) -> float:
     """Return the total time spent [veh s].
 
-    dt * sum over k = 0 .. T-1 of all vehicles, the objective of Tumu et al., with vehicles that wait outside. A removed
-    vehicle counts until the end of the horizon, so that a trip that is not made never counts less than one that is.
+    In a regional model dt * sum over k = 0 .. T-1 of all vehicles, the objective of Tumu et al., with those that wait
+    outside. In SUMO the sum over private vehicles, from the wanted departure to the end, the removal, or the end of the
+    run, to the millisecond.
 
         >>> run = nmfd.run("economic_mpc", "no-control", steps=2)
         >>> bool(total_time_spent(run) == run.step * run.accumulation[:2].sum())  # no vehicle waits or was removed
         True
     """
+    if "time_spent" in result:
+        return float(result.time_spent.sum())
     vehicles = result.accumulation[:-1].sum() + result.backlog[:-1].sum() + result.removed[:-1].sum()
     return float(result.step * vehicles)
 
@@ -58,6 +63,11 @@ def percent_change(value: float, reference: float) -> float:
     50.0
     """
     return 100.0 * (value / reference - 1.0) if reference else math.nan
+
+
+def decision_ms(row: Mapping[str, float]) -> str:
+    """Return the processor times [ms] of the first, the median and the longest decision of a row as text."""
+    return " / ".join(f"{row[f'control_step_ms_{which}']:.3g}" for which in ("first", "median", "max"))
 
 
 def gini(values: PerRegion, weights: PerRegion) -> float:
@@ -99,8 +109,9 @@ def summary(result: Result) -> dict[str, float | int | str]:
         "total_time_spent_veh_s": total_time_spent(result),
         "final_accumulation_veh": float(total[-1]),
         "max_accumulation_veh": float(total.max()),
-        "completed_veh": float(result.completed[-1]),
+        "completed_veh": float(facts.pop("completed_veh", result.completed[-1])),
         "evaluation_time_s": float(result.decision_time.sum()),
+        "control_step_ms_first": float(decision_ms[0]),
         "control_step_ms_median": float(np.median(decision_ms)),
         "control_step_ms_max": float(decision_ms.max()),
         **{name: int(((result.status & kind.value) != 0).sum()) for name, kind in zip(COUNTED, KINDS, strict=True)},

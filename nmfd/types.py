@@ -172,7 +172,7 @@ VARIABLES: dict[str, Quantity] = {
     "prices": Quantity(("interval", "region"), "1", "added share of the travel time through the region"),
     "status": Quantity(("interval",), "1", "status of the decision, 0 if OK (nmfd.types.Status)"),
     "note": Quantity(("interval",), "", "the status in words"),
-    "decision_time": Quantity(("interval",), "s", "wall time of Controller.act"),
+    "decision_time": Quantity(("interval",), "s", "processor time of Controller.act, of all threads of the process"),
 }
 HOST_TIMES = ("decision_time", "wall_time", "sumo_time_s", "setup_time_s", "overhead_share")  # differ between two runs
 

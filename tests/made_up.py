@@ -71,6 +71,7 @@ def result(scenario, strategy, *, seed, demand, city) -> Result:
         "gateway_queue": random.uniform(0.0, 9.0, (steps, gateways)),
         "gateway_queue_max": np.full((steps, gateways), 9),
         "teleports": np.zeros(steps, dtype=int),
+        "time_spent": scenario.step * accumulation[:-1].sum(axis=(1, 2)),
         "production": random.uniform(0.0, 9.0, (steps, regions)),
         "mean_accumulation": np.ones((steps, regions)),
         "guided": crossings * guides,

@@ -6,9 +6,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import trajectories
 
 from cosim.evaluation import simulate
+from cosim.plant.meter import Trip
 from cosim.plant.plant import SumoPlant
 from cosim.sumo.net import edge_room
 from cosim.sumo.outputs import TripReader
@@ -17,26 +17,38 @@ from nmfd.api import load_scenario
 from nmfd.types import Controls
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
-TRIP = '<tripinfo id="v" depart="{}" departDelay="{}" arrival="{}" duration="{}">{}</tripinfo>'
-EMITTED = '<emissions CO2_abs="2000000" fuel_abs="1000000"/>'
+TRIP = '<tripinfo id="v" depart="{}" arrival="{}" duration="{}"><emissions CO2_abs="2e6" fuel_abs="1e6"/></tripinfo>'
 
 
-def test_trips_under_way_and_not_departed_count_with_what_they_have_spent(tmp_path):
+def test_vehicles_under_way_have_emitted_too(tmp_path):
     path = tmp_path / "trips.xml"
-    path.write_text(
-        "<tripinfos>"
-        + "".join(
-            (TRIP.format(10, 5, 110, 100, EMITTED), TRIP.format(50, 0, -1, 70, EMITTED), TRIP.format(-1, 40, -1, 0, ""))
-        )
-        + "</tripinfos>"
-    )
+    path.write_text(f"<tripinfos>{TRIP.format(10, 110, 100)}{TRIP.format(50, -1, 70)}</tripinfos>")
     reader = TripReader(path)
-    reader.finish()
-    read = reader.facts
-    assert (read.trips, read.completed, read.travel_time, read.departure_delay) == (3, 1, 170.0, 45.0)
-    assert (read.co2, read.fuel) == (4.0, 2.0)
-    row = simulate.trip_means(read)
-    assert row["mean_trip_time_s"] == pytest.approx(170 / 3) and row["mean_departure_delay_s"] == 15.0
+    assert [end.time for end in reader.finish()] == [110.0]
+    assert (reader.facts.completed, reader.facts.co2, reader.facts.fuel) == (1, 4.0, 2.0)
+
+
+def test_trips_that_never_began_count_with_what_they_have_waited():
+    row = simulate.trip_measures(
+        [
+            Trip(0, True, "completed", 5.0, 105.0, 30.0),
+            Trip(0, True, "under way", 0.0, 70.0, 10.0),
+            Trip(1, True, "waiting", 400.0, 400.0),
+            Trip(1, True, "given up", 25.0, 25.0),
+            Trip(0, False, "waiting", 9000.0, 9000.0),
+            Trip(1, False, "removed", 10.0, 90.0, 7.0),
+        ]
+    )
+    assert row.pop("lost_time_gini") == pytest.approx((212.5 - 22.5) / (2 * (212.5 + 22.5)))
+    assert row == pytest.approx(
+        dict(trips=4, departed_veh=2, completed_veh=1, removed_veh=1, removed_waiting_veh=1, final_backlog_veh=1)
+        | dict(mean_trip_time_s=150.0, mean_finished_trip_time_s=105.0, median_trip_time_s=87.5)
+        | dict(p95_trip_time_s=105.0 + 0.85 * 295.0, mean_departure_delay_s=107.5, total_backlog_veh_s=430.0)
+        | dict(mean_time_loss_s=20.0)
+        | dict(other_trips=2, other_time_spent_veh_s=9090.0, other_departure_delay_veh_s=9010.0)
+    )
+    nobody = simulate.trip_measures([])
+    assert nobody["trips"] == nobody["other_time_spent_veh_s"] == 0 and np.isnan(nobody["mean_trip_time_s"])
 
 
 @pytest.fixture(scope="module")
@@ -52,44 +64,23 @@ def run():
         network = scenario.network
         for _ in range(3):
             plant.step(Controls(perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=None))
-        yield plant, SimpleNamespace(**plant.record()), running, plant.trip_facts()
+        facts = plant.trip_facts()
+        yield plant, SimpleNamespace(**plant.record()), running, facts
     finally:
         plant.close()
 
 
 def test_time_on_the_road_is_that_of_the_vehicles_seen_second_by_second(run):
-    plant, record, running, trips = run
-    assert trips.travel_time == pytest.approx(sum(running), rel=0.01)  # a second at either end of a trip
-    assert trips.completed == record.arrivals.sum() and trips.trips >= record.departures.sum()
+    plant, record, running, facts = run
+    trips = plant.trips()
+    assert sum(trip.time - trip.departure_delay for trip in trips) == pytest.approx(sum(running))
+    assert record.time_spent.sum() == pytest.approx(sum(trip.time for trip in trips))
+    assert facts.completed == record.arrivals.sum() and len(trips) >= record.departures.sum()
+    lost = [sum(trip.time_loss for trip in trips if trip.origin == origin) for origin in range(7)]
+    assert ((np.array(lost) > 0.0) == (record.departures.sum(axis=(0, 2)) > 0)).all() and sum(lost) < sum(running)
 
 
-def test_what_is_lost_on_the_road_is_known_by_origin(run):
-    plant, record, running, trips = run
-    lost = plant.time_loss()
-    assert lost.sum() == pytest.approx(trips.time_loss) and 0.0 < trips.time_loss < trips.travel_time
-    assert ((lost > 0.0) == (record.departures.sum(axis=(0, 2)) > 0)).all()
-
-
-def test_fairness_is_that_of_mean_delays_by_origin():
-    waiting = np.zeros((3, 2, 2))
-    waiting[:, 1, 0] = [10.0, 10.0, 5.0]  # two intervals of 30 s, five that never entered
-    departures = np.zeros((2, 2, 2))
-    departures[0], departures[1, 1, 0] = [[20.0, 10.0], [0.0, 5.0]], 20.0
-    run = trajectories.made(
-        controller="no-control",
-        plant="sumo",
-        seed=0,
-        step=30.0,
-        accumulation=waiting,
-        backlog=waiting,
-        completed=np.zeros(3),
-        perimeter=np.zeros((2, 2, 2)),
-        splits=np.zeros((2, 2, 2, 2)),
-    )
-    arrays = trajectories.record(2, regions=2) | {"departures": departures, "given_up": np.zeros((2, 2, 2))}
-    run = trajectories.recorded(run, arrays, {})
-    # 30 trips from region 0 lose 10 s each, 30 from region 1 wait 20 s and lose 10 s each
-    assert simulate.delay_gini(run, np.array([300.0, 300.0])) == pytest.approx((30 - 10) / (2 * (30 + 10)))
+def test_gini_coefficients():
     assert metrics.gini(np.array([5.0, 5.0, 5.0]), np.array([1.0, 9.0, 0.0])) == 0.0
     assert metrics.gini(np.array([0.0, 0.0, 3.0]), np.array([1.0, 1.0, 1.0])) == pytest.approx(2 / 3)
     assert metrics.gini(np.array([0.0, 3.0]), np.array([2.0, 1.0])) == pytest.approx(2 / 3)  # people, not regions

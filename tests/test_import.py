@@ -131,7 +131,7 @@ def test_scenario_drives_the_original_vehicles(imported, config):
             measurement = plant.step(
                 Controls(perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=network.nominal_splits)
             )
-        record, due = SimpleNamespace(**plant.record()), plant.trips
+        record, due = SimpleNamespace(**plant.record()), len(plant.trips())
         # every car, and the buses: one, and one per 200 s in ten minutes
         assert due == (traffic.depart < 600.0 + scenario.steps * scenario.step - 10).sum() + 1 + 3
         assert record.departures.sum() == due - measurement.backlog.sum()

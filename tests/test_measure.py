@@ -29,7 +29,7 @@ class Streets:
 
     def __init__(self):
         self.time, self.places, self.routes, self.waiting, self.bound = 0.0, {}, {}, [], set()
-        self.held, self.jumped = set(), 0
+        self.held, self.jumped, self.due = set(), 0, {}
         self.clear()
 
     def clear(self):
@@ -71,6 +71,11 @@ class Streets:
 
     def is_free(self, vehicle):
         return vehicle not in self.bound
+
+    is_private = is_free
+
+    def departure(self, vehicle):
+        return self.time, self.time - self.due.get(vehicle, self.time)
 
     def vehicles_on(self, edge):
         return tuple(sorted(vehicle for vehicle, place in self.places.items() if place == edge))
@@ -252,11 +257,11 @@ def test_the_ends_that_sumo_tells_are_booked_by_hand(play):
     with pytest.raises(LedgerError, match=r"step 3: .* how the trips of 4 vehicles ended \(such as k\)"):
         meter.accumulation(3)
     told += [
-        End(vehicle="v", edge="b1", time_loss=5.0),
-        End(vehicle="w", edge="b0", reason="traci", time_loss=11.0),
-        End(vehicle="k", reason="traci"),
-        End(vehicle="l"),
-        End(vehicle="j", edge="c0", reason="collision"),  # not called arrived
+        End(vehicle="v", time=9.0, edge="b1", time_loss=5.0),
+        End(vehicle="w", time=9.0, edge="b0", reason="traci", time_loss=11.0),
+        End(vehicle="k", time=9.0, reason="traci"),
+        End(vehicle="l", time=9.0),
+        End(vehicle="j", time=9.0, edge="c0", reason="collision"),  # not called arrived
     ]
     play.session.places.pop("j")
     assert (meter.accumulation() == x((0, 2))).all()
@@ -266,7 +271,14 @@ def test_the_ends_that_sumo_tells_are_booked_by_hand(play):
     state = meter.state(4, 9.0)
     assert (state.step, state.time, state.completed) == (4, 9.0, 2.0) and (state.removed == meter.removals).all()
     meter.close_books()
-    assert meter.time_loss.tolist() == [23.0, 0.0, 0.0]
+    assert [(trip.outcome, trip.time_loss) for trip in meter.trips()] == [
+        ("removed", 0.0),
+        ("completed", 0.0),
+        ("removed", 0.0),
+        ("removed", 11.0),
+        ("completed", 5.0),
+        ("under way", 7.0),
+    ]
     trips.facts = TripFacts(completed=2, removed=4)
     with pytest.raises(LedgerError, match="2 completed trips and 3 removed vehicles were booked, .* has 2 and 4"):
         meter.close_books()

@@ -109,7 +109,7 @@ def imported(folder: Path, regions: int = 3, source: Path | None = None, **optio
 
 
 def driven(scenario: Scenario, intervals: int, gates: float, **overrides) -> tuple:
-    """(plant.trips, departures, arrivals, accumulation, backlog) of a run with all u at `gates`; in every interval the
+    """(trips due, departures, arrivals, accumulation, backlog) of a run with all u at `gates`; in every interval the
     ledger is checked."""
     scenario = replace(scenario, steps=intervals)
     plant = SumoPlant(scenario, settings=settings(scenario).changed(**overrides))
@@ -123,7 +123,7 @@ def driven(scenario: Scenario, intervals: int, gates: float, **overrides) -> tup
             )
         record = SimpleNamespace(**plant.record())
         return (
-            plant.trips,
+            len(plant.trips()),
             record.departures.sum(),
             record.arrivals.sum(),
             measured.accumulation.sum(),

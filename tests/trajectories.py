@@ -65,4 +65,4 @@ def in_city(scenario, strategy, seed: int, demand: float, *, tts: float, trips: 
         "scenario_folder": str(scenario.folder),
         "demand": demand,
     }
-    return recorded(run, record(1, regions=regions), facts)
+    return recorded(run, record(1, regions=regions) | {"time_spent": np.array([tts])}, facts)

@@ -2,21 +2,24 @@
 
 import math
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from numpy.typing import ArrayLike
 
 from cosim.plant.max_pressure import FACTS as PRESSURE_FACTS
+from cosim.plant.meter import COMPLETED, GIVEN_UP, REMOVED, UNDER_WAY, WAITING, Trip
 from cosim.plant.plant import Observer, SumoPlant
 from cosim.plant.record import RECORD, settled
 from cosim.plant.settings import settings
 from cosim.sumo.arrays import RegionCounts
 from cosim.sumo.net import City, Gateway, gateway_room_taken
-from cosim.sumo.outputs import TripFacts, check_whole
+from cosim.sumo.outputs import check_whole
 from nmfd import closed_loop, metrics
 from nmfd.arrays import PerRegion
 from nmfd.controllers.strategy import Strategy
@@ -28,15 +31,23 @@ FULL_SHARE = 0.8  # of an edge's room: a queue that reaches its upstream end lea
 FACTS = {  # attribute of a result, column of runs.csv -> meaning
     "scenario": "name of the scenario",
     "demand": "multiple of the scenario's demand",
-    "trips": "trips due",
+    "trips": "trips of private vehicles that were due; so are all trips below",
     "departed_veh": "trips that entered",
     "final_backlog_veh": "trips waiting to enter at the end",
-    "total_backlog_veh_s": "time integral of trips waiting to enter",
-    "teleports": "vehicles that SUMO took out of jams",
-    "mean_trip_time_s": "time on the road, mean over all trips; unfinished ones with what they spent until the end",
+    "total_backlog_veh_s": "total departure delay: time spent waiting to enter",
+    "removed_veh": "vehicles removed before the end of their trips",
+    "removed_waiting_veh": "those of them removed before they entered",
+    "mean_trip_time_s": "from the wanted departure to the end, the removal, or the end of the run; all trips",
+    "mean_finished_trip_time_s": "the same of completed trips",
+    "median_trip_time_s": "50th percentile of all trips",
+    "p95_trip_time_s": "95th percentile of all trips",
     "mean_departure_delay_s": "wanted to actual departure, mean over all trips",
-    "mean_time_loss_s": "time lost against driving freely, mean over all trips (SUMO's timeLoss)",
-    "delay_gini": "Gini coefficient of the mean delays of regions of origin",
+    "mean_time_loss_s": "delay: time lost against driving freely (SUMO's timeLoss), mean of trips that entered",
+    "lost_time_gini": "Gini coefficient of delay plus departure delay, means of regions of origin",
+    "other_trips": "trips due of public transport, and of classes that no controller commands",
+    "other_time_spent_veh_s": "their total time spent",
+    "other_departure_delay_veh_s": "their total departure delay",
+    "teleports": "vehicles that SUMO took out of jams",
     "co2_kg": "CO2 of all vehicles, SUMO's HBEFA4 petrol car",
     "fuel_kg": "fuel of all vehicles, same model",
     "gateway_queue_mean_veh": "vehicles halting on edges before gateways, mean over edges and time",
@@ -51,8 +62,6 @@ FACTS = {  # attribute of a result, column of runs.csv -> meaning
     "overhead_share": "share of the wall time outside SUMO",
     "setup_time_s": "wall time before the first interval",
     "signals_left_alone": "signals with their own programmes",
-    "removed_veh": "vehicles removed before the end of their trips",
-    "removed_waiting_veh": "those of them removed before they entered",
     "freed_veh": "vehicles in a gridlocked junction that were moved on",
     "led_on_veh": "guided vehicles that could not change lanes and went on where theirs led",
     "jumps": "vehicles that entered another region without a gateway",
@@ -111,24 +120,21 @@ def simulate(
         )
         stack.callback(plant.close)
         result = closed_loop.run(plant, controller, scenario, seed=job.seed, progress=progress)
-        result = result.assign(controller=strategy.name, plant="sumo")
+        result = result.assign(controller=strategy.name, plant="sumo").add({}, RECORD, **plant.record())
         if gui:
             return result
         plant_facts, leaks, trip_facts = plant.facts(), set(plant.leaks()), plant.trip_facts()
         result = settled(result.add({}, RECORD, **plant.record()))
-        backlog = result.backlog.sum(axis=(1, 2))
         rmse_share, cell_rmse = estimation_errors(result, scenario.network.critical)
         facts = {
             "scenario": job.scenario.name,
             "scenario_folder": str(scenario.folder or ""),
             "demand": float(job.demand),
             **plant_facts,
-            "departed_veh": int(result.departures.sum()),
-            "final_backlog_veh": int(backlog[-1]),
-            "total_backlog_veh_s": float(scenario.step * backlog[:-1].sum()),
+            **trip_measures(plant.trips()),
+            "co2_kg": trip_facts.co2,
+            "fuel_kg": trip_facts.fuel,
             "teleports": int(result.teleports.sum()),
-            **trip_means(trip_facts),
-            "delay_gini": delay_gini(result, plant.time_loss()),
             **queue_facts(result, plant.city),
             "notes": metrics.notes(result),
             "outside_training": strategy.outside_training(scenario, job.demand, job.policy),
@@ -137,8 +143,6 @@ def simulate(
             "estimate_cell_rmse_veh": cell_rmse,
             "overhead_share": 1.0 - plant_facts["sumo_time_s"] / result.wall_time,
             "setup_time_s": time.perf_counter() - begin - result.wall_time,
-            "removed_veh": int(result.removals.sum() + result.given_up.sum()),
-            "removed_waiting_veh": int(result.given_up.sum()),
             "jumps": int(result.jumps.sum()),
         }
         check_whole(files)
@@ -153,15 +157,32 @@ def regional_outflow(record: Mapping[str, np.ndarray] | Result, step: float) -> 
     return (record["arrivals"] + record["crossings"].sum(axis=(2, 3))) / step
 
 
-def delay_gini(result: Result, time_loss: PerRegion) -> float:
-    """Return the Gini coefficient of the mean delays (on the road and to enter) of regions, weighted by their trips.
-
-    time_loss: SUMO's timeLoss of all trips that began in a region (R,) [s]
-    """
-    begun = result.departures.sum(axis=(0, 2)) + result.backlog[-1].sum(axis=1)
-    trips = begun + result.given_up.sum(axis=(0, 2))
-    waiting = result.step * result.backlog[:-1].sum(axis=(0, 2))
-    return metrics.gini((time_loss + waiting) / np.maximum(trips, 1.0), trips.astype(float))
+def trip_measures(trips: Sequence[Trip]) -> dict[str, float]:
+    """Return counts and times [s] of the trips that were due: of private vehicles, and apart of others."""
+    table = pd.DataFrame(trips, columns=Trip._fields).astype({"private": bool, "time": float, "departure_delay": float})
+    private, other = table[table["private"]], table[~table["private"]]
+    count = Counter(private["outcome"])
+    entered = private[private["outcome"].isin((COMPLETED, REMOVED, UNDER_WAY))]
+    lost = (private["time_loss"] + private["departure_delay"]).astype(float).groupby(private["origin"])
+    return {
+        "trips": len(private),
+        "departed_veh": len(entered),
+        "completed_veh": count[COMPLETED],
+        "final_backlog_veh": count[WAITING],
+        "total_backlog_veh_s": private["departure_delay"].sum(),
+        "removed_veh": count[REMOVED] + count[GIVEN_UP],
+        "removed_waiting_veh": count[GIVEN_UP],
+        "mean_trip_time_s": private["time"].mean(),
+        "mean_finished_trip_time_s": private.loc[private["outcome"] == COMPLETED, "time"].mean(),
+        "median_trip_time_s": private["time"].median(),
+        "p95_trip_time_s": private["time"].quantile(0.95),
+        "mean_departure_delay_s": private["departure_delay"].mean(),
+        "mean_time_loss_s": entered["time_loss"].mean(),
+        "lost_time_gini": metrics.gini(lost.mean().to_numpy(), lost.size().to_numpy(float)),
+        "other_trips": len(other),
+        "other_time_spent_veh_s": other["time"].sum(),
+        "other_departure_delay_veh_s": other["departure_delay"].sum(),
+    }
 
 
 def queue_facts(result: Result, city: City) -> dict[str, float]:
@@ -197,15 +218,3 @@ def leaking_share(result: Result, city: City, leaks: Collection[Gateway]) -> flo
     flow = result.gateway_flow.sum(axis=0)
     leaking = sum(passed for gateway, passed in zip(city.gateways, flow, strict=True) if gateway in leaks)
     return float(leaking / max(flow.sum(), 1))
-
-
-def trip_means(facts: TripFacts) -> dict[str, float]:
-    """Return means over all trips due [s], and emissions of the whole run [kg]."""
-    trips = max(facts.trips, 1)
-    return {
-        "mean_trip_time_s": facts.travel_time / trips,
-        "mean_departure_delay_s": facts.departure_delay / trips,
-        "mean_time_loss_s": facts.time_loss / trips,
-        "co2_kg": facts.co2,
-        "fuel_kg": facts.fuel,
-    }

@@ -7,26 +7,29 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from nmfd.metrics import COUNTED, percent_change
+from nmfd.metrics import COUNTED, decision_ms, percent_change
 from nmfd.runs.tables import markdown_table, text_table, wrapped
 from nmfd.studies import benchmark
 from nmfd.studies.benchmark import REFERENCE, interval
 
 TTS = "total_time_spent_veh_s"
 COLUMNS = {  # heading without unit -> meaning
-    "TTS": "total time spent, running and waiting to enter, mean over seeds ± 95 % interval",
+    "TTS": "total time spent by private vehicles, on the road and waiting to enter, mean over seeds ± 95 % interval",
     "change": "of TTS against no-control, or the controller in the heading, paired by seed, mean of the percentages ± "
     "95 % interval, * if that excludes zero",
     "completed": "trips that ended on the last edge of their route",
-    "removed": "vehicles removed by SUMO, in TTS as if they stayed to the end",
-    "backlog": "trips waiting to enter at the end, and their time integral",
+    "removed": "vehicles removed by SUMO, in TTS until then",
+    "backlog": "trips waiting to enter at the end, and total departure delay",
     "teleports": "all seeds",
-    "trip": "mean time on the road of all trips",
-    "delay": "mean time between wanted and actual departure",
+    "trip": "mean, median and 95th percentile of all trips, departure delay included, unfinished ones until the end",
+    "finished": "mean of completed trips",
+    "departure delay": "mean time between wanted and actual departure",
+    "delay": "mean time lost on the road against driving freely",
+    "other": "total time spent by public transport and classes that no controller commands",
     "CO2": "all vehicles, SUMO's HBEFA4 petrol car",
     "queue": "vehicles halting on edges before gateways, mean / longest",
     "full": "share of these edges and intervals that were full",
-    "decision": "median / longest",
+    "decision": "processor time, first / median / longest",
     **dict(COUNTED.values()),
     "outside SUMO": "share of the wall time outside SUMO",
 }
@@ -137,17 +140,24 @@ def shown(table: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
         second.append(
             {
                 "controller": row["controller"],
-                "trip [s]": f"{row['mean_trip_time_s']:,.0f}",
-                "delay [s]": f"{row['mean_departure_delay_s']:,.0f}",
+                "trip [s]": " / ".join(_seconds(row[f"{kind}_trip_time_s"]) for kind in ("mean", "median", "p95")),
+                "finished [s]": _seconds(row["mean_finished_trip_time_s"]),
+                "departure delay [s]": _seconds(row["mean_departure_delay_s"]),
+                "delay [s]": _seconds(row["mean_time_loss_s"]),
+                "other [veh s]": f"{row['other_time_spent_veh_s']:.2e}",
                 "CO2 [kg]": f"{row['co2_kg']:,.0f}",
                 "queue [veh]": f"{row['gateway_queue_mean_veh']:.1f} / {row['gateway_queue_max_veh']:.0f}",
                 "full": f"{100 * row['gateway_full_share']:.1f} %",
-                "decision [ms]": f"{row['control_step_ms_median']:.3g} / {row['control_step_ms_max']:.3g}",
+                "decision [ms]": decision_ms(row),
                 **{heading: row[column] for column, (heading, _) in COUNTED.items()},
                 "outside SUMO": f"{100 * row['overhead_share']:.1f} %",
             }
         )
     return pd.DataFrame(first), pd.DataFrame(second)
+
+
+def _seconds(value: float) -> str:
+    return "-" if math.isnan(value) else f"{value:,.0f}"
 
 
 def _change(row: Mapping) -> str:

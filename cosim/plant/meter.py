@@ -5,11 +5,13 @@ final route, else a removal.
 """
 
 from collections import Counter
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from cosim.plant.metering import Metering
 from cosim.sumo.arrays import PerGateway
@@ -21,6 +23,7 @@ from nmfd.ledger import LedgerError
 from nmfd.types import State
 
 POLL_PERIOD_S = 3.0  # longest time between two looks at the entry edges
+COMPLETED, REMOVED, UNDER_WAY, WAITING, GIVEN_UP = "completed", "removed", "under way", "waiting", "given up"
 
 
 @dataclass
@@ -32,6 +35,9 @@ class _Vehicle:
     edge: str  # last one of its route
     announced: int  # region of its last Event, perhaps ahead
     free: bool = True  # guidance may reroute it
+    private: bool = True  # `Session.is_private`
+    due: float = 0.0  # [s]
+    waited: float = 0.0  # departure delay [s]
     region: int | None = None  # the present one, None before the departure
 
     @property
@@ -57,6 +63,21 @@ class Event:
     free: bool = True
 
 
+class Trip(NamedTuple):
+    """A trip that was due.
+
+    origin: region; outcome: COMPLETED, REMOVED on the road, UNDER_WAY, WAITING to enter, or GIVEN_UP before that
+    departure_delay, time, time_loss: [s], waiting to enter; in all, until its end or now; against driving freely
+    """
+
+    origin: int
+    private: bool
+    outcome: str
+    departure_delay: float
+    time: float
+    time_loss: float = 0.0
+
+
 class Meter:
     """Follows every vehicle from loading to its end.
 
@@ -69,7 +90,6 @@ class Meter:
     crossings (R, R, R) [i, h, j] from i to h by a gateway; jumps (R, R, R), without one: teleports, streets closed to
         cars, vehicles moved by another program, or too fast to be seen in between
     redirected (R, R, R) [i, j, l], in i, bound for j and from now on for l
-    time_loss (R,) [s], against driving freely, by region of origin; complete when the books are closed
     teleports; entry_flow, (source region, first edge behind the boundary) -> vehicles
     """
 
@@ -90,6 +110,8 @@ class Meter:
         self._vehicles: dict[str, _Vehicle] = {}
         self._gone: dict[str, list[_Vehicle]] = {}  # not in tripinfo yet; several if an id is used again
         self._teleporting: set[str] = set()
+        self._ended: list[Trip] = []
+        self._spent = np.zeros(2)  # by their trips [veh s]: other, private
         self._joined = {(g.source, g.target) for g in city.gateways}
         entries = sorted({g.to_edge for g in city.gateways})
         self._entries = {edge: city.region_of[edge] for edge in entries}
@@ -102,7 +124,7 @@ class Meter:
         self._running, self.departures, self.probe_departures, self.removals, self.given_up = np.zeros(
             (5, regions, regions), dtype=int
         )
-        self.arrivals, self.time_loss = np.zeros(regions, dtype=int), np.zeros(regions)
+        self.arrivals = np.zeros(regions, dtype=int)
         self.crossings, self.jumps, self.redirected = np.zeros((3, regions, regions, regions), dtype=int)
         self.entry_flow: Counter[tuple[int, str]] = Counter()
         # Several movements may lead from one region to one edge: they share its flow.
@@ -134,6 +156,7 @@ class Meter:
                 self._load(vehicle)
             except REFUSALS:  # gone already: SUMO found no route when it was due
                 self.given_up[0, 0] += 1
+                self._end(Trip(0, True, GIVEN_UP, 0.0, 0.0))
         for vehicle in session.started_teleport():
             self.teleports += 1
             self._teleporting.add(vehicle)
@@ -203,9 +226,6 @@ class Meter:
         if self._trips is None:
             return
         self._settle(self._trips.finish(self._gone))
-        for vehicle, lost in self._trips.under_way.items():
-            if vehicle in self._vehicles:
-                self.time_loss[self._vehicles[vehicle].origin] += lost
         facts, booked = self._trips.facts, (int(self.arrivals.sum()), int(self.removals.sum()))
         if self._gone or (facts.completed, facts.removed) != booked:
             raise LedgerError(
@@ -218,9 +238,38 @@ class Meter:
         pending = self._session.pending()
         waiting = self.held() + self._waiting(pending)
         ahead = {vehicle for vehicle, known in self._vehicles.items() if known.region is None}.difference(pending)
-        for vehicle in ahead.difference(self._session.known()) if ahead else ():
+        for vehicle in sorted(ahead.difference(self._session.known())) if ahead else ():
             self._leave(vehicle)
+        for vehicle, known in self._vehicles.items():
+            if known.region is None and known.due < self._session.time:  # or not, if it waits for a person
+                self._time(vehicle, known)
         return waiting
+
+    def time_spent(self) -> Float[np.ndarray, "2"]:
+        """Return the total time spent since the beginning [veh s], of other and of private vehicles."""
+        spent = self._spent.copy()
+        for trip in self._open():
+            spent[int(trip.private)] += trip.time
+        return spent
+
+    def trips(self) -> list[Trip]:
+        """Return all trips that were due; time losses of those under way are complete when the books are closed."""
+        return [*self._ended, *self._open()]
+
+    def _open(self) -> Iterator[Trip]:
+        """Yield the trips that were due and have not ended."""
+        now, losses = self._session.time, {} if self._trips is None else self._trips.under_way
+        for vehicle, known in self._vehicles.items():
+            if known.region is not None:
+                yield _trip(known, UNDER_WAY, now, losses.get(vehicle, 0.0))
+            elif known.due < now:
+                yield _trip(known, WAITING, now)
+        for origin, due in [] if self._metering is None else self._metering.waiting():
+            yield Trip(origin, True, WAITING, now - due, now - due)
+
+    def _end(self, trip: Trip) -> None:
+        self._ended.append(trip)
+        self._spent[int(trip.private)] += trip.time
 
     def held(self) -> PerPair:
         """Return (R, R) [veh] of the backlog: metered trips."""
@@ -260,11 +309,9 @@ class Meter:
                     raise LedgerError(f"vehicle ledger broken: {end.vehicle} ended a trip, but was never seen to load")
                 self._under_way(end.vehicle)
                 self._leave(end.vehicle)
-            gone = self._gone[end.vehicle].pop(0)
-            self.time_loss[gone.origin] += end.time_loss
+            self._book(self._gone[end.vehicle].pop(0), end)
             if not self._gone[end.vehicle]:
                 del self._gone[end.vehicle]
-            self._book(gone, end)
 
     def _unknown_ends(self) -> str:
         if not self._gone:
@@ -276,6 +323,7 @@ class Meter:
 
     def _book(self, gone: _Vehicle, end: End) -> None:
         """Book the end of a vehicle."""
+        self._end(_trip(gone, REMOVED if end.reason else COMPLETED, end.time, end.time_loss))
         i, j = gone.here, gone.destination
         if not end.reason and (to := self._city.region_of.get(end.edge, j)) != j:
             self.redirected[i, j, to] += 1
@@ -298,13 +346,23 @@ class Meter:
                 edge=route[-1],
                 announced=origin,
                 free=self._session.is_free(vehicle),
+                private=self._session.is_private(vehicle),
             )
+            self._time(vehicle, self._vehicles[vehicle])
         return self._vehicles[vehicle]
+
+    def _time(self, vehicle: str, known: _Vehicle) -> None:
+        """Note when a vehicle was due, and its departure delay until now."""
+        departed, known.waited = self._session.departure(vehicle)
+        if self._metering is not None:
+            known.waited += self._metering.waited.get(vehicle, 0.0)
+        known.due = departed - known.waited
 
     def _depart(self, vehicle: str) -> _Vehicle:
         """Book a departure where the vehicle is first seen, for where its route leads by now."""
         known = self._load(vehicle)
         with suppress(REFUSALS):  # gone already
+            self._time(vehicle, known)
             self._follow(vehicle, known)
             known.origin = self._city.region_of.get(self._session.road(vehicle), known.origin)
         known.region = known.announced = known.origin
@@ -332,13 +390,14 @@ class Meter:
     def _leave(self, vehicle: str) -> None:
         """Take a vehicle out; its end is booked when tripinfo has it."""
         self._teleporting.discard(vehicle)
-        known = self._vehicles.pop(vehicle)
+        known, ended = self._vehicles.pop(vehicle), self._session.time - self._session.step_length
         if known.region is None:  # given up before it departed
             self.given_up[known.origin, known.destination] += 1
+            self._end(_trip(known, GIVEN_UP, ended))
             return
         self._running[known.region, known.destination] -= 1
         if self._trips is None:
-            self._book(known, End(vehicle=vehicle))
+            self._book(known, End(vehicle=vehicle, time=ended))
         else:
             self._gone.setdefault(vehicle, []).append(known)
 
@@ -360,6 +419,12 @@ class Meter:
             self._running[known.region, known.destination] -= 1
             self._running[region, known.destination] += 1
             known.region = region
+
+
+def _trip(known: _Vehicle, outcome: str, end: float, time_loss: float = 0.0) -> Trip:
+    time = max(end - known.due, 0.0)
+    waited = time if known.region is None else known.waited
+    return Trip(known.origin, known.private, outcome, waited, time, time_loss)
 
 
 def _event(vehicle: str, known: _Vehicle, source: int | None, region: int) -> Event:

@@ -8,6 +8,7 @@ accumulation of every region (velocity form, as in ALINEA):
 """
 
 from collections import deque
+from itertools import chain
 
 import numpy as np
 
@@ -22,7 +23,7 @@ FILLING_S = 60.0  # in which the largest rate fills a region to its critical acc
 class Metering:
     """The metered trips of one run: `command` once per control interval, `play` before every simulation step.
 
-    waited: by all trips that have begun [s]
+    waited: vehicle -> time that it waited outside [s], of trips that have begun
     """
 
     def __init__(self, session: Session, trips: HeldTrips, critical: PerRegion, *, level: float, step: float):
@@ -30,7 +31,8 @@ class Metering:
         self._session, self._trips, self._set_point, self._step = session, trips, level * critical, step
         self._most = critical / FILLING_S
         self._queues: list[deque[int]] = [deque() for _ in critical]  # numbers of trips, by departure
-        self._due, self.waited = 0, 0.0
+        self._due = 0
+        self.waited: dict[str, float] = {}
         self._rate, self._credit = self._most.copy(), np.ones(len(critical))
         self._before: PerRegion | None = None
 
@@ -57,7 +59,7 @@ class Metering:
                 self._credit[region] -= 1.0
                 trip = queue.popleft()
                 self._session.begin_trip(self._trips.orders[trip])
-                self.waited += now - depart[trip]
+                self.waited[self._trips.orders[trip]["vehID"]] = now - depart[trip]
 
     def backlog(self) -> PerPair:
         """Return (R, R) [veh]: trips from i to j that wait."""
@@ -67,7 +69,7 @@ class Metering:
                 waiting[region, self._trips.destination[trip]] += 1
         return waiting
 
-    def waiting(self) -> tuple[int, float]:
-        """Return the number of trips that wait, and their waiting time so far [s]."""
-        since = [self._session.time - self._trips.depart[trip] for queue in self._queues for trip in queue]
-        return len(since), float(sum(since))
+    def waiting(self) -> list[tuple[int, float]]:
+        """Return region and time [s] at which the trips that wait were due."""
+        due = range(self._due, int(np.searchsorted(self._trips.depart, self._session.time)))
+        return [(int(self._trips.origin[n]), float(self._trips.depart[n])) for n in chain(*self._queues, due)]

@@ -12,7 +12,7 @@ from cosim.plant.detectors import READING_PERIOD_S, Estimation, instruments, lay
 from cosim.plant.guidance import Guide
 from cosim.plant.incidents import Incidents
 from cosim.plant.launch import Launch
-from cosim.plant.meter import Meter
+from cosim.plant.meter import Meter, Trip
 from cosim.plant.metering import Metering
 from cosim.plant.programmes import city_signals
 from cosim.plant.record import Recorder
@@ -24,7 +24,7 @@ from cosim.sumo.arrays import PerEdge
 from cosim.sumo.net import City, Gateway, check_adjacency, city_of
 from cosim.sumo.outputs import TripFacts, TripReader
 from cosim.sumo.session import Session
-from nmfd.arrays import PerRegion, PerTurn
+from nmfd.arrays import PerTurn
 from nmfd.model.planning import PlanningModel, planning_model
 from nmfd.model.scenario import Scenario
 from nmfd.types import Controls, Observation, State
@@ -186,7 +186,6 @@ class SumoPlant:
     def facts(self) -> dict[str, float]:
         """Return scalar facts of the run so far, by the names of the columns of its table."""
         return {
-            "trips": self.trips,
             "sumo_time_s": self.session.sumo_time,
             "signals_left_alone": len(self.other_signals),
             "freed_veh": 0 if self._junctions is None else self._junctions.freed,
@@ -207,16 +206,12 @@ class SumoPlant:
             else:
                 self._trips.finish()
             self._recorder.close()
-            self._facts = facts = self._trips.facts
-            if self._metering is not None:
-                held, waiting = self._metering.waiting()
-                delay = facts.departure_delay + self._metering.waited + waiting
-                self._facts = replace(facts, trips=facts.trips + held, departure_delay=delay)
+            self._facts = self._trips.facts
         return self._facts
 
-    def time_loss(self) -> PerRegion:
-        """Return (R,) [s] lost on the road against driving freely, by region of origin; after `trip_facts`."""
-        return self._meter.time_loss
+    def trips(self) -> list[Trip]:
+        """Return all trips that were due; after `trip_facts` with their whole time losses."""
+        return self._meter.trips()
 
     def leaks(self) -> list[Gateway]:
         """Return the gateways that no command reaches."""
@@ -228,14 +223,6 @@ class SumoPlant:
         if self._session is None:
             raise RuntimeError("no simulation is running; call reset(seed) first")
         return self._session
-
-    @property
-    def trips(self) -> int:
-        """Return the number of trips: drawn from the demand, or of the recorded ones those due so far."""
-        if not self._settings.routes:
-            return len(self._launch.vehicles)
-        meter = self._meter
-        return int(meter.departures.sum() + meter.backlog().sum() + meter.given_up.sum())
 
     def _splits(self, controls: Controls) -> PerTurn | None:
         """Return the split ratios of the guidance: the drivers' own ones mean guidance by travel times alone."""

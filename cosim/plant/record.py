@@ -37,6 +37,8 @@ RECORD: Mapping[str, Quantity] = {
     "gateway_queue": Quantity(_GATEWAYS, "veh", "vehicles halting on the edge before it, mean of samples"),
     "gateway_queue_max": Quantity(_GATEWAYS, "veh", "vehicles halting on the edge before it, largest of samples"),
     "teleports": Quantity(("interval",), "1", "vehicles that SUMO took out of a jam"),
+    "time_spent": Quantity(("interval",), "veh s", "by private vehicles on the road, or due and waiting to enter"),
+    "other_time_spent": Quantity(("interval",), "veh s", "by public transport and classes that nothing commands"),
     "guided": Quantity(_TURNS, "veh", "reroutes by route guidance"),
 }
 
@@ -94,17 +96,21 @@ class Recorder:
 
     def close(self) -> None:
         """Add to the last interval what was booked when the books were closed."""
-        totals = {name: getattr(self._meter, name).copy() for name in BOOKS}
-        for name in BOOKS if self._rows else ():
+        totals = self._booked()
+        for name in totals if self._rows else ():
             self._rows[-1][name] = self._rows[-1][name] + totals[name] - self._before[name]
         self._before |= totals
 
+    def _booked(self) -> dict[str, np.ndarray]:
+        other, private = self._meter.time_spent()
+        spent = {"time_spent": private, "other_time_spent": other}
+        return {name: getattr(self._meter, name).copy() for name in BOOKS} | spent
+
     def _totals(self) -> dict[str, np.ndarray]:
-        meter = self._meter
         return {
-            **{name: getattr(meter, name).copy() for name in BOOKS},
-            "teleports": np.array(meter.teleports),
+            **self._booked(),
+            "teleports": np.array(self._meter.teleports),
             "guided": self._guide.realised.copy(),
-            "gateway_flow": meter.gateway_flow(),
+            "gateway_flow": self._meter.gateway_flow(),
             "gateway_green": self._actuation.green_time(),
         }

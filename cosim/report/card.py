@@ -3,7 +3,6 @@
 import math
 from dataclasses import dataclass
 from statistics import mean
-from typing import Any
 
 import pandas as pd
 
@@ -16,7 +15,7 @@ QUANTITIES = {  # label -> format of a value, sign of an improvement, meaning
     "Time per trip": ("{:.1f} min", -1, "mean of all trips, from the wanted departure to the arrival or end of run"),
     "Trips served": ("{:,.0f}", 1, "completed trips, mean over seeds"),
     "CO2": ("{:.2f} t", -1, "of all vehicles while the run lasted, by SUMO's HBEFA4 petrol car"),
-    "Total time spent": ("{:,.0f} h", -1, "of all drivers, on the road and waiting to enter, mean over seeds"),
+    "Total time spent": ("{:,.0f} veh h", -1, "private vehicles on the road and waiting to enter, mean over seeds"),
 }
 
 
@@ -39,16 +38,16 @@ def card(rows: pd.DataFrame) -> tuple[str, list[Figure], str]:
     """
     against, level = statistics.compared_with(rows), rows["demand"].iloc[0]
     name = next((name for name in ranked(rows) if name != against), against)
-    values = (minutes_per_trip(rows), rows["completed_veh"], rows["co2_kg"] / 1000.0, rows[statistics.TTS] / HOUR)
+    values = (
+        rows["mean_trip_time_s"] / MINUTE,
+        rows["completed_veh"],
+        rows["co2_kg"] / 1000.0,
+        rows[statistics.TTS] / HOUR,
+    )
     table = rows.assign(**dict(zip(QUANTITIES, values, strict=True)))
     figures = [_figure(table, level, name, against, label) for label in QUANTITIES]
     heading = name if name == against else f"{name} compared with {against.replace('-', ' ')}"
     return heading, [figure for figure in figures if figure is not None], name
-
-
-def minutes_per_trip(facts: Any) -> Any:
-    """Return the time per trip [min] of a row of facts, or of a table of them."""
-    return (facts["mean_trip_time_s"] + facts["mean_departure_delay_s"]) / MINUTE
 
 
 def _figure(table: pd.DataFrame, level: float, name: str, against: str, label: str) -> Figure | None:

@@ -26,19 +26,14 @@ END_TAG_BYTES = 200  # these last bytes of a file hold the end tag of its root
 
 @dataclass(frozen=True, kw_only=True)
 class TripFacts:
-    """Sums over all trips that were due before the end of the simulation.
+    """Sums over all vehicles that departed before the end of the simulation.
 
-    completed: at the last edge of their route; removed: taken out before; travel_time: on the road [s]
-    departure_delay: between wanted and real departure [s]; time_loss: against driving freely [s]
-    co2, fuel: [kg] of all vehicles (EMISSION_CLASS); trips under way or not departed count until the end
+    completed: at the last edge of their route; removed: taken out before
+    co2, fuel: [kg], of those under way too (EMISSION_CLASS)
     """
 
-    trips: int = 0
     completed: int = 0
     removed: int = 0
-    travel_time: float = 0.0
-    departure_delay: float = 0.0
-    time_loss: float = 0.0
     co2: float = 0.0
     fuel: float = 0.0
 
@@ -47,10 +42,12 @@ class TripFacts:
 class End:
     """The end of a vehicle's trip.
 
-    edge: last one, "" if unknown; reason: tripinfo's `vaporized`, "" at the end of the route; time_loss: [s]
+    time: [s], of the simulation; edge: last one, "" if unknown
+    reason: tripinfo's `vaporized`, "" at the end of the route; time_loss: [s]
     """
 
     vehicle: str
+    time: float
     edge: str = ""
     reason: str = ""
     time_loss: float = 0.0
@@ -99,20 +96,17 @@ class TripReader:
         ends = []
         for element in elements:
             vehicle, reason = element.get("id", ""), element.get("vaporized", "")
-            departed, loss = float(attribute(element, "depart")) >= 0, _time_loss(element)
-            ended = float(attribute(element, "arrival")) >= 0 or (departed and left(vehicle))
+            depart, loss = float(attribute(element, "depart")), max(float(element.get("timeLoss", 0.0)), 0.0)
+            ended = float(attribute(element, "arrival")) >= 0 or (depart >= 0 and left(vehicle))
             self.facts = _added(self.facts, element, ended=ended, completed=ended and not reason)
             if ended:
                 edge = element.get("arrivalLane", "").rpartition("_")[0]
-                ends.append(End(vehicle=vehicle, edge=edge, reason=reason, time_loss=loss))
-            elif departed:
+                time = depart + float(attribute(element, "duration"))
+                ends.append(End(vehicle=vehicle, time=time, edge=edge, reason=reason, time_loss=loss))
+            elif depart >= 0:
                 self.under_way[vehicle] = loss
             element.clear()
         return ends
-
-
-def _time_loss(trip: Element) -> float:
-    return max(float(trip.get("timeLoss", 0.0)), 0.0)
 
 
 def _added(facts: TripFacts, trip: Element, *, ended: bool, completed: bool) -> TripFacts:
@@ -121,12 +115,8 @@ def _added(facts: TripFacts, trip: Element, *, ended: bool, completed: bool) -> 
         co2 += KG_PER_MG * float(attribute(emissions, "CO2_abs"))
         fuel += KG_PER_MG * float(attribute(emissions, "fuel_abs"))
     return TripFacts(
-        trips=facts.trips + 1,
         completed=facts.completed + completed,
         removed=facts.removed + (ended and not completed),
-        travel_time=facts.travel_time + max(float(attribute(trip, "duration")), 0.0),
-        departure_delay=facts.departure_delay + float(attribute(trip, "departDelay")),
-        time_loss=facts.time_loss + _time_loss(trip),
         co2=co2,
         fuel=fuel,
     )

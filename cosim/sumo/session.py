@@ -175,12 +175,17 @@ class Session:
         return int(libsumo.simulation.getParameter("", "stats.teleports.total"))
 
     def is_free(self, vehicle: str) -> bool:
-        """Return True if the driver may take another route: no public transport, no stops."""
-        return (
-            libsumo.vehicle.getVehicleClass(vehicle) not in BOUND
-            and not libsumo.vehicle.getLine(vehicle)
-            and not libsumo.vehicle.getStops(vehicle, 1)
-        )
+        """Return True if the driver may take another route: a private vehicle without stops."""
+        return self.is_private(vehicle) and not libsumo.vehicle.getStops(vehicle, 1)
+
+    def is_private(self, vehicle: str) -> bool:
+        """Return False for public transport, and for classes that no controller commands."""
+        return libsumo.vehicle.getVehicleClass(vehicle) not in BOUND and not libsumo.vehicle.getLine(vehicle)
+
+    def departure(self, vehicle: str) -> tuple[float, float]:
+        """Return the time of the departure, or else now, and the departure delay until then [s]; < 0: not due yet."""
+        departed = libsumo.vehicle.getDeparture(vehicle)
+        return departed if departed >= 0.0 else self.time, libsumo.vehicle.getDepartDelay(vehicle)
 
     def place(self, vehicle: str) -> tuple[str, float]:
         """Return the lane of a vehicle, and the position on it [m]."""

@@ -152,8 +152,7 @@ class Reporter:
 
     def recorded(self, controls: Controls, state: State, row: Mapping[str, np.ndarray]) -> None:
         """Send the frame at the end of a control interval."""
-        spent = float(self._state.unfinished.sum())
-        self._frame, self._state = after(self._picture, self._frame, spent, controls, state, row), state
+        self._frame, self._state = after(self._picture, self._frame, controls, state, row), state
         self._send(self._frame)
         self._wait(state.time)
 

@@ -20,7 +20,7 @@ REGION_REACH = 0.08  # of the map's extent: places farther from all streets belo
 GATE_SETBACK = 0.015  # of the map's extent: distance of a gate from the end of its street
 ROW = (  # variables of a result that `after` reads
     *("gateway_green", "gateway_original_green", "gateway_queue"),
-    *("arrivals", "crossings", "edge_vehicles", "guided"),
+    *("arrivals", "crossings", "edge_vehicles", "guided", "time_spent"),
 )
 
 
@@ -148,9 +148,9 @@ def between(picture: CityPicture, before: Frame, time: float, vehicles: PerEdge)
 
 
 def after(
-    picture: CityPicture, before: Frame, spent: float, controls: Controls, state: State, row: Mapping[str, np.ndarray]
+    picture: CityPicture, before: Frame, controls: Controls, state: State, row: Mapping[str, np.ndarray]
 ) -> Frame:
-    """Return the frame at the end of a control interval; spent: unfinished vehicles at its start [veh]."""
+    """Return the frame at the end of a control interval."""
     with np.errstate(invalid="ignore", divide="ignore"):
         green = row["gateway_green"] / row["gateway_original_green"]
     flows = {name: row[name][None] for name in ("arrivals", "crossings")}
@@ -163,7 +163,7 @@ def after(
         waiting=float(state.backlog.sum()),
         completed=state.completed,
         removed=0.0 if state.removed is None else float(state.removed.sum()),
-        time_spent=before.time_spent + picture.step * spent,
+        time_spent=before.time_spent + float(row["time_spent"]),
         perimeter=controls.perimeter,
         green=green,
         queue=row["gateway_queue"].astype(float),
@@ -189,7 +189,7 @@ def frames(picture: CityPicture, result: Any) -> list[Frame]:
     for k, state in enumerate(states[1:]):
         controls = Controls(perimeter=result.perimeter[k], splits=None, note=str(result.note[k]))
         row = {name: getattr(result, name)[k] for name in ROW}
-        made.append(after(picture, made[-1], float(states[k].unfinished.sum()), controls, state, row))
+        made.append(after(picture, made[-1], controls, state, row))
     return made
 
 

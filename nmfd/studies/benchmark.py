@@ -12,7 +12,7 @@ from scipy.special import stdtrit
 from nmfd import closed_loop, faults
 from nmfd.controllers.strategy import Strategy
 from nmfd.errors import InputError
-from nmfd.metrics import COUNTED, percent_change
+from nmfd.metrics import COUNTED, decision_ms, percent_change
 from nmfd.model.plant import AcyclicPlant, NmfdPlant
 from nmfd.model.scenario import Scenario, perturbed
 from nmfd.runs.progress import Progress
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 PLANTS: dict[str, Callable[[Scenario], Plant]] = {"nmfd": NmfdPlant, "acyclic": AcyclicPlant}
 REFERENCE = "no-control"
 CAPTION = (
-    "TTS: total time spent, mean over seeds ± 95 % interval; change: of TTS against {against}; control: time of all "
-    "decisions of a run; step: median / longest decision; decisions of all seeds: "
+    "TTS: total time spent, mean over seeds ± 95 % interval; change: of TTS against {against}; control: processor "
+    "time of all decisions of a run; step: first / median / longest decision; decisions of all seeds: "
     + "; ".join(f"{heading}: {what}" for heading, what in COUNTED.values())
 )
 BOUND_CAPTION = (
@@ -131,7 +131,7 @@ def summary_table(rows: "pd.DataFrame") -> str:
     with_bound = any(name in tts for name in ("bound-pc", "bound-pcrg"))
     lines = []
     for name, group in groups.items():
-        mean, spread = group.mean(numeric_only=True), interval(tts[name])
+        mean, spread = group.mean(numeric_only=True).to_dict(), interval(tts[name])
         bound = "bound-pcrg" if "-pcrg" in name else "bound-pc"
         above = _percent(tts[name], tts[bound]) if bound in tts and name != bound else ""
         lines.append(
@@ -146,7 +146,7 @@ def summary_table(rows: "pd.DataFrame") -> str:
                 "max [veh]": f"{mean['max_accumulation_veh']:,.0f}",
                 "completed [veh]": f"{mean['completed_veh']:,.0f}",
                 "control [s]": f"{mean['evaluation_time_s']:.3g}",
-                "step [ms]": f"{mean['control_step_ms_median']:.3g} / {group['control_step_ms_max'].max():.3g}",
+                "step [ms]": decision_ms(mean | {"control_step_ms_max": group["control_step_ms_max"].max()}),
                 **{heading: int(group[column].sum()) for column, (heading, _) in COUNTED.items()},
             }
         )
