@@ -149,19 +149,6 @@ def test_another_seed_is_another_policy(tmp_path, scenario):
     assert not torch.equal(weights(paths[0])["backbone.0.weight"], weights(paths[1])["backbone.0.weight"])
 
 
-def test_training_may_begin_as_no_control():
-    """Whatever the state: gateways nearly open, split ratios nearly the drivers' own."""
-    torch.manual_seed(0)
-    first = Policy(NETWORK, Architecture(guidance=True))
-    training.begin_as_no_control(first, NETWORK)
-    x = 400.0 * torch.rand(20, 7, 7)
-    with torch.no_grad():
-        perimeter, splits = first(x)
-    opening = (perimeter - NETWORK.u_min) / (NETWORK.u_max - NETWORK.u_min)
-    assert opening[:, torch.tensor(NETWORK.adjacency)].min() > 0.9
-    assert (splits - torch.tensor(NETWORK.nominal_splits)).abs().max() < 0.1
-
-
 def test_training_lowers_the_total_time_spent(tmp_path, scenario):
     """An untrained policy holds the perimeter half closed, to no purpose."""
     trained = training.train(scenario, parse("dpc-pc"), seed=0, out=tmp_path / "p.pt", steps=20)
@@ -209,16 +196,20 @@ def test_the_device_is_the_gpu_where_there_is_one(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "options, problem",
+    "controller, options, problem",
     [
-        ({"widht": 3}, "widht: unknown key"),
-        ({"steps": 0}, "steps: should be greater"),
-        ({"steps": 1.5}, "steps: should be a valid integer"),
+        ("dpc-pc", {"widht": 3}, "widht: unknown key"),
+        ("dpc-pc", {"steps": 0}, "steps: should be greater"),
+        ("dpc-pc", {"steps": 1.5}, "steps: should be a valid integer"),
+        ("dpc-pc", {"from_gating": True}, "from_gating: expected a scenario with protected regions"),
+        ("dpc-pc", {"from_gating": True, "from_no_control": True}, "from_gating: a policy cannot begin as a gate and"),
+        ("dpc-pcrg", {"local": True}, "local: a local policy guides no routes; train dpc-pc"),
     ],
 )
-def test_wrong_training_settings(scenario, options, problem):
-    with pytest.raises(InputError, match=f"controllers.dpc-pc.{problem}"):
-        training.settings(replace(scenario, controller_options={"dpc-pc": options}), parse("dpc-pc"))
+def test_wrong_training_settings(scenario, controller, options, problem):
+    wrong = replace(scenario, protected=(), controller_options={controller: options})
+    with pytest.raises(InputError, match=f"controllers.{controller}.{problem}"):
+        training.settings(wrong, parse(controller))
 
 
 @pytest.mark.parametrize("guidance", [False, True], ids=["pc", "pcrg"])
@@ -277,11 +268,6 @@ def test_a_local_policy_drives_another_city(tmp_path):
         load_policy(tmp_path / "False.pt", other)
 
 
-def test_a_local_policy_guides_no_routes(scenario):
-    with pytest.raises(InputError, match="controllers.dpc-pcrg.local: a local policy guides no routes; train dpc-pc"):
-        training.settings(replace(scenario, controller_options={"dpc-pcrg": {"local": True}}), parse("dpc-pcrg"))
-
-
 def test_every_rollout_has_a_model_of_its_own(scenario):
     """Around the nominal one, always valid for the integration step; without a spread it is the nominal one again."""
     limited = replace(scenario, network=tiny.limited(scenario.network))
@@ -326,15 +312,6 @@ def test_a_policy_begins_as_a_gate(scenario):
     assert min(share[:, 1, 0].min() for share in shares) > 0.8
 
 
-def test_a_gate_needs_a_protected_region(scenario):
-    open_city = replace(scenario, protected=(), controller_options={"dpc-pc": {"from_gating": True}})
-    with pytest.raises(InputError, match="controllers.dpc-pc.from_gating: expected a scenario with protected regions"):
-        training.settings(open_city, parse("dpc-pc"))
-    both = replace(scenario, controller_options={"dpc-pc": {"from_gating": True, "from_no_control": True}})
-    with pytest.raises(InputError, match="cannot begin as a gate and as no control"):
-        training.settings(both, parse("dpc-pc"))
-
-
 PEAK = load_scenario(Path(__file__).parents[1] / "scenarios" / "grid7_peak")
 PEAK = replace(PEAK, steps=12, demand=PEAK.demand[20:32], measurement_std=0.0)
 
@@ -373,20 +350,3 @@ def test_a_rollout_with_metering_and_detours_is_the_plant():
         state = plant.step(Controls(perimeter=perimeter, splits=splits, metering=metering))
     total = rollout.total_time_spent(made, start, demand, torch.Generator())
     assert total.shape == (2,) and total[0].item() == pytest.approx(PEAK.step * spent)
-
-
-def test_random_starts_and_demands():
-    """Three quarters start late from random states; demand has one factor per rollout, or one per flow."""
-    rollout, due = training.Rollout(planning_model(PEAK), dtype=torch.float64), PEAK.demand > 0
-    x, demand = rollout.random_start(200, 0.0, 0.75, torch.Generator().manual_seed(0))
-    totals, jam = x[:150].sum(-1), rollout.parameters.jam
-    assert (totals <= 0.8 * jam).all() and (totals.amax(0) > 0.5 * jam).all() and x.min() >= 0.0
-    assert torch.equal(x[150:], rollout.start.expand(50, 7, 7))
-    later = [torch.cat([rollout.demand[k:], torch.zeros(k, 7, 7)]) for k in range(12)]
-    shifts = [[torch.equal(demand[:, n], shifted) for shifted in later].index(True) for n in range(200)]
-    assert set(shifts) == set(range(6)) and not any(shifts[150:])  # at most half of the time
-    for spread, low, high, levels in ((0.2, 0.8, 1.2, (1.0, 1.0)), (0.0, 0.5, 2.0, (0.5, 2.0))):
-        _, demand = rollout.random_start(300, spread, 0.0, torch.Generator().manual_seed(0), levels)
-        factor = demand.numpy().swapaxes(0, 1)[:, due] / PEAK.demand[due]
-        assert low <= factor.min() < low + 0.02 and high - 0.02 < factor.max() <= high
-        assert (np.ptp(factor, axis=1).min() > 0.2) if spread else (np.ptp(factor, axis=1).max() < 1e-9)

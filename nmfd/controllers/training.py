@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Generator
+from torch.optim import Adam
 
 from nmfd.controllers.dpc.compact import CompactPolicy, Numbers
 from nmfd.controllers.dpc.options import Training
@@ -80,6 +82,7 @@ def available(device: str) -> str:
     return "cuda" if device == "auto" and torch.cuda.is_available() else device.replace("auto", "cpu")
 
 
+@one_thread()
 def train(
     scenario: Scenario,
     strategy: Strategy,
@@ -100,73 +103,71 @@ def train(
     anyway: train even if `check` raises
     progress: called with (done, steps, note) after every step
     """
-    with one_thread():
-        setup = settings(scenario, strategy, steps)
-        if not anyway:
-            check(scenario, strategy)
-        planning = planning_model(scenario, strategy.controller.name, strategy.table(scenario))
-        steps = setup.steps if setup.descend else 0
-        configuration = {"controller": strategy.name, "scenario": planning.name, "seed": seed, "compiled": compiled}
-        configuration |= {**vars(setup), "steps": steps}
-        torch.manual_seed(seed)
-        generator = torch.Generator().manual_seed(seed)
-        architecture = Architecture(
-            guidance=strategy.controller.guides,
-            local=setup.local,
-            compact=planning.protected if setup.compact else (),
-            metering=setup.metering,
-        )
-        policy = new_policy(planning.network, architecture)
-        if setup.numbers and isinstance(policy, CompactPolicy):
-            policy.numbers.data.copy_(torch.tensor(Numbers(*setup.numbers)))
-        if setup.from_no_control:
-            begin_as_no_control(policy, planning.network)
-        device = "cpu" if setup.compact else device
-        policy = policy.to(device)
-        rollout = Rollout(planning, device=device, detour_cost=setup.detour_cost)
-        if setup.from_gating and not resume:
-            begin_as_gate(policy, rollout, generator)
-        advance = compiled_step(rollout.step) if compiled else rollout.step
-        optimizer = torch.optim.Adam(policy.parameters(), lr=setup.learning_rate)
-        first, best = 0, float("inf")
-        state_file = out.with_name(out.name + ".resume")
+    setup = settings(scenario, strategy, steps)
+    if not anyway:
+        check(scenario, strategy)
+    planning = planning_model(scenario, strategy.controller.name, strategy.table(scenario))
+    steps = setup.steps if setup.descend else 0
+    configuration = {"controller": strategy.name, "scenario": planning.name, "seed": seed, "compiled": compiled}
+    configuration |= {**vars(setup), "steps": steps}
+    torch.manual_seed(seed)
+    generator = Generator().manual_seed(seed)
+    architecture = Architecture(
+        guidance=strategy.controller.guides,
+        local=setup.local,
+        compact=planning.protected if setup.compact else (),
+        metering=setup.metering,
+    )
+    policy = new_policy(planning.network, architecture)
+    if setup.numbers and isinstance(policy, CompactPolicy):
+        policy.numbers.data.copy_(torch.tensor(Numbers(*setup.numbers)))
+    if setup.from_no_control:
+        begin_as_no_control(policy, planning.network)
+    device = "cpu" if setup.compact else device
+    policy = policy.to(device)
+    rollout = Rollout(planning, device=device, detour_cost=setup.detour_cost)
+    if setup.from_gating and not resume:
+        begin_as_gate(policy, rollout, generator)
+    advance = compiled_step(rollout.step) if compiled else rollout.step
+    optimizer = Adam(policy.parameters(), lr=setup.learning_rate)
+    first, best = 0, float("inf")
+    state_file = out.with_name(out.name + ".resume")
 
-        def keep_the_better(best: float) -> float:
-            score = validate(policy, rollout, seed, setup)
-            if not score < best:
-                return best
+    def keep_the_better(best: float) -> float:
+        score = validate(policy, rollout, seed, setup)
+        if score < best:
             write(checkpoint(policy, planning.network, {**configuration, "validation_veh_s": score}), out)
-            return score
+        return min(best, score)
 
-        if resume:
-            first, best = _restore(state_file, configuration, policy, optimizer, generator)
-        for step in range(first, steps):
-            for group in optimizer.param_groups:
-                cosine = 0.5 * (1.0 + math.cos(math.pi * step / steps))
-                group["lr"] = setup.learning_rate * (0.1 + 0.9 * cosine)
-            _descend(policy, rollout, setup, generator, advance, optimizer, step)
-            if (step + 1) % VALIDATION_PERIOD == 0 or step + 1 == steps:
-                best = keep_the_better(best)
-                state = {"configuration": configuration, "step": step + 1, "best": best}
-                state |= {"policy": policy.state_dict(), "optimizer": optimizer.state_dict()}
-                write(state | {"generator": generator.get_state()}, state_file)
-            if progress:
-                progress(step + 1, steps, f"best {best:.4g} veh s")
-        if not steps:  # the initial policy
+    if resume:
+        first, best = _restore(state_file, configuration, policy, optimizer, generator)
+    for step in range(first, steps):
+        for group in optimizer.param_groups:
+            cosine = 0.5 * (1.0 + math.cos(math.pi * step / steps))
+            group["lr"] = setup.learning_rate * (0.1 + 0.9 * cosine)
+        _descend(policy, rollout, setup, generator, advance, optimizer, step)
+        if (step + 1) % VALIDATION_PERIOD == 0 or step + 1 == steps:
             best = keep_the_better(best)
-        if not math.isfinite(best):
-            raise RunFailed(f"{strategy.name}: every validation of {steps} steps diverged; lower the learning rate")
-        state_file.unlink(missing_ok=True)
-        return out
+            state = {"configuration": configuration, "step": step + 1, "best": best}
+            state |= {"policy": policy.state_dict(), "optimizer": optimizer.state_dict()}
+            write(state | {"generator": generator.get_state()}, state_file)
+        if progress:
+            progress(step + 1, steps, f"best {best:.4g} veh s")
+    if not steps:  # the initial policy
+        best = keep_the_better(best)
+    if not math.isfinite(best):
+        raise RunFailed(f"{strategy.name}: every validation of {steps} steps diverged; lower the learning rate")
+    state_file.unlink(missing_ok=True)
+    return out
 
 
 def _descend(
     policy: Policy,
     rollout: Rollout,
     setup: Training,
-    generator: torch.Generator,
+    generator: Generator,
     advance: Callable,
-    optimizer: torch.optim.Optimizer,
+    optimizer: Adam,
     step: int,
 ) -> None:
     """Do one Adam step."""
@@ -199,13 +200,13 @@ def begin_as_no_control(policy: Policy, network: RegionalModel) -> None:
             policy.splits_decoder.bias.copy_(own.clamp(min=NO_CONTROL_SPLIT).log().flatten())
 
 
-def begin_as_gate(policy: Policy, rollout: Rollout, generator: torch.Generator) -> None:
+def begin_as_gate(policy: Policy, rollout: Rollout, generator: Generator) -> None:
     """Fit `policy` to gates that close the entries of protected regions as these fill, half at the set point."""
     network, gate = rollout.planning.network, PiGating(rollout.planning)
     protected = gate.regions.tolist()
     set_point = torch.tensor(gate.set_point, dtype=rollout.dtype, device=rollout.device)
     counts = rollout.parameters.adjacency.expand(GATE_BATCH, -1, -1)
-    optimizer = torch.optim.Adam(policy.parameters(), lr=GATE_RATE)
+    optimizer = Adam(policy.parameters(), lr=GATE_RATE)
     for _ in range(GATE_STEPS):
         x, _ = rollout.random_start(GATE_BATCH, 0.0, 1.0, generator)
         full = torch.rand(GATE_BATCH, len(protected), generator=generator).to(x) * GATE_FULLEST * set_point
@@ -224,18 +225,14 @@ def validate(policy: Policy, rollout: Rollout, seed: int, setup: Training) -> fl
 
     If training perturbs demand or model, also of VALIDATION_ROLLOUTS perturbed rollouts of increasing sigma.
     """
-    generator = torch.Generator().manual_seed(seed)
-    perturbed = setup.noise or setup.mfd_spread or setup.demand_low < setup.demand_high
-    count = 2 + (VALIDATION_ROLLOUTS if perturbed else 0)
+    generator, low, high = Generator().manual_seed(seed), setup.demand_low, setup.demand_high
+    count = 2 + (VALIDATION_ROLLOUTS if setup.noise or setup.mfd_spread or low < high else 0)
     rollout.draw_model(count, setup.mfd_spread, generator, setup.mfd_scale)
     level = torch.linspace(0.0, 1.0, count // 2).repeat_interleave(2)
     nominal = rollout.demand.unsqueeze(1).expand(-1, count, -1, -1)
     demand = rollout.perturb(nominal, level, setup.noise, generator)
-    if setup.demand_low < setup.demand_high:
-        factor = (
-            setup.demand_low
-            + (setup.demand_high - setup.demand_low) * level[torch.randperm(count, generator=generator)]
-        )
+    if low < high:
+        factor = low + (high - low) * level[torch.randperm(count, generator=generator)]
         demand = demand * factor.to(demand)[:, None, None]
     with torch.no_grad():
         total = rollout.total_time_spent(policy, rollout.start.expand_as(demand[0]), demand, generator)
@@ -243,11 +240,7 @@ def validate(policy: Policy, rollout: Rollout, seed: int, setup: Training) -> fl
 
 
 def _restore(
-    state_file: Path,
-    configuration: Mapping[str, Any],
-    policy: Policy,
-    optimizer: torch.optim.Optimizer,
-    generator: torch.Generator,
+    state_file: Path, configuration: Mapping[str, Any], policy: Policy, optimizer: Adam, generator: Generator
 ) -> tuple[int, float]:
     """Restore the state of a training; return the number of its next step and its best validation."""
     state = read_file(state_file, "nothing to resume; train without --resume")

@@ -1,7 +1,5 @@
 """Regional plants: the NMFD and its acyclic variant, in float64 (nmfd.types.Plant)."""
 
-from typing import Any
-
 import numpy as np
 import torch
 
@@ -25,7 +23,6 @@ class NmfdPlant:
 
     def __init__(self, scenario: Scenario):
         self._scenario = scenario
-        self._scheme: dict[str, Any] = {"integrator": scenario.integrator, "substeps": scenario.substeps}
         self._build()
 
     def reset(self, seed: int) -> State:
@@ -98,9 +95,8 @@ class NmfdPlant:
     def _advance(self, demand: PerPair, perimeter: PerPair, splits: PerTurn) -> float:
         """Advance `_x` by one control interval; return the completed trips [veh]."""
         inflow, u, theta = (torch.from_numpy(values) for values in (demand, perimeter, splits))
-        self._x, ended = dynamics.advance_counted(
-            self._parameters, self._x, inflow, u, theta, self._scenario.step, **self._scheme
-        )
+        scheme = self._scenario.scheme
+        self._x, ended = dynamics.advance_counted(self._parameters, self._x, inflow, u, theta, **scheme)
         return float(ended)
 
 
@@ -127,10 +123,10 @@ class AcyclicPlant(NmfdPlant):
         self._x = self._x * factor[self._model.region, self._model.destination]
 
     def _advance(self, demand: PerPair, perimeter: PerPair, splits: PerTurn) -> float:
-        model, step = self._model, self._scenario.step
+        model = self._model
         theta, forced = acyclic.shares(model, splits)
         if forced.any():
             passing = acyclic.transfers(model, self._x, acyclic.outflow(model, self._x), perimeter, theta)
-            self.forced_moves += step * float(passing[model.fallback[forced]].sum())
-        self._x, ended = acyclic.advance_counted(model, self._x, demand, perimeter, theta, step, **self._scheme)
+            self.forced_moves += self._scenario.step * float(passing[model.fallback[forced]].sum())
+        self._x, ended = acyclic.advance_counted(model, self._x, demand, perimeter, theta, **self._scenario.scheme)
         return ended

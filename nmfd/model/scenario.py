@@ -57,6 +57,11 @@ class Horizon:
     folder: Path | None = None
 
     @property
+    def scheme(self) -> dict[str, Any]:
+        """Control interval and integration, as arguments of the regional models."""
+        return {"step": self.step, "integrator": self.integrator, "substeps": self.substeps}
+
+    @property
     def where(self) -> str:
         """File that error messages name."""
         return "scenario.toml" if self.folder is None else str(self.folder / "scenario.toml")

@@ -155,10 +155,8 @@ def _total_time_spent(
 ) -> Float[torch.Tensor, " B"]:
     """Return the total time spent [veh s] of plans: perimeter (T, B, R, R), splits (T, B or 1, R, R, R)."""
     x, demand = torch.from_numpy(scenario.start).expand(perimeter.shape[1], -1, -1), torch.from_numpy(scenario.demand)
-    states, integrator, substeps = [x], scenario.integrator, scenario.substeps
+    states = [x]
     for k in range(scenario.steps - 1):
-        x = dynamics.advance(
-            parameters, x, demand[k], perimeter[k], splits[k], scenario.step, integrator=integrator, substeps=substeps
-        )
+        x = dynamics.advance(parameters, x, demand[k], perimeter[k], splits[k], **scenario.scheme)
         states.append(x)
     return scenario.step * torch.stack(states).sum((0, -2, -1))

@@ -69,7 +69,7 @@ def compare(scenario, measured, guidance):
     """Total time spent over the horizon [veh s] by our MPC, by plain IPOPT, and whether that converged."""
     controller, k = EconomicMpc(planning_model(scenario), guidance=guidance), measured.step
     assert controller.act(measured).status == Status.OK
-    ipopt = Ipopt(planning_model(scenario), guidance=guidance, horizon=HORIZON)
+    ipopt = Ipopt(planning_model(scenario), guidance=guidance, horizon=HORIZON, limits={"max_iter": 200})
     perimeter, splits, reason = ipopt.solve(np.maximum(measured.accumulation, 0.0), forecast(scenario, k))
     rows = [controller.admissible.decision(u, theta) for u, theta in zip(perimeter, splits, strict=True)]
     other = controller.admissible.project(np.stack(rows))
@@ -120,7 +120,7 @@ def test_plain_dpc_decides_the_same(seen, guidance):
 @pytest.mark.benchmark(group="MPC, four decisions from nothing, 7 regions")
 class TestMpc:
     def test_plain(self, benchmark, seen, guidance):
-        ipopt = Ipopt(planning_model(SCENARIO), guidance=guidance, horizon=HORIZON)
+        ipopt = Ipopt(planning_model(SCENARIO), guidance=guidance, horizon=HORIZON, limits={"max_iter": 200})
         benchmark(lambda: [ipopt.solve(m.accumulation, forecast(SCENARIO, m.step)) for m in seen])
 
     def test_ours(self, benchmark, seen, guidance):

@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
+from torch import Generator
 
 from nmfd.controllers.dpc.policy import Policy
 from nmfd.model import dynamics
@@ -25,11 +26,7 @@ class Rollout:
     """Regional model of a scenario as tensors; random numbers are drawn on the CPU, so that devices agree."""
 
     def __init__(
-        self,
-        planning: PlanningModel,
-        dtype: torch.dtype = torch.float32,
-        device: str | torch.device = "cpu",
-        detour_cost: float = 0.0,
+        self, planning: PlanningModel, dtype: torch.dtype = torch.float32, device: str = "cpu", detour_cost: float = 0.0
     ):
         """detour_cost: time lost by a vehicle that is guided off the nominal split ratios (s)"""
 
@@ -46,12 +43,7 @@ class Rollout:
         self.start = torch.zeros_like(self.demand[0]) if planning.initial is None else tensor(planning.initial)
 
     def random_start(
-        self,
-        batch: int,
-        spread: float,
-        share: float,
-        generator: torch.Generator,
-        levels: tuple[float, float] = (1.0, 1.0),
+        self, batch: int, spread: float, share: float, generator: Generator, levels: tuple[float, float] = (1.0, 1.0)
     ) -> tuple[States, Demands]:
         """Return initial states (veh, (B, R, R)) and demands (veh/s, (T, B, R, R)).
 
@@ -78,7 +70,7 @@ class Rollout:
             demand = demand * (levels[0] + (levels[1] - levels[0]) * uniform(batch, 1, 1))
         return torch.where((rollout < share * batch)[:, None, None], x, self.start), demand
 
-    def draw_model(self, batch: int, spread: float, generator: torch.Generator, scale: float = 1.0) -> None:
+    def draw_model(self, batch: int, spread: float, generator: Generator, scale: float = 1.0) -> None:
         """Draw a regional model for each of `batch` rollouts, around the nominal one.
 
         spread: standard deviation of the logarithm of every region's accumulation axis (jam, critical accumulation,
@@ -107,7 +99,7 @@ class Rollout:
             )
         self.parameters = p
 
-    def perturb(self, demand: Demands, level: Levels, noise: float, generator: torch.Generator) -> Demands:
+    def perturb(self, demand: Demands, level: Levels, noise: float, generator: Generator) -> Demands:
         """Add Gaussian noise of sigma `level` (B,) times `noise` to the pairs with demand, clipped at zero.
 
         demand: (T, B, R, R) [veh/s]
@@ -121,19 +113,11 @@ class Rollout:
     def step(self, policy: Policy, x: States, demand: States, noise: States) -> States:
         """Return the state one control interval after x (veh, (B, R, R)), which `policy` observes with `noise`."""
         perimeter, splits = policy(x + noise)
-        return dynamics.advance(
-            self.parameters,
-            x,
-            demand,
-            perimeter,
-            self.nominal_splits if splits is None else splits,
-            self.planning.step,
-            integrator=self.planning.integrator,
-            substeps=self.planning.substeps,
-        )
+        splits = self.nominal_splits if splits is None else splits
+        return dynamics.advance(self.parameters, x, demand, perimeter, splits, **self.planning.scheme)
 
     def states(
-        self, policy: Policy, x: States, demand: Demands, generator: torch.Generator, step: Callable | None = None
+        self, policy: Policy, x: States, demand: Demands, generator: Generator, step: Callable | None = None
     ) -> tuple[Demands, Demands, Float[torch.Tensor, "T B"]]:
         """Return the states under `policy`, the observed ones (veh, (T, B, R, R)), and the backlog (veh, (T, B)).
 
@@ -153,7 +137,7 @@ class Rollout:
         return exact, exact + noise, torch.stack(waiting)
 
     def total_time_spent(
-        self, policy: Policy, x: States, demand: Demands, generator: torch.Generator, step: Callable | None = None
+        self, policy: Policy, x: States, demand: Demands, generator: Generator, step: Callable | None = None
     ) -> Levels:
         """Return the TTS (veh s, (B,)) of rollouts from x under `policy`, with detours; arguments as `states`."""
         exact, seen, waiting = self.states(policy, x, demand, generator, step)

@@ -69,8 +69,6 @@ class Admissible:
     def __init__(self, network: RegionalModel, model: Turns, *, guidance: bool):
         self._network, self._model, self._guidance = network, model, guidance
         self._edges = len(model.edges)
-        unused = np.setdiff1d(np.arange(network.regions), model.destinations)
-        self._unused = (slice(None), slice(None), unused)
 
     def open(self, moves: int) -> Plan:
         """Return the plan without control: open perimeter, nominal splits."""
@@ -119,8 +117,7 @@ class Admissible:
         perimeter[tuple(self._model.edges.T)] = decision[: self._edges]
         if not self._guidance:
             return perimeter, None
-        splits = np.zeros((self._network.regions,) * 3)
-        splits[self._unused] = self._network.nominal_splits[self._unused]
+        splits = self._network.nominal_splits.copy()
         splits[tuple(self._model.turns.T)] = decision[self._edges :]
         return perimeter, splits
 
@@ -142,18 +139,15 @@ class EconomicMpc:
         """Raise InputError for a wrong option. terminal: cost beyond the horizon"""
         self.name = ("mpc-pcrg" if guidance else "mpc-pc") + ("-terminal" if terminal is not None else "")
         self._terminal = terminal
-        self._beyond: Callable[[PerCell], tuple[float, PerCell]] | None = None
         self.options = options(Mpc, planning, self.name)
         network, horizon = planning.network, self.options.horizon
         used = np.flatnonzero(planning.destinations)
-        self._regions = network.regions
         self._used = used if len(used) else np.arange(network.regions)
         self._demand, self._step, self._steps = planning.forecast, planning.step, planning.steps
         # With one Euler step per interval, the last controls move vehicles that do not arrive within the horizon.
         blind = planning.integrator == "euler" and planning.substeps == 1 and terminal is None
         self._moves = min(horizon - 1 if blind else horizon, self.options.control_horizon or horizon)
-        scheme = {"step": planning.step, "substeps": planning.substeps, "integrator": planning.integrator}
-        self._model = edge_model.build(network, self._used, guidance=guidance, **scheme)
+        self._model = edge_model.build(network, self._used, guidance=guidance, **planning.scheme)
         rounded = replace(self._model, rounding=JAM_ROUNDING * min(mfd.jam for mfd in network.mfds))
         self._exact = partial(edge_model.vehicle_steps, self._model)
         self._rounded: Callable = partial(edge_model.vehicle_steps, rounded, gradient=True)
@@ -166,10 +160,8 @@ class EconomicMpc:
         if self.options.solver == "ipopt":
             if terminal is not None:
                 raise error(planning.where, f"controllers.{self.name}.solver", "ipopt has no terminal cost; omit it")
-            seconds = DEADLINE_SHARE * self.deadline
-            self._ipopt = Ipopt(
-                planning, guidance=guidance, horizon=horizon, iterations=MAX_ITERATIONS, seconds=seconds
-            )
+            limits = {"max_iter": MAX_ITERATIONS, "max_wall_time": DEADLINE_SHARE * self.deadline}
+            self._ipopt = Ipopt(planning, guidance=guidance, horizon=horizon, limits=limits)
         self.reset()
 
     def reset(self, seed: int = 0) -> None:
@@ -179,14 +171,14 @@ class EconomicMpc:
     def act(self, observation: Observation) -> Controls:
         deadline = time.perf_counter() + DEADLINE_SHARE * self.deadline
         start, demand = self.forecast(observation)
-        if self._terminal is not None:
-            self._beyond = partial(self._terminal, step=observation.step + self.options.horizon)
+        end = observation.step + self.options.horizon
+        beyond = None if self._terminal is None else partial(self._terminal, step=end)
         last = np.concatenate([self._plan[1:], self._plan[-1:]]) if self._left else self._open
         try:
             if self._left:
-                cost = partial(self._exact, start, demand, deadline=deadline, beyond=self._beyond)
+                cost = partial(self._exact, start, demand, deadline=deadline, beyond=beyond)
                 last = self._open if cost(self._open)[0] < cost(last)[0] else last
-            minimum = self._solve(start, demand, last, deadline)
+            minimum = self._solve(start, demand, last, deadline, beyond)
         except Late:
             return self._fallback(observation, last, TIME_LIMIT)
         except (ArithmeticError, ValueError, RuntimeError) as failure:  # of NumPy and SciPy, LinAlgError too
@@ -206,14 +198,13 @@ class EconomicMpc:
         if self._left:
             self._left -= 1
             return self._first(FAILED, f"{reason}: last plan used")
+        controls = self._first(FAILED, f"{reason}: perimeter opened, nominal splits")
         if self._gating is None or not np.isfinite(observation.accumulation).all():
-            return self._first(FAILED, f"{reason}: perimeter opened, nominal splits")
+            return controls
         if not self._gates:
             self._gating.reset()
-        self._gates = True
-        _, splits = self.admissible.controls(self._open[0])
-        note = f"{reason}: pi-gating in control"
-        return replace(self._gating.act(observation), splits=splits, status=FAILED, note=note)
+        self._gates, gating = True, self._gating.act(observation)
+        return replace(controls, perimeter=gating.perimeter, note=f"{reason}: pi-gating in control")
 
     def _first(self, status: Status = Status.OK, note: str = "") -> Controls:
         """Return the first interval of the plan."""
@@ -234,12 +225,12 @@ class EconomicMpc:
         start = np.maximum(observation.accumulation, 0.0)[:, self._used].ravel()
         return start, demand[:, :, self._used].reshape(horizon, -1)
 
-    def _solve(self, start: PerCell, demand: Demands, plan: Plan, deadline: float) -> Minimum:
+    def _solve(self, start: PerCell, demand: Demands, plan: Plan, deadline: float, beyond: Callable | None) -> Minimum:
         """Return the best plan from `plan` on, with its value (veh) by the rounded model. Raise Late."""
         if self._ipopt is not None:
             return self._by_ipopt(self._ipopt, start, demand)
         return minimise(
-            partial(self._rounded, start, demand, deadline=deadline, beyond=self._beyond),
+            partial(self._rounded, start, demand, deadline=deadline, beyond=beyond),
             self.admissible.project,
             self.admissible.gap,
             plan,
@@ -251,10 +242,9 @@ class EconomicMpc:
 
     def _by_ipopt(self, solver: Ipopt, start: PerCell, demand: Demands) -> Minimum:
         """Return the plan of IPOPT, made admissible: it meets bounds and sums up to its tolerance only."""
-        regions = self._regions
-        state, forecast = np.zeros((regions, regions)), np.zeros((len(demand), regions, regions))
-        state[:, self._used] = start.reshape(regions, -1)
-        forecast[:, :, self._used] = demand.reshape(len(demand), regions, -1)
+        state, forecast = np.zeros(solver.shape), np.zeros((len(demand), *solver.shape))
+        state[:, self._used] = start.reshape(len(state), -1)
+        forecast[:, :, self._used] = demand.reshape(len(demand), len(state), -1)
         perimeter, splits, reason = solver.solve(state, forecast)
         rows = [self.admissible.decision(u, theta) for u, theta in zip(perimeter, splits, strict=True)]
         plan = self.admissible.project(np.stack(rows[: self._moves]))

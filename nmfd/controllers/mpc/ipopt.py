@@ -4,6 +4,8 @@ Multiple shooting on the CasADi twin of the regional model (nmfd.model.dynamics_
 of every interval is a variable and the dynamics are constraints. Two orders of magnitude slower.
 """
 
+from collections.abc import Mapping
+
 import casadi as ca
 import numpy as np
 
@@ -17,22 +19,14 @@ UNIT = 1000.0  # veh, unit of the accumulations in the solver
 class Ipopt:
     """Solver that minimises the vehicles summed over the ends of `horizon` intervals."""
 
-    def __init__(
-        self,
-        planning: PlanningModel,
-        *,
-        guidance: bool,
-        horizon: int,
-        iterations: int = 200,
-        seconds: float | None = None,
-    ):
-        """iterations: at most; seconds: deadline of a decision (s), or None"""
+    def __init__(self, planning: PlanningModel, *, guidance: bool, horizon: int, limits: Mapping[str, float]):
+        """limits: options of IPOPT, such as max_iter and max_wall_time (s)"""
         network = planning.network
         self._network, self._horizon, self._guidance = network, horizon, guidance
         self._edges, self._turns = np.argwhere(network.adjacency), np.argwhere(network.split_mask & guidance)
         regions, p = network.regions, model.parameters(network)
+        self.shape = regions, regions
         start, demand = ca.SX.sym("start", regions, regions), ca.SX.sym("demand", regions, regions * horizon)
-        scheme: dict = {"integrator": planning.integrator, "substeps": planning.substeps}
         variables, constraints, total, x = [], [], 0.0, start
         for k in range(horizon):
             u, theta = ca.SX.sym(f"u{k}", len(self._edges)), ca.SX.sym(f"theta{k}", len(self._turns))
@@ -42,14 +36,13 @@ class Ipopt:
                 perimeter[i, h] = u[n]
             after = ca.SX.sym(f"x{k}", regions, regions)
             flows = demand[:, k * regions : (k + 1) * regions], perimeter, splits
-            moved = model.advance(p, UNIT * x, *flows, planning.step, **scheme)
+            moved = model.advance(p, UNIT * x, *flows, **planning.scheme)
             constraints += [*sums, ca.vec(ca.densify(moved) / UNIT - after)]
             total, x = total + ca.sum1(ca.vec(after)), after
             variables += [u, theta, ca.vec(after)]
         edges, turns, cells = len(self._edges), len(self._turns), regions**2
         self._lower = np.tile([network.u_min] * edges + [0.0] * (turns + cells), horizon)
         self._upper = np.tile([network.u_max] * edges + [1.0] * turns + [np.inf] * cells, horizon)
-        limits = {"max_iter": iterations} | ({} if seconds is None else {"max_wall_time": seconds})
         problem = {"x": ca.vertcat(*variables), "f": total, "g": ca.vertcat(*constraints)}
         problem["p"] = ca.vertcat(ca.vec(start), ca.vec(demand))
         options = {"print_time": False, "ipopt": {"print_level": 0, "sb": "yes", **limits}}
