@@ -339,7 +339,7 @@ def identify(
     seeds: int = 2,
     city: str | None = None,
     network: Path | None = None,
-    runs: Sequence[Path] = (),
+    protect: bool = False,
     iterations: int = 600,
     workers: int = 1,
     scheduler: str | None = None,
@@ -352,7 +352,7 @@ def identify(
     seeds: loading runs per level, from seed 1000
     city: strategy options of the loading runs, such as "guided+max-pressure" or "own"; own, then guided, if None
     network: folder of the model, the scenario's network if None
-    runs: folders of finished runs to fit as well
+    protect: write the regions to protect into the scenario, those of the first model
     """
     scenario = shipped.found(scenario, shipped.SCENARIO, shipped.NETWORK)
     if (scenario / "network.toml").exists():
@@ -360,8 +360,6 @@ def identify(
     loaded = load_scenario(scenario, settings)
     strategy = parse("no-control", "" if city == "own" else city or "")
     kinds = [False, True] if city is None and network is None and identification.without_model(loaded) else []
-    if len(kinds) > 1 and runs:
-        raise InputError("--runs: fits one model; say which, by --with own or --with guided")
     report = []
     for guided in kinds or [strategy.guides]:
         loaded = load_scenario(scenario, settings)  # the second model takes the split ratios of the first
@@ -375,7 +373,7 @@ def identify(
             options=[word for word in strategy.words if word != "guided"],
             network=network,
             iterations=iterations,
-            runs=runs,
+            protect=protect and guided == (kinds or [guided])[0],
         )
         with watched("identify", None) as show:
             text = identification.identify(

@@ -286,13 +286,14 @@ def import_(source: Path | None, bbox: str | None, **options: Any) -> None:
     "guided, a model each]",
 )
 @click.option("--network", type=FOLDER, metavar="DIR", help="Folder of the model. [default: the scenario's network]")
-@click.option("--runs", type=FOLDER, multiple=True, metavar="DIR", help="Finished runs to fit as well.")
+@click.option("--protect", is_flag=True, help="Write the regions to protect into the scenario.")
 @WORKERS
 @out_option("runs/SCENARIO-identify", "Folder of loading runs, samples and figures.")
 def identify(scenario: Path, **options: Any) -> None:
     """Fit the regional model of a SUMO city.
 
     Loads the city with multiples of its demand, without control and with probing gates, and writes network.toml.
+    Says which regions to protect.
     Policies trained on the network before do not fit the new one. SCENARIO may be the folder of an imported network.
 
     \b

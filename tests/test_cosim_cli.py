@@ -96,9 +96,6 @@ def test_identify_writes_a_network_that_loads(small, tmp_path):
     assert after.hash != before.hash and (after.adjacency == before.adjacency).all()
     assert after.observed_split_ratios and all(mfd.problem() is None for mfd in after.mfds)
     assert len(pd.read_csv(out / "samples.csv")) > 40 and (out / "mfd.png").is_file()
-    more, runs = tmp_path / "city" / "networks" / "more", [out]
-    api.identify(scenario, iterations=2, city="own", runs=runs, network=more, **options)
-    assert "from 4 loading runs of" in (more / "network.toml").read_text()
 
 
 @pytest.mark.slow
@@ -156,7 +153,6 @@ IMPORT = ("import", "--out", "{tmp}/out/city")
         ((*EVALUATE, "no-control", "--policy", "dpc-pc=x.pt"), "--policy: 'dpc-pc' is not among no-control; add it"),
         (("compare", "{tmp}"), "holds no finished runs"),
         (("report", "{tmp}"), "holds no finished runs"),
-        (("identify", "{small}", "--runs", "{tmp}"), "holds no finished runs"),
         (("identify", "{small}", "--levels", "0,1"), "'--levels': 0.0 is not in the range 0.0<x<=10.0"),
         (("watch", "{small}", "--controller", "no-control", "--against", "x", "--gui"), "omit --against"),
         (("tune", "{small}", "--controller", "pi-gating", "--option", "kp"), "--option"),

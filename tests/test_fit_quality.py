@@ -12,7 +12,15 @@ from nmfd.model.authority import Boundaries, verdict
 from nmfd.model.identification import Observed
 from nmfd.model.mfd import Mfd
 from nmfd.model.regional_model import load_network
-from nmfd.studies.fit_quality import MEANINGS, fit_table, prediction_table, predictions, region_fits, write_fits
+from nmfd.studies.fit_quality import (
+    MEANINGS,
+    fit_table,
+    prediction_table,
+    predictions,
+    region_fits,
+    without_fall,
+    write_fits,
+)
 
 
 @pytest.fixture
@@ -27,6 +35,7 @@ def cloud(x, outflow):
 
 def doubts(network, samples, most=2.0, seeds=2):
     state = np.repeat(np.diag([most * mfd.critical for mfd in network.mfds])[None], 3, axis=0)
+    network = replace(network, critical_above=without_fall(network, samples, [state]))
     return list(region_fits(network, samples, [state], seeds)["doubts"])
 
 
@@ -38,21 +47,25 @@ def test_good_fits_have_no_warning_and_bad_ones_say_what_is_wrong(network):
     few = cloud(x[:3], x[:3])
     assert doubts(network, [good_one] * 3) == [()] * 3
     bad = doubts(network, [good_one, noise, few])
-    assert bad[0] == () and bad[1][0].startswith("R2 ") and bad[2] == ("few samples (3)",)
-    assert doubts(network, [good_one] * 3, most=0.4)[0] == ("not reached (40 % of critical)",)
+    assert bad[0] == () and bad[1][0].startswith("R2 ") and bad[2][0] == "few samples (3)"
+    assert doubts(network, [good_one] * 3, most=0.4)[0] == ("no falling branch (critical above 136 veh, not seen)",)
     assert doubts(network, [good_one] * 3, seeds=1)[2] == ("one seed",)
     assert doubts(network, [cloud(x, np.ones(200))] * 3)[0] == ("R2 nan",)
     endless = replace(network, mfds=(Mfd(a=0.0, b=-1e-6, c=0.004, jam=1000.0), *network.mfds[1:]))
     assert doubts(endless, [cloud(x, endless.mfds[0].outflow(x))] * 3)[0] == (
-        "no falling branch (jam 1000, critical 1000 veh)",
+        "no falling branch (critical above 2000 veh, not seen)",
     )
 
 
 def test_warnings_are_in_the_table_and_the_file(network, tmp_path):
+    network = replace(network, critical_above=dict.fromkeys(range(3), 1.0))
     fits = region_fits(network, [cloud([1.0], [1.0])] * 3, seeds=1)
     table = fit_table(network, fits)
-    assert "WARNINGS" in table.splitlines()[0] and table.count("few samples (1); not reached (0 % of critical)") == 3
-    for kind in ("few samples", "not reached", "one seed"):
+    assert (
+        "WARNINGS" in table.splitlines()[0]
+        and table.count("few samples (1); no falling branch (critical above 1 veh, not seen)") == 3
+    )
+    for kind in ("few samples", "no falling branch", "one seed"):
         assert f"WARNING, {kind}: " in table and kind in MEANINGS
     write_fits(tmp_path / "fit.csv", fits)
     rows = pd.read_csv(tmp_path / "fit.csv")
@@ -102,31 +115,94 @@ def crossing(flow, share):
 FLOW = [[0, 300, 0], [100, 0, 100], [0, 300, 0]]
 
 
+def judged(network, boundaries, most, started, waiting=0.0, slowness=1.3):
+    """The verdict of accumulations that are multiples of the critical ones."""
+    most, started = np.array(most) * network.critical, np.array(started, dtype=float)
+    known = {"most": most, "started": started, "waiting": waiting, "slowness": slowness, "where": "in 2 runs"}
+    return verdict(network, boundaries, scenario="scenarios/x", **known)
+
+
 @pytest.mark.parametrize(
-    "most, started, share, answer",
+    "most, started, share, answer, protect, commands",
     [
-        ((0.5, 0.9, 0.2), (10, 10, 10), 1.0, "No: no region is ever critical, region 1 comes nearest with 0.90"),
-        ((0.5, 1.9, 0.2), (10, 10, 10), 0.0, "No: no gateway has a signal"),
-        ((0.5, 1.9, 0.2), (10, 600, 10), 1.0, "It may: region 1 becomes critical, and gateways could hold 50%"),
+        (
+            (0.5, 0.9, 0.2),
+            (10, 10, 10),
+            1.0,
+            "No: no region is seen to become critical, region 1 comes nearest with 0.90",
+            (),
+            3,
+        ),
+        ((0.5, 1.9, 0.2), (10, 10, 10), 0.0, "No: no gateway has a signal", (), 2),
+        (
+            (0.5, 1.9, 0.2),
+            (10, 600, 10),
+            1.0,
+            "It may: region 1 becomes critical, and gateways could hold 50%",
+            (1,),
+            0,
+        ),
+        (
+            (1.5, 1.9, 1.2),
+            (99, 99, 9),
+            1.0,
+            "It may: region 2 becomes critical, and gateways could hold 92%",
+            (0, 1, 2),
+            0,
+        ),
         (
             (0.5, 1.9, 0.2),
             (10, 5400, 10),
             1.0,
             "Hardly: regions become critical, but gateways could hold no more than 10",
+            (1,),
+            0,
         ),
-        ((0.5, 1.9, 0.2), (10, 600, 10), 0.06, "No: regions become critical, but gateways could hold no more than 3%"),
+        (
+            (0.5, 1.9, 0.2),
+            (10, 600, 10),
+            0.06,
+            "No: regions become critical, but gateways could hold no more than 3%",
+            (),
+            2,
+        ),
     ],
 )
-def test_the_verdict_has_reasons_and_numbers(network, most, started, share, answer):
-    most, started = np.array(most), np.array(started, dtype=float)
-    found = verdict(network, crossing(FLOW, share), most=most, started=started, where="in 2 runs")
+def test_the_verdict_has_reasons_numbers_and_commands(network, most, started, share, answer, protect, commands):
+    found = judged(network, crossing(FLOW, share), most, started)
     assert found.sentences[0].startswith(f"Can perimeter control help? {answer}"), found.sentences
+    assert found.protect == protect and sum("cosim " in each for each in found.sentences[1:]) == commands
     text = found.text()
     assert f"{share:.0%} of the 800 crossings in 2 runs" in text
     table = text.partition("\n\n")[2].splitlines()
     assert len(table) == 1 + (crossing(FLOW, 1.0).gateways > 0).sum()
 
 
+def test_there_is_no_verdict_before_identification_or_on_congestion_that_no_region_explains(network):
+    """584 vehicles outside and trips of 12 times the free-flow time are no "No: nothing to protect"."""
+    calm, guesses = ((0.5, 0.4, 0.2), (4000, 10, 10)), replace(network, placeholder=True)
+    for model, busy, answer, command in (
+        (guesses, {"waiting": 584.0, "slowness": 12.0}, "Cannot say yet: the critical", "cosim identify scenarios/x"),
+        (guesses, {}, "Cannot say yet", "cosim identify scenarios/x"),
+        (network, {"waiting": 584.0}, "Cannot say yet: up to 584 vehicles", "cosim identify scenarios/x --levels"),
+        (network, {"slowness": 12.0}, "Cannot say yet: up to 0 vehicles", "12.0 times its free-flow time"),
+        (network, {"slowness": np.nan}, "No: no region is seen", "no-control+max-pressure --demand 1,1.3,1.6"),
+    ):
+        found = judged(model, crossing(FLOW, 1.0), *calm, **busy)
+        assert found.sentences[0].startswith(f"Can perimeter control help? {answer}") and command in found.text()
+
+
+def test_a_critical_accumulation_that_was_not_seen_is_not_called_so(network):
+    seen = replace(network, critical_above={1: 480.0})
+    found = judged(seen, crossing(FLOW, 1.0), (0.5, 1.9, 0.2), (10, 10, 10))
+    assert found.sentences[0].endswith("region 0 comes nearest with 0.50; more demand may change that.")
+    assert "region 1 above 480 veh, not seen" in found.text() and found.protect == ()
+    found = judged(
+        replace(network, critical_above=dict.fromkeys(range(3), 9.0)), crossing(FLOW, 1.0), (9, 9, 9), (1, 1, 1)
+    )
+    assert "No: no region is seen to become critical; more demand" in found.sentences[0]
+
+
 def test_nobody_crosses(network):
-    found = verdict(network, crossing(np.zeros((3, 3)), 1.0), most=np.ones(3), started=np.ones(3), where="in 1 run")
+    found = judged(network, crossing(np.zeros((3, 3)), 1.0), np.ones(3), np.ones(3))
     assert "No: no vehicle crosses" in found.sentences[0]

@@ -148,7 +148,26 @@ def test_doubts_of_few_days_free_flow_and_loops_at_stop_lines(tmp_path):
         "days: 1",
     ):
         assert doubt in text and f"WARNING, {doubt.split(' (')[0].split(':')[0]}" in found.text, doubt
-    assert found.network.mfds[0].outflow(800.0) == pytest.approx(found.network.mfds[0].capacity, rel=0.06)
+    n = found.network.critical_above[0]
+    assert n == found.intervals["accumulation_veh"].max() < 210.0 and np.isnan(found.fits["critical_veh"]).all()
+    assert (
+        f"above {n:.0f} " in found.text and f"critical_above = {n:.6g}" in (tmp_path / "city/network.toml").read_text()
+    )
+    for curve in found.network.mfds:  # measured up to n, beyond a guess from lanes: 27 veh per lane-km
+        assert curve.outflow(n) == pytest.approx(CURVE.outflow(n), rel=0.03)
+        assert curve.jam == 80.0 * LANE_KM and curve.critical == pytest.approx(27.2 * LANE_KM, rel=0.01)
+    again = nmfd.load_network(tmp_path / "city")
+    assert np.isnan(again.seen_critical).all() and (again.critical > 200.0).all()
+
+
+@pytest.mark.usefixtures("without_pictures")
+def test_a_critical_density_that_no_city_has_is_doubted(tmp_path, made):
+    counts, detectors = made
+    files = written(tmp_path, counts.assign(occ=counts["occ"] / 8.0), detectors)
+    found = nmfd.identify(**files, trip_length=TRIP, out=tmp_path / "city")
+    assert (
+        found.fits["doubts"][0][0] == "critical density 4.17 veh per lane-km" and "WARNING, critical dens" in found.text
+    )
 
 
 def changed(**columns):

@@ -1,6 +1,7 @@
 """Controllers compared without no-control: tables and reasons take the first one as reference."""
 
 import re
+from dataclasses import replace
 
 import made_up
 import pytest
@@ -56,6 +57,19 @@ def test_reasons_name_what_the_controller_did_and_what_limits_it(folder):
     assert loses.startswith("dpc-pcrg loses (+")
     for words in ("80% of the boundary flow", "50% of the time, not 10%", "3 of 9 lanes", "between stages 30%"):
         assert words in loses
+
+
+def test_a_gate_that_never_closes_says_so_first_and_no_critical_accumulation_is_made_up(tmp_path):
+    finished = results.read(made_up.folder(tmp_path / "gate", controllers=("no-control", "pi-gating"), seeds=(1, 2)))
+    network, level = finished.scenario.network, finished.level(1.0)
+    gate = {"pi-gating": {"set_point": [90000.0] * len(finished.scenario.protected)}}
+    unseen = replace(network, critical_above=dict.fromkeys(range(network.regions), 1.0))
+    finished = replace(finished, scenario=replace(finished.scenario, network=unseen, controller_options=gate))
+    reasons = explain.paragraph(level, finished, "pi-gating").partition("): ")[2]
+    name = network.region_names[finished.scenario.protected[0]]
+    assert reasons.startswith(f"{name} never reaches the set point of its gate, 90000 vehicles, with ")
+    assert "is critical" not in reasons
+    assert f"critical accumulation; that of {network.regions} regions was not seen" in explain.city(level, finished)
 
 
 def test_one_controller_alone(tmp_path):

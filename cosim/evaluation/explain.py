@@ -7,8 +7,10 @@ import numpy as np
 from cosim.evaluation import statistics
 from cosim.evaluation.results import Finished, Level
 from nmfd.arrays import PerRegion
-from nmfd.controllers.strategy import ALONE, parse
+from nmfd.controllers.rules import Gating, PiGating
+from nmfd.controllers.strategy import ALONE, Strategy, parse
 from nmfd.model.regional_model import RegionalModel
+from nmfd.model.scenario import Scenario
 from nmfd.studies.benchmark import REFERENCE
 from nmfd.types import Result
 
@@ -21,8 +23,11 @@ WAIT_S = 1.0  # before a trip begins
 
 
 def load(network: RegionalModel, runs: Sequence[Result]) -> tuple[PerRegion, PerRegion]:
-    """Return peak accumulation over critical (R,) and the share of time beyond critical (R,), mean over runs."""
-    states = [run.accumulation.sum(axis=2) / network.critical for run in runs]
+    """Return peak accumulation over critical (R,) and the share of time beyond critical (R,), mean over runs.
+
+    NaN and 0 where the critical accumulation was not seen.
+    """
+    states = [run.accumulation.sum(axis=2) / network.seen_critical for run in runs]
     return np.mean([s.max(axis=0) for s in states], axis=0), np.mean([(s > 1).mean(axis=0) for s in states], axis=0)
 
 
@@ -37,8 +42,11 @@ def city(level: Level, finished: Finished) -> str:
     """Return two sentences about the city under the reference."""
     names, against = finished.scenario.network.region_names, statistics.compared_with(level.rows)
     peak, beyond = load(finished.scenario.network, _runs(level, against))
-    most = int(np.argmax(peak))
-    state = f"no region exceeds its critical accumulation; {names[most]} is nearest, with {peak[most]:.1f} times"
+    state = "no region exceeds its critical accumulation"
+    if len(known := np.flatnonzero(~np.isnan(peak))):
+        most = known[np.argmax(peak[known])]
+        state += f"; {names[most]} is nearest, with {peak[most]:.1f} times"
+    state += f"; that of {len(names) - len(known)} regions was not seen" * (len(known) < len(names))
     if hot := [
         f"{names[r]} ({beyond[r]:.0%} of the time, up to {peak[r]:.1f} times)"
         for r in np.flatnonzero(beyond > SMALL_SHARE)
@@ -62,14 +70,14 @@ def paragraph(level: Level, finished: Finished, name: str) -> str:
     if pair.percent and not clear:
         verdict = "shows no significant change"
     spread = f"± {pair.percent_half:.1f} % over {pair.seeds} seeds" if pair.seeds > 1 else "on one seed, no proof"
-    reasons = _reasons(level, finished.scenario.network, name, against, gains=clear and gains)
+    reasons = _reasons(level, finished.scenario, name, against, gains=clear and gains)
     size = f"{pair.percent:+.1f} % total time spent against {against} {spread}"
     return f"{name} {verdict} ({size}){': ' if reasons else ''}{'; '.join(reasons)}."
 
 
-def _reasons(level: Level, network: RegionalModel, name: str, against: str, *, gains: bool) -> list[str]:
+def _reasons(level: Level, scenario: Scenario, name: str, against: str, *, gains: bool) -> list[str]:
     """Return what the controller did, and what limits it if it does not gain."""
-    reference, runs, strategy = _runs(level, against), _runs(level, name), parse(name)
+    reference, runs, strategy, network = _runs(level, against), _runs(level, name), parse(name), scenario.network
     beyond = load(network, reference)[1]
     trips, acts = max(sum(run.departures.sum() for run in runs), 1), strategy.controller.name != ALONE
     limit = network.u_max - OPEN_SHARE * (network.u_max - network.u_min)
@@ -82,7 +90,8 @@ def _reasons(level: Level, network: RegionalModel, name: str, against: str, *, g
         f"it guides {guided:.1f} times per trip": guided > 0,
         f"its trips wait {waited:.0f} s before they begin": waited >= WAIT_S,
     }
-    done = [words for words, true in deeds.items() if true] or ["it never holds back and never guides"] * acts
+    done = _never_reached(strategy, scenario, runs)
+    done += [words for words, true in deeds.items() if true] or ["it never holds back and never guides"] * acts
     critical, region = np.flatnonzero(beyond > SMALL_SHARE), int(np.argmax(beyond))
     if gains:
         now = load(network, runs)[1][region]
@@ -99,13 +108,28 @@ def _reasons(level: Level, network: RegionalModel, name: str, against: str, *, g
     slow = between[0] > between[1] + INTERGREEN_SHARE
     limits = {
         f"{leaking:.0%} of the boundary flow passes no signal under control": acts and leaking > LEAKING_SHARE,
-        "no region is ever critical, so there is nothing to protect": acts and not len(critical),
+        "no region is seen to be critical, so there is nothing to protect": acts and not len(critical),
         "most vehicles in the critical regions start there, behind the gateways": holds and inside,
         f"its queues fill the edges before gateways {full[name]:.0%} of the time, not {full[against]:.0%}": blocks,
         f"{split:.0f} of {mean.get('signal_lanes', 0):.0f} lanes serve movements of several stages": split > 0,
         f"its signals are between stages {between[0]:.0%} of the time, the original programmes {between[1]:.0%}": slow,
     }
     return done + [words for words, true in limits.items() if true]
+
+
+def _never_reached(strategy: Strategy, scenario: Scenario, runs: Sequence[Result]) -> list[str]:
+    """Return the gates whose region never reached its set point, in any run."""
+    if not issubclass(strategy.controller.options, Gating):
+        return []
+    gate = strategy.make(scenario)
+    assert isinstance(gate, PiGating)
+    most = np.max([run.accumulation.sum(axis=2).max(axis=0) for run in runs], axis=0)
+    return [
+        f"{scenario.network.region_names[region]} never reaches the set point of its gate, {goal:.0f} vehicles, with "
+        f"{most[region]:.0f} at most"
+        for region, goal in zip(gate.regions, gate.set_point, strict=True)
+        if most[region] < goal
+    ]
 
 
 def _runs(level: Level, name: str) -> list[Result]:

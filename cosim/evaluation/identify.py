@@ -2,10 +2,12 @@
 
 First the city is loaded without perimeter control, and every region's MFD is fitted to its outflow samples. Then it is
 loaded under a probing controller, whose set points come from these MFDs, and the whole model is fitted to all runs by
-prediction error. Finished runs of other controllers may be added.
+prediction error.
 """
 
 import os
+import re
+import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,12 +15,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from cosim.evaluation import results
 from cosim.evaluation.model_validation import observed, outflow_samples
 from cosim.evaluation.runs import runs_of
 from cosim.sumo.arrays import Points
 from cosim.sumo.build import network_folder
-from cosim.sumo.net import city_of
+from cosim.sumo.net import City, city_of
+from nmfd.arrays import PerRegion, StatesOverTime
 from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
 from nmfd.model import authority, identification, mfd
@@ -37,6 +39,7 @@ from nmfd.studies.fit_quality import (
     prediction_table,
     predictions,
     region_fits,
+    without_fall,
     write_fits,
 )
 from nmfd.types import Result
@@ -53,7 +56,7 @@ class Loading:
     options: words of the strategies, such as max-pressure
     network: folder whose network.toml is written; None for the scenario's own or, if guided, its folder GUIDED
     iterations: of the fit
-    runs: folders of finished runs of the same city that are fitted as well
+    protect: write the regions to protect into the scenario
     """
 
     levels: Sequence[float]
@@ -62,7 +65,7 @@ class Loading:
     options: Sequence[str] = ()
     network: Path | None = None
     iterations: int = identification.ITERATIONS
-    runs: Sequence[Path] = ()
+    protect: bool = False
 
     @property
     def stages(self) -> tuple[str, str]:
@@ -103,13 +106,6 @@ def identify(
     """
     target, own = loading.target(loaded), network_folder(loaded.network)
     _check_target(loading, loaded.name, target, own)
-    more: list[Result] = []
-    for folder in loading.runs:
-        found = results.read(folder)
-        if found.scenario.name != loaded.name:
-            raise InputError(f"--runs: {folder}: holds runs of {found.scenario.name}, not of {loaded.name}")
-        found.map()  # checks that the city is the same
-        more += [level.read(*run) for level in found.levels for run in level.runs]
 
     def load(stage: int, **options: object) -> list[Result]:
         """Do the loading runs of a stage at all levels that are not finished; return all of them."""
@@ -128,7 +124,7 @@ def identify(
     first = load(0)
     network = static_model(loaded, first, guided=loading.guided)
     second = load(1, set_point=tuple(network.mfds[region].critical for region in loaded.protected))
-    runs = [*first, *second, *more]
+    runs = [*first, *second]
     scheme: dict = {"step": loaded.step, "substeps": loaded.substeps, "integrator": loaded.integrator}
 
     def fitted(runs: Sequence[Result], samples: Sequence[dict]) -> RegionalModel:
@@ -139,12 +135,14 @@ def identify(
 
     samples = samples_of(network, runs)
     model = fitted(runs, samples)
-    fits = region_fits(model, samples, [run.accumulation for run in runs], seeds=len(loading.seeds))
+    states, lane_km = [run.accumulation for run in runs], city_lane_km(city_of(network))
+    model = with_guesses(model, samples, states, lane_km, loaded.substeps / loaded.step)
+    fits = region_fits(model, samples, states, seeds=len(loading.seeds), lane_km=lane_km)
     text, errors = fit_table(model, fits), None
     if len(loading.seeds) > 1:  # the last seed is held out once
-        kept = [run for run in runs if run.seed != loading.seeds[-1] or any(run is other for other in more)]
-        without = fitted(kept, samples_of(network, kept))
-        unseen = [observed(run) for run in (*first, *second) if run.seed == loading.seeds[-1]]
+        kept = [run for run in runs if run.seed != loading.seeds[-1]]
+        without = replace(fitted(kept, samples_of(network, kept)), critical_above=model.critical_above)
+        unseen = [observed(run) for run in runs if run.seed == loading.seeds[-1]]
         errors = predictions(without, unseen, scheme)
         text += "\n" + prediction_table(without, errors, loaded.step)
     files.write_text(out / "fit.txt", text + "\n")
@@ -156,7 +154,7 @@ def identify(
     files.write_table(out / "samples.csv", table, float_format="%.6g")
     plots.draw_mfds(out / "mfd.png", model, samples)
     model = replace(model, placeholder=False, doubts=tuple(fits["doubts"]))
-    verdict = run_verdict(model, first)
+    verdict = run_verdict(loaded, model, first)
     model = replace(model, controllable=verdict.boundaries.shares)
     target.mkdir(parents=True, exist_ok=True)
     comment = (
@@ -169,7 +167,32 @@ def identify(
     sumo |= {key: files.relative(own / sumo[key], target) for key in PATHS if isinstance(sumo.get(key), str)}
     files.write_text(target / "network.toml", network_toml(model, sumo, comment))
     files.write_text(target / authority.FILE, verdict.text())
-    return "\n".join([text, *wrapped("\n".join(verdict.sentences))])
+    proposed = _protected(loaded, verdict.protect, write=loading.protect)
+    return "\n".join([text, *wrapped("\n".join([*verdict.sentences, *proposed]))])
+
+
+def _protected(scenario: Scenario, regions: tuple[int, ...], *, write: bool) -> list[str]:
+    """Return the proposal to protect `regions`, unless the scenario does; write it into its scenario.toml if told to.
+
+    Raises InputError if the file cannot be changed.
+    """
+    if not regions or set(regions) == set(scenario.protected):
+        return []
+    names = scenario.network.titles
+    line = f"protected = [{', '.join(map(str, regions))}]"
+    proposal = f"Regions to protect: {', '.join(names[r] for r in regions)}. The scenario protects "
+    proposal += f"{', '.join(names[r] for r in scenario.protected) or 'none'}"
+    if not write:
+        return [f"{proposal}; write {line} into {scenario.where}, or use --protect."]
+    path = shipped.beside(Path(scenario.where).parent, "scenario.toml", f"a scenario of your own with {line}")
+    text = path.read_text(encoding="utf-8")
+    top, bracket, tables = (text + "\n").partition("\n[")
+    top, count = re.subn(r"(?m)^protected *=.*$", line, top)
+    changed = (top if count else f"{top.rstrip()}\n{line}\n") + bracket + tables
+    if tomllib.loads(changed) != tomllib.loads(text) | {"protected": list(regions)}:
+        raise InputError(f"{path}: protected: cannot be changed here; write {line} yourself")
+    files.write_text(path, changed.rstrip("\n") + "\n")
+    return [f"{proposal.replace('protects', 'protected')}; {path} has {line} now."]
 
 
 def _named(progress: Callable[[int, int, str], None] | None, stage: str) -> Callable[..., None] | None:
@@ -195,7 +218,7 @@ def _check_target(loading: Loading, name: str, target: Path, own: Path) -> None:
 
 def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool) -> RegionalModel:
     """Return the network with fitted MFDs, and own split ratios unless guided. Raises InputError for empty runs."""
-    network = replace(scenario.network, exit_rates=None, capacity=None, storage=None)
+    network = replace(scenario.network, exit_rates=None, capacity=None, storage=None, critical_above={})
     samples = samples_of(network, results)
     empty = nearly_empty(samples)
     if len(empty) == network.regions:
@@ -230,7 +253,28 @@ def as_it_was(network: RegionalModel, model: RegionalModel, regions: Sequence[in
     )
 
 
-def run_verdict(network: RegionalModel, results: Sequence[Result]) -> authority.Verdict:
+def city_lane_km(city: City) -> PerRegion:
+    """Return the lane-kilometres (R,) of the regions."""
+    metres = [city.length[edge] * city.lanes[edge] for edge in city.edges]
+    return np.bincount([city.region_of[edge] for edge in city.edges], metres, city.regions) / 1000.0
+
+
+def with_guesses(
+    model: RegionalModel, samples: Sequence[dict], states: Sequence[StatesOverTime], lane_km: PerRegion, fastest: float
+) -> RegionalModel:
+    """Return `model` with guesses from lanes (R,) [km] beyond data that show no falling branch.
+
+    samples, states: as of `without_fall`; fastest: largest rate of any vehicle [1/s]
+    """
+    above, mfds = without_fall(model, samples, states), list(model.mfds)
+    most = np.full(model.regions, fastest) if model.exit_rates is None else fastest / model.exit_rates.max(axis=1)
+    for n in set(above) - set(nearly_empty(samples)):
+        mfds[n] = mfd.guess_beyond(mfds[n], mfd.JAM_DENSITY * lane_km[n], above[n], max_rate=most[n])
+    storage = None if model.storage is None else np.maximum(model.storage, [curve.jam for curve in mfds])
+    return replace(model, mfds=tuple(mfds), storage=storage, critical_above=above)
+
+
+def run_verdict(scenario: Scenario, network: RegionalModel, results: Sequence[Result]) -> authority.Verdict:
     """Judge from runs with open gateways whether perimeter control can help."""
     gateways = []
     for n, gateway in enumerate(city_of(network).gateways):
@@ -238,7 +282,18 @@ def run_verdict(network: RegionalModel, results: Sequence[Result]) -> authority.
         reached = not np.isnan(results[0]["gateway_original_green"][0, n])  # NaN without a signal under control
         gateways.append((gateway.source, gateway.target, passed, reached))
     boundaries = authority.Boundaries.of_gateways(network.regions, gateways)
-    most = np.max([result.accumulation.sum(axis=2).max(axis=0) for result in results], axis=0) / network.critical
+    most = np.max([result.accumulation.sum(axis=2).max(axis=0) for result in results], axis=0)
+    times = ("mean_trip_time_s", "mean_departure_delay_s", "mean_time_loss_s")
+    trip, delay, loss = (np.mean([getattr(result, name) for result in results]) for name in times)
     started = np.sum([result["departures"].sum(axis=(0, 2)) for result in results], axis=0).astype(float)
     where = f"in {len(results)} loading run{'s' * (len(results) > 1)} under {results[0].controller}"
-    return authority.verdict(network, boundaries, most=most, started=started, where=where)
+    return authority.verdict(
+        network,
+        boundaries,
+        most=most,
+        started=started,
+        waiting=max(float(result.backlog.sum(axis=(1, 2)).max()) for result in results),
+        slowness=trip / max(trip - delay - loss, 1e-9),
+        where=where,
+        scenario=os.path.relpath(scenario.folder) if scenario.folder else scenario.name,
+    )

@@ -82,7 +82,7 @@ def errors(scenario: Scenario, result: Result, predicted: Result) -> pd.DataFram
     following = _advanced(scenario, result, result.accumulation[:-1], slice(None))
     off = _with_all(predicted.accumulation.sum(-1) - simulated)
     next_off = _with_all(following.sum(-1) - simulated[1:])
-    seen, critical = _with_all(simulated), np.append(network.critical, network.critical.sum())
+    seen, critical = _with_all(simulated), np.append(network.seen_critical, network.seen_critical.sum())
     return pd.DataFrame(
         {
             "region": [*range(network.regions), "all"],
@@ -155,9 +155,9 @@ def prediction_errors(found: Finished, model: Path | None = None) -> pd.DataFram
                 "runs": len(runs),
                 "model": os.path.normpath(network.folder) if network.folder else "",
                 "region": range(network.regions),
-                "critical_veh": network.critical,
+                "critical_veh": network.seen_critical,
                 "most_share": np.max([run.accumulation.sum(axis=2).max(axis=0) for run in runs], axis=0)
-                / network.critical,
+                / network.seen_critical,
             }
             tables.append(pd.DataFrame(columns).join(predictions(network, runs, scheme)))
     return pd.concat(tables, ignore_index=True)

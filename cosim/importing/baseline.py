@@ -41,6 +41,7 @@ class Baseline:
     ways: (edges that a vehicle drove to the end, last edge of its route) -> number of vehicles
     teleports; waiting: vehicles not inserted at the end; running: on the road at the end
     dropped: vehicles of the demand that SUMO gave up
+    slowness: trip time over free-flow time of completed trips [-], NaN without any
     """
 
     presence: Float[np.ndarray, "K E"]
@@ -49,6 +50,7 @@ class Baseline:
     waiting: int
     running: int
     dropped: int = 0
+    slowness: float = np.nan
 
     def density(self, streets: Streets) -> PerEdge:
         """Return the density (E,) [veh/m of lane] in the quarter of an hour with the most vehicles."""
@@ -140,6 +142,8 @@ def _measured(folder: Path, streets: Streets, begin: float, end: float, vehicles
     statistic = ElementTree.parse(folder / "statistic.xml").getroot()
     counts = child(statistic, "vehicles")
     waiting = int(attribute(counts, "waiting"))
+    trips = child(statistic, "vehicleTripStatistics")
+    duration, loss = (float(attribute(trips, name)) for name in ("duration", "timeLoss"))
     ways, driven = _ways(folder / "ways.xml", streets)
     return Baseline(
         presence=_presence(folder / "edges.xml", streets, begin, end),
@@ -148,6 +152,7 @@ def _measured(folder: Path, streets: Streets, begin: float, end: float, vehicles
         waiting=waiting,
         running=int(attribute(counts, "running")),
         dropped=max(len(vehicles - driven) - waiting, 0),
+        slowness=duration / (duration - loss) if duration > loss else np.nan,
     )
 
 

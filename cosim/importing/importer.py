@@ -122,7 +122,7 @@ def import_city(
         pd.DataFrame({"edge": streets.edges, "region": labels}).to_csv(net_folder / "regions.csv", index=False)
         city = load_city(net_folder / NET, net_folder / "regions.csv", network.regions)
         tables = quality.tables(streets, labels, network.region_names, city, baseline, left)
-        verdict = quality.import_verdict(network, tables.gateways, labels, baseline)
+        verdict = quality.import_verdict(network, tables.gateways, labels, baseline, scenario.name)
         network = replace(network, controllable=verdict.boundaries.shares)
         report = _report(case, streets, traffic, clock, tables, baseline, assigned)
         if isinstance(regions, int) and network.regions < regions:

@@ -12,16 +12,12 @@ from cosim.importing.demand import Traffic
 from cosim.importing.regions import digraph, names, positions
 from cosim.importing.streets import Streets
 from cosim.sumo.arrays import EdgeNumbers
-from cosim.sumo.net import JAM_SPACING
 from nmfd.arrays import PairsOverTime
 from nmfd.model.identification import observed_split_ratios
-from nmfd.model.mfd import Mfd
+from nmfd.model.mfd import JAM_DENSITY, Mfd, guess
 from nmfd.model.regional_model import RegionalModel
 from nmfd.runs.config import quoted
 
-# Shape of the published MFD until one is measured: g = c (ALPHA y^2 + BETA y + 1) x with y = x / jam.
-ALPHA, BETA = 0.98405, -1.97190
-JAM_SHARE = 0.6  # of the lanes that can fill up
 SIGNAL_SPEED_SHARE = 0.5  # speed with signals over the speed limit
 DEFAULT_CYCLE_S = 90.0
 SHORTEST_STEP_S, LONGEST_STEP_S = 60.0, 180.0  # control intervals; shorter cycles are taken several times
@@ -114,8 +110,8 @@ def _placeholders(streets: Streets, regions: np.ndarray, baseline: Baseline) -> 
     across = np.array([np.sqrt(np.ptp(streets.centre[regions == r], axis=0).prod()) for r in range(count)])
     measured = baseline.metres_per_visit(streets, regions)
     visit = np.where(np.isnan(measured), 0.7 * np.maximum(across, 100.0), np.maximum(measured, 50.0))
-    rate, jam = SIGNAL_SPEED_SHARE * speed / visit, np.maximum(JAM_SHARE * lanes / JAM_SPACING, 10.0)
-    return tuple(Mfd(a=c * ALPHA / n**2, b=c * BETA / n, c=c, jam=n) for c, n in zip(rate, jam, strict=True))
+    rate, jam = SIGNAL_SPEED_SHARE * speed / visit, np.maximum(JAM_DENSITY * lanes / 1000.0, 10.0)
+    return tuple(map(guess, rate, jam))
 
 
 def options(case: SumoInput, clock: Clock) -> dict[str, str]:

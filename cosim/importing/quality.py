@@ -102,9 +102,9 @@ def left_alone(streets: Streets, switched: Sequence[str] = ()) -> dict[str, str]
 
 
 def import_verdict(
-    network: RegionalModel, gateways: Sequence[Mapping], regions: EdgeNumbers, baseline: Baseline
+    network: RegionalModel, gateways: Sequence[Mapping], regions: EdgeNumbers, baseline: Baseline, scenario: str
 ) -> Verdict:
-    """Judge from the run without control whether perimeter control can help."""
+    """Judge from the run without control whether perimeter control can help; scenario: its name."""
     crossings = ((row["source"], row["target"], row["flow_veh"], row["control"] == CONTROLLED) for row in gateways)
     boundaries = Boundaries.of_gateways(network.regions, crossings)
     inside = np.array([np.bincount(regions, row, network.regions) for row in baseline.presence]) / INTERVAL_S
@@ -112,5 +112,13 @@ def import_verdict(
     for (way, _), vehicles in baseline.ways.items():
         if way:
             started[regions[way[0]]] += vehicles
-    most = inside.max(axis=0) / network.critical
-    return authority.verdict(network, boundaries, most=most, started=started, where="in the run without control")
+    return authority.verdict(
+        network,
+        boundaries,
+        most=inside.max(axis=0),
+        started=started,
+        waiting=baseline.waiting,
+        slowness=baseline.slowness,
+        where="in the run without control",
+        scenario=f"scenarios/{scenario}",
+    )

@@ -61,7 +61,8 @@ class City:
         """
         rows = pd.DataFrame(self._tables.quality[:-1])[REGION_COLUMNS].astype({"region": int})
         rows["x_m"], rows["y_m"] = self._places.round(1).T
-        for column, attribute in (("critical_veh", "critical"), ("jam_veh", "jam"), ("max_outflow_veh_s", "capacity")):
+        rows["critical_veh"] = self.network.seen_critical
+        for column, attribute in (("jam_veh", "jam"), ("max_outflow_veh_s", "capacity")):
             rows[column] = [getattr(mfd, attribute) for mfd in self.network.mfds]
         return rows
 

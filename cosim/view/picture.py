@@ -45,7 +45,8 @@ class CityPicture:
     name: of the scenario; region_names: R; edges: E ids; shapes: E lines (n, 2) [m]
     lane_km: (E,) length times lanes; lanes, region: (E,)
     outlines: rings (n, 2) [m] of every region; places: (R, 2) [m] of its number
-    critical: (R,) [veh]; curves: R MFDs (n, 2) in veh and veh/s; step: control interval [s]; steps: number of them
+    critical: (R,) [veh], NaN where not seen; curves: R MFDs (n, 2) in veh and veh/s
+    step: control interval [s]; steps: number of them
     """
 
     name: str
@@ -86,7 +87,7 @@ class CityPicture:
             outlines=rings_round(shapes, region, REGION_REACH),
             places=np.stack([middles[region == r].mean(axis=0) for r in range(city.regions)]),
             gates=_gates(city, dict(zip(city.edges, shapes, strict=True))),
-            critical=network.critical,
+            critical=network.seen_critical,
             curves=[np.stack([x, mfd.outflow(x)], axis=1) for x, mfd in zip(axes, network.mfds, strict=True)],
             step=scenario.step,
             steps=scenario.steps,

@@ -16,6 +16,12 @@ from nmfd.runs.tables import text_columns
 
 ENOUGH = 0.25  # share of the filling vehicles that can be held: control may help
 NOTHING = 0.05  # or less: control does not help
+WAITING_SHARE = 0.02  # of all trips waiting outside at a time, and
+SLOW = 2.5  # times the free-flow time: the city is congested
+IDENTIFY = "cosim identify {scenario}"
+EVALUATE = "cosim evaluate {scenario} --controllers no-control,route-guidance"
+PRESSURE = ",no-control+max-pressure"
+PARTITION = "cosim import SUMOCFG --regions N --out networks/OTHER"
 
 Counts = Real[np.ndarray, "R R"]
 FILE = "verdict.txt"
@@ -60,10 +66,11 @@ class Boundaries:
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """Answer in the first of some sentences, and the numbers behind it."""
+    """Answer in the first of some sentences, and the numbers behind it; protect: the regions to protect."""
 
     sentences: tuple[str, ...]
     boundaries: Boundaries
+    protect: tuple[int, ...] = ()
 
     def text(self) -> str:
         """Return the sentences and a table of the boundaries."""
@@ -81,38 +88,61 @@ class Verdict:
 
 
 def verdict(
-    network: RegionalModel, boundaries: Boundaries, *, most: PerRegion, started: PerRegion, where: str
+    network: RegionalModel,
+    boundaries: Boundaries,
+    *,
+    most: PerRegion,
+    started: PerRegion,
+    waiting: float,
+    slowness: float,
+    where: str,
+    scenario: str,
 ) -> Verdict:
     """Return the verdict.
 
-    most: (R,) [-], highest accumulation over the critical one, in any run; started: (R,) [veh], departures by region
-    where: the runs, such as "in 6 loading runs"
+    most: (R,) [veh], highest accumulation in any run; started: (R,) [veh], departures by region
+    waiting: most vehicles that waited outside at a time [veh]; slowness: trip time over free-flow time [-], NaN if
+        unknown
+    where: the runs, such as "in 6 loading runs"; scenario: its folder, for commands
     """
-    names = network.titles
-    flow = boundaries.flow.sum()
+    names, flow, load = network.titles, boundaries.flow.sum(), most / network.seen_critical
     passed = (
         f"; {boundaries.controlled.sum() / flow:.0%} of the {flow:,.0f} crossings {where} passed one" if flow else ""
     )
-    ratios = ", ".join(f"{name} {ratio:.2f}" for name, ratio in zip(names, most, strict=True))
+    guess = ", a guess" if network.placeholder else ""
+    ratios = ", ".join(
+        f"{name} above {network.critical_above[r]:.0f} veh, not seen" if np.isnan(ratio) else f"{name} {ratio:.2f}"
+        for r, (name, ratio) in enumerate(zip(names, load, strict=True))
+    )
+    crowded = waiting > WAITING_SHARE * started.sum() or slowness > SLOW
+    slow = "" if np.isnan(slowness) else f", and a trip took {slowness:.1f} times its free-flow time"
+    traffic = f"up to {waiting:,.0f} vehicles waited outside at a time{slow}"
     details = [
         f"Of {boundaries.gateways.sum()} gateways {boundaries.controllable.sum()} have a signal that perimeter control "
         f"can use{passed}.",
-        f"Highest accumulation {where}, as a multiple of the critical one: {ratios}.",
+        f"Highest accumulation {where}, as a multiple of the critical one{guess}: {ratios}.",
+        f"{traffic[0].upper()}{traffic[1:]} {where}.",
     ]
-    if network.placeholder:
-        details.append("The critical accumulations are guesses from lanes and speed limits until cosim identify.")
-    critical, nearest = np.flatnonzero(most >= 1.0), int(np.argmax(most))
+    critical = np.flatnonzero(load >= 1.0)
     came, held = boundaries.flow.sum(axis=0), boundaries.controlled.sum(axis=0)
-    holdable = held / np.maximum(came + started, 1.0)
+    holdable, protect = held / np.maximum(came + started, 1.0), np.empty(0, dtype=int)
+    remedies = [f"guidance and other signals: {EVALUATE}{PRESSURE}", f"another partition: {PARTITION}"]
     if not boundaries.controllable.any():
         answer = f"No: {NO_GATEWAY}."
+        remedies[0] = f"guidance: {EVALUATE}"
     elif not flow:
         answer = "No: no vehicle crosses a boundary."
+    elif network.placeholder:
+        answer = "Cannot say yet: the critical accumulations are guesses from lanes and speed limits."
+        remedies = [f"the model of the city: {IDENTIFY}"]
+    elif not len(critical) and crowded:
+        answer = f"Cannot say yet: {traffic}, but no region is seen to become critical."
+        remedies = [f"other demand shows more: {IDENTIFY} --levels 0.8,1,1.3", *remedies]
     elif not len(critical):
-        answer = (
-            f"No: no region is ever critical, {names[nearest]} comes nearest with {most[nearest]:.2f} of its critical "
-            "accumulation; more demand may change that."
-        )
+        ratio = np.nanmax(load, initial=0.0)
+        near = f", {names[int(np.nanargmax(load))]} comes nearest with {ratio:.2f}" if ratio else ""
+        answer = f"No: no region is seen to become critical{near}; more demand may change that."
+        remedies.append(f"more demand: {EVALUATE}{PRESSURE} --demand 1,1.3,1.6")
     else:
         details += [
             f"{names[r]} becomes critical: {came[r]:,.0f} vehicles entered from other regions, "
@@ -122,10 +152,17 @@ def verdict(
         ]
         best = int(critical[np.argmax(holdable[critical])])
         share = f"{holdable[best]:.0%} of what fills {names[best]}"
+        protect = critical[holdable[critical] >= min(ENOUGH, max(holdable[best], NOTHING + 1e-9))]
         if holdable[best] <= NOTHING:
             answer = f"No: regions become critical, but gateways could hold no more than {share}; try other regions."
         elif holdable[best] < ENOUGH:
             answer = f"Hardly: regions become critical, but gateways could hold no more than {share}."
         else:
             answer = f"It may: {names[best]} becomes critical, and gateways could hold {share}."
-    return Verdict(sentences=(f"Can perimeter control help? {answer}", *details), boundaries=boundaries)
+    if not answer.startswith(("It may", "Hardly")):
+        details += [f"Next, {remedy.format(scenario=scenario)}" for remedy in remedies]
+    return Verdict(
+        sentences=(f"Can perimeter control help? {answer}", *details),
+        boundaries=boundaries,
+        protect=tuple(map(int, protect)),
+    )

@@ -13,6 +13,9 @@ from nmfd.errors import InputError
 
 Values = Float[np.ndarray | np.floating, "*B"]
 Samples = Real[np.ndarray, " N"]
+# Geometric guess of a curve: the shape of the published one, g = c (ALPHA y^2 + BETA y + 1) x with y = x / jam.
+ALPHA, BETA = 0.98405, -1.97190
+JAM_DENSITY = 80.0  # veh per lane-km: 60 % of the lanes full of standing vehicles
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,6 +78,24 @@ class Mfd:
         if not rate.min() > 0:
             return f"the outflow is not positive at {grid[rate.argmin()]:.0f} veh, below jam = {self.jam:g}"
         return None
+
+
+def guess(rate: float, jam: float, *, seen: float = 0.0) -> Mfd:
+    """Return a curve of the published shape with q(0) = `rate` [1/s].
+
+    jam: of the region's lanes [veh], raised if the critical accumulation is less than `seen` [veh]
+    """
+    unit = Mfd(a=ALPHA * rate / jam**2, b=BETA * rate / jam, c=rate, jam=jam)
+    return unit if seen <= unit.critical else guess(rate, 1.0001 * jam * seen / unit.critical)
+
+
+def guess_beyond(curve: Mfd, jam: float, seen: float, *, max_rate: float = np.inf) -> Mfd:
+    """Return the guess with the outflow of `curve`, fitted to data without a falling branch, at their end `seen` [veh].
+
+    jam: of the region's lanes [veh]; max_rate: [1/s]
+    """
+    shape = guess(1.0, jam, seen=seen)
+    return guess(float(min(curve.outflow(seen) / shape.outflow(seen), max_rate)), shape.jam)
 
 
 def fit(accumulation: Samples, outflow: Samples, *, max_rate: float = np.inf, bins: int = 24) -> Mfd:

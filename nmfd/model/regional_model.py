@@ -44,6 +44,7 @@ class RegionalModel:
         the desired flow
     storage: (R,) [veh], accumulation that leaves no room for vehicles from other regions; with `capacity`
     controllable: (R, R) [-], [i, h]: share of the flow that passes signals under control; None if unknown
+    critical_above: {region: largest accumulation [veh]} where data show no falling branch; the MFD is a guess beyond
     placeholder: the MFDs are guesses that no run has measured
     doubts: warnings about the fit of each region; () if unknown
     folder: of network.toml, or None
@@ -61,6 +62,7 @@ class RegionalModel:
     capacity: PerPair | None = None
     storage: PerRegion | None = None
     controllable: PerPair | None = None
+    critical_above: Mapping[int, float] = field(default_factory=dict)
     placeholder: bool = False
     doubts: tuple[tuple[str, ...], ...] = ()
     folder: Path | None = None
@@ -79,6 +81,11 @@ class RegionalModel:
     def critical(self) -> PerRegion:
         """Critical accumulations (R,) [veh]."""
         return np.array([mfd.critical for mfd in self.mfds])
+
+    @property
+    def seen_critical(self) -> PerRegion:
+        """Critical accumulations (R,) [veh], NaN where data show no falling branch."""
+        return np.where([r in self.critical_above for r in range(self.regions)], np.nan, self.critical)
 
     @cached_property
     def hops(self) -> Hops:
@@ -200,6 +207,14 @@ class RegionTable(Settings):
         None,
         unit="-",
     )
+    critical_above: float | None = setting(
+        "largest accumulation in data that show no falling branch: the critical one is above, and that of the MFD a "
+        "guess for control",
+        None,
+        unit="veh",
+        ge=0.0,
+        le=MOST_VEHICLES,
+    )
     doubts: config.Texts = setting("warnings of cosim identify about the fit", ())
     observed_split_ratios: dict[str, dict[str, Share]] = setting(
         "measured shares: destination region = { next region = share }, sum 1; elsewhere vehicles cross the fewest "
@@ -288,6 +303,7 @@ def load_network(folder: Path | str) -> RegionalModel:
         capacity=numbers("capacity", by_pair=True),
         storage=numbers("storage"),
         controllable=numbers("controllable", by_pair=True),
+        critical_above={i: row.critical_above for i, row in enumerate(rows) if row.critical_above is not None},
         placeholder=table.placeholder,
         folder=folder,
         doubts=tuple(row.doubts for row in rows) if any(row.doubts for row in rows) else (),
@@ -336,6 +352,8 @@ def network_toml(network: RegionalModel, sumo: Mapping[str, str], comment: str) 
             out.write(f"storage = {network.storage[region]:.6g}\n")
         if network.controllable is not None:
             out.write(f"controllable = {_listed(network.controllable[region, onward])}\n")
+        if region in network.critical_above:
+            out.write(f"critical_above = {network.critical_above[region]:.6g}\n")
         if network.doubts and network.doubts[region]:
             out.write(f"doubts = [{', '.join(map(quoted, network.doubts[region]))}]\n")
         out.write("\n[regions.mfd]\n")

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from nmfd.arrays import Points, StatesOverTime
+from nmfd.arrays import PerRegion, Points, StatesOverTime
 from nmfd.model import identification
 from nmfd.model.identification import Observed
 from nmfd.model.regional_model import RegionalModel
@@ -19,13 +19,17 @@ HYSTERESIS_BINS = 12  # of accumulation
 EXPLAINED = 0.3  # R2 below which the curve explains hardly more than the mean outflow
 FALL = 0.05  # of the largest outflow: a smaller fall up to the jam accumulation is no falling branch
 AHEAD_S = 900.0  # of the longer prediction
-FEW, POOR, SHORT, ENDLESS, ALONE = "few samples", "R2", "not reached", "no falling branch", "one seed"
+CRITICAL_DENSITIES = 8.0, 60.0  # veh per lane-km, of cities
+FEW, POOR, ENDLESS, ODD, ALONE = "few samples", "R2", "no falling branch", "critical density", "one seed"
 MEANINGS = {  # beginning of a doubt -> meaning and remedy
     FEW: f"fewer than {SAMPLES} samples, the MFD is unchanged; give a higher demand (cosim: --levels)",
     POOR: f"below {EXPLAINED:g} the curve explains hardly anything of the outflow and misleads controllers; give more "
     "data (cosim: --levels, --seeds), or other regions",
-    SHORT: "no sample beyond the critical accumulation, the rest is a guess; give a higher demand (cosim: --levels)",
-    ENDLESS: "no falling branch: the onset of congestion is unknown; give a higher demand (cosim: --levels)",
+    ENDLESS: "the critical accumulation is above and was not seen; controllers use a guess from lanes; give a higher "
+    "demand (cosim: --levels)",
+    ODD: "outside {:g} to {:g} veh per lane-km, as no city has it; check regions, lanes and data".format(
+        *CRITICAL_DENSITIES
+    ),
     ALONE: "there is no held-out error; give --seeds 2 or more",
 }
 HELD_OUT = (
@@ -34,43 +38,68 @@ HELD_OUT = (
 )
 
 
+def without_fall(
+    network: RegionalModel, samples: Sequence[Mapping[str, Points]], accumulations: Sequence[StatesOverTime] = ()
+) -> dict[int, float]:
+    """Return region -> largest accumulation [veh] where the fitted curve hardly falls up to there.
+
+    samples, accumulations: as of `region_fits`
+    """
+    most = largest(samples, accumulations)
+    return {
+        region: float(most[region])
+        for region, curve in enumerate(network.mfds)
+        if region in nearly_empty(samples)
+        or most[region] <= curve.critical
+        or curve.outflow(most[region]) > (1.0 - FALL) * curve.capacity
+    }
+
+
+def largest(samples: Sequence[Mapping[str, Points]], accumulations: Sequence[StatesOverTime] = ()) -> PerRegion:
+    """Return the largest accumulation (R,) [veh] of the runs, without any of the samples."""
+    if len(accumulations):
+        return np.max([state.sum(axis=2).max(axis=0) for state in accumulations], axis=0)
+    return np.array([max((part[:, 0].max() for part in cloud.values() if len(part)), default=0.0) for cloud in samples])
+
+
 def region_fits(
     network: RegionalModel,
     samples: Sequence[Mapping[str, Points]],
     accumulations: Sequence[StatesOverTime] = (),
     seeds: int = 2,
+    lane_km: PerRegion | None = None,
 ) -> pd.DataFrame:
     """Return the fit of each region, a row each.
 
-    Columns: region, name; critical_veh, jam_veh, storage_veh, max_outflow_veh_s of the model; samples; r2; spread of
-    samples around the curve, as a share of its maximum; hysteresis [-]; most_share, the largest accumulation in any run
-    over the critical one [-]; doubts, each of which begins with a key of MEANINGS. NaN where unknown.
+    Columns: region, name; critical_veh, jam_veh, storage_veh, max_outflow_veh_s of the model, the critical one NaN
+    where it was not seen, then critical_above_veh; samples; r2; spread of samples around the curve, as a share of its
+    maximum; hysteresis [-]; most_share, the largest accumulation in any run over the critical one [-]; doubts, each of
+    which begins with a key of MEANINGS. NaN where unknown.
 
     samples: by region, label -> (n, 2) of accumulation [veh] and outflow [veh/s]; accumulations: (T+1, R, R) [veh] of
-    each run; seeds: of the loading runs
+    each run; seeds: of the loading runs; lane_km: (R,)
     """
-    most = [max((part[:, 0].max() for part in cloud.values() if len(part)), default=0.0) for cloud in samples]
-    if len(accumulations):
-        most = np.max([state.sum(axis=2).max(axis=0) for state in accumulations], axis=0)
-    rows = []
+    most, critical, rows = largest(samples, accumulations), network.seen_critical, []
+    density = critical / (np.full(network.regions, np.nan) if lane_km is None else lane_km)
     for region, (curve, cloud) in enumerate(zip(network.mfds, samples, strict=True)):
-        points = own_points(cloud)
-        residuals, r2, share = points[:, 1] - curve.outflow(points[:, 0]), np.nan, most[region] / curve.critical
+        points, above = own_points(cloud), network.critical_above.get(region, np.nan)
+        residuals, r2 = points[:, 1] - curve.outflow(points[:, 0]), np.nan
         if len(points) >= SAMPLES and points[:, 1].var() > 0:
             r2 = 1.0 - (residuals**2).mean() / points[:, 1].var()
         doubts = {
             f"{FEW} ({len(points)})": len(points) < SAMPLES,
             f"{POOR} {r2:.2f}": len(points) >= SAMPLES and not r2 >= EXPLAINED,  # NaN too
-            f"{SHORT} ({100 * share:.0f} % of critical)": share < 1.0,
-            f"{ENDLESS} (jam {curve.jam:.0f}, critical {curve.critical:.0f} veh)": curve.outflow(curve.jam)
-            > (1.0 - FALL) * curve.capacity,
+            f"{ENDLESS} (critical above {above:.0f} veh, not seen)": region in network.critical_above,
+            f"{ODD} {density[region]:.3g} veh per lane-km": abs(density[region] - np.mean(CRITICAL_DENSITIES))
+            > np.ptp(CRITICAL_DENSITIES) / 2.0,
             ALONE: seeds < 2,
         }
         rows.append(
             {
                 "region": region,
                 "name": network.region_names[region],
-                "critical_veh": curve.critical,
+                "critical_veh": critical[region],
+                "critical_above_veh": above,
                 "jam_veh": curve.jam,
                 "storage_veh": np.inf if network.storage is None else network.storage[region],
                 "max_outflow_veh_s": curve.capacity,
@@ -78,7 +107,7 @@ def region_fits(
                 "r2": r2,
                 "spread": np.sqrt((residuals**2).mean()) / curve.capacity if len(points) else np.nan,
                 "hysteresis": hysteresis(cloud),
-                "most_share": share,
+                "most_share": most[region] / critical[region],
                 "doubts": tuple(text for text, there in doubts.items() if there),
             }
         )
@@ -118,7 +147,9 @@ def fit_table(network: RegionalModel, fits: pd.DataFrame, known: Mapping[str, st
         [
             {
                 "region": f"{fit.region} {fit.name}",
-                "critical [veh]": f"{fit.critical_veh:.0f}",
+                "critical [veh]": f"above {fit.critical_above_veh:.0f}"
+                if np.isnan(fit.critical_veh)
+                else f"{fit.critical_veh:.0f}",
                 "jam [veh]": f"{fit.jam_veh:.0f}",
                 **({} if network.storage is None else {"storage [veh]": f"{fit.storage_veh:.0f}"}),
                 "max outflow [veh/s]": f"{fit.max_outflow_veh_s:.3f}",
@@ -126,7 +157,7 @@ def fit_table(network: RegionalModel, fits: pd.DataFrame, known: Mapping[str, st
                 "R2": f"{fit.r2:.2f}",
                 "spread": f"{100 * fit.spread:.0f} %",
                 "hysteresis": "-" if np.isnan(fit.hysteresis) else f"{100 * fit.hysteresis:.0f} %",
-                "most / critical": f"{fit.most_share:.2f}",
+                "most / critical": "-" if np.isnan(fit.most_share) else f"{fit.most_share:.2f}",
                 "WARNINGS": "; ".join(fit.doubts) or "none",
             }
             for fit in fits.itertuples(index=False)
@@ -152,7 +183,7 @@ def predictions(network: RegionalModel, runs: Sequence[Observed], scheme: dict) 
         states = [run.accumulation.sum(axis=2) for run in runs]
         unchanged = np.concatenate([state[:-intervals] - state[intervals:] for state in states])
         for name, part in (("rmse_share", errors), ("persistence_rmse_share", unchanged)):
-            columns[f"{when}_{name}"] = np.sqrt((part**2).mean(axis=0)) / network.critical
+            columns[f"{when}_{name}"] = np.sqrt((part**2).mean(axis=0)) / network.seen_critical
     return pd.DataFrame({**columns, "ahead_s": ahead * scheme["step"]})
 
 

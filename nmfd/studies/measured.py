@@ -44,7 +44,7 @@ MEANINGS = {
 UNKNOWN_PARTS = (
     "Not in such data: which trips end in a region; vehicles on links without detectors; split ratios (vehicles cross "
     "the fewest boundaries); capacities of boundaries; controlled signals; anything beyond the largest accumulation, "
-    "where the outflow is constant. Demand belongs into a scenario.toml."
+    "where the outflow is constant or a guess. Demand belongs into a scenario.toml."
 )
 
 
@@ -157,7 +157,13 @@ def identify(
             f"{adjacency or counts}: region {names[j]} cannot be reached from {names[i]}; give all pairs of "
             "neighbours, region,neighbour, with --adjacency"
         )
-    fits = fit_quality.region_fits(network, samples)
+    above = fit_quality.without_fall(network, samples)
+    curves = [
+        mfd.guess_beyond(curve, mfd.JAM_DENSITY * lane_km[n], above[n]) if n in above else curve
+        for n, curve in enumerate(network.mfds)
+    ]
+    network = replace(network, mfds=tuple(curves), critical_above=above)
+    fits = fit_quality.region_fits(network, samples, lane_km=lane_km)
     lengths = np.where(assumed, trip_km, np.nan)
     fits["doubts"] = [
         (*doubts, *_doubts(stations[stations["region"] == region], used, coverage[n], lengths[n], days))

@@ -107,21 +107,22 @@ def region_accumulation(
 
     Results of several plants share the controller's colour and differ in line style.
     """
-    critical = network.mfds[region].critical
+    critical = network.seen_critical[region]
     style = dict(color="0.35", linewidth=1.0, linestyle=":", zorder=1)
     ax.hlines(critical, 0.0, 1.0, transform=ax.get_yaxis_transform(), label=CRITICAL, **style)
     _curves(ax, trajectories, lambda t: t.accumulation[:, region].sum(axis=1), seed)
     ax.set_ylabel("accumulation [veh]")
     highest = max((t.accumulation[:, region].sum(axis=1).max() for t in trajectories), default=0.0)
-    ax.set_ylim(0.0, 1.06 * max(highest, 1.25 * critical))
+    ax.set_ylim(0.0, 1.06 * np.nanmax([highest, 1.25 * critical]))
     ax.set_title(network.titles[region], fontsize="medium")
     return ax
 
 
-def mfd(ax: Axes, mfd: Mfd, samples: Mapping[str, np.ndarray] | None = None) -> Axes:
+def mfd(ax: Axes, mfd: Mfd, samples: Mapping[str, np.ndarray] | None = None, *, seen: bool = True) -> Axes:
     """Draw outflow against accumulation, and hatch what lies beyond the samples.
 
     samples: label -> (n, 2) of accumulation [veh] and outflow [veh/s], such as {"loading": ..., "unloading": ...}
+    seen: False if the critical accumulation is a guess, which is not shown
     """
     clouds = {label: np.asarray(cloud) for label, cloud in (samples or {}).items() if len(cloud)}
     right = 1.15 * mfd.jam
@@ -131,12 +132,13 @@ def mfd(ax: Axes, mfd: Mfd, samples: Mapping[str, np.ndarray] | None = None) -> 
         ax.axvspan(
             largest, max(right, largest), facecolor="none", edgecolor="0.75", hatch="///", linewidth=0, label=UNSEEN
         )
-    ax.axvline(mfd.critical, color="0.35", linewidth=1.0, linestyle=":", label=CRITICAL, zorder=1)
+    if seen:
+        ax.axvline(mfd.critical, color="0.35", linewidth=1.0, linestyle=":", label=CRITICAL, zorder=1)
     for (label, cloud), tone in zip(clouds.items(), _tones(len(clouds)), strict=True):
         ax.scatter(cloud[:, 0], cloud[:, 1], s=7, color=COLOURS.get(label, tone), alpha=0.6, linewidths=0, label=label)
     grid = np.linspace(0.0, right, 1001)
     ax.plot(grid, mfd.outflow(grid), color="black", linewidth=1.8, label="MFD")
-    if not clouds:
+    if seen and not clouds:
         text, top = f"{mfd.critical:,.0f} veh, {mfd.capacity:.3g} veh/s", (mfd.critical, mfd.capacity)
         ax.annotate(text, top, xytext=(0, 6), textcoords="offset points", ha="center", fontsize="small")
     ax.set_xlim(0.0, right)
@@ -154,7 +156,8 @@ def draw_mfds(path: Path, network: RegionalModel, samples: Sequence[Mapping[str,
     shown = range(network.regions) if samples or len(set(network.mfds)) > 1 else [0]
     drawing, axes = panels(len(shown))
     for region, ax in zip(shown, axes, strict=True):
-        mfd(ax, network.mfds[region], samples[region] if samples else None)
+        seen = region not in network.critical_above
+        mfd(ax, network.mfds[region], samples[region] if samples else None, seen=seen)
         title = network.titles[region] if len(shown) == network.regions else "every region"
         ax.set_title(title, fontsize="medium")
     legend_below(drawing, axes)
