@@ -5,6 +5,8 @@ import os
 import pickle
 import re
 import signal
+import subprocess
+import sys
 import threading
 import time
 from contextlib import suppress
@@ -121,8 +123,12 @@ def job(controller="no-control", seed=0, calls=None):
     return trajectory(controller, seed)
 
 
-def die():
-    os._exit(3)
+def die(status=3):
+    os._exit(status)
+
+
+def crash():
+    os.kill(os.getpid(), signal.SIGSEGV)
 
 
 def divide():
@@ -194,12 +200,34 @@ def test_failures_are_rows_and_the_others_go_on(tmp_path):
 
 
 def test_processes_that_die_or_hang_are_rows_and_give_the_same_numbers(tmp_path):
-    runs = [run_of("a", work=die), run_of("b", work=hang), run_of("c")]
-    rows = run_many(runs, tmp_path / "out", workers=3, time_limit=20.0).set_index("controller")["failure"]
-    assert rows.to_dict() == {"a": "its process died (status 3)", "b": "not finished within the time limit", "c": ""}
-    run_many(runs[2:], tmp_path / "here", workers=0)
-    one, other = (Result.read(tmp_path / where / "c-0.nc") for where in ("out", "here"))
+    works = {"a": die, "b": partial(die, 0), "c": crash, "d": hang, "e": None}
+    runs = [run_of(name, work=work) for name, work in works.items()]
+    rows = run_many(runs, tmp_path / "out", workers=3, time_limit=5.0).set_index("controller")["failure"]
+    assert rows.to_dict() == {
+        "a": "its process died (status 3)",
+        "b": "its process died (status 0)",
+        "c": "its process died (status -11, Segmentation fault)",
+        "d": "not finished within the time limit",
+        "e": "",
+    }
+    run_many([run_of("c")], tmp_path / "here", workers=1)
+    run_many([run_of("c")], tmp_path / "again", workers=0)
+    one, other = (Result.read(tmp_path / where / "c-0.nc") for where in ("here", "again"))
     assert one.data.identical(other.data)
+
+
+def test_a_script_without_a_guard_is_not_run_again_by_its_processes(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(f"""
+import sys
+sys.path.append({os.path.dirname(__file__)!r})
+print("begun", flush=True)
+from test_runs import run_of, run_many
+print(list(run_many([run_of("a"), run_of("b")], {str(tmp_path / "out")!r}, workers=2)["failure"]))
+""")
+    (tmp_path / "statistics.py").write_text("raise ImportError")  # a file of the user is not a module
+    done = subprocess.run([sys.executable, "-P", script], capture_output=True, text=True, cwd=tmp_path, timeout=120)
+    assert done.stdout.split("\n") == ["begun", "['', '']", ""], done.stderr
 
 
 def test_finished_runs_survive_an_interruption(tmp_path):

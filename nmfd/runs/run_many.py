@@ -7,26 +7,32 @@
 """
 
 import json
+import math
 import multiprocessing
 import os
 import platform
 import shlex
+import signal
 import subprocess
 import sys
+import threading
+import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, Future, as_completed
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, as_completed
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cache
 from importlib import metadata
+from multiprocessing import connection, forkserver, resource_tracker
+from multiprocessing.process import BaseProcess
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote
 
 from filelock import FileLock, Timeout
-from pebble import ProcessExpired, ProcessPool
 
 from nmfd import __version__
 from nmfd.errors import InputError, RunFailed, need
@@ -41,6 +47,8 @@ if TYPE_CHECKING:
 
 MANIFEST, TABLE, LOCK = "manifest.json", "runs.csv", ".lock"
 DASK_PATIENCE_S = 10.0  # for the scheduler to answer
+POLL_S, EXIT_S = 0.2, 5.0  # between looks at the time limit; for a process to end after its outcome
+STARTING = threading.Lock()  # held while a process starts
 PACKAGES = ("numpy", "torch", "casadi", "libsumo")  # whose versions are in the manifest
 
 
@@ -71,7 +79,6 @@ def run_many(
     out: Path | str,
     *,
     workers: int = 1,
-    fresh: bool = True,
     scheduler: str | None = None,
     time_limit: float | None = None,
     progress: Progress = None,
@@ -81,8 +88,7 @@ def run_many(
     Columns are those of `nmfd.metrics.summary`, `folder` if there are several, and `failure`: "" of a finished run,
     else the reason with file and line. Finished runs of earlier calls that share the keys come last.
 
-    workers: number of processes; 0: this process
-    fresh: a new process for every run
+    workers: runs at a time, each in a process of its own; 0: one after the other in this process
     scheduler: address of a Dask scheduler, whose workers do the runs; it takes TLS certificates from Dask's own
         configuration
     time_limit: wall time of a run (s), in processes only
@@ -92,15 +98,15 @@ def run_many(
         InputError: another process has the folder, or it is not a folder of runs
     """
     out = Path(out)
-    with _locked(out):
+    with locked(out):
         keys = _write_manifest(out, runs, workers)
         rows = {file: _row(file, result) for file, key in keys.items() if (result := _finished(out / file, key))}
         todo = [run for run in runs if run.file not in rows]
         try:
-            with watched("runs", progress) as show:
+            with watched("runs", progress) as show, closing(_outcomes(todo, workers, scheduler, time_limit)) as ended:
                 if show and todo:
                     show(0, len(todo))
-                for done, (run, outcome) in enumerate(_outcomes(todo, workers, fresh, scheduler, time_limit), 1):
+                for done, (run, outcome) in enumerate(ended, 1):
                     if isinstance(outcome, Result):
                         outcome = outcome.assign(key=json.dumps(keys[run.file]))
                         (out / run.file).parent.mkdir(parents=True, exist_ok=True)
@@ -126,8 +132,8 @@ def raise_failures(rows: "pd.DataFrame") -> None:
         raise RunFailed("; ".join(f"{label}: {why}" for label, why in zip(labels, failed["failure"], strict=True)))
 
 
-def attempt(job: Callable[[], Result]) -> Result | str:
-    """Return the result of `job`, or why there is none, with file and line."""
+def attempt(job: Callable[[], Result | str]) -> Result | str:
+    """Return the outcome of `job`, or why there is none, with file and line."""
     try:
         return job()
     except InputError as error:
@@ -138,49 +144,118 @@ def attempt(job: Callable[[], Result]) -> Result | str:
 
 
 def _outcomes(
-    todo: Sequence[Run], workers: int, fresh: bool, scheduler: str | None, time_limit: float | None
-) -> Iterator[tuple[Run, Result | str]]:
+    todo: Sequence[Run], workers: int, scheduler: str | None, time_limit: float | None
+) -> Generator[tuple[Run, Result | str]]:
     """Yield every run with its result or the reason of its failure, as they end."""
-    if not todo:
-        return
-    if scheduler is not None:
+    if scheduler is not None and todo:
         with _dask(scheduler) as executor:
-            yield from _ended({executor.submit(_alone, run.job, os.getcwd(), time_limit): run for run in todo})
+            futures = {executor.submit(_alone, run.job, os.getcwd(), time_limit): run for run in todo}
+            for future in as_completed(list(futures)):
+                run = futures.pop(future)  # with its result, which may be large
+                yield run, attempt(future.result)
     elif workers == 0:
         yield from ((run, attempt(run.job)) for run in todo)
     else:
-        pool = _pool(min(workers, len(todo)), fresh)
-        try:
-            yield from _ended({pool.schedule(attempt, [run.job], timeout=time_limit): run for run in todo})
-        finally:
-            pool.stop()
-            pool.join()
-
-
-def _ended(futures: dict[Future, Run]) -> Iterator[tuple[Run, Result | str]]:
-    for future in as_completed(list(futures)):
-        run = futures.pop(future)  # with its result, which may be large
-        try:
-            yield run, future.result()
-        except TimeoutError:
-            yield run, "not finished within the time limit"
-        except ProcessExpired as error:
-            yield run, f"its process died (status {error.exitcode})"
-        except Exception as error:
-            yield run, f"{type(error).__name__}: {' '.join(str(error).split())}"
-
-
-def _pool(workers: int, fresh: bool, **options: Any) -> ProcessPool:
-    context = multiprocessing.get_context("spawn")
-    return ProcessPool(max_workers=workers, max_tasks=int(fresh), context=context, **options)
+        yield from _processes(todo, workers, time_limit)
 
 
 def _alone(job: Callable[[], Result], folder: str, time_limit: float | None) -> Result | str:
     """Do `job` in a new process in `folder`, from a worker of Dask."""
     multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]  # may have a child
-    with _pool(1, True, initializer=os.chdir, initargs=[folder]) as pool:
-        future = pool.schedule(attempt, [job], timeout=time_limit)
-        return next(outcome for _, outcome in _ended({future: Run("", {}, job)}))
+    return list(_processes([Run("", {}, job)], 1, time_limit, folder))[0][1]
+
+
+def _processes(
+    todo: Sequence[Run], workers: int, time_limit: float | None, folder: str = ""
+) -> Generator[tuple[Run, Result | str]]:
+    """Yield every run with its outcome from a process of its own in `folder`, `workers` at a time."""
+    waiting: list[Run] = list(reversed(todo))
+    live: dict[connection.Connection, tuple[Run, BaseProcess, float]] = {}
+    try:
+        while waiting or live:
+            while waiting and len(live) < workers:
+                run = waiting.pop()
+                channel, process = _start(run.job, os.path.abspath(folder))
+                live[channel] = run, process, time.monotonic() + (time_limit or math.inf)
+                with suppress(BrokenPipeError):  # it has died, which is an outcome
+                    channel.send(run.job)
+            ready, now = connection.wait(live, POLL_S), time.monotonic()
+            for channel in [one for one, (_, _, end) in live.items() if one in ready or now > end]:
+                run, process, _ = live[channel]
+                outcome = _outcome(channel, process)
+                del live[channel]
+                yield run, outcome
+    except BaseException:  # Ctrl-C, perhaps while the server imports, or an end of the iteration
+        for _, process, _ in live.values():
+            process.kill()
+            process.join()
+        if server := getattr(forkserver._forkserver, "_forkserver_pid", None):
+            os.kill(server, signal.SIGTERM)
+        raise
+
+
+def _start(job: Callable[[], Result], folder: str) -> tuple[connection.Connection, BaseProcess]:
+    """Start a process for `job`, and return it behind the channel for the job and its outcome.
+
+    Where the system can, it is forked from a server that has imported the module of the job.
+    """
+    method = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
+    context: Any = multiprocessing.get_context(method)
+    if method == "forkserver":
+        context.set_forkserver_preload([__name__, getattr(job, "func", job).__module__])
+        resource_tracker.ensure_running()  # first, as it lets Ctrl-C through
+        blocked, kept = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}), dict(os.environ)
+        os.environ |= {"PYTHONSAFEPATH": "1", "PYTHONPATH": os.pathsep.join(sys.path)}  # the modules of this process
+        try:
+            forkserver.ensure_running()
+        finally:
+            os.environ.clear()
+            os.environ |= kept
+            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+    ours, theirs = context.Pipe()
+    process = context.Process(target=_work, args=(theirs, folder, dict(os.environ)), daemon=True)
+    with STARTING:  # without the user's script, which would do everything again
+        main, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
+        try:
+            process.start()
+        finally:
+            sys.modules["__main__"] = main
+    theirs.close()
+    return ours, process
+
+
+def _work(channel: connection.Connection, folder: str, environment: Mapping[str, str]) -> None:
+    """Send back the outcome of the job that comes through `channel`, unless the process at its other end is gone."""
+    os.environ.clear()
+    os.environ.update(environment)
+    os.chdir(folder)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    with suppress(OSError):
+        channel.send(attempt(lambda: channel.recv()()))
+
+
+def _end_with_parent() -> None:
+    if parent := multiprocessing.parent_process():
+        parent.join()
+        os._exit(1)
+
+
+def _outcome(channel: connection.Connection, process: BaseProcess) -> Result | str:
+    """Return what comes through `channel`, or why nothing does; end the process."""
+    if not channel.poll():
+        process.kill()
+        return "not finished within the time limit"
+    try:
+        return channel.recv()
+    except (EOFError, OSError):
+        process.join(EXIT_S)
+        status = process.exitcode or 0
+        name = f", {signal.strsignal(-status)}" if status < 0 else ""
+        return f"its process died (status {status}{name})"
+    finally:
+        process.join(EXIT_S)
+        process.kill()
+        channel.close()
 
 
 @contextmanager
@@ -205,7 +280,7 @@ def _dask(address: str) -> Iterator[Executor]:
 
 
 @contextmanager
-def _locked(out: Path) -> Iterator[None]:
+def locked(out: Path) -> Iterator[None]:
     """Make the folder, and hold it against other processes. Raises InputError."""
     remedy = "choose another folder with --out"
     if out.exists() and not out.is_dir():
@@ -214,7 +289,7 @@ def _locked(out: Path) -> Iterator[None]:
     if not (out / MANIFEST).is_file() and {path.name for path in out.iterdir()} - {LOCK}:
         raise InputError(f"{out}: is not empty and holds no {MANIFEST}; {remedy}")
     try:
-        with FileLock(out / LOCK, timeout=0):
+        with FileLock(out / LOCK, timeout=0, is_singleton=True):  # a command holds it around its runs
             yield
     except Timeout:
         raise InputError(f"{out}: another process is writing to it; wait for its end, or {remedy}") from None

@@ -90,9 +90,9 @@ def benchmark(
 
 
 def processes(strategies: Sequence[Strategy], workers: int) -> dict:
-    """Return the options of `run_many`: this process for one worker, a new one for each run of a user's controller."""
+    """Return the options of `run_many`: this process for one worker, unless the user's own controllers may crash."""
     own = any(strategy.controller.own for strategy in strategies)
-    return {"workers": workers if own or workers > 1 else 0, "fresh": own}
+    return {"workers": workers if own or workers > 1 else 0}
 
 
 def key_of(
