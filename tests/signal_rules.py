@@ -11,6 +11,8 @@ MIN_GREEN = 5.0
 # never ends, and the green of link 4 runs over the end of the cycle.
 PHASES = [("GGrgG", 30), ("yGrgG", 3), ("rGrgy", 6), ("ryrgr", 3), ("rrGgr", 40), ("rrygr", 3), ("rrrgG", 5)]
 SINGLE = [("Gr", 42), ("yr", 3), ("rG", 4), ("rG", 38), ("ry", 3)]
+# Link 2 is a crossing of the street of link 1.
+WALK = [("GrG", 20), ("Grr", 4), ("yrr", 4), ("rrr", 1), ("rGr", 3), ("ryr", 2), ("rrr", 2)]
 CROSS = [("Gr", 30), ("yr", 3), ("rG", 30), ("ry", 3)]
 
 

@@ -157,6 +157,8 @@ USUAL, TWICE, ALWAYS = 2 * lit("30G", "3y", "27r"), lit("10G", "3y", "7r", "20G"
         (USUAL, 0.0, 4.0, 2 * lit("4G", "3y", "53r")),  # less than the minimum green to begin with
         (TWICE, 0.4, 30.0, lit("10G", "3y", "7r", "5G", "3y", "32r")),
         (TWICE, 0.3, 30.0, lit("10G", "3y", "47r")),  # the remaining 2.5 s are below the minimum green
+        (lit("8G", "3y", "49G"), 0.2, 30.0, lit("8G", "3y", "49r")),  # 2 s are left after the yellow of the programme
+        (lit("8G", "3y", "49G"), 0.4, 30.0, lit("8G", "3y", "7G", "3y", "39r")),
         (lit("20r", "40G"), 0.4, 30.0, lit("20r", "15G", "3y", "22r")),
         (ALWAYS, 0.4, None, lit("27G", "3y", "30r", "27G", "3y", "30r", "10G")),
         (ALWAYS, 53 / 55, None, lit("58G", "3y", "58G", "3y", "8G")),  # a yellow ends before the next green begins

@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import tiny_city
-from signal_rules import CROSS, MIN_GREEN, PHASES, SINGLE, check, signal
+from signal_rules import CROSS, MIN_GREEN, PHASES, SINGLE, WALK, check, signal
 
 from cosim.plant import max_pressure
 from cosim.plant.max_pressure import MAX_RED_S, PERMISSIVE, Junction, MaxPressure, Roads, stages_of, transition
@@ -40,6 +40,17 @@ def test_the_programme_s_own_way_is_kept():
     assert [(p.state, p.duration) for p in transition(phases, 0, 3)] == [("yyr", 4), ("rrr", 2)]
     assert [(p.state, p.duration) for p in transition(phases, 0, 5)] == [("Gyr", 4), ("Grr", 2)]
     assert transition(phases, 5, 0) == [Phase(duration=3, state="yrr")]
+
+
+def test_other_ways_take_the_times_between_greens_from_the_programme():
+    """Link 0 needs 2 s of red before 3, which no phase after the first has; a crossing is cleared beside cars."""
+    states = "GGrr Gyrr GrGr yryr rrrr rrrG rrry".split()
+    phases = signal(list(zip(states, (20, 3, 20, 3, 2, 20, 3), strict=True))).phases
+    assert [(p.state, p.duration) for p in transition(phases, 0, 5)] == [("yyrr", 3), ("rrrr", 2)]
+    crossed = signal(WALK)
+    assert [(p.state, p.duration) for p in transition(crossed.phases, 0, 4)] == [("Gry", 4), ("yry", 4), ("rrr", 1)]
+    junction = Junction(crossed, 0.0)
+    assert junction.may_switch(20.0) and not junction.may_switch(19.0)
 
 
 @pytest.mark.parametrize(

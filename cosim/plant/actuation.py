@@ -21,6 +21,7 @@ class Actuation:
 
     original_green: (G,) [s] per control interval in the original programme, mean of the gateway's links; NaN where no
         command arrives
+    states: signal -> time [s] and state at every change, as SUMO shows it
     """
 
     def __init__(
@@ -61,6 +62,7 @@ class Actuation:
         phases |= {signal.signal: signal.phases for signal in self._gates}
         self._commanded: Collection[str] = phases.keys()
         self.original_green = _programmed_green(city, phases, step)
+        self.states: dict[str, list[tuple[float, str]]] = {signal: [(0.0, "")] for signal in session.signals()}
 
     def command(self, perimeter: PerPair) -> None:
         """Set u (R, R) [-] of the control interval that begins."""
@@ -82,6 +84,14 @@ class Actuation:
         for responsive in self._responsive:
             responsive.play(now)
         self._incidents.play(now)
+
+    def observe(self) -> None:
+        """Note the states that SUMO has shown in the last simulation step."""
+        state_of, now = self._session.signal_state, self._session.time
+        for signal, states in self.states.items():
+            state = state_of(signal)
+            if state != states[-1][1]:
+                states.append((now, state))
 
     def green_time(self) -> PerGateway:
         """Return (G,) [s] of green so far per gateway, mean of its links; NaN where no command arrives."""

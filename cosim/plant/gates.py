@@ -46,6 +46,7 @@ class GatewaySignal:
         self._original = [phase.duration for phase in programme.phases]
         self._movements = {link: _Movement(pair) for link, pair in movements.items()}
         self._redistribute, self._cycle = redistribute, programme.cycle
+        self._walking = walking(programme.phases)
         self._windows = {link: _windows(programme, link) for link in movements}
         self._yellow = {link: yellow_time(programme.phases, link) for link in movements}
         self._cycle_start = start - programme.position
@@ -84,7 +85,7 @@ class GatewaySignal:
         shares: dict[int, float] = {}
         for link, movement in self._movements.items():
             for phase, state in enumerate(self._states):
-                if state[link] in GREEN and "y" not in state:
+                if state[link] in GREEN and "y" not in state and phase not in self._walking:
                     shares[phase] = max(shares.get(phase, 0.0), movement.share)
         takers = [phase for phase, state in enumerate(self._states) if phase not in shares and is_stage(state)]
         if not takers:
@@ -138,16 +139,29 @@ def _windows(programme: Programme, link: int) -> dict[int, float]:
     if all(green):
         return {0: programme.cycle}
     starts = [n for n in range(len(phases)) if green[n] and not green[n - 1]]
-    return {n: _run_length(phases, n, link, GREEN) for n in starts}
+    return {n: run_length(phases, n, link, GREEN) for n in starts}
 
 
 def yellow_time(phases: Sequence[Phase], link: int) -> float:
     """Return the longest yellow after a green of a link [s]."""
     starts = [n for n, phase in enumerate(phases) if phase.state[link] == "y" and phases[n - 1].state[link] in GREEN]
-    return max((_run_length(phases, n, link, "y") for n in starts), default=DEFAULT_YELLOW_S)
+    return max((run_length(phases, n, link, "y") for n in starts), default=DEFAULT_YELLOW_S)
 
 
-def _run_length(phases: Sequence[Phase], first: int, link: int, lights: Collection[str]) -> float:
+def ends_bare(phases: Sequence[Phase]) -> set[int]:
+    """Return the links whose green ends without yellow, such as those of crossings."""
+    changes = [(phases[n - 1].state, phase.state) for n, phase in enumerate(phases)]
+    return {k for a, b in changes for k in range(len(b)) if a[k] in GREEN and b[k] == "r"}
+
+
+def walking(phases: Sequence[Phase]) -> set[int]:
+    """Return the phases in which a crossing is green, or has just been green: they last as long as originally."""
+    bare = ends_bare(phases)
+    green = {n for n, phase in enumerate(phases) if any(phase.state[link] in GREEN for link in bare)}
+    return green | {(n + 1) % len(phases) for n in green}
+
+
+def run_length(phases: Sequence[Phase], first: int, link: int, lights: Collection[str]) -> float:
     """Return how long a link shows one of `lights` from phase `first` on [s]."""
     length, n = 0.0, first
     while phases[n % len(phases)].state[link] in lights:
@@ -217,6 +231,8 @@ class Ration:
 
     def _filter(self, light: str, now: float, lasting: bool) -> tuple[str, float]:
         left = self._budget - self._spent
+        if light != "y" and self._yellow_until == NEVER:
+            self._yellow_until = now
         if light in GREEN:
             if self._open and left <= 1e-6:
                 self._open, self._yellow_until = False, now + self._yellow
@@ -225,8 +241,9 @@ class Ration:
             if self._open:
                 return light, now + left
         elif self._open:
-            self._open = light == "y"  # its yellow after this green
-            return light, NEVER
+            self._open = False  # a green after the yellow of the programme has to be a whole one again
+            if light == "y":
+                self._yellow_until = NEVER
         return ("y", self._yellow_until) if now < self._yellow_until - 1e-6 else ("r", NEVER)
 
 
@@ -260,6 +277,7 @@ class ResponsiveSignal:
             )
             for link, pair in movements.items()
         }
+        self._walking = walking(phases)
         self._always = {link for link in movements if all(phase.state[link] in GREEN for phase in phases)}
         self._base, self._since, self._next, self._held, self._limited = "", start, start, False, False
 
@@ -299,8 +317,13 @@ class ResponsiveSignal:
     def _hold(self, state: str, now: float) -> None:
         """Show `state` from the first limit on; give the signal back to SUMO in the midst of a stage after the last."""
         # A stage that has just begun could end too early, one step behind SUMO.
+        crossed = [self.phases[n].duration for n in self._walking if self.phases[n].state == state]
         limited = self._limited or any(ration.limited for ration in self._rations.values())
-        again = NEVER if limited or state != self._base or not is_stage(state) else self._since + MIN_GREEN_S
+        again = (
+            NEVER
+            if limited or state != self._base or not is_stage(state)
+            else self._since + max(MIN_GREEN_S, *crossed, 0.0)
+        )
         self._held = now < again - 1e-6
         if self._held:
             self._show(self.signal, state)

@@ -24,7 +24,7 @@ from itertools import permutations
 import numpy as np
 from scipy.sparse import csr_array
 
-from cosim.plant.gates import MIN_GREEN_S, NEVER, Ration, yellow_time
+from cosim.plant.gates import MIN_GREEN_S, NEVER, Ration, ends_bare, run_length, yellow_time
 from cosim.sumo.net import City, gateway_movements
 from cosim.sumo.session import Phase, Session
 from cosim.sumo.signals import GREEN, Link, Signal, is_stage, lane_id
@@ -152,6 +152,19 @@ class Junction:
         self.signal, self._phases, self._numbers = signal.id, signal.phases, stages_of(signal)
         self.stages, self.stage = len(self._numbers), 0
         self._base = signal.phases[self._numbers[0]].state
+        phases, bare = signal.phases, ends_bare(signal.phases)
+        self._least = [  # time of a stage: the longest green of its crossings
+            max(
+                [MIN_GREEN_S]
+                + [
+                    run_length(phases, n, k, GREEN)
+                    for n in range(len(phases))
+                    for k in bare
+                    if phases[stage].state[k] in GREEN
+                ]
+            )
+            for stage in self._numbers
+        ]
         self._green_since, self.stage_since = now, now
         cycle = sum(phase.duration for phase in signal.phases)
         self.rations = {
@@ -183,7 +196,8 @@ class Junction:
 
     def may_switch(self, now: float) -> bool:
         """Return True if the stage may end at `now` [s]."""
-        return not self._coming and now >= self._green_since + MIN_GREEN_S - 1e-6
+        least = max(self._green_since + MIN_GREEN_S, self.stage_since + self._least[self.stage])
+        return not self._coming and now >= least - 1e-6
 
     def switch(self, stage: int, now: float) -> str:
         """Leave the stage for another one; return the state from `now` on."""
@@ -231,12 +245,39 @@ def stages_of(signal: Signal) -> tuple[int, ...]:
     return tuple(n for n in level if n not in covered)
 
 
+@lru_cache(maxsize=4096)
+def clearance(phases: tuple[Phase, ...]) -> np.ndarray:
+    """Return the least times (K, K) [s] from the end of a green to the green of another link that was red with it.
+
+    Those of the programme, where the other link is among the next ones and waits for no third one that goes on;
+    elsewhere the least after the end of this green.
+    """
+    green = np.array([_green(phase.state) for phase in phases])
+    apart, bare = ~(green.T @ green), ends_bare(phases)
+    direct = np.full(apart.shape, NEVER)
+    for n, link in np.argwhere(np.roll(green, 1, axis=0) & ~green):
+        time, first, left = 0.0, NEVER, apart[link]
+        for m in range(n, n + len(phases)):
+            on = green[m % len(phases)]
+            if (on & apart[link]).any():
+                first = min(first, time)
+            if time >= first + MIN_GREEN_S:
+                break
+            direct[link, on & left] = np.minimum(direct[link, on & left], time)
+            time += phases[m % len(phases)].duration
+            left = left & ~on
+            if time >= MIN_GREEN_S and link not in bare:
+                left = left & ~(apart @ on)
+    usual = direct.min(axis=1, keepdims=True)
+    return np.where(apart, np.where(direct < NEVER, direct, np.where(usual < NEVER, usual, 0.0)), 0.0)
+
+
 def transition(phases: tuple[Phase, ...], source: int, target: int) -> list[Phase]:
     """Return the phases between two stages.
 
     The original ones if the programme goes from `source` to `target`; else yellow, as long as in the programme, and
-    red, as long as after `source`, for links that lose their green or their right of way (G, then g). The others stay
-    as they are, so that no conflicting movement is green before the target stage.
+    red, as long as after `source` and until all is clear, for links that lose their green or their right of way (G,
+    then g). The others stay as they are, so that no conflicting movement is green before the target stage.
     """
     between, n = [], (source + 1) % len(phases)
     while phases[n].state == phases[source].state:
@@ -252,12 +293,19 @@ def transition(phases: tuple[Phase, ...], source: int, target: int) -> list[Phas
         for k, (a, b) in enumerate(zip(before, after, strict=True))
         if a in GREEN and (b not in GREEN or (a, b) == ("G", "g"))
     }
-    yellow = max((yellow_time(phases, link) for link in losing), default=0.0)
-    red = sum(phase.duration for phase in between if "y" not in phase.state) if losing else 0.0
+    if not losing:
+        return []
+    coming = {k for k, b in enumerate(after) if b in GREEN and (k in losing or before[k] not in GREEN)}
+    clear = {k: max(clearance(phases)[k, [*coming]], default=0.0) for k in losing}
+    walking = losing & ends_bare(phases)  # their red begins while cars beside them are still green
+    yellow = max(yellow_time(phases, link) for link in losing)
+    red = sum(phase.duration for phase in between if "y" not in phase.state)
+    red = max(red, *(clear[k] - yellow for k in losing - walking))
+    alone = max((clear[k] - yellow - red for k in walking), default=0.0)
     return [
-        Phase(duration=seconds, state="".join(light if k in losing else a for k, a in enumerate(before)))
-        for seconds, light in ((yellow, "y"), (red, "r"))
-        if seconds
+        Phase(duration=seconds, state="".join(light if k in ends else a for k, a in enumerate(before)))
+        for seconds, light, ends in ((alone, "y", walking), (yellow, "y", losing), (red, "r", losing))
+        if seconds > 0.0
     ]
 
 

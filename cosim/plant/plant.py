@@ -144,6 +144,7 @@ class SumoPlant:
             if self._metering:
                 self._metering.play()
             session.step()
+            self._actuation.observe()
             events = self._meter.observe()
             if self._estimation and n % reading == 0:
                 self._estimation.sample()
@@ -212,6 +213,10 @@ class SumoPlant:
     def trips(self) -> list[Trip]:
         """Return all trips that were due; after `trip_facts` with their whole time losses."""
         return self._meter.trips()
+
+    def signal_states(self) -> dict[str, list[tuple[float, str]]]:
+        """Return signal -> time [s] and state at every change since the reset."""
+        return {signal: states[1:] for signal, states in self._actuation.states.items()}
 
     def leaks(self) -> list[Gateway]:
         """Return the gateways that no command reaches."""

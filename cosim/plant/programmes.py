@@ -8,15 +8,20 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
+from xml.etree.ElementTree import ElementTree
 from xml.sax.saxutils import quoteattr
 
+import numpy as np
 import sumo
 
+from cosim.plant.gates import MIN_GREEN_S, walking
 from cosim.plant.settings import ACTUATED, FIXED, PRESSURES, Settings, check_lanes, own_files, settings
 from cosim.sumo.build import network_folder
 from cosim.sumo.net import City
+from cosim.sumo.session import Phase
 from cosim.sumo.signals import FIXED as FIXED_TIME
-from cosim.sumo.signals import HELD, Signal, read_signals
+from cosim.sumo.signals import HELD, Signal, is_stage, read_signals
+from cosim.sumo.xml_files import attribute, read_xml
 from nmfd.controllers.strategy import Strategy
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
@@ -80,7 +85,7 @@ def write_actuated(path: Path, signals: Iterable[Signal]) -> None:
         )
         for n, phase in enumerate(signal.phases):
             fixed, limits = phase.duration, ""
-            low = min(ACTUATED_MIN_GREEN_S, fixed)
+            low = fixed if n in walking(signal.phases) else min(ACTUATED_MIN_GREEN_S, fixed)
             high = max(min(1.5 * fixed, ACTUATED_MAX_GREEN_S), ACTUATED_MIN_GREEN_S)
             if n in signal.stages and low != high:
                 limits = f' minDur="{low:g}" maxDur="{high:g}"'
@@ -105,10 +110,10 @@ def optimised_plans(
     routes = "\n".join(["<routes>", *rows, "</routes>\n"]).encode()
     key = hashlib.sha256(routes + city.net_file.read_bytes() + metadata.version("eclipse-sumo").encode()).hexdigest()
     folder = shipped.build_folder(network_folder(scenario.network))
-    cycles, offsets = (folder / f"plan-{key[:16]}-{kind}.add.xml" for kind in ("cycles", "offsets"))
+    cycles, offsets = (folder / f"webster-{key[:16]}-{kind}.add.xml" for kind in ("cycles", "offsets"))
     if cycles.is_file() and offsets.is_file():
         return [cycles, offsets]
-    unified = ("-u", "-y", "3", "-p", "webster", "--skip", ",".join(others))
+    unified = ("-u", "-y", "3", "-p", "webster", f"--skip={','.join(others)}")
     with temporary_folder() as scratch:
         (scratch / "routes.xml").write_bytes(routes)
         for tool, output, options in (
@@ -116,14 +121,54 @@ def optimised_plans(
             ("tlsCoordinator.py", "offsets.xml", ("-a", "cycles.xml")),
         ):
             program = Path(sumo.SUMO_HOME) / "tools" / tool
-            command = [sys.executable, str(program), "-n", str(city.net_file), "-r", "routes.xml", "-o", output]
+            command = [
+                sys.executable,
+                str(program),
+                "-n",
+                str(city.net_file.resolve()),
+                "-r",
+                "routes.xml",
+                "-o",
+                output,
+            ]
             result = subprocess.run([*command, *options], cwd=scratch, capture_output=True, text=True, check=False)
             if result.returncode:
                 words = (result.stderr.strip() or "no message").splitlines()[-1]
                 raise InputError(f"{city.net_file}: {tool} cannot plan its signals ({words}); choose other signals")
+            if output == "cycles.xml":
+                _keep_times(scratch / output, city.net_file)
         for output, file in (("cycles.xml", cycles), ("offsets.xml", offsets)):
             text = (scratch / output).read_text(encoding="utf-8")
             # Whole seconds: perimeter control follows programmes second by second.
             text = re.sub(r'offset="([^"]+)"', lambda m: f'offset="{round(float(m[1]))}"', text)
             write_text(file, text)
     return [cycles, offsets]
+
+
+def _keep_times(plan: Path, net_file: Path) -> None:
+    """Lengthen yellow and red to those of the network's programmes, and greens to the minimum, within the same cycle.
+
+    The seconds come from the phases that exceed their least time most.
+    """
+    originals: dict[tuple[str, ...], list[Phase]] = {}
+    for logic in read_xml(net_file).iter("tlLogic"):
+        phases = [Phase(duration=float(attribute(row, "duration")), state=attribute(row, "state")) for row in logic]
+        originals[(attribute(logic, "id"), *(phase.state for phase in phases))] = phases
+    root = read_xml(plan)
+    for logic in root.iter("tlLogic"):
+        rows = list(logic)
+        phases = originals[(attribute(logic, "id"), *(attribute(row, "state") for row in rows))]
+        planned, kept = [float(attribute(row, "duration")) for row in rows], walking(phases)
+        least = np.array(
+            [
+                min(phase.duration, MIN_GREEN_S) if is_stage(phase.state) and n not in kept else phase.duration
+                for n, phase in enumerate(phases)
+            ]
+        )
+        seconds = np.maximum(planned, least)
+        while (missing := seconds.sum() - sum(planned)) > 1e-6 and (seconds > least).any():
+            longest = np.argmax(seconds - least)
+            seconds[longest] -= min(1.0, missing, seconds[longest] - least[longest])
+        for row, duration in zip(rows, seconds, strict=True):
+            row.set("duration", f"{duration:g}")
+    ElementTree(root).write(plan)

@@ -1,0 +1,169 @@
+"""Proof sheet of the signals of a run: what each showed, against its original programmes.
+
+A green lasts MIN_GREEN_S or as long as originally, that of a crossing as long as originally. After a green comes the
+original yellow, YELLOW_S where the programme ends no green. Links are green together, and have the right of way
+together, only if a programme shows it. Between the greens of others lies the original time. Of several
+programmes the one counts that fits best. The sheet shares no code with the controllers, and reads what SUMO shows. It
+leaves out signals whose states are not phases, such as NEMA's.
+"""
+
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from cosim.sumo.xml_files import attribute, read_xml
+from nmfd.types import Quantity
+
+KINDS = ("static", "actuated", "delay_based")
+MIN_GREEN_S, YELLOW_S = 5.0, 3.0
+SHEET = {  # variable of a result, column of signals.csv
+    "signal": Quantity(("signal",), "", "id of the signal"),
+    "shortest_green": Quantity(("signal",), "s", "shortest green of a link; NaN without one that began and ended"),
+    "shortest_yellow": Quantity(("signal",), "s", "shortest yellow after a green; NaN without one"),
+    "longest_red": Quantity(("signal",), "s", "longest time without green of a link that has green in a programme"),
+    "short_greens": Quantity(("signal",), "1", "greens below the minimum"),
+    "short_yellows": Quantity(("signal",), "1", "greens without the original yellow after them"),
+    "short_intergreens": Quantity(("signal",), "1", "greens too soon after the green of another link"),
+    "conflicts": Quantity(("signal",), "1", "pairs of links with green, or the right of way, as never originally"),
+}
+VIOLATIONS = tuple(SHEET)[-4:]
+States = Sequence[tuple[float, str]]  # time [s] and state at every change
+
+
+def proof_sheet(states: Mapping[str, States], files: Iterable[Path], *, end: float, step: float) -> dict:
+    """Return the arrays (S,) of SHEET.
+
+    states: by signal; files: network and additional files, with the programmes
+    end: of the run [s]; step: of the simulation [s], to which times are rounded down
+    """
+    programmes: dict[str, list[Element]] = {}
+    crossings: dict[str, set[int]] = {}
+    for root in map(read_xml, files):
+        for logic in root.iter("tlLogic"):
+            programmes.setdefault(attribute(logic, "id"), []).append(logic)
+        for link in root.iter("connection"):
+            if (signal := link.get("tl")) and attribute(link, "from").startswith(":"):
+                indices = link.get("linkIndex"), link.get("linkIndex2")
+                crossings.setdefault(signal, set()).update(int(index) for index in indices if index)
+    rows = {
+        signal: min(
+            (Rules(logic, crossings.get(signal, ()), step).judge(states[signal], end) for logic in programmes[signal]),
+            key=lambda row: sum(row[-len(VIOLATIONS) :]),
+        )
+        for signal in sorted(states.keys() & programmes.keys())
+        if all(logic.get("type") in KINDS for logic in programmes[signal])
+    }
+    return {"signal": np.array(list(rows), dtype=str)} | {
+        key: np.array([row[n] for row in rows.values()]) for n, key in enumerate(tuple(SHEET)[1:])
+    }
+
+
+class Rules:
+    """The rules of one signal with K links, from a programme.
+
+    green, yellow: (K,) [s] least; between: (K, K) [s] least, from the end of a green of the first to a green of the
+    second; apart, yielding: (K, K) bool, never green, never G, together
+    """
+
+    def __init__(self, logic: Element, crossings: Collection[int], step: float):
+        """crossings: links for pedestrians; step: see `proof_sheet`"""
+        least, together, priority = _least_times(logic, crossings)
+        self.green, self.yellow, self.between = (np.floor(each / step + 1e-6) * step - 1e-6 for each in least)
+        self.apart, self.yielding = ~together, ~priority
+
+    def judge(self, states: States, end: float) -> tuple[float, float, float, int, int, int, int]:
+        """Return the row of SHEET; lights that began before the first state, or last to the end, are not judged."""
+        time = np.array([time for time, _ in states])[:, None]
+        lights = np.array([list(state) for _, state in states])
+        green, yellow = np.isin(lights, ["G", "g"]), lights == "y"
+        was, was_yellow = _before(green), _before(yellow)
+        starts, ends = green & ~was, was & ~green
+        ended = _latest(ends, time)
+        since = _before(_latest(starts | ends | (yellow != was_yellow), time))  # beginning of the light before
+        lasted, over = time - since, was_yellow & ~yellow & (since == _before(ended))
+        bare = ends & ~yellow & (self.yellow > 0.0)
+        red = np.where(starts, time - np.maximum(_before(ended), time[0]), 0.0).max(axis=0)
+        red = np.where(green[-1], red, np.maximum(red, end - np.maximum(ended[-1], time[0])))
+        early = 0
+        for link, apart in enumerate(self.apart.T):
+            rows = starts[:, link]
+            gap = time[rows] - ended[rows]
+            early += np.count_nonzero((apart & ~green[rows] & (gap < self.between[:, link])).any(axis=1))
+        conflicts = 0
+        for state, count in Counter(state for _, state in states).items():
+            on, first = (np.isin(list(state), kinds) for kinds in (["G", "g"], ["G"]))
+            pairs = self.apart & np.outer(on, on) | self.yielding & np.outer(first, first)
+            conflicts += count * np.count_nonzero(np.triu(pairs, 1))
+        return (
+            _least(lasted[ends]),
+            _least(lasted[over]),
+            float(red[~self.apart.diagonal()].max(initial=0.0)),
+            np.count_nonzero(ends & (lasted < self.green)),
+            np.count_nonzero(bare) + np.count_nonzero(over & (lasted < self.yellow)),
+            early,
+            conflicts,
+        )
+
+
+def _before(rows: np.ndarray) -> np.ndarray:
+    """Return the rows before those of an array (M, K), the first one twice."""
+    return np.vstack([rows[:1], rows[:-1]])
+
+
+def _latest(events: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Return the time (M, K) [s] of the latest of the events (M, K), -inf before the first. time: (M, 1) [s]"""
+    return np.maximum.accumulate(np.where(events, time, -np.inf))
+
+
+def _least(times: np.ndarray) -> float:
+    return float(times.min(initial=np.inf, where=np.isfinite(times))) if np.isfinite(times).any() else np.nan
+
+
+def _least_times(logic: Element, crossings: Collection[int]) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray]:
+    """Return green, yellow (K,) and between (K, K) [s] of a programme, then pairs (K, K) green and G together."""
+    phases = list(logic.iter("phase"))
+    lights = np.array([list(attribute(phase, "state")) for phase in phases])
+    green, yellow = np.isin(lights, ["G", "g"]), lights == "y"
+    shortest = "duration" if logic.get("type") == "static" else "minDur"
+    duration = [float(phase.get(shortest) or attribute(phase, "duration")) for phase in phases]
+    after = [[*map(int, phase.get("next", "").split())] or [(n + 1) % len(phases)] for n, phase in enumerate(phases)]
+    steps = [(n, m) for n, others in enumerate(after) for m in others]
+
+    def least(first: np.ndarray, then: np.ndarray) -> np.ndarray:
+        """Return the least time (K,) [s] in phases `then` (n, K) after phases `first` (n, K), inf if never."""
+        times = np.where(then, np.inf, 0.0)
+        for _ in phases:
+            onward = [seconds + times[others].min(axis=0) for seconds, others in zip(duration, after, strict=True)]
+            times = np.where(then, onward, 0.0)
+        return np.min([np.where(first[n] & ~first[m], times[m], np.inf) for n, m in steps], axis=0)
+
+    together, priority = (np.any(on[:, :, None] & on[:, None, :], axis=0) for on in (green, lights == "G"))
+    crossing = np.isin(np.arange(lights.shape[1]), list(crossings))
+    own, passed = least(~green, green), least(green, yellow)
+    least_green = np.where(crossing & np.isfinite(own), own, np.minimum(own, MIN_GREEN_S))
+    least_yellow = np.where(np.isfinite(passed), passed, np.where(crossing, 0.0, YELLOW_S))
+    direct, between = np.full((2, *together.shape), np.inf)
+    for start, link in ((m, link) for n, m in steps for link in np.flatnonzero(green[n] & ~green[m])):
+        # Walk from the end of the green. Direct is the way to a link that is among the first ones, or follows these at
+        # once, if nothing goes on that it must wait for; but a crossing is cleared while cars beside it are green.
+        coming = ~together[link] & together.diagonal()
+        walks = [(start, 0.0, np.inf, coming, coming)]
+        while walks:
+            phase, time, first, left, usual = walks.pop()
+            on, later = green[phase], time + duration[phase]
+            first = min(first, time) if (on & ~together[link]).any() else first
+            usual = usual & (time - first < MIN_GREEN_S)
+            for gaps, links in ((between, on & left), (direct, on & left & usual)):
+                gaps[link, links] = np.minimum(gaps[link, links], time)
+            left = left & ~on
+            if later >= MIN_GREEN_S and not crossing[link]:
+                usual = usual & ~(on @ ~together)
+            if left.any() and later < sum(duration):
+                walks += [(other, later, first, left, usual) for other in after[phase]]
+    usual = direct.min(axis=1, keepdims=True)
+    usual = np.where(np.isfinite(usual), usual, least_yellow[:, None])
+    between = np.minimum(np.where(np.isfinite(direct), direct, usual), between)
+    return (least_green, least_yellow, between), together, priority

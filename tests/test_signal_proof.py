@@ -1,0 +1,133 @@
+"""The proof sheet of signals: violations by hand, SUMO's own record, and random commands under every signal control."""
+
+from dataclasses import replace
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import tiny_city
+from signal_rules import CROSS, WALK
+from test_responsive import CARS, CONFIG
+
+from cosim.evaluation.signal_proof import VIOLATIONS, proof_sheet
+from cosim.plant.plant import SumoPlant
+from cosim.plant.settings import own_files, settings
+from cosim.sumo.net import city_of
+from cosim.sumo.xml_files import read_xml
+from nmfd.api import load_scenario
+from nmfd.controllers.strategy import parse
+from nmfd.types import Controls
+
+CONTROLS = ("", "redistribute", "max-pressure", "max-pressure-cyclic", "actuated", "webster", "metering")
+
+
+def judge(folder, phases, shown, crossings=()):
+    """The row of one signal with such phases, which shows (state, seconds)."""
+    net = ElementTree.Element("net")
+    logic = ElementTree.SubElement(net, "tlLogic", id="s", type="static")
+    for state, duration in phases:
+        ElementTree.SubElement(logic, "phase", duration=str(duration), state=state)
+    for link in crossings:
+        ElementTree.SubElement(net, "connection", {"from": ":c", "tl": "s", "linkIndex": str(link)})
+    ElementTree.ElementTree(net).write(folder / "net.xml")
+    begins = np.cumsum([0, *(seconds for _, seconds in shown)])
+    states = [(float(begin), state) for begin, (state, _) in zip(begins, shown, strict=False)]
+    sheet = proof_sheet({"s": states}, [folder / "net.xml"], end=float(begins[-1]), step=1.0)
+    return {key: values[0] for key, values in sheet.items()}
+
+
+@pytest.mark.parametrize(
+    "phases, shown, expected",
+    [
+        (CROSS, 3 * CROSS, {}),
+        (WALK, 3 * WALK, {}),
+        (CROSS, [*CROSS, ("Gr", 4), *CROSS[1:]], {"short_greens": 1}),
+        (CROSS, [*CROSS, ("Gr", 9), ("yr", 2), ("rr", 1), *CROSS[2:]], {"short_yellows": 1}),
+        (CROSS, [*CROSS, ("Gr", 9), ("rr", 3), *CROSS[2:]], {"short_yellows": 1}),
+        (CROSS, [*CROSS, ("Gr", 9), ("yr", 1), ("yG", 2), ("rG", 9)], {"short_intergreens": 1}),
+        (CROSS, [*CROSS, ("GG", 9), ("yy", 3), ("rr", 9)], {"conflicts": 1, "short_intergreens": 0}),
+        ([("Gg", 9), ("yr", 3), ("rG", 9), ("ry", 3)], [("GG", 9), ("gG", 9)], {"conflicts": 1}),
+        (WALK, [*WALK, ("GrG", 19), *WALK[1:]], {"short_greens": 1}),  # a crossing keeps its 20 s
+        (
+            WALK,
+            [*WALK, WALK[0], ("yrr", 4), ("rrr", 1), ("rGr", 3)],
+            {"short_intergreens": 1},
+        ),  # and is cleared for 9 s
+        (WALK, [*WALK, *WALK[:4], ("rGr", 2), ("ryr", 2)], {"short_greens": 1}),  # 3 s originally
+    ],
+)
+def test_violations_are_counted(tmp_path, phases, shown, expected):
+    row = judge(tmp_path, phases, shown, crossings=(2,) if phases is WALK else ())
+    assert {key: row[key] for key in VIOLATIONS} == dict.fromkeys(VIOLATIONS, 0) | expected
+
+
+def test_figures_of_a_sheet(tmp_path):
+    row = judge(tmp_path, CROSS, [*CROSS, ("Gr", 7), ("yr", 4), ("rG", 8)])
+    assert (row["signal"], row["shortest_green"], row["shortest_yellow"], row["longest_red"]) == ("s", 7.0, 3.0, 36.0)
+
+
+def proven(folder, city, intervals, tmp_path, **overrides):
+    """Run with random commands in every interval; return the sheet of what SUMO's saveTLSStates wrote."""
+    scenario = replace(load_scenario(folder), steps=intervals)
+    chosen = (
+        settings(scenario).changed(gateways_fixed=False, mesoscopic=False).changed(**parse("no-control", city).city)
+    )
+    city, network, random = city_of(scenario.network), scenario.network, np.random.default_rng(5)
+    programmes = [city.net_file, *own_files(scenario, chosen.additional)]
+    events = ElementTree.Element("additional")
+    for signal in {logic.get("id") for file in programmes for logic in read_xml(file).iter("tlLogic")}:
+        dest = str(tmp_path / "states.xml")
+        ElementTree.SubElement(events, "timedEvent", type="SaveTLSStates", source=signal, dest=dest)
+    ElementTree.ElementTree(events).write(tmp_path / "tls.add.xml")
+    chosen = chosen.changed(additional=(*chosen.additional, str(tmp_path / "tls.add.xml")))
+    plant = SumoPlant(scenario, settings=chosen)
+    try:
+        plant.reset(5)
+        for _ in range(intervals):
+            share = random.choice([0.0, 1.0, random.uniform()], network.adjacency.shape)
+            u = network.u_min + share * (network.u_max - network.u_min)
+            rate = random.uniform(0.0, 1.0, network.regions)
+            plant.step(Controls(perimeter=np.where(network.adjacency, u, 0.0), splits=None, metering=rate))
+        end, observed = plant.session.time, plant.signal_states()
+    finally:
+        plant.close()
+    states: dict[str, list] = {}
+    for element in ElementTree.parse(tmp_path / "states.xml").iter("tlsState"):
+        row = states.setdefault(element.get("id"), [])
+        if not row or row[-1][1] != element.get("state"):
+            row.append((float(element.get("time")), element.get("state")))
+    sheet = proof_sheet(states, programmes, end=end, step=chosen.step_length)
+    own = proof_sheet(observed, programmes, end=end, step=chosen.step_length)
+    assert all(np.array_equal(sheet[key], own[key]) for key in VIOLATIONS) and len(sheet["signal"]) > 3
+    return sheet, states, observed
+
+
+@pytest.fixture(scope="module")
+def imported(tmp_path_factory):
+    """Imported cities with crossings, by kind of their signals."""
+    made = {}
+    for kind in ("static", "actuated", "delay_based"):
+        folder = tmp_path_factory.mktemp(kind)
+        crossings = ("--sidewalks.guess", "--sidewalks.guess.max-speed", "50", "--crossings.guess")
+        tiny_city.network(folder, "--tls.set", "B1,B2,C1,C2", "--tls.default-type", kind, *crossings)
+        (folder / "cars.rou.xml").write_text(CARS)
+        (folder / "city.sumocfg").write_text(CONFIG)
+        made[kind] = tiny_city.imported(folder, regions=2, source=folder / "city.sumocfg")
+    return made
+
+
+@pytest.mark.parametrize("city", CONTROLS)
+@pytest.mark.parametrize(
+    "place",
+    [
+        "static",
+        "actuated",
+        "delay_based",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("demo", "grid7_peak", "bologna", "luxembourg")),
+    ],
+)
+def test_random_commands_violate_nothing(imported, tmp_path, place, city):
+    if place in ("actuated", "delay_based") and city in ("actuated", "webster"):
+        pytest.skip("only for fixed-time signals")
+    sheet, _, _ = proven(imported.get(place, place), city, 4 if place == "luxembourg" else 6, tmp_path)
+    assert {key: sheet["signal"][sheet[key] > 0].tolist() for key in VIOLATIONS} == {key: [] for key in VIOLATIONS}
