@@ -7,7 +7,7 @@ import pytest
 import streets
 
 from cosim.plant.meter import Event, Meter
-from cosim.sumo.outputs import End, TripFacts
+from cosim.sumo.outputs import End
 from nmfd.ledger import LedgerError
 
 # a0 -> b0 -> b1 -> c0 in a row, regions 0, 1, 1, 2, and a way back c0 -> a0. Entries: b0, c0 and a0.
@@ -248,7 +248,7 @@ def test_the_ledger_names_step_and_numbers(play, break_it, numbers):
 def test_the_ends_that_sumo_tells_are_booked_by_hand(play):
     """Start all in 0, bound for 2 or 1; one ends in 1 instead, others are removed in 0, 1 and 2."""
     play.session.routes = {vehicle: ("a0", "b0", "b1", "c0") for vehicle in "vwkju"} | {"l": ("a0", "b0")}
-    told, trips = [], SimpleNamespace(under_way={"u": 7.0}, facts=TripFacts(completed=2, removed=3))
+    told, trips = [], SimpleNamespace(under_way={"u": 7.0}, completed=2, removed=3)
     trips.ends, trips.finish = (lambda: [told.pop() for _ in list(told)]), lambda gone: []
     meter = Meter(play.session, CITY, trips=trips)
     play.step(new=[*play.session.routes], observed=meter)
@@ -259,9 +259,9 @@ def test_the_ends_that_sumo_tells_are_booked_by_hand(play):
     told += [
         End(vehicle="v", time=9.0, edge="b1", time_loss=5.0),
         End(vehicle="w", time=9.0, edge="b0", reason="traci", time_loss=11.0),
-        End(vehicle="k", time=9.0, reason="traci"),
-        End(vehicle="l", time=9.0),
-        End(vehicle="j", time=9.0, edge="c0", reason="collision"),  # not called arrived
+        End(vehicle="k", time=9.0, reason="traci", time_loss=0.0),
+        End(vehicle="l", time=9.0, time_loss=0.0),
+        End(vehicle="j", time=9.0, edge="c0", reason="collision", time_loss=0.0),  # not called arrived
     ]
     play.session.places.pop("j")
     assert (meter.accumulation() == x((0, 2))).all()
@@ -279,7 +279,7 @@ def test_the_ends_that_sumo_tells_are_booked_by_hand(play):
         ("completed", 5.0),
         ("under way", 7.0),
     ]
-    trips.facts = TripFacts(completed=2, removed=4)
+    trips.removed = 4
     with pytest.raises(LedgerError, match="2 completed trips and 3 removed vehicles were booked, .* has 2 and 4"):
         meter.close_books()
 

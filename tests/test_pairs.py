@@ -46,15 +46,18 @@ def test_reasons_are_against_the_first(folder):
 def test_reasons_name_what_the_controller_did_and_what_limits_it(folder):
     finished = results.read(folder)
     level = finished.level(1.0)
+    level.rows["removed_veh"], level.rows["trips"] = 10.0, 1000.0
     gains = explain.paragraph(level, finished, "dpc-pcrg")
-    assert "holds vehicles back in" in gains and "times per trip" in gains
+    assert "holds vehicles back in" in gains and "times per trip" in gains and "removal" not in gains
+    level.rows["removed_veh"] = 11.0
+    assert explain.city(level, finished).endswith("; 1.1% of its trips end by removal.")
     level.rows["total_time_spent_veh_s"] *= level.rows["controller"].map({"dpc-pcrg": 9.0, "pi-gating": 1.0})
     level.rows["leaking_share"] = 0.8
     level.rows["gateway_full_share"] = level.rows["controller"].map({"dpc-pcrg": 0.5, "pi-gating": 0.1})
     level.rows["split_lanes"], level.rows["signal_lanes"] = 3.0, 9.0
     level.rows["intergreen_share"], level.rows["programmed_intergreen_share"] = 0.3, 0.1
     loses = explain.paragraph(level, finished, "dpc-pcrg")
-    assert loses.startswith("dpc-pcrg loses (+")
+    assert loses.startswith("dpc-pcrg loses (+") and loses.endswith("; 1.1% of its trips end by removal.")
     for words in ("80% of the boundary flow", "50% of the time, not 10%", "3 of 9 lanes", "between stages 30%"):
         assert words in loses
 

@@ -15,7 +15,7 @@ from nmfd.studies.benchmark import REFERENCE
 from nmfd.types import Result
 
 LEAKING_SHARE = 0.5  # of the boundary flow without a signal: perimeter control has no authority
-SMALL_SHARE = 0.01  # of commands, or of the time
+SMALL_SHARE = 0.01  # of commands, of the time, or of trips
 OPEN_SHARE = 0.1  # of the range of u below its upper bound: a policy never quite reaches that
 FULL_SHARE = 0.02  # more full edges before gateways than under the reference
 INTERGREEN_SHARE = 0.03  # more time between two stages than in the original programmes
@@ -53,6 +53,7 @@ def city(level: Level, finished: Finished) -> str:
     ]:
         state = f"these regions exceed their critical accumulation: {', '.join(hot)}"
     when = "Without control" if against == REFERENCE else f"Under {against}"
+    state = "; ".join([state, *_removed(level, against)])
     return f"Signals under control see {1.0 - _leaking(level):.0%} of the boundary flow. {when} {state}."
 
 
@@ -70,7 +71,7 @@ def paragraph(level: Level, finished: Finished, name: str) -> str:
     if pair.percent and not clear:
         verdict = "shows no significant change"
     spread = f"± {pair.percent_half:.1f} % over {pair.seeds} seeds" if pair.seeds > 1 else "on one seed, no proof"
-    reasons = _reasons(level, finished.scenario, name, against, gains=clear and gains)
+    reasons = _reasons(level, finished.scenario, name, against, gains=clear and gains) + _removed(level, name)
     size = f"{pair.percent:+.1f} % total time spent against {against} {spread}"
     return f"{name} {verdict} ({size}){': ' if reasons else ''}{'; '.join(reasons)}."
 
@@ -130,6 +131,12 @@ def _never_reached(strategy: Strategy, scenario: Scenario, runs: Sequence[Result
         for region, goal in zip(gate.regions, gate.set_point, strict=True)
         if most[region] < goal
     ]
+
+
+def _removed(level: Level, name: str) -> list[str]:
+    """Return the removed trips as a reason if they are many: their time counts until then."""
+    removed, trips = level.rows.loc[level.rows["controller"] == name, ["removed_veh", "trips"]].sum()
+    return [f"{removed / trips:.1%} of its trips end by removal"] if removed > SMALL_SHARE * trips else []
 
 
 def _runs(level: Level, name: str) -> list[Result]:

@@ -123,7 +123,7 @@ def simulate(
         result = result.assign(controller=strategy.name, plant="sumo").add({}, RECORD, **plant.record())
         if gui:
             return result
-        plant_facts, leaks, trip_facts = plant.facts(), set(plant.leaks()), plant.trip_facts()
+        plant_facts, leaks, emissions = plant.facts(), set(plant.leaks()), plant.trip_facts()
         result = settled(result.add({}, RECORD, **plant.record()))
         rmse_share, cell_rmse = estimation_errors(result, scenario.network.critical)
         facts = {
@@ -132,8 +132,7 @@ def simulate(
             "demand": float(job.demand),
             **plant_facts,
             **trip_measures(plant.trips()),
-            "co2_kg": trip_facts.co2,
-            "fuel_kg": trip_facts.fuel,
+            **emissions,
             "teleports": int(result.teleports.sum()),
             **queue_facts(result, plant.city),
             "notes": metrics.notes(result),
@@ -159,11 +158,11 @@ def regional_outflow(record: Mapping[str, np.ndarray] | Result, step: float) -> 
 
 def trip_measures(trips: Sequence[Trip]) -> dict[str, float]:
     """Return counts and times [s] of the trips that were due: of private vehicles, and apart of others."""
-    table = pd.DataFrame(trips, columns=Trip._fields).astype({"private": bool, "time": float, "departure_delay": float})
+    table = pd.DataFrame(trips, columns=Trip._fields).astype(Trip.__annotations__)
     private, other = table[table["private"]], table[~table["private"]]
     count = Counter(private["outcome"])
     entered = private[private["outcome"].isin((COMPLETED, REMOVED, UNDER_WAY))]
-    lost = (private["time_loss"] + private["departure_delay"]).astype(float).groupby(private["origin"])
+    lost = (private["time_loss"] + private["departure_delay"]).groupby(private["origin"])
     return {
         "trips": len(private),
         "departed_veh": len(entered),

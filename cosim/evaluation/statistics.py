@@ -1,7 +1,7 @@
 """Tables of an evaluation: means over seeds and changes paired by seed, with 95 % intervals by Student's t."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -169,16 +169,16 @@ def _change(row: Mapping) -> str:
 
 def text(rows: pd.DataFrame) -> str:
     """Return the tables of one scenario for the terminal."""
-    parts = []
-    for level, part in statistics(rows).groupby("demand", sort=True):
-        parts += [f"Demand times {level:g}", *(text_table(each.to_dict("records")) + "\n" for each in shown(part))]
-    return "\n".join([*parts, *wrapped(CAPTION)])
+    tables = _tables(rows, "Demand times {:g}", lambda each: text_table(each.to_dict("records")) + "\n")
+    return "\n".join([*tables, *wrapped(CAPTION)])
 
 
 def markdown(rows: pd.DataFrame) -> str:
     """Return the tables of one scenario as markdown."""
-    parts = []
+    tables = _tables(rows, "## Demand times {:g}", lambda each: markdown_table(list(each), each.to_numpy().tolist()))
+    return "\n\n".join([*tables, CAPTION]) + "\n"
+
+
+def _tables(rows: pd.DataFrame, heading: str, form: Callable[[pd.DataFrame], str]) -> Iterator[str]:
     for level, part in statistics(rows).groupby("demand", sort=True):
-        tables = (markdown_table(list(each), each.to_numpy().tolist()) for each in shown(part))
-        parts += [f"## Demand times {level:g}", *tables]
-    return "\n\n".join([*parts, CAPTION]) + "\n"
+        yield from (heading.format(level), *map(form, shown(part)))

@@ -4,6 +4,7 @@ SUMO's tripinfo says what became of vehicles that have left (cosim.sumo.outputs)
 final route, else a removal.
 """
 
+import math
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import suppress
@@ -67,7 +68,8 @@ class Trip(NamedTuple):
     """A trip that was due.
 
     origin: region; outcome: COMPLETED, REMOVED on the road, UNDER_WAY, WAITING to enter, or GIVEN_UP before that
-    departure_delay, time, time_loss: [s], waiting to enter; in all, until its end or now; against driving freely
+    departure_delay, time, time_loss: [s], waiting to enter; in all, until its end or now; against driving freely, NaN
+        if it is not known yet
     """
 
     origin: int
@@ -226,11 +228,11 @@ class Meter:
         if self._trips is None:
             return
         self._settle(self._trips.finish(self._gone))
-        facts, booked = self._trips.facts, (int(self.arrivals.sum()), int(self.removals.sum()))
-        if self._gone or (facts.completed, facts.removed) != booked:
+        trips, booked = self._trips, (int(self.arrivals.sum()), int(self.removals.sum()))
+        if self._gone or (trips.completed, trips.removed) != booked:
             raise LedgerError(
                 f"vehicle ledger broken at the end: {booked[0]} completed trips and {booked[1]} removed vehicles were "
-                f"booked, but SUMO's tripinfo has {facts.completed} and {facts.removed}{self._unknown_ends()}"
+                f"booked, but SUMO's tripinfo has {trips.completed} and {trips.removed}{self._unknown_ends()}"
             )
 
     def backlog(self) -> PerPair:
@@ -253,7 +255,7 @@ class Meter:
         return spent
 
     def trips(self) -> list[Trip]:
-        """Return all trips that were due; time losses of those under way are complete when the books are closed."""
+        """Return all trips that were due; time losses of those under way are known when the books are closed."""
         return [*self._ended, *self._open()]
 
     def _open(self) -> Iterator[Trip]:
@@ -261,7 +263,7 @@ class Meter:
         now, losses = self._session.time, {} if self._trips is None else self._trips.under_way
         for vehicle, known in self._vehicles.items():
             if known.region is not None:
-                yield _trip(known, UNDER_WAY, now, losses.get(vehicle, 0.0))
+                yield _trip(known, UNDER_WAY, now, losses.get(vehicle, math.nan))
             elif known.due < now:
                 yield _trip(known, WAITING, now)
         for origin, due in [] if self._metering is None else self._metering.waiting():

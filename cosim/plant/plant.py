@@ -22,7 +22,7 @@ from cosim.plant.settings import settings as settings_of
 from cosim.plant.stuck import Junctions
 from cosim.sumo.arrays import PerEdge
 from cosim.sumo.net import City, Gateway, check_adjacency, city_of
-from cosim.sumo.outputs import TripFacts, TripReader
+from cosim.sumo.outputs import TripReader
 from cosim.sumo.session import Session
 from nmfd.arrays import PerTurn
 from nmfd.model.planning import PlanningModel, planning_model
@@ -89,7 +89,7 @@ class SumoPlant:
         scenario, settings, city = self._scenario, self._settings, self.city
         self._k, self._session = 0, self._launch.start(seed)
         session = self._session
-        self._trips, self._facts = TripReader(self._launch.trip_file, session.flush or (lambda: None)), TripFacts()
+        self._trips = TripReader(self._launch.trip_file, session.flush or (lambda: None))
         self._incidents = Incidents(scenario.ordered_faults, session, city)
         held, critical = self._launch.held, self._planning.network.critical
         self._metering = None
@@ -194,8 +194,8 @@ class SumoPlant:
             **self._actuation.pressure_facts(),
         }
 
-    def trip_facts(self) -> TripFacts:
-        """End the simulation, close the books, and return sums over all trips.
+    def trip_facts(self) -> dict[str, float]:
+        """End the simulation, close the books, and return emissions [kg] of all vehicles.
 
         Raises LedgerError if SUMO's tripinfo differs from the books.
         """
@@ -207,8 +207,7 @@ class SumoPlant:
             else:
                 self._trips.finish()
             self._recorder.close()
-            self._facts = self._trips.facts
-        return self._facts
+        return {"co2_kg": self._trips.co2, "fuel_kg": self._trips.fuel}
 
     def trips(self) -> list[Trip]:
         """Return all trips that were due; after `trip_facts` with their whole time losses."""

@@ -1,7 +1,7 @@
 """The card on top of the report: the best strategy in four figures."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import mean
 
 import pandas as pd
@@ -59,16 +59,15 @@ def _figure(table: pd.DataFrame, level: float, name: str, against: str, label: s
     if math.isnan(value):
         return None
     pair = statistics.paired(now, before)
+    figure = Figure(label=label, value=form.format(value), meaning=meaning)
     if name == against or math.isnan(pair.percent):
-        return Figure(label=label, value=form.format(value), meaning=meaning)
+        return figure
     single = math.isnan(pair.percent_half)
     spread = " on one seed" if single else f" ± {pair.percent_half:.0f} (95 %, {pair.seeds} seeds)"
     than = "without control" if against == REFERENCE else f"under {against}"
-    return Figure(
-        label=label,
-        value=form.format(value),
+    return replace(
+        figure,
         before=f"{form.format(mean([before[seed] for seed in common]))} {than}",
         change=f"{pair.percent:+.0f} %{spread}",
         better=pair.percent * good > 0 if pair.excludes_zero else None,
-        meaning=meaning,
     )

@@ -1,5 +1,6 @@
 """SUMO's output files: tripinfo, read while SUMO writes it, and others on request."""
 
+import math
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Container, Iterable, Mapping
@@ -25,20 +26,6 @@ END_TAG_BYTES = 200  # these last bytes of a file hold the end tag of its root
 
 
 @dataclass(frozen=True, kw_only=True)
-class TripFacts:
-    """Sums over all vehicles that departed before the end of the simulation.
-
-    completed: at the last edge of their route; removed: taken out before
-    co2, fuel: [kg], of those under way too (EMISSION_CLASS)
-    """
-
-    completed: int = 0
-    removed: int = 0
-    co2: float = 0.0
-    fuel: float = 0.0
-
-
-@dataclass(frozen=True, kw_only=True)
 class End:
     """The end of a vehicle's trip.
 
@@ -50,20 +37,23 @@ class End:
     time: float
     edge: str = ""
     reason: str = ""
-    time_loss: float = 0.0
+    time_loss: float = math.nan
 
 
 class TripReader:
     """Reader of SUMO's tripinfo output while SUMO writes it.
 
-    facts: of all trips so far; under_way: vehicle -> time loss [s], of those on the road at the end of the simulation
+    completed, removed: vehicles so far, at the last edge of their route or before
+    co2, fuel: of all vehicles [kg] (EMISSION_CLASS), at the end of the simulation of those on the road, too
+    under_way: vehicle on the road at the end of the simulation -> time loss [s]
     """
 
     def __init__(self, path: Path, flush: Callable[[], None] = lambda: None):
         """flush: makes SUMO write what it buffers (about ten trips)"""
         self._path, self._flush, self._offset = path, flush, 0
         self._parser: ElementTree.XMLPullParser[Element] = ElementTree.XMLPullParser()
-        self.facts = TripFacts()
+        self.completed = self.removed = 0
+        self.co2 = self.fuel = 0.0
         self.under_way: dict[str, float] = {}
 
     def ends(self) -> list[End]:
@@ -98,8 +88,11 @@ class TripReader:
             vehicle, reason = element.get("id", ""), element.get("vaporized", "")
             depart, loss = float(attribute(element, "depart")), max(float(element.get("timeLoss", 0.0)), 0.0)
             ended = float(attribute(element, "arrival")) >= 0 or (depart >= 0 and left(vehicle))
-            self.facts = _added(self.facts, element, ended=ended, completed=ended and not reason)
+            for emissions in element.iter("emissions"):
+                self.co2 += KG_PER_MG * float(attribute(emissions, "CO2_abs"))
+                self.fuel += KG_PER_MG * float(attribute(emissions, "fuel_abs"))
             if ended:
+                self.completed, self.removed = self.completed + (not reason), self.removed + bool(reason)
                 edge = element.get("arrivalLane", "").rpartition("_")[0]
                 time = depart + float(attribute(element, "duration"))
                 ends.append(End(vehicle=vehicle, time=time, edge=edge, reason=reason, time_loss=loss))
@@ -107,19 +100,6 @@ class TripReader:
                 self.under_way[vehicle] = loss
             element.clear()
         return ends
-
-
-def _added(facts: TripFacts, trip: Element, *, ended: bool, completed: bool) -> TripFacts:
-    co2, fuel = facts.co2, facts.fuel
-    for emissions in trip.iter("emissions"):
-        co2 += KG_PER_MG * float(attribute(emissions, "CO2_abs"))
-        fuel += KG_PER_MG * float(attribute(emissions, "fuel_abs"))
-    return TripFacts(
-        completed=facts.completed + completed,
-        removed=facts.removed + (ended and not completed),
-        co2=co2,
-        fuel=fuel,
-    )
 
 
 def check(kinds: Iterable[str]) -> None:
