@@ -24,20 +24,7 @@ FILES = [
     ),
 ]
 NOTEBOOKS = [file for file in FILES if file.suffix == ".ipynb"]
-PROGRAMS = (
-    "nmfd",
-    "cosim",
-    "python",
-    "python3",
-    "pip",
-    "pytest",
-    "dask",
-    "pdoc",
-    "jupyter",
-    ".",
-    "netgenerate",
-    "openssl",
-)
+PROGRAMS = "nmfd cosim python python3 pip pytest dask pdoc jupyter . netgenerate openssl".split()
 
 
 @dataclass(frozen=True)
@@ -112,9 +99,9 @@ def _called(sources: list[str]) -> Iterator[str]:
     if QUICK else VALUE gives to whoever runs it whole."""
     nodes = [node for source in sources if not source.startswith("%%") for node in ast.walk(ast.parse(source))]
     values = {
-        node.targets[0].id: ast.literal_eval(node.value.orelse)
+        node.targets[0].id: node.value.orelse.value
         for node in nodes
-        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name) and isinstance(node.value, ast.IfExp)
+        if isinstance(node, ast.Assign) and isinstance(getattr(node.value, "orelse", None), ast.Constant)
     }
     for node in nodes:
         if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "command":

@@ -70,14 +70,8 @@ def test_every_key_of_a_sumo_table(tmp_path, text):
 
 ROW = tiny.row_network()
 FILES = {
-    "demand to an unknown region": (tiny.SCENARIO.replace("to = 1", "to = 7"), ROW, "7"),
     "step too long": (tiny.SCENARIO.replace("step = 30.0", "step = 300.0"), ROW, "at most 238 s"),
-    "no network": (tiny.SCENARIO.replace("../network", "../none"), ROW, "network.toml: no such file"),
-    "no TOML": ("name = tiny", ROW, "is not valid TOML"),
     "own neighbour": (tiny.SCENARIO, ROW.replace("[0]", "[0, 1]"), "regions[1].adjacent: "),
-    "no way": (tiny.SCENARIO, ROW.replace("= [0]", "= []").replace("= [1]", "= []"), "cannot be reached"),
-    "no MFD": (tiny.SCENARIO, ROW.replace("c = 0.0042", "c = -1"), "mfd.c: "),
-    "bounds": (tiny.SCENARIO, ROW.replace("max = 0.9", "max = 0.1"), "min must be less"),
     "controller": (tiny.SCENARIO + "\n[controllers.pi-gatin]\nkp = 1\n", ROW, "did you mean pi-gating?"),
     "option": (tiny.SCENARIO + "\n[controllers.dpc-pc]\nwidht = 1\n", ROW, "controllers.dpc-pc.widht: unknown key"),
 }

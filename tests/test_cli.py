@@ -12,16 +12,12 @@ import torch
 from commands import MAINS, call, error_line, good, nmfd
 
 from nmfd import closed_loop
-from nmfd.api import load_scenario
 from nmfd.controllers import training
-from nmfd.controllers.dpc import rollout
 from nmfd.controllers.rules import PiGating
-from nmfd.controllers.strategy import CONTROLLERS
 from nmfd.runs.run_many import run_many
 from nmfd.types import Result
 
 HEAVY = ("pydantic", "torch", "casadi", "libsumo", "numpy", "pandas", "matplotlib")
-MOST_COMMANDS, MOST_PARAMETERS = 17, 110
 
 
 @pytest.fixture
@@ -53,18 +49,11 @@ def same(left, right):
     return set(left) == set(right) and all(left[name].identical(right[name]) for name in left)
 
 
-def test_size_of_the_command_lines():
-    commands = [command for main in MAINS.values() for command in main.commands.values()]
-    assert len(commands) <= MOST_COMMANDS
-    assert sum(len(command.params) for command in commands) <= MOST_PARAMETERS
-    for main in MAINS.values():
-        assert sorted(name for names in main.sections.values() for name in names) == sorted(main.commands)
-
-
 @pytest.mark.parametrize("package", MAINS)
 def test_help_is_quick_fits_a_screen_and_shows_examples(package):
-    begin = time.process_time()
-    for name in MAINS[package].commands:
+    begin, main = time.process_time(), MAINS[package]
+    assert sorted(name for names in main.sections.values() for name in names) == sorted(main.commands)
+    for name in main.commands:
         text = good(call(package, name, "--help"))
         assert "Example" in text and f"{package} {name}" in text, name
     assert time.process_time() - begin < 2.0
@@ -99,8 +88,6 @@ def test_settings(scenario, tmp_path):
     command = ("benchmark", scenario, "--controllers", "pi-gating", "--out", tmp_path / "out", "--set")
     good(nmfd(*command, "steps=3", "--set", "controllers.pi-gating.kp=2.5"))
     assert Result.read(tmp_path / "out" / "pi-gating-0.nc").accumulation.shape[0] == 4
-    loaded = load_scenario(scenario, {"controllers.pi-gating.kp": 2.5, "name": "other"})
-    assert loaded.controller_options["pi-gating"] == {"kp": 2.5} and loaded.name == "other"
     for text, problem in (
         ("stepz=3", "scenario.toml: stepz: unknown key; did you mean step?"),
         ("steps=x", "scenario.toml: steps: should be a valid integer, got 'x'"),
@@ -169,39 +156,20 @@ def test_without_a_compiler_training_is_not_compiled(scenario, tmp_path, monkeyp
     assert content["configuration"]["compiled"] is False
 
 
-def test_a_compiler_that_does_not_work_counts_as_none(monkeypatch):
-    def compiled_step(step):
-        def compiled(x):
-            raise RuntimeError("Python.h: no such file")
-
-        return compiled
-
-    monkeypatch.setattr(rollout, "compiled_step", compiled_step)
-    assert not rollout.can_compile()
-
-
 def test_a_gpu_that_is_not_there_is_one_line(scenario, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     result = nmfd("train", scenario, "--controller", "dpc-pc", "--steps", 1, "--device", "cuda")
     assert "finds no GPU here" in error_line(result, "nmfd")
 
 
-def test_show_draws_the_scenario_and_lists_what_is_shipped(scenario, tmp_path):
+def test_show_draws_the_scenario(scenario, tmp_path):
     assert "2 regions, 360 trips between 1 pairs" in good(nmfd("show", scenario, "--out", tmp_path / "figures"))
     assert {path.name for path in (tmp_path / "figures").iterdir()} == {"spawn_matrix.png", "region_map.png", "mfd.png"}
-    listed = good(nmfd("show"))
-    names = {line.split()[0] for line in listed.splitlines() if line.startswith("  ")}
-    assert {"economic_mpc", "hexagon7", "economic_mpc/dpc-pc.pt", *CONTROLLERS} <= names
-    assert max(map(len, listed.splitlines())) < 170
 
 
 def test_a_new_controller_runs(scenario, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert "nmfd benchmark economic_mpc" in good(nmfd("new-controller", "mine.py"))
     good(nmfd("benchmark", scenario, "--controllers", "mine.py:MyController", "--set", "steps=2", "--out", "out"))
-    for name, problem in (
-        ("mine.py", "exists; choose another"),
-        ("mine.txt", "ends in .py"),
-        ("no/x.py", "No such"),
-    ):
+    for name, problem in (("mine.py", "exists; choose another"), ("mine.txt", "ends in .py"), ("no/x.py", "No such")):
         assert problem in error_line(nmfd("new-controller", name), "nmfd")

@@ -204,6 +204,12 @@ def test_the_device_is_the_gpu_where_there_is_one(monkeypatch):
         ("dpc-pc", {"from_gating": True}, "from_gating: expected a scenario with protected regions"),
         ("dpc-pc", {"from_gating": True, "from_no_control": True}, "from_gating: a policy cannot begin as a gate and"),
         ("dpc-pcrg", {"local": True}, "local: a local policy guides no routes; train dpc-pc"),
+        ("dpc-pc", {"numbers": [1.0] * 8}, "numbers: expected 8 to 11 numbers >= 0 of a compact"),
+        ("dpc-pc", {"compact": True, "numbers": [1.0]}, "numbers: should have at least 8"),
+        ("dpc-pc", {"compact": True, "numbers": [-1.0] * 8}, "numbers: expected 8 to 11 numbers >= 0"),
+        ("dpc-pc", {"compact": True, "local": True}, "compact: begins with its numbers"),
+        ("dpc-pc", {"metering": True}, "metering: only for compact policies"),
+        ("dpc-pc", {"descend": False}, "descend: only for compact policies"),
     ],
 )
 def test_wrong_training_settings(scenario, controller, options, problem):

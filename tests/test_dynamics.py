@@ -12,7 +12,7 @@ from tiny import random_controls
 
 from nmfd.model import dynamics, dynamics_casadi
 from nmfd.model.mfd import Mfd
-from nmfd.model.regional_model import LEAST_ROOM, RegionalModel, load_network
+from nmfd.model.regional_model import LEAST_ROOM, load_network
 
 STEP = 30.0
 NETWORK = load_network(Path(__file__).parents[1] / "networks" / "hexagon7")
@@ -27,20 +27,6 @@ def random_tensors(seed, *, filling, batch=()):
     x = random.uniform(size=(*batch, 7, 7)) * random.uniform(0.0, filling / 3.5, (*batch, 7, 1))
     demand = random.uniform(0.0, 3.0, (*batch, 7, 7))
     return tuple(torch.from_numpy(array) for array in (x, demand, *random_controls(random, NETWORK, batch)))
-
-
-def one_region(mfd):
-    return dynamics.parameters(
-        RegionalModel(
-            name="one",
-            region_names=("only",),
-            positions=np.zeros((1, 2)),
-            adjacency=np.zeros((1, 1), dtype=bool),
-            mfds=(mfd,),
-            u_min=0.1,
-            u_max=0.9,
-        )
-    )
 
 
 @KINDS
@@ -79,7 +65,8 @@ def test_who_is_where_he_wants_to_be_is_not_sent_on(network):
 
 
 def test_one_region_with_a_linear_mfd_decays_exponentially():
-    p = one_region(Mfd(a=0.0, b=0.0, c=0.0042, jam=10_000.0))
+    mfds, adjacency = (Mfd(a=0.0, b=0.0, c=0.0042, jam=10_000.0),), np.zeros((1, 1), dtype=bool)
+    p = dynamics.parameters(replace(NETWORK, region_names=("only",), adjacency=adjacency, mfds=mfds))
     none = torch.zeros(1, 1, dtype=torch.float64)
     x = dynamics.advance(p, none + 5000.0, none, none, none[None], 600.0, integrator="rk4", substeps=600)
     assert x.item() == pytest.approx(5000.0 * np.exp(-0.0042 * 600.0), rel=1e-8)
@@ -90,13 +77,8 @@ def test_a_turned_or_mirrored_hexagon_is_the_same_hexagon(order):
     x, demand, perimeter, splits = random_tensors(3, filling=20_000.0)
     assert (NETWORK.adjacency[order][:, order] == NETWORK.adjacency).all()
     plain = dynamics.advance(PARAMETERS, x, demand, perimeter, splits, STEP, substeps=3)
-    turned = dynamics.advance(
-        PARAMETERS,
-        *(matrix[order][:, order] for matrix in (x, demand, perimeter)),
-        splits[order][:, order][:, :, order],
-        STEP,
-        substeps=3,
-    )
+    inputs = [matrix[order][:, order] for matrix in (x, demand, perimeter)]
+    turned = dynamics.advance(PARAMETERS, *inputs, splits[order][:, order][:, :, order], STEP, substeps=3)
     torch.testing.assert_close(turned, plain[order][:, order], rtol=1e-12, atol=0.0)
 
 
@@ -136,17 +118,11 @@ def test_torch_and_casadi_agree(integrator, substeps, network):
     p, x, twin, most = dynamics_casadi.parameters(network), torch.zeros(7, 7, dtype=torch.float64), ca.DM(7, 7), 0.0
     for _ in range(120):
         demand, (perimeter, splits) = random.uniform(0.0, 2.0, (7, 7)), random_controls(random, NETWORK)
-        kwargs = {"integrator": integrator, "substeps": substeps}
-        x = dynamics.advance(
-            dynamics.parameters(network),
-            x,
-            *(torch.from_numpy(array) for array in (demand, perimeter, splits)),
-            STEP,
-            **kwargs,
-        )
-        twin = dynamics_casadi.advance(
-            p, twin, ca.DM(demand), ca.DM(perimeter), [ca.sparsify(ca.DM(rows)) for rows in splits], STEP, **kwargs
-        )
+        scheme = {"step": STEP, "integrator": integrator, "substeps": substeps}
+        inputs = (torch.from_numpy(array) for array in (demand, perimeter, splits))
+        x = dynamics.advance(dynamics.parameters(network), x, *inputs, **scheme)
+        inputs = ca.DM(demand), ca.DM(perimeter), [ca.sparsify(ca.DM(rows)) for rows in splits]
+        twin = dynamics_casadi.advance(p, twin, *inputs, **scheme)
         most = max(most, x.sum(-1).max().item())
         np.testing.assert_allclose(twin.full(), x.numpy(), rtol=0.0, atol=1e-9)
     assert most > 1.5 * NETWORK.mfds[0].jam

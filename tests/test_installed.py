@@ -61,23 +61,10 @@ def installed(built, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("a new user")
     called(sys.executable, "-m", "venv", "--without-pip", folder / "venv", where=folder)
     programs = folder / "venv" / ("Scripts" if os.name == "nt" else "bin")
-    called(
-        sys.executable,
-        "-m",
-        "pip",
-        "--python",
-        programs / "python",
-        "install",
-        "--no-deps",
-        "--no-index",
-        built[1],
-        where=folder,
-    )
-    site = Path(
-        called(
-            programs / "python", "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", where=folder
-        ).strip()
-    )
+    pip = (sys.executable, "-m", "pip", "--python", programs / "python")
+    called(*pip, "install", "--no-deps", "--no-index", built[1], where=folder)
+    code = "import sysconfig; print(sysconfig.get_path('purelib'))"
+    site = Path(called(programs / "python", "-c", code, where=folder).strip())
     (site / "libraries.pth").write_text(sysconfig.get_path("purelib") + "\n", encoding="utf-8")
     return programs
 

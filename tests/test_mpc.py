@@ -101,26 +101,15 @@ def test_the_plan_costs_what_the_regional_model_says(states, guidance):
     for scenario in (SCENARIO, replace(SCENARIO, step=90.0, substeps=3), replace(SCENARIO, integrator="rk4")):
         controller = EconomicMpc(planning_model(scenario), guidance=guidance)
         start, demand = controller.forecast(states[20])
-        random = np.random.default_rng(7)
-        plan = controller.admissible.project(
-            np.stack(
-                [controller.admissible.decision(*random_controls(random, NETWORK)) for _ in range(controller._moves)]
-            )
-        )
+        random, admissible = np.random.default_rng(7), controller.admissible
+        rows = [admissible.decision(*random_controls(random, NETWORK)) for _ in range(controller._moves)]
+        plan = admissible.project(np.stack(rows))
         p, x, total = dynamics.parameters(NETWORK), torch.from_numpy(states[20].accumulation), 0.0
         for k in range(8):
             perimeter, splits = controller.admissible.controls(plan[min(k, len(plan) - 1)])
             splits = NETWORK.nominal_splits if splits is None else splits
-            x = dynamics.advance(
-                p,
-                x,
-                torch.from_numpy(scenario.demand[20 + k]),
-                torch.from_numpy(perimeter),
-                torch.from_numpy(splits),
-                scenario.step,
-                substeps=scenario.substeps,
-                integrator=scenario.integrator,
-            )
+            inputs = (torch.from_numpy(values) for values in (scenario.demand[20 + k], perimeter, splits))
+            x = dynamics.advance(p, x, *inputs, **scenario.scheme)
             total += scenario.step * x.sum().item()
         # Region 3 holds no destination: the measured columns without demand are empty.
         assert controller.cost(start, demand, plan) == pytest.approx(total, rel=1e-12)

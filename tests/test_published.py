@@ -15,7 +15,7 @@ from nmfd.api import load_scenario
 from nmfd.closed_loop import run
 from nmfd.controllers.dpc.rollout import Rollout
 from nmfd.errors import InputError
-from nmfd.metrics import total_time_spent
+from nmfd.metrics import summary, total_time_spent
 from nmfd.model import dynamics
 from nmfd.model.planning import planning_model
 from nmfd.model.plant import AcyclicPlant, NmfdPlant
@@ -52,6 +52,18 @@ def test_the_noise_of_the_benchmark_is_a_standard_deviation_of_the_measurement_o
     assert (first.accumulation != noisy.accumulation).any() and first.accumulation.min() >= 0.0
     assert (first.accumulation - quiet.accumulation)[1].std() == pytest.approx(0.25, rel=0.3)
     assert scenario.hash != moved.hash != replace(moved, process_std=0.0).hash
+
+
+def test_the_benchmark_without_control():
+    """The reconstructed demand, and the published figures, which the constant outflow beyond the jam decides."""
+    scenario = load_scenario("economic_mpc")
+    assert scenario.step * scenario.demand.sum() == pytest.approx(31_680)
+    bare = tuple(replace(mfd, jam=1e9) for mfd in scenario.network.mfds)
+    other = replace(scenario, network=replace(scenario.network, mfds=bare))
+    row, bare_row = (summary(run(NmfdPlant(s), make_controller("no-control", s), s, seed=0)) for s in (scenario, other))
+    assert row["total_time_spent_veh_s"] == pytest.approx(1.773e8, rel=0.005)
+    assert row["final_accumulation_veh"] == pytest.approx(25_526, rel=0.01)
+    assert bare_row["final_accumulation_veh"] < 0.9 * 25_526
 
 
 def seen(inside):
@@ -179,12 +191,8 @@ def test_policies_are_trained_and_bounds_sought_from_the_same_start(begun):
     x, _ = Rollout(planning).random_start(3, 0.0, 0.0, torch.Generator())
     np.testing.assert_array_equal(x[2], quiet.initial)
     gates, splits = bound.neutral_starts(quiet.network, quiet.steps, guidance=False)["open"]
-    (total,) = bound._total_time_spent(
-        quiet,
-        dynamics.parameters(quiet.network),
-        torch.tensor(gates).unsqueeze(1),
-        torch.tensor(splits).unsqueeze(1),
-    )
+    controls = (torch.tensor(values).unsqueeze(1) for values in (gates, splits))
+    (total,) = bound._total_time_spent(quiet, dynamics.parameters(quiet.network), *controls)
     uncontrolled = total_time_spent(run(NmfdPlant(quiet), make_controller("no-control", quiet), quiet, seed=0))
     assert float(total) == pytest.approx(uncontrolled, rel=1e-12)
     assert make_controller("mpc-pc", quiet).act(seen([100.0, 50.0])).note == ""

@@ -6,11 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 import tiny
-import torch
 
 from nmfd.api import load_scenario, robustness
-from nmfd.controllers import training
-from nmfd.model.planning import planning_model
 from nmfd.model.scenario import pairs_with_demand, perturbed
 from nmfd.studies import robustness as study
 
@@ -41,17 +38,6 @@ def test_noise_is_common_to_all_sigmas_and_follows_its_seed(scenario):
     np.testing.assert_allclose(two, 2.0 * one, atol=1e-10)
     np.testing.assert_array_equal(perturbed(high, 0.0, 3).demand, high.demand)
     assert not np.array_equal(perturbed(high, 1.0, 4).demand - high.demand, one)
-
-
-def test_training_noise_is_that_of_the_evaluation(scenario):
-    """On the pairs in use; sigma is the level times the setting."""
-    rollout = training.Rollout(planning_model(scenario))
-    nominal = 50.0 + rollout.demand.unsqueeze(1).repeat(50, 400, 1, 1)
-    level = torch.full((400,), 0.5)
-    change = rollout.perturb(nominal, level, 2.0, torch.Generator().manual_seed(0)) - nominal
-    assert change[:, :, 0, 1].std().item() == pytest.approx(1.0, rel=0.02)
-    assert change[:, :, 1, 0].abs().max().item() == 0.0
-    assert rollout.perturb(nominal, level, 0.0, torch.Generator()) is nominal
 
 
 def test_rows_and_picture_of_a_comparison(folder, tmp_path):

@@ -38,6 +38,12 @@ def beside(base, text, name="other"):
     return folder
 
 
+def model(folder, jam=800.0, regions=2):
+    """A network in `folder`, named by its jam accumulation."""
+    folder.mkdir()
+    (folder / "network.toml").write_text(tiny.row_network(regions).replace("jam = 1000.0", f"jam = {jam}"))
+
+
 def test_what_a_scenario_does_not_say_is_its_bases(base):
     own, inherited = load_scenario(base), load_scenario(beside(base, OTHER))
     assert (inherited.name, inherited.steps, inherited.step) == ("other", 5, own.step)
@@ -132,8 +138,7 @@ def test_wrong_networks(tmp_path, old, new, message):
 
 
 def test_a_controller_plans_with_the_model_that_it_names(base, tmp_path):
-    (tmp_path / "model").mkdir()
-    (tmp_path / "model" / "network.toml").write_text(tiny.row_network(2).replace("jam = 1000.0", "jam = 800.0"))
+    model(tmp_path / "model")
     folder = beside(base, 'name = "x"\nbase = "../scenario"\n[controllers.mpc-pc]\nmodel = "../model"\nhorizon = 4\n')
     scenario = load_scenario(folder)
     planned = planning_model(scenario, "mpc-pc")
@@ -144,10 +149,8 @@ def test_a_controller_plans_with_the_model_that_it_names(base, tmp_path):
 
 def test_guiding_controllers_find_the_model_of_guided_drivers(base, tmp_path):
     network = load_scenario(base).network.folder
-    (network / "guided").mkdir()
-    (network / "guided" / "network.toml").write_text(tiny.row_network(2).replace("jam = 1000.0", "jam = 800.0"))
-    (tmp_path / "model").mkdir()
-    (tmp_path / "model" / "network.toml").write_text(tiny.row_network(2).replace("jam = 1000.0", "jam = 700.0"))
+    model(network / "guided")
+    model(tmp_path / "model", jam=700.0)
     scenario = load_scenario(
         beside(base, 'name = "x"\nbase = "../scenario"\n[controllers."dpc-pcrg+max-pressure"]\nmodel = "../model"\n')
     )
@@ -162,19 +165,16 @@ def test_guiding_controllers_find_the_model_of_guided_drivers(base, tmp_path):
 
 
 def test_an_inherited_model_lies_where_the_base_says(base, tmp_path):
-    (tmp_path / "model").mkdir()
-    (tmp_path / "model" / "network.toml").write_text(tiny.row_network(2).replace("jam = 1000.0", "jam = 800.0"))
-    beside(base, 'name = "x"\nbase = "../scenario"\n[controllers.mpc-pc]\nmodel = "../model"\n')
+    model(tmp_path / "model")
+    first = beside(base, 'name = "x"\nbase = "../scenario"\n[controllers.mpc-pc]\nmodel = "../model"\n')
     far = tmp_path / "far" / "away"
     far.mkdir(parents=True)
-    [first] = [folder.parent for folder in tmp_path.glob("*/scenario.toml") if 'name = "x"' in folder.read_text()]
     (far / "scenario.toml").write_text(f'name = "y"\nbase = "../../{first.name}"\n')
     assert planning_model(load_scenario(far), "mpc-pc").network.mfds[0].jam == 800.0
 
 
 def test_a_variant_has_options_model_and_policy_of_its_own(base, tmp_path):
-    (tmp_path / "model").mkdir()
-    (tmp_path / "model" / "network.toml").write_text(tiny.row_network(2).replace("jam = 1000.0", "jam = 800.0"))
+    model(tmp_path / "model")
     folder = beside(
         base,
         """name = "x"
@@ -203,8 +203,7 @@ mfd_spread = 0.2
 
 
 def test_a_model_of_another_city_is_refused(base, tmp_path):
-    (tmp_path / "model").mkdir()
-    (tmp_path / "model" / "network.toml").write_text(tiny.row_network(3))
+    model(tmp_path / "model", regions=3)
     folder = beside(base, 'name = "x"\nbase = "../scenario"\n[controllers.mpc-pc]\nmodel = "../model"\n')
     with pytest.raises(InputError, match="controllers.mpc-pc.model: network row3 has other regions"):
         make_controller("mpc-pc", load_scenario(folder))

@@ -1,7 +1,6 @@
 """Regions, their adjacency, control bounds and MFDs, and the network.toml that declares them."""
 
 import hashlib
-import io
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -335,35 +334,32 @@ def check_step(network: RegionalModel, step: float, where: str) -> None:
 
 def network_toml(network: RegionalModel, sumo: Mapping[str, str], comment: str) -> str:
     """Return network.toml of `network` with this table [sumo]."""
-    out = io.StringIO()
-    out.write(f"# {comment}\nname = {quoted(network.name)}\n")
-    out.write("placeholder = true\n\n" if network.placeholder else "\n")
-    out.write(f"[perimeter]\nmin = {network.u_min:g}\nmax = {network.u_max:g}\n")
+    lines = [f"# {comment}", f"name = {quoted(network.name)}", *["placeholder = true"] * network.placeholder]
+    lines += ["", "[perimeter]", f"min = {network.u_min:g}", f"max = {network.u_max:g}"]
     if sumo:
-        out.write("\n[sumo]\n" + "".join(f"{key} = {quoted(value)}\n" for key, value in sumo.items()))
+        lines += ["", "[sumo]", *(f"{key} = {quoted(value)}" for key, value in sumo.items())]
     for region, (x, y) in enumerate(network.positions):
         onward, curve = network.adjacency[region], network.mfds[region]
-        out.write(f"\n[[regions]]\nname = {quoted(network.region_names[region])}\nposition = [{x:.6g}, {y:.6g}]\n")
-        out.write(f"adjacent = [{', '.join(map(str, np.flatnonzero(onward)))}]\n")
+        lines += ["", "[[regions]]", f"name = {quoted(network.region_names[region])}"]
+        lines += [f"position = [{x:.6g}, {y:.6g}]", f"adjacent = {np.flatnonzero(onward).tolist()}"]
         if network.exit_rates is not None:
-            out.write(f"exit_rates = {_listed(network.exit_rates[region])}\n")
+            lines.append(f"exit_rates = {_listed(network.exit_rates[region])}")
         if network.capacity is not None and network.storage is not None:
-            out.write(f"capacity = {_listed(network.capacity[region, onward])}\n")
-            out.write(f"storage = {network.storage[region]:.6g}\n")
+            lines.append(f"capacity = {_listed(network.capacity[region, onward])}")
+            lines.append(f"storage = {network.storage[region]:.6g}")
         if network.controllable is not None:
-            out.write(f"controllable = {_listed(network.controllable[region, onward])}\n")
+            lines.append(f"controllable = {_listed(network.controllable[region, onward])}")
         if region in network.critical_above:
-            out.write(f"critical_above = {network.critical_above[region]:.6g}\n")
+            lines.append(f"critical_above = {network.critical_above[region]:.6g}")
         if network.doubts and network.doubts[region]:
-            out.write(f"doubts = [{', '.join(map(quoted, network.doubts[region]))}]\n")
-        out.write("\n[regions.mfd]\n")
-        out.write(f"a = {curve.a:.6g}\nb = {curve.b:.6g}\nc = {curve.c:.6g}\njam = {curve.jam:.6g}\n")
-        splits = [(j, shares) for (i, j), shares in sorted(network.observed_split_ratios.items()) if i == region]
-        if splits:
-            out.write("\n[regions.observed_split_ratios]\n")
-        for j, shares in splits:
-            out.write(f"{j} = {{ {', '.join(f'{h} = {share:.4f}' for h, share in shares.items())} }}\n")
-    return out.getvalue()
+            lines.append(f"doubts = [{', '.join(map(quoted, network.doubts[region]))}]")
+        lines += ["", "[regions.mfd]", *(f"{name} = {getattr(curve, name):.6g}" for name in ("a", "b", "c", "jam"))]
+        observed = sorted((j, shares) for (i, j), shares in network.observed_split_ratios.items() if i == region)
+        if observed:
+            lines += ["", "[regions.observed_split_ratios]"]
+        for j, shares in observed:
+            lines.append(f"{j} = {{ {', '.join(f'{h} = {share:.4f}' for h, share in shares.items())} }}")
+    return "\n".join([*lines, ""])
 
 
 def _listed(values: Sequence[float] | np.ndarray) -> str:
