@@ -9,16 +9,18 @@ regions that are behind their share. Random assignment sends drivers round the f
 
 A guided vehicle in region i bound for edge d takes the fastest way inside i to a gateway i -> h, and from there to d
 without coming back to i, at recent travel times (cosim.plant.routes) as its class of drivers sees them. With a period,
-it is guided again in i. No driver takes a much longer detour, and none leaves the present way for a small gain, because
-every change makes the travel times of others wrong. With `ways_return`, for ragged boundaries, the fastest way of all
-is open to all drivers and counts for the region that it enters when it leaves i for good.
+it is guided again in i. No driver takes a much longer detour, by times without prices, and none leaves the present way
+for a small gain, because every change makes the travel times of others wrong. With `ways_return`, for ragged
+boundaries, the fastest way of all is open to all drivers and counts for the region that it enters when it leaves i for
+good.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import groupby, pairwise
+from typing import TypeAlias
 
 import numpy as np
 
@@ -34,10 +36,12 @@ from nmfd.arrays import PerRegion, PerTurn
 DRIVER_CLASSES = 4  # groups of drivers who see different travel times: all on one way would jam it
 SPREAD, MESO_SPREAD = 0.05, 0.15  # standard deviation of the logarithm of these times, with lanes and without
 SHARE_PENALTY_S = 30.0  # per vehicle that a region is behind its share
-MOST_DETOUR_S = 60.0  # that a commanded next region may cost a driver
+MOST_DETOUR_S = 60.0  # that a commanded next region, or a price, may cost a driver
 # Drivers keep their way if another one saves less than this share of its delay, times the delay's share of its time.
 SWITCHING_THRESHOLD = 0.6
 MESO_THRESHOLD = 0.3  # in the mesoscopic model: if another one saves less than this share of its own time
+# The fastest way by each next region: times [s], infinite if too long; True if there is one; its edges by number.
+_Options: TypeAlias = tuple[list[float], list[bool], Callable[[int], list[int]]]
 RETRY_S = 10.0  # after which a driver is guided again who could not change lanes
 MEMORY = 0.9  # of the vehicles assigned before and of their wishes, per control interval
 
@@ -135,6 +139,7 @@ class Guide:
         spread = SPREAD if lanes else MESO_SPREAD
         self._taste = np.exp(spread * random.standard_normal((DRIVER_CLASSES, len(city.edges))))
         self._prices: PerRegion | None = None
+        self._unpriced = tuple(range(city.regions))
         # Results of the run; then those of one control interval, which `command` clears.
         self._leading, self._ahead, self._back = cache(self._to_gateways), cache(self._to_nearest), cache(self._behind)
         self._home, self._ways, self._everywhere = cache(self._home_from), cache(self._ways_from), cache(self._all_ways)
@@ -204,42 +209,43 @@ class Guide:
     def _guide_home(self, visit: _Visit, here: int, target: int) -> None:
         """Give the fastest way inside the region of destination; if ways may return, the fastest of all."""
         event, region = visit.event, 0 if self._ways_return else visit.event.region
-        home = self._home(region, visit.taste, self._free(event.destination))
-        present = self._present(event.vehicle, here, home.time)
-        cost = home.cost(here, target, self._worth(present) + 1.0)
+        told, true = (self._home(region, visit.taste, free) for free in (self._free(event.destination), self._unpriced))
+        present = self._present(event.vehicle, here, told.time)
+        cost = told.cost(here, target, self._worth(present) + 1.0)
         if here == target or not np.isfinite(cost) or self._keeps(present, cost):
             return
-        self._send(event.vehicle, home.route(here, target))
+        way = told.route(here, target)
+        if told is not true:
+            takes = self._takes(way, true.time)
+            if true.cost(here, target, takes) < takes - self._most_detour:
+                way = true.route(here, target)
+        self._send(event.vehicle, way)
 
     def _guide_on(self, visit: _Visit, here: int, target: int) -> None:
         """Give the next region, and the fastest way through it."""
         event = visit.event
-        ways = self._ways(event.region, visit.taste, self._free(event.destination))
-        present = self._present(event.vehicle, here, ways.time)
-        cost, reached = ways.cost(here, target, self._most_detour + present.takes + 1.0 if present.bound else np.inf)
-        # Plain numbers from here on: a handful of next regions is too few for arrays to pay.
-        least, open_ways = (
-            best.reduceat(values, ways.begins).tolist()
-            for best, values in ((np.minimum, cost), (np.logical_or, reached))
-        )
-        fastest = min(least, default=np.inf)
-        returning = None  # next region of the fastest way of all, if that one comes back
-        of_all, gateway = ways.returning(here, target, min(fastest, present.takes + 1.0 if present.bound else np.inf))
-        if of_all < fastest:
-            way, fastest = ways.returning_route(here, gateway, target), of_all
-            returning = int(np.searchsorted(ways.begins, gateway, side="right")) - 1
-            least[returning], open_ways[returning] = fastest, True
-        if fastest == np.inf:
+        free = self._free(event.destination)
+        told, true = (self._ways(event.region, visit.taste, regions) for regions in (free, self._unpriced))
+        present = self._present(event.vehicle, here, told.time)
+        least, open_ways, way = options = self._options(told, here, target, present)
+        if (fastest := min(least, default=np.inf)) == np.inf:
             return
-        n = self._next(event, ways, least, open_ways, fastest)
+        limit = fastest + self._most_detour
+        if told is true:
+            least = [cost if cost <= limit else np.inf for cost in least]
+        else:
+            truly = self._present(event.vehicle, here, true.time)
+            shortest = self._options(true, here, target, truly)
+            limit = min(shortest[0]) + self._most_detour
+            least, open_ways, way = self._shortened(options, shortest, limit, told.time, true.time)
+        n = self._next(event, told, least, open_ways)
         if n is None:
             return
-        following = int(ways.neighbours[n])
-        if not self._keeps(present, least[n], following):
-            if n != returning:
-                way = ways.route(here, int(ways.begins[n] + np.argmin(cost[ways.begins[n] : ways.ends[n]])), target)
-            if not self._send(event.vehicle, way):
-                return
+        following, cost = int(told.neighbours[n]), least[n]
+        if told is not true and truly.takes > limit:
+            present, cost = truly, self._takes(way(n), true.time)
+        if not self._keeps(present, cost, following) and not self._send(event.vehicle, way(n)):
+            return
         if visit.following is not None:  # the region given before does not count any more
             before = event.region, visit.following, event.destination
             self.realised[before] -= 1
@@ -248,8 +254,41 @@ class Guide:
         self._assigned[event.region, following, event.destination] += 1.0
         visit.following, visit.interval = following, self._interval
 
-    def _next(self, event: Event, ways: Ways, least: list[float], open_ways: list[bool], fastest: float) -> int | None:
-        """Return which of ways.neighbours a driver gets next; None if no share is left. least: [s] by neighbour"""
+    def _options(self, ways: Ways, here: int, target: int, present: _Present) -> _Options:
+        """Return the fastest ways, if these are not much longer than the present one."""
+        most = present.takes + 1.0 if present.bound else np.inf
+        cost, reached = ways.cost(here, target, self._most_detour + most)
+        # Plain numbers from here on: a handful of next regions is too few for arrays to pay.
+        least, open_ways = (
+            best.reduceat(values, ways.begins).tolist()
+            for best, values in ((np.minimum, cost), (np.logical_or, reached))
+        )
+        returning = None  # next region of the fastest way of all, if that one comes back
+        fastest = min(least, default=np.inf)
+        of_all, gateway = ways.returning(here, target, min(fastest, most))
+        if of_all < fastest:
+            returning = int(np.searchsorted(ways.begins, gateway, side="right")) - 1
+            least[returning], open_ways[returning] = of_all, True
+
+        def way(n: int) -> list[int]:
+            if n == returning:
+                return ways.returning_route(here, gateway, target)
+            return ways.route(here, int(ways.begins[n] + np.argmin(cost[ways.begins[n] : ways.ends[n]])), target)
+
+        return least, open_ways, way
+
+    def _shortened(self, told: _Options, true: _Options, limit: float, seen: PerEdge, time: PerEdge) -> _Options:
+        """Return ways within the limit [s] at `time` (E,) [s], with their times as `seen` (E,) [s]."""
+        ways = [told[2](n) if cost < np.inf else [] for n, cost in enumerate(told[0])]
+        for n, cost in enumerate(true[0]):
+            if not ways[n] or self._takes(ways[n], time) > limit:
+                ways[n] = true[2](n) if cost <= limit < np.inf else []
+        least = [self._takes(way, seen) if way else np.inf for way in ways]
+        return least, np.logical_or(told[1], true[1]).tolist(), ways.__getitem__
+
+    def _next(self, event: Event, ways: Ways, least: list[float], open_ways: list[bool]) -> int | None:
+        """Return which of ways.neighbours a driver gets next; None if no share is left. least: [s], inf if too long"""
+        fastest = min(least)
         self._wished[event.region, ways.neighbours[least.index(fastest)], event.destination] += 1.0
         wish, own, theta, assigned = (
             values[event.region, ways.neighbours, event.destination].tolist()
@@ -261,7 +300,7 @@ class Guide:
         if (total := sum(shares)) <= 0:
             return None
         shares, count = [share / total for share in shares], sum(assigned) + 1.0
-        allowed = [share > 1e-3 and c <= fastest + self._most_detour for share, c in zip(shares, least, strict=True)]
+        allowed = [share > 1e-3 and c < np.inf for share, c in zip(shares, least, strict=True)]
         if not any(allowed):  # every region with a share is too long a detour
             allowed = [c <= fastest for c in least]
         price = [
@@ -285,6 +324,10 @@ class Guide:
         free = times.free.take(ahead).sum() + times.free_turns.take(known).sum()
         back = not self._ways_return and (regions := self._regions(way)).count(regions[0]) > 1
         return _Present(way, takes, max(takes - free, 0.0), len(known) == len(moves) and not back)
+
+    def _takes(self, way: list[int], time: PerEdge) -> float:
+        """Return the time [s] from the end of the first edge of a way, at `time` (E,) [s]."""
+        return float(time[way[1:]].sum() + self._times.turns[[self._move[pair] for pair in pairwise(way)]].sum())
 
     def _regions(self, way: list[int]) -> list[int]:
         """Return the regions along a way."""
@@ -318,20 +361,21 @@ class Guide:
             return False
         return self._session.set_route(vehicle, edges)
 
-    def _free(self, destination: int) -> int | None:
-        """Return the region without a price for drivers to `destination`, None if all have theirs."""
-        return destination if self._prices is not None and self._prices[destination] > 0.0 else None
+    def _free(self, destination: int) -> tuple[int, ...]:
+        """Return the regions without a price for drivers to `destination`."""
+        prices = self._prices
+        return tuple(r for r in self._unpriced if prices is None or r == destination or not prices[r])
 
-    def _seen(self, taste: int, free: int | None) -> PerEdge:
+    def _seen(self, taste: int, free: tuple[int, ...]) -> PerEdge:
         """Return the times (E,) [s] that a class of drivers sees, with the prices of all regions but `free`."""
         prices = np.zeros(self._city.regions) if self._prices is None else self._prices.copy()
-        prices[[] if free is None else free] = 0.0
+        prices[list(free)] = 0.0
         return self._times.edges * (1.0 + prices)[self._region] * self._taste[taste]
 
-    def _home_from(self, region: int, taste: int, free: int | None) -> Home:
+    def _home_from(self, region: int, taste: int, free: tuple[int, ...]) -> Home:
         return Home(self._homeward[region], self._seen(taste, free), self._times.turns, self._searches)
 
-    def _ways_from(self, region: int, taste: int, free: int | None) -> Ways:
+    def _ways_from(self, region: int, taste: int, free: tuple[int, ...]) -> Ways:
         first, second, move, following = self._gateways[region]
         leading, reached = self._leading(region)
         turns, everywhere = self._times.turns, None
@@ -353,7 +397,7 @@ class Guide:
             everywhere=everywhere,
         )
 
-    def _all_ways(self, taste: int, free: int | None) -> Trees:
+    def _all_ways(self, taste: int, free: tuple[int, ...]) -> Trees:
         assert self._anywhere is not None
         return Trees(self._anywhere, self._seen(taste, free), self._times.turns, self._searches)
 
