@@ -10,7 +10,8 @@ import tiny
 import torch
 from tiny import random_controls
 
-from nmfd.model import dynamics, dynamics_casadi
+from nmfd.controllers.mpc import ipopt
+from nmfd.model import dynamics
 from nmfd.model.mfd import Mfd
 from nmfd.model.regional_model import LEAST_ROOM, load_network
 
@@ -115,14 +116,14 @@ def test_gradients_against_finite_differences(integrator, filling, network):
 def test_torch_and_casadi_agree(integrator, substeps, network):
     """Over a rollout into the jam and beyond, with new controls in every interval."""
     random = np.random.default_rng(6)
-    p, x, twin, most = dynamics_casadi.parameters(network), torch.zeros(7, 7, dtype=torch.float64), ca.DM(7, 7), 0.0
+    p, x, twin, most = ipopt.parameters(network), torch.zeros(7, 7, dtype=torch.float64), ca.DM(7, 7), 0.0
     for _ in range(120):
         demand, (perimeter, splits) = random.uniform(0.0, 2.0, (7, 7)), random_controls(random, NETWORK)
         scheme = {"step": STEP, "integrator": integrator, "substeps": substeps}
         inputs = (torch.from_numpy(array) for array in (demand, perimeter, splits))
         x = dynamics.advance(dynamics.parameters(network), x, *inputs, **scheme)
         inputs = ca.DM(demand), ca.DM(perimeter), [ca.sparsify(ca.DM(rows)) for rows in splits]
-        twin = dynamics_casadi.advance(p, twin, *inputs, **scheme)
+        twin = ipopt.advance(p, twin, *inputs, **scheme)
         most = max(most, x.sum(-1).max().item())
         np.testing.assert_allclose(twin.full(), x.numpy(), rtol=0.0, atol=1e-9)
     assert most > 1.5 * NETWORK.mfds[0].jam
@@ -132,7 +133,7 @@ def test_both_rates_are_those_of_the_mfd():
     accumulation = np.linspace(0.0, 20_000.0, 7)
     expected = [mfd.rate(n) for mfd, n in zip(NETWORK.mfds, accumulation, strict=True)]
     torch_rate = dynamics.rate(PARAMETERS, torch.from_numpy(accumulation)).numpy()
-    casadi_rate = dynamics_casadi.rate(dynamics_casadi.parameters(NETWORK), ca.DM(accumulation)).full().ravel()
+    casadi_rate = ipopt.rate(ipopt.parameters(NETWORK), ca.DM(accumulation)).full().ravel()
     np.testing.assert_allclose(torch_rate, expected, rtol=1e-13)
     np.testing.assert_allclose(casadi_rate, expected, rtol=1e-13)
 

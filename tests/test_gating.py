@@ -8,8 +8,7 @@ import pytest
 
 from nmfd.api import load_scenario
 from nmfd.closed_loop import run
-from nmfd.controllers.excitation import Probing
-from nmfd.controllers.rules import PiGating
+from nmfd.controllers.rules import PiGating, Probing
 from nmfd.errors import InputError
 from nmfd.metrics import summary
 from nmfd.model.planning import planning_model

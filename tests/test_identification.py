@@ -10,7 +10,7 @@ import torch
 
 from nmfd import closed_loop
 from nmfd.api import load_scenario
-from nmfd.controllers.excitation import Probing
+from nmfd.controllers.rules import Probing
 from nmfd.model import dynamics, identification
 from nmfd.model.identification import Observed
 from nmfd.model.mfd import Mfd

@@ -26,13 +26,9 @@ class Settings(config.Settings):
     """The city in SUMO. Files are relative to the scenario's folder."""
 
     step_length: float = setting("time step, a divisor of the control interval", 1.0, unit="s", gt=0.0, le=1.0)
-    time_to_teleport: float = setting(
-        "standing time after which SUMO moves a vehicle on; -1: never", -1.0, unit="s", ge=-1.0
-    )
+    time_to_teleport: float = setting("waiting time before SUMO moves a vehicle on; -1: never", -1.0, unit="s", ge=-1.0)
     begin: Seconds = setting("simulation time at which interval 0 begins", 0.0)
-    mesoscopic: bool = setting(
-        "SUMO's queue model without lanes, about ten times as fast as car-following; for quick studies", False
-    )
+    mesoscopic: bool = setting("SUMO's queue model without lanes, about ten times as fast; for quick studies", False)
     routes: Texts = setting("route files of recorded trips; without any, trips are drawn from the demand", ())
     background: Texts = setting("route files of traffic outside the demand: public transport, persons", ())
     additional: Texts = setting("additional files: vehicle types, stops, signal programmes", ())
@@ -43,19 +39,13 @@ class Settings(config.Settings):
     guided: bool = setting("drivers are guided by travel times if the controller does not guide them", False)
     compliance: Share = setting("probability that a driver follows the guidance in a region", 1.0)
     guidance_period: Seconds = setting("time after which a driver is guided again in the same region; 0: never", 0.0)
-    ways_return: bool = setting(
-        "guided drivers may leave a region and come back where that is fastest, as along a ragged boundary", False
-    )
+    ways_return: bool = setting("guided drivers may leave a region and come back where that is fastest", False)
     rerouting: Share = setting("share of the drivers with SUMO's rerouting device", 0.0)
     metering: float = setting(
-        "trips wait outside while their region holds more, in critical accumulations; 0: no metering",
-        0.0,
-        unit="-",
-        ge=0.0,
-        le=10.0,
+        "critical accumulations in a region above which trips wait outside; 0: never", 0.0, unit="-", ge=0.0, le=10.0
     )
     measurement: Literal["exact", "estimate"] = setting(
-        "controllers see the exact state, or an estimate from detectors and probe vehicles", EXACT
+        "what controllers see; estimate: by detectors and probes", EXACT
     )
     detector_share: Share = setting("share of the links with loop detectors", 0.3)
     probe_share: Share = setting("share of the vehicles that are probes", 0.1)
@@ -63,10 +53,8 @@ class Settings(config.Settings):
     @model_validator(mode="after")
     def _is_possible(self) -> Self:
         if self.measurement == ESTIMATE and self.detector_share == self.probe_share == 0:
-            raise Problem(
-                "measurement",
-                '"estimate" needs sumo.detector_share or sumo.probe_share, but both are 0; raise one of them',
-            )
+            problem = '"estimate" needs sumo.detector_share or sumo.probe_share, but both are 0; raise one of them'
+            raise Problem("measurement", problem)
         return self
 
 
@@ -107,7 +95,5 @@ def check_lanes(scenario: "Scenario", settings: Settings) -> None:
         ("measurement", (ESTIMATE,), "needs loop detectors on lanes"),
     ):
         if settings.mesoscopic and (value := getattr(settings, key)) in values:
-            raise InputError(
-                f"{scenario_file(scenario)}: sumo.{key}: {value} {what}, but SUMO's mesoscopic model has no lanes; "
-                "omit it, or set mesoscopic = false (import the city without --mesoscopic)"
-            )
+            what += ", but SUMO's mesoscopic model has no lanes; omit it, or import the city without --mesoscopic"
+            raise InputError(f"{scenario_file(scenario)}: sumo.{key}: {value} {what}")

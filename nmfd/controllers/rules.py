@@ -1,4 +1,6 @@
-"""Rule-based controllers: no control, route guidance by travel times, PI gating and greedy control."""
+"""Rule-based controllers: no control, route guidance by travel times, PI gating, greedy control, excitation."""
+
+from dataclasses import replace
 
 import numpy as np
 
@@ -6,6 +8,12 @@ from nmfd.errors import InputError
 from nmfd.model.planning import Options, PlanningModel, options
 from nmfd.runs.config import PositiveNumbers, Problem, got, setting
 from nmfd.types import Controls, Observation
+
+# Of the excitation.
+HOLD_INTERVALS = (3, 9)  # control intervals between two draws, from and to
+SET_POINT_RANGE = (0.5, 1.3)  # factor of the set points
+DISTURBED_SHARE = 0.35  # of the gateways whose u is drawn at random
+MAX_DIVERTED_SHARE = 0.6  # of the vehicles with a random next region; more locks a city
 
 
 class NoControl:
@@ -31,22 +39,22 @@ class RouteGuidance(NoControl):
 
     def __init__(self, planning: PlanningModel):
         super().__init__(planning)
-        self._controls = Controls(perimeter=self._controls.perimeter, splits=planning.network.nominal_splits)
+        self._controls = replace(self._controls, splits=planning.network.nominal_splits)
 
 
 class SetPoint(Options):
     """Options of controllers that hold the accumulation of protected regions; cosim identify sets it for probing."""
 
     set_point: PositiveNumbers | None = setting(
-        "accumulation to hold in each protected region; derived from the MFD by default", None, unit="veh"
+        "accumulation to hold in each protected region; by default from the MFD", None, unit="veh"
     )
 
     def misfit(self, planning: PlanningModel) -> Problem | None:
         """Return a wrong number of set points as a problem."""
         count = len(planning.protected)
-        if not count or self.set_point is None or len(self.set_point) == count:
-            return None
-        return Problem("set_point", got(f"a list of {count} numbers", list(self.set_point)))
+        if count and self.set_point is not None and len(self.set_point) != count:
+            return Problem("set_point", got(f"a list of {count} numbers", list(self.set_point)))
+        return None
 
 
 class Gating(SetPoint):
@@ -57,12 +65,7 @@ class Gating(SetPoint):
     """
 
     outflow_share: float = setting(
-        "share of the MFD's maximum that defines the set point: the smallest accumulation with this outflow; 1 is the "
-        "critical accumulation, less leaves a margin",
-        1.0,
-        unit="-",
-        ge=0.1,
-        le=1.0,
+        "outflow at the set point, as a share of the MFD's maximum: less leaves a margin", 1.0, unit="-", ge=0.1, le=1.0
     )
     kp: float = setting("proportional gain, per relative error", 1.0, unit="-", ge=0.0)
     ki: float = setting("integral gain, per relative error", 0.01, unit="1/s", gt=0.0)
@@ -85,10 +88,8 @@ class PiGating:
         """Raise InputError without a protected region or for a wrong option."""
         network, setup = planning.network, options(Gating, planning, self.name)
         if not planning.protected:
-            raise InputError(
-                f"{planning.where}: protected: pi-gating needs at least one protected region, got none; "
-                f"add protected = [<region>, ...] with regions from 0 to {network.regions - 1}"
-            )
+            missing = "pi-gating needs at least one protected region, got none; add protected = [<region>, ...]"
+            raise InputError(f"{planning.where}: protected: {missing} with regions from 0 to {network.regions - 1}")
         self.regions = np.array(planning.protected)
         self.critical = np.array([network.mfds[region].critical for region in self.regions])
         self.set_point = np.array(
@@ -138,3 +139,52 @@ class Greedy:
         congested, fullness = vehicles > self._critical, vehicles / self._jam
         hold = congested & (~congested[:, None] | (fullness[:, None] < fullness))  # [i, h]
         return Controls(perimeter=np.where(hold, self._closed, self._open), splits=None)
+
+
+class Probing:
+    """Excitation for identification: gating at random set points, with some gateways at a random u.
+
+    Random controls alone would lock the city early; gating alone moves all gateways of a region together. With
+    guidance, theta lies between the nominal split ratios and a random point of the simplex. The seed of the run draws
+    all of it again every few control intervals. The set points vary around the option set_point, or else the critical
+    accumulation.
+    """
+
+    def __init__(self, planning: PlanningModel, *, guidance: bool):
+        """Raise InputError for a wrong option."""
+        self.name = "probing-pcrg" if guidance else "probing-pc"
+        self._network, self._guidance, self._gating = planning.network, guidance, None
+        middle = options(SetPoint, planning, self.name).set_point
+        middle = middle or tuple(planning.network.mfds[region].critical for region in planning.protected)
+        if middle:
+            gating = replace(planning, controller_options={PiGating.name: {"set_point": list(middle)}})
+            self._gating = PiGating(gating)
+            self._gating.critical = np.array(middle)
+        self._open = np.where(planning.network.adjacency, planning.network.u_max, 0.0)
+        self.reset()
+
+    def reset(self, seed: int = 0) -> None:
+        self._random, self._left = np.random.default_rng([seed, 0x70726F62]), 0
+        if self._gating is not None:
+            self._gating.reset()
+
+    def act(self, observation: Observation) -> Controls:
+        if self._left == 0:
+            self._draw()
+        self._left -= 1
+        perimeter = self._open if self._gating is None else self._gating.act(observation).perimeter
+        return Controls(perimeter=np.where(self._disturbed, self._random_u, perimeter), splits=self._splits)
+
+    def _draw(self) -> None:
+        random, network = self._random, self._network
+        self._left = int(random.integers(*HOLD_INTERVALS))
+        if self._gating is not None:
+            self._gating.set_point = random.uniform(*SET_POINT_RANGE) * self._gating.critical
+        self._random_u = random.uniform(network.u_min, network.u_max, network.adjacency.shape)
+        self._disturbed = network.adjacency & (random.random(network.adjacency.shape) < DISTURBED_SHARE)
+        self._splits = None
+        if self._guidance:
+            point = random.exponential(size=network.split_mask.shape) ** 2 * network.split_mask
+            point /= np.maximum(point.sum(axis=1, keepdims=True), 1e-12)
+            share = MAX_DIVERTED_SHARE * random.random((network.regions, 1, network.regions)) ** 2
+            self._splits = (1.0 - share) * network.nominal_splits + share * point

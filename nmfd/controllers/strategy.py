@@ -18,9 +18,8 @@ import numpy as np
 from nmfd.controllers import custom, open_loop
 from nmfd.controllers.dpc import policy_file
 from nmfd.controllers.dpc.options import Training
-from nmfd.controllers.excitation import Probing
 from nmfd.controllers.mpc import controller as mpc
-from nmfd.controllers.rules import Gating, Greedy, NoControl, PiGating, RouteGuidance, SetPoint
+from nmfd.controllers.rules import Gating, Greedy, NoControl, PiGating, Probing, RouteGuidance, SetPoint
 from nmfd.errors import InputError, did_you_mean
 from nmfd.model.planning import Options, PlanningModel, guided_model, options, other_model, planning_model
 from nmfd.model.scenario import Scenario

@@ -10,8 +10,8 @@ i, j, h; x_i = sum_j x_ij; N_i the regions adjacent to i:
     dx_ii/dt = d_ii - m_ii + sum_{h in N_i} u_hi m_hii
     dx_ij/dt = d_ij - sum_{h in N_i} u_ih m_ihj + sum_{h in N_i, h != j} u_hi m_hij        j != i
 
-Twins: `dynamics_casadi` (for IPOPT), `acyclic` (no vehicle turns back), nmfd.controllers.mpc.edge_model (as edges, with
-adjoint gradients).
+Twins: `acyclic` (no vehicle turns back), and in nmfd.controllers.mpc `ipopt` (in CasADi) and `edge_model` (as edges,
+with adjoint gradients).
 
 Shapes: `...` is any batch. x (..., R, R) [veh], [i, j] in region i bound for j; demand (..., R, R) [veh/s];
 perimeter (..., R, R) [-], [i, h]; splits (..., R, R, R) [-], [i, h, j].

@@ -183,28 +183,16 @@ class RegionTable(Settings):
     adjacent: Regions = setting("regions into which roads lead from here")
     mfd: MfdTable | None = setting("own MFD instead of [mfd]", None)
     exit_rates: config.PositiveNumbers | None = setting(
-        "rate at which vehicles leave, relative to the MFD, per destination region; for all regions or none",
-        None,
-        unit="-",
+        "rate at which vehicles leave, relative to the MFD, per destination region", None, unit="-"
     )
     capacity: config.PositiveNumbers | None = setting(
-        "largest flow into each adjacent region while that is empty, under the largest control, in the order of "
-        "adjacent; with storage, for all regions or none",
-        None,
-        unit="veh/s",
+        "largest flow into each adjacent region while that is empty, under max; with storage", None, unit="veh/s"
     )
     storage: float | None = setting(
-        "accumulation that leaves no room for vehicles from other regions; with capacity",
-        None,
-        unit="veh",
-        gt=0.0,
-        le=MOST_VEHICLES,
+        "accumulation that lets no vehicle in; with capacity", None, unit="veh", gt=0.0, le=MOST_VEHICLES
     )
     controllable: Annotated[tuple[Share, ...], Field(strict=False)] | None = setting(
-        "share of the flow into each adjacent region that passes signals under control, in the order of adjacent; for "
-        "all regions or none",
-        None,
-        unit="-",
+        "share of the flow into each adjacent region that passes signals under control", None, unit="-"
     )
     critical_above: float | None = setting(
         "largest accumulation in data that show no falling branch: the critical one is above, and that of the MFD a "
@@ -216,9 +204,7 @@ class RegionTable(Settings):
     )
     doubts: config.Texts = setting("warnings of cosim identify about the fit", ())
     observed_split_ratios: dict[str, dict[str, Share]] = setting(
-        "measured shares: destination region = { next region = share }, sum 1; elsewhere vehicles cross the fewest "
-        "boundaries",
-        {},
+        "measured: destination = { next region = share }, sum 1; elsewhere vehicles cross the fewest boundaries", {}
     )
 
 

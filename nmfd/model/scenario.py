@@ -169,9 +169,7 @@ class ScenarioTable(Settings):
     """A network, its demand and noise, and the horizon."""
 
     name: Name = setting("name of the scenario")
-    base: Text | None = setting(
-        "folder or shipped name of a scenario that gives what this one omits; tables are completed key by key", None
-    )
+    base: Text | None = setting("folder or shipped name of a scenario that gives the keys omitted here", None)
     network: Text = setting("folder or shipped name of the network")
     step: float = setting("control interval", unit="s", gt=0.0, le=LONGEST_STEP_S)
     steps: int = whole("control intervals", low=1, high=MOST_STEPS)
@@ -185,16 +183,9 @@ class ScenarioTable(Settings):
         "standard deviation of the noise on each observed accumulation by destination", 0.0, unit="veh", ge=0.0, le=1e6
     )
     process_std: float = setting(
-        "standard deviation of the noise on each accumulation by destination after every control interval, regional "
-        "model only; clipped at 0",
-        0.0,
-        unit="veh",
-        ge=0.0,
-        le=1e6,
+        "standard deviation of the noise on the state after each interval; not in SUMO", 0.0, unit="veh", ge=0.0, le=1e6
     )
-    forecast_error: float = setting(
-        "standard deviation of the logarithm of forecast over demand", 0.0, unit="-", ge=0.0, le=2.0
-    )
+    forecast_error: float = setting("standard deviation of log(forecast / demand)", 0.0, unit="-", ge=0.0, le=2.0)
     initial: Annotated[tuple[Numbers, ...], Field(strict=False)] = setting(
         "vehicles at the start, regional model only: one row per region, by destination", (), unit="veh"
     )

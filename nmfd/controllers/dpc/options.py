@@ -11,56 +11,28 @@ from nmfd.runs.config import Flow, Numbers, Problem, Share, setting, whole
 class Training(Options):
     """Options of a DPC policy and of its training, `nmfd train SCENARIO --controller NAME`."""
 
-    local: bool = setting(
-        "one small network for every boundary, whose inputs are the regions around it: perimeter control of many "
-        "regions, also by a policy that was trained in another city",
-        False,
-    )
-    compact: bool = setting(
-        "a policy of a few readable numbers instead of a network: gates of the protected regions, and prices of the "
-        "ways through crowded regions that guide drivers; trained on the CPU",
-        False,
-    )
+    local: bool = setting("one small network for every boundary, which fits other cities; perimeter control", False)
+    compact: bool = setting("gates and prices of a few readable numbers instead of a network; on the CPU", False)
     numbers: Annotated[Numbers, Field(min_length=8, max_length=11)] | None = setting(
         "initial numbers of a compact policy: set_point, gain, relief, price, price_from, elsewhere, elsewhere_from, "
         "metering, integral (0), metering_protected (0), metering_gain (1); see nmfd/controllers/dpc/compact.py",
         None,
         unit="-",
     )
-    metering: bool = setting(
-        "a compact policy makes trips wait while regions are full; for cities with +metering", False
-    )
+    metering: bool = setting("a compact policy makes trips wait while regions are full; for +metering", False)
     descend: bool = setting("false leaves a compact policy at its initial numbers, such as those of cosim tune", True)
     steps: int = whole("Adam steps", 400, low=1, high=10**7)
-    learning_rate: float = setting(
-        "initial learning rate of Adam; falls to a tenth along a cosine", 1e-3, unit="-", gt=0.0, le=1.0
-    )
-    demand_low: float = setting(
-        "least factor of all demand; one factor is drawn per rollout", 1.0, unit="-", gt=0.0, le=1.0
-    )
+    learning_rate: float = setting("of Adam; falls to a tenth along a cosine", 1e-3, unit="-", gt=0.0, le=1.0)
+    demand_low: float = setting("least factor of all demand, drawn per rollout", 1.0, unit="-", gt=0.0, le=1.0)
     demand_high: float = setting("largest factor of all demand", 1.0, unit="-", ge=1.0, le=100.0)
-    noise: Flow = setting(
-        "largest standard deviation of the Gaussian noise on the demand of the pairs with demand; every rollout draws "
-        "its own from 0 to this",
-        0.0,
-    )
+    noise: Flow = setting("largest standard deviation of Gaussian noise on the demand; drawn per rollout", 0.0)
     mfd_spread: Share = setting("standard deviation of the logarithm of the MFD of every region, per rollout", 0.0)
     mfd_scale: float = setting(
-        "factor of the accumulation axes of the MFDs; below 1 for a city that may lock before its mean outflow falls",
-        1.0,
-        unit="-",
-        ge=0.1,
-        le=1.0,
+        "factor of the MFDs' accumulation axes; below 1 for a city that may lock early", 1.0, unit="-", ge=0.1, le=1.0
     )
-    detour_cost: float = setting(
-        "time that a vehicle loses off the nominal split ratios, in the objective", 0.0, unit="s", ge=0.0, le=1e6
-    )
+    detour_cost: float = setting("time lost by a vehicle off the nominal splits", 0.0, unit="s", ge=0.0, le=1e6)
     from_no_control: bool = setting("the initial policy is nearly no control", False)
-    from_gating: bool = setting(
-        "the initial policy is nearly a gate at the set point of pi-gating, which descent does not find by itself "
-        "where the regional model locks",
-        False,
-    )
+    from_gating: bool = setting("the initial policy is nearly a gate at the set point of pi-gating", False)
 
     @model_validator(mode="after")
     def _fits_together(self) -> "Training":

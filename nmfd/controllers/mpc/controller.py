@@ -45,15 +45,13 @@ class Mpc(Options):
 
     horizon: int = whole("horizon of the plan, in control intervals", 8, low=2, high=1000)
     control_horizon: int | None = whole(
-        "control intervals with controls of their own, the last of which hold to the end of the horizon; all by "
-        "default",
+        "intervals with controls of their own, the last of which hold to the end; by default all",
         None,
         low=1,
         high=1000,
     )
     solver: Literal["projected-gradient", "ipopt"] = setting(
-        "ipopt is the reference: the published formulation by CasADi and IPOPT, two orders of magnitude slower",
-        "projected-gradient",
+        "ipopt: the published formulation, as a reference, a hundred times slower", "projected-gradient"
     )
 
     @model_validator(mode="after")

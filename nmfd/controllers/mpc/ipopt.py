@@ -1,19 +1,28 @@
 """Economic MPC by IPOPT on the published formulation: the reference of the projected-gradient solver.
 
-Multiple shooting on the CasADi twin of the regional model (nmfd.model.dynamics_casadi): every x_ij, u_ih and theta_ihj
-of every interval is a variable and the dynamics are constraints. Two orders of magnitude slower.
+Multiple shooting on the CasADi twin of nmfd.model.dynamics: every x_ij, u_ih and theta_ihj of every interval is a
+variable and the dynamics are constraints. Two orders of magnitude slower.
+
+The twin has the same names and equations on SX, MX or DM matrices, without a batch: x (R, R) [veh]; demand (R, R)
+[veh/s]; perimeter (R, R) [-]; splits: R matrices (R, R) [-], splits[i][h, j]. Structural zeros are kept.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from types import SimpleNamespace
+from typing import Any, TypeAlias
 
 import casadi as ca
 import numpy as np
 
 from nmfd.arrays import PairsOverTime, PerPair, TurnsOverTime
-from nmfd.model import dynamics_casadi as model
+from nmfd.model import dynamics
 from nmfd.model.planning import PlanningModel
+from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, RegionalModel
 
 UNIT = 1000.0  # veh, unit of the accumulations in the solver
+Matrix: TypeAlias = ca.SX | ca.MX | ca.DM
+Turns: TypeAlias = Sequence[Matrix]  # R of them
+Parameters: TypeAlias = SimpleNamespace
 
 
 class Ipopt:
@@ -24,7 +33,7 @@ class Ipopt:
         network = planning.network
         self._network, self._horizon, self._guidance = network, horizon, guidance
         self._edges, self._turns = np.argwhere(network.adjacency), np.argwhere(network.split_mask & guidance)
-        regions, p = network.regions, model.parameters(network)
+        regions, p = network.regions, parameters(network)
         self.shape = regions, regions
         start, demand = ca.SX.sym("start", regions, regions), ca.SX.sym("demand", regions, regions * horizon)
         variables, constraints, total, x = [], [], 0.0, start
@@ -36,7 +45,7 @@ class Ipopt:
                 perimeter[i, h] = u[n]
             after = ca.SX.sym(f"x{k}", regions, regions)
             flows = demand[:, k * regions : (k + 1) * regions], perimeter, splits
-            moved = model.advance(p, UNIT * x, *flows, **planning.scheme)
+            moved = advance(p, UNIT * x, *flows, **planning.scheme)
             constraints += [*sums, ca.vec(ca.densify(moved) / UNIT - after)]
             total, x = total + ca.sum1(ca.vec(after)), after
             variables += [u, theta, ca.vec(after)]
@@ -74,3 +83,56 @@ class Ipopt:
         for n, (i, h, j) in enumerate(self._turns.tolist()):
             splits[i][h, j] = theta[n]
         return splits, [ca.sum1(splits[i][:, j]) - 1.0 for i in range(regions) for j in range(regions) if i != j]
+
+
+def parameters(network: RegionalModel) -> Parameters:
+    """Return `dynamics.parameters` as constants: vectors (R, 1), but storage (1, R); adjacency 1 or structural zero."""
+    known = vars(dynamics.parameters(network)).items()
+    p = Parameters(**{name: None if values is None else ca.DM(values.numpy()) for name, values in known})
+    p.adjacency, p.storage = ca.sparsify(p.adjacency), None if p.storage is None else p.storage.T
+    return p
+
+
+def rate(p: Parameters, accumulation: Matrix) -> Matrix:
+    """Return q_i = g_i(min(x_i, jam_i)) / x_i (R, 1) [1/s] of accumulation (R, 1) [veh]."""
+    body = ca.fmin(accumulation, p.jam)
+    return ((p.a * body + p.b) * body + p.c) * p.jam / (accumulation + p.jam - body)
+
+
+def flows(p: Parameters, x: Matrix, perimeter: Matrix, splits: Turns) -> tuple[Matrix, list[Matrix]]:
+    """Return trip completions m_ii (R, 1) and transfer flows [veh/s], R matrices (R, R) [h, j]."""
+    regions, accumulation = x.shape[0], ca.sum2(x)
+    leaving = ca.repmat(rate(p, accumulation), 1, regions) * x
+    if p.exit_rates is not None:
+        leaving *= p.exit_rates
+    completions = ca.diag(leaving)
+    wishing = leaving - ca.diag(completions)
+    transfers = [splits[i] * ca.repmat(wishing[i, :], regions, 1) for i in range(regions)]
+    if p.capacity is None:
+        open_share = perimeter * p.adjacency
+    else:
+        wish = ca.vertcat(*(ca.sum2(transfer).T for transfer in transfers))
+        open_share = passing(p, wish, perimeter, accumulation) * p.adjacency
+    return completions, [ca.repmat(open_share[i, :].T, 1, regions) * transfer for i, transfer in enumerate(transfers)]
+
+
+def passing(p: Parameters, wish: Matrix, perimeter: Matrix, accumulation: Matrix) -> Matrix:
+    """Return the share (R, R) [-] of the desired flow `wish` (R, R) [veh/s] that passes each boundary."""
+    room = ca.fmax(1.0 - accumulation.T / p.storage, LEAST_ROOM)
+    limit = perimeter * p.capacity * ca.repmat(room, wish.shape[0], 1)
+    return (1.0 + (wish / (limit + LEAST_LIMIT)) ** SHARPNESS) ** (-1.0 / SHARPNESS)
+
+
+def derivative(p: Parameters, x: Matrix, demand: Matrix, perimeter: Matrix, splits: Turns) -> Matrix:
+    """Return dx_ij/dt (R, R) [veh/s]."""
+    completions, transfers = flows(p, x, perimeter, splits)
+    leaving = ca.vertcat(*(ca.sum1(transfer) for transfer in transfers))
+    entering = sum(transfers[1:], transfers[0])
+    return demand - ca.diag(completions) - leaving + entering
+
+
+def advance(
+    p: Parameters, x: Matrix, demand: Matrix, perimeter: Matrix, splits: Turns, step: float, **scheme: Any
+) -> Matrix:
+    """Return x after one control interval of `step` [s] under constant inputs; scheme: see `dynamics.integrated`."""
+    return dynamics.integrated(lambda x: derivative(p, x, demand, perimeter, splits), x, step, **scheme)
