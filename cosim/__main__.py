@@ -1,6 +1,12 @@
-"""`python -m cosim` is the command `cosim`."""
+"""The command `cosim`, also `python -m cosim`."""
 
-from cosim.cli import main
+from nmfd.__main__ import start
+
+
+def main() -> None:
+    """Run the command `cosim`."""
+    start("cosim")
+
 
 if __name__ == "__main__":
     main()

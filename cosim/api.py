@@ -7,6 +7,7 @@ import os
 import sys
 import webbrowser
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,7 @@ from nmfd.model.scenario import Scenario, with_demand
 from nmfd.runs import shipped
 from nmfd.runs.files import default_folder, file_name, write_table
 from nmfd.runs.progress import Progress, watched
-from nmfd.runs.run_many import raise_failures, run_many
+from nmfd.runs.run_many import locked, raise_failures, run_many
 from nmfd.studies.benchmark import draw_accumulations
 from nmfd.types import Controller, Result
 
@@ -109,10 +110,11 @@ def run_controllers(
     out = default_folder(loaded.name) if out is None else out
     sumo_files = tuple(sumo_output or ())
     runs = runs_of(loaded, strategies, [seed], demand=demand, policies=policies, sumo_output=sumo_files, out=out)
-    raise_failures(run_many(runs, out, workers=2))
-    finished = results.read(out)
-    there = [level.read(*name) for level in finished.levels for name in level.runs]
-    draw_accumulations(out, loaded, there)
+    with locked(out):
+        raise_failures(run_many(runs, out, workers=2))
+        finished = results.read(out)
+        there = [level.read(*name) for level in finished.levels for name in level.runs]
+        draw_accumulations(out, loaded, there)
     return f"{statistics.text(finished.rows)}\nWritten to {out}"
 
 
@@ -121,14 +123,15 @@ def demo(out: Path, *, seed: int = 1000) -> str:
     from cosim.report import html
 
     scenario, strategies = load_scenario(DEMO), [parse("no-control"), parse("pi-gating")]
-    rows = run_many(runs_of(scenario, strategies, [seed]), out, workers=2)
-    raise_failures(rows)
-    lines = [
-        f"{row['controller'] + ':':12} {row['completed_veh']:,.0f} of {row['trips']:,.0f} trips completed, "
-        f"{row['mean_trip_time_s'] / 60:.1f} minutes per trip"
-        for row in rows[rows["seed"] == seed].to_dict("records")
-    ]
-    page = html.write_page(out / "report.html", [results.read(out)], seed=seed).resolve()
+    with locked(out):
+        rows = run_many(runs_of(scenario, strategies, [seed]), out, workers=2)
+        raise_failures(rows)
+        lines = [
+            f"{row['controller'] + ':':12} {row['completed_veh']:,.0f} of {row['trips']:,.0f} trips completed, "
+            f"{row['mean_trip_time_s'] / 60:.1f} minutes per trip"
+            for row in rows[rows["seed"] == seed].to_dict("records")
+        ]
+        page = html.write_page(out / "report.html", [results.read(out)], seed=seed).resolve()
     if _has_screen():
         webbrowser.open(page.as_uri())
     return "\n".join([*lines, f"Both side by side: {page}"])
@@ -210,14 +213,15 @@ def evaluate(
         runs = evaluation.plan(chosen, strategies, seeds, policies)
         lines = evaluation.check(runs, out, check, workers=workers)
         return "\n".join(lines) or f"{min(check, len(runs))} runs of {out} done again: no difference"
-    rows = evaluation.evaluate(
-        chosen, strategies, seeds, out=out, policies=policies, workers=workers, scheduler=scheduler
-    )
-    text = []
-    for each in dict.fromkeys(results.finished_rows(rows).get("scenario", ())):
-        finished = results.read(out, each)
-        figures.draw_all(finished)
-        text += [each] * (len(chosen) > 1) + [statistics.text(finished.rows)]
+    with locked(out):
+        rows = evaluation.evaluate(
+            chosen, strategies, seeds, out=out, policies=policies, workers=workers, scheduler=scheduler
+        )
+        text = []
+        for each in dict.fromkeys(results.finished_rows(rows).get("scenario", ())):
+            finished = results.read(out, each)
+            figures.draw_all(finished)
+            text += [each] * (len(chosen) > 1) + [statistics.text(finished.rows)]
     raise_failures(rows)
     return "\n".join([*text, f"Written to {out}: see evaluate.md, runs.csv and the figures"])
 
@@ -229,14 +233,16 @@ def compare(folder: Path, *, controller: str | None = None, seed: int | None = N
     """
     finished = results.read(folder)
     if controller is None:
-        rows = model_validation.prediction_errors(finished, model)
-        write_table(folder / "foresight.csv", rows, float_format="%.6g")
+        with locked(folder):
+            rows = model_validation.prediction_errors(finished, model)
+            write_table(folder / "foresight.csv", rows, float_format="%.6g")
         return f"{model_validation.prediction_table(rows)}\nWritten to {folder / 'foresight.csv'}"
     level = finished.level()
     result = level.read(controller, seed or 0)
     scenario = with_demand(finished.scenario, steps=level.key["steps"], factor=level.demand)
     scenario = replace(scenario, network=parse(controller).planning(scenario, model).network)
-    rows = model_validation.write_comparison(level.folder, scenario, result)
+    with locked(folder):
+        rows = model_validation.write_comparison(level.folder, scenario, result)
     return f"{model_validation.error_table(rows)}\nWritten to {level.folder}"
 
 
@@ -245,7 +251,8 @@ def report(folders: Sequence[Path], *, seed: int | None = None, out: Path | None
     from cosim.report import html
 
     runs = [results.read(folder) for folder in folders]
-    return html.write_page(out or folders[0] / "report.html", runs, seed=seed)
+    with locked(folders[0]) if out is None else nullcontext():
+        return html.write_page(out or folders[0] / "report.html", runs, seed=seed)
 
 
 def tune(
@@ -375,7 +382,7 @@ def identify(
             iterations=iterations,
             protect=protect and guided == (kinds or [guided])[0],
         )
-        with watched("identify", None) as show:
+        with locked(folder), watched("identify", None) as show:
             text = identification.identify(
                 loaded, loading, out=folder, workers=workers, scheduler=scheduler, progress=show
             )

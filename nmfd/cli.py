@@ -1,13 +1,15 @@
 """Command line `nmfd`: it parses options and calls nmfd.api; cosim.cli takes the shared options from here."""
 
+import os
 import shlex
 import signal
+import sys
 import threading
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import click
 
@@ -46,16 +48,32 @@ class Commands(click.Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run a command; exit with 2 after a user error, 1 after failed runs, 130 after Ctrl-C or SIGTERM."""
+        stops = []  # an import may make another exception of it
+
+        def stop(*_: object) -> NoReturn:
+            stops.append("interrupted")
+            raise KeyboardInterrupt
+
         if threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+            signal.signal(signal.SIGTERM, stop)
+            if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+                signal.signal(signal.SIGINT, stop)
+        for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+            if getattr(sys, name) is None:  # closed: some other file would get its number
+                setattr(sys, name, open(os.devnull, mode))
+                os.set_inheritable(getattr(sys, name).fileno(), True)
         try:
             return super().invoke(ctx)
-        except KeyboardInterrupt as stop:
-            text, status = ": ".join(["interrupted", *filter(None, [str(stop)])]), 130
-        except RunFailed as failure:
-            text, status = f"error: {failure}", 1
-        except (InputError, OSError) as error:
-            text, status = f"error: {error}", 2
+        except (KeyboardInterrupt, Exception) as error:
+            if isinstance(error, KeyboardInterrupt) or stops:
+                told = isinstance(error, KeyboardInterrupt) and str(error)
+                text, status = f"interrupted: {told}" if told else "interrupted", 130
+            elif isinstance(error, RunFailed):
+                text, status = f"error: {error}", 1
+            elif isinstance(error, (InputError, OSError)) and not isinstance(error, BrokenPipeError):
+                text, status = f"error: {error}", 2
+            else:  # click ends without a word if nobody reads on
+                raise
         click.echo(f"{self.name}: {' '.join(text.split())}", err=True)
         ctx.exit(status)
 

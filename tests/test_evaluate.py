@@ -9,7 +9,8 @@ import made_up
 import pandas as pd
 import pytest
 import trajectories
-from commands import cosim, good
+from commands import cosim, error_line, good
+from filelock import FileLock, Timeout
 
 from cosim.evaluation import evaluate, results
 from nmfd.api import load_scenario
@@ -53,6 +54,35 @@ def evaluated(city, tmp_path, *, controllers=("no-control", "pi-gating"), seeds=
     scenario = with_demand(load_scenario(city), steps=STEPS)
     strategies = [parse(name) for name in controllers]
     return evaluate.evaluate([(scenario, levels)], strategies, seeds, out=tmp_path / "out", progress=False)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "evaluate CITY --controllers no-control --demand 2 --out OUT",
+        "run CITY --controller no-control --out OUT",
+        "identify CITY --with own --out OUT",
+        "report OUT",
+        "compare OUT",
+        "compare OUT --controller no-control --seed 2000",
+    ],
+)
+def test_one_command_writes_into_a_folder_at_a_time(city, tmp_path, ran, command):
+    evaluated(city, tmp_path)
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+    words = [{"CITY": city, "OUT": tmp_path / "out"}.get(word, word) for word in command.split()]
+    with FileLock(tmp_path / "out" / ".lock"):
+        assert "out: another process is writing to it" in error_line(cosim(*words))
+    assert before == {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+
+
+def test_the_folder_is_held_until_its_figures_are_drawn(city, tmp_path, ran, monkeypatch):
+    def draw(_):
+        with pytest.raises(Timeout):
+            FileLock(tmp_path / "out" / ".lock", timeout=0).acquire()
+
+    monkeypatch.setattr("cosim.report.figures.draw_all", draw)
+    good(cosim("evaluate", city, "--controllers", "no-control", "--seeds", 1, "--out", tmp_path / "out"))
 
 
 def test_runs_come_seed_by_seed_and_are_kept(city, tmp_path, ran):

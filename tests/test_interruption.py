@@ -1,6 +1,7 @@
 """Ctrl-C and kill -9: finished runs stay, nothing half-written counts, and the same command continues to the same."""
 
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -26,16 +27,34 @@ def same(left, right):
     return set(left) == set(right) and all(left[name].identical(right[name]) for name in left)
 
 
-def stopped(program, *arguments, out, by):
-    """Run a command in a process group that gets a signal after its first finished run; return status and stderr."""
+def stopped(program, *arguments, out, by, after="[!.]*.nc", wait=0.0):
+    """Run a command in a process group that gets a signal after its first finished run; return status and stderr.
+
+    after: pattern of another file; wait: time after that (s). All processes have ended when stderr has
+    """
     command = [sys.executable, "-m", program, *map(str, arguments), "--out", str(out)]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
     deadline = time.monotonic() + 120.0
-    while process.poll() is None and time.monotonic() < deadline and not list(out.rglob("[!.]*.nc")):
+    while process.poll() is None and time.monotonic() < deadline and not list(out.parent.rglob(after)):
         time.sleep(0.02)
+    time.sleep(wait)
     os.killpg(process.pid, by)
     _, said = process.communicate(timeout=60)
     return process.returncode, said
+
+
+@pytest.mark.parametrize("after, wait", [("*", 0.15), ("*", 1.0), (".lock", 0.0), ("manifest.json", 0.3)])
+def test_ctrl_c_at_any_moment_is_one_line(tmp_path, after, wait):
+    command = ("benchmark", tiny.write(tmp_path), "--controllers", "no-control", "--seeds", 200, "--workers", 2)
+    returned, said = stopped("nmfd", *command, out=tmp_path / "out", by=signal.SIGINT, after=after, wait=wait)
+    assert returned == 130 and said.startswith("nmfd: interrupted") and said.count("\n") == 1, said
+
+
+@pytest.mark.parametrize("streams", ["<&- >&- 2>&-", "| true", "2>&1 | true"])
+def test_runs_are_kept_without_standard_streams(tmp_path, streams):
+    command = [sys.executable, "-m", "nmfd", "benchmark", str(tiny.write(tmp_path)), "--controllers", "no-control"]
+    subprocess.run([f"{shlex.join(command)} --workers 2 --seeds 2 --out {tmp_path}/out {streams}"], shell=True)
+    assert len(results(tmp_path / "out")) == 2 and (tmp_path / "out" / "total_accumulation.png").exists()
 
 
 @pytest.mark.parametrize(

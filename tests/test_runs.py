@@ -1,5 +1,6 @@
 """Results and their files; many runs in a folder: nothing half-written, resumable, the same numbers everywhere."""
 
+import errno
 import json
 import os
 import pickle
@@ -252,9 +253,24 @@ def test_a_folder_is_that_of_one_process_and_of_runs(tmp_path):
     run_many([run_of()], tmp_path / "out", workers=0)
     with FileLock(tmp_path / "out" / ".lock"), pytest.raises(InputError, match="another process is writing to it"):
         run_many([run_of()], tmp_path / "out", workers=0)
+    with module.locked(tmp_path / "out"):  # as a command does
+        run_many([run_of()], tmp_path / "out", workers=0)
     (tmp_path / "out" / "manifest.json").write_text("[]")
     with pytest.raises(InputError, match="is no manifest of runs"):
         run_many([run_of()], tmp_path / "out", workers=0)
+
+
+def test_a_full_disk_leaves_nothing_that_is_refused(tmp_path, monkeypatch):
+    def full(path, _):
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    with monkeypatch.context() as patch, pytest.raises(OSError, match="No space left on device: .*manifest.json"):
+        patch.setattr(module, "write_text", full)
+        run_many([run_of()], tmp_path / "out", workers=0)
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / ".manifest-1.tmp.json").write_text("{")  # of a process that was killed
+    assert len(run_many([run_of()], tmp_path / "out", workers=0)) == 1
 
 
 def test_progress_counts_runs(tmp_path):

@@ -39,11 +39,11 @@ from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
 from nmfd.runs import files
 from nmfd.runs.progress import Progress
-from nmfd.runs.run_many import TABLE, Run, raise_failures, run_many
+from nmfd.runs.run_many import TABLE, Run, locked, raise_failures, run_many
 
 OPTION = re.compile(r"[a-z_]\w*(\[[0-9]\])?")  # KEY, or KEY[N] for one number of a list
 INITIAL_DEVIATION = 0.25  # standard deviation of the first generation, as a share of every range
-SCORE = "score_veh_s"
+SCORE, JOURNAL = "score_veh_s", "optuna.journal"
 Range: TypeAlias = FloatDistribution | IntDistribution
 
 
@@ -135,30 +135,32 @@ def tune(order: Tuning, *, workers: int = 1, scheduler: str | None = None, progr
     A candidate with a failed run has no score.
     Raises: InputError if the folder holds another search, RunFailed if no candidate of a generation has a score
     """
-    city, study = city_key(order.scenario, [order.strategy]), _study(order)
-    generation = 4 + math.floor(3 * math.log(len(order.options)))
-    while True:
-        trials = study.get_trials(deepcopy=False)
-        running = [trial for trial in trials if trial.state == TrialState.RUNNING]  # of an interrupted call
-        left = order.trials - sum(trial.state != TrialState.WAITING for trial in trials)
-        if not running and left <= 0:
-            return _write(order, study)
-        begun = any(trial.state == TrialState.COMPLETE for trial in trials)
-        for _ in range(0 if running else min(left, generation if begun else 1)):
-            number = len(study.get_trials(deepcopy=False))
-            study.sampler = _sampler(order, number)
-            study.ask(order.space)
-        running = [trial for trial in study.get_trials(deepcopy=False) if trial.state == TrialState.RUNNING]
-        runs = _runs(order, running, city, workers)
-        rows = run_many(runs, order.out / "runs", workers=workers, scheduler=scheduler, progress=progress)
-        for trial in running:
-            totals = np.maximum(list(_totals(order, rows, trial.number).values()), 1.0)  # a city may be empty
-            score = float(np.exp(np.log(totals).mean()))
-            failed = math.isnan(score)
-            study.tell(trial.number, None if failed else score, state=TrialState.FAIL if failed else None)
-        table = _write(order, study)
-        if table[SCORE].tail(len(running)).isna().all():
-            raise_failures(rows)
+    city = city_key(order.scenario, [order.strategy])
+    with locked(order.out, JOURNAL):
+        study = _study(order)
+        generation = 4 + math.floor(3 * math.log(len(order.options)))
+        while True:
+            trials = study.get_trials(deepcopy=False)
+            running = [trial for trial in trials if trial.state == TrialState.RUNNING]  # of an interrupted call
+            left = order.trials - sum(trial.state != TrialState.WAITING for trial in trials)
+            if not running and left <= 0:
+                return _write(order, study)
+            begun = any(trial.state == TrialState.COMPLETE for trial in trials)
+            for _ in range(0 if running else min(left, generation if begun else 1)):
+                number = len(study.get_trials(deepcopy=False))
+                study.sampler = _sampler(order, number)
+                study.ask(order.space)
+            running = [trial for trial in study.get_trials(deepcopy=False) if trial.state == TrialState.RUNNING]
+            runs = _runs(order, running, city, workers)
+            rows = run_many(runs, order.out / "runs", workers=workers, scheduler=scheduler, progress=progress)
+            for trial in running:
+                totals = np.maximum(list(_totals(order, rows, trial.number).values()), 1.0)  # a city may be empty
+                score = float(np.exp(np.log(totals).mean()))
+                failed = math.isnan(score)
+                study.tell(trial.number, None if failed else score, state=TrialState.FAIL if failed else None)
+            table = _write(order, study)
+            if table[SCORE].tail(len(running)).isna().all():
+                raise_failures(rows)
 
 
 def best(table: pd.DataFrame) -> pd.Series:
@@ -183,8 +185,7 @@ def _study(order: Tuning) -> optuna.Study:
         "levels": list(order.levels),
         "search_seed": order.search_seed,
     }
-    order.out.mkdir(parents=True, exist_ok=True)
-    storage = JournalStorage(JournalFileBackend(str(order.out / "optuna.journal")))
+    storage = JournalStorage(JournalFileBackend(str(order.out / JOURNAL)))
     study = optuna.create_study(storage=storage, study_name="tune", load_if_exists=True)
     kept = study.user_attrs.get("search")
     if kept is None:

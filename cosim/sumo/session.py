@@ -306,7 +306,8 @@ def _start_quietly(command: list[str]) -> None:
         said.seek(0)
         words = said.read().decode(errors="replace")
     if failure is None:
-        sys.stderr.write(words)
+        with suppress(BrokenPipeError):  # perhaps nobody reads on
+            sys.stderr.write(words)
         return
     lines = [line.removeprefix("Error: ") for line in words.splitlines() if line.startswith("Error: ")]
     raise libsumo.FatalTraCIError(lines[0] if lines else _one_line(failure))

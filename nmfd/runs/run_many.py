@@ -12,6 +12,7 @@ import multiprocessing
 import os
 import platform
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -280,17 +281,24 @@ def _dask(address: str) -> Iterator[Executor]:
 
 
 @contextmanager
-def locked(out: Path) -> Iterator[None]:
-    """Make the folder, and hold it against other processes. Raises InputError."""
+def locked(out: Path, mark: str = MANIFEST) -> Iterator[None]:
+    """Make the folder, hold it against other processes, and remove it if nothing comes into it. Raises InputError.
+
+    mark: file that a folder with other files must hold. A command holds its folder around its runs, tables and figures
+    """
     remedy = "choose another folder with --out"
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file; {remedy}")
     out.mkdir(parents=True, exist_ok=True)
-    if not (out / MANIFEST).is_file() and {path.name for path in out.iterdir()} - {LOCK}:
-        raise InputError(f"{out}: is not empty and holds no {MANIFEST}; {remedy}")
+    if not (out / mark).is_file() and list(out.glob("[!.]*")):
+        raise InputError(f"{out}: is not empty and holds no {mark}; {remedy}")
     try:
-        with FileLock(out / LOCK, timeout=0, is_singleton=True):  # a command holds it around its runs
-            yield
+        with FileLock(out / LOCK, timeout=0, is_singleton=True):
+            try:
+                yield
+            finally:
+                if [path.name for path in out.glob("*")] == [LOCK]:
+                    shutil.rmtree(out, ignore_errors=True)
     except Timeout:
         raise InputError(f"{out}: another process is writing to it; wait for its end, or {remedy}") from None
 
@@ -335,7 +343,8 @@ def _finished(path: Path, key: Mapping) -> Result | None:
     except (InputError, AttributeError, ValueError):  # missing, cut off, or not of this package
         return None
     if changed := sorted(name for name in {**kept, **key} if kept.get(name) != key.get(name)):
-        print(f"{path}: out of date, {', '.join(changed)} changed", file=sys.stderr)
+        with suppress(BrokenPipeError):  # perhaps nobody reads on
+            print(f"{path}: out of date, {', '.join(changed)} changed", file=sys.stderr)
         return None
     return result
 

@@ -16,7 +16,7 @@ from nmfd.metrics import COUNTED, decision_ms, percent_change
 from nmfd.model.plant import AcyclicPlant, NmfdPlant
 from nmfd.model.scenario import Scenario, perturbed
 from nmfd.runs.progress import Progress
-from nmfd.runs.run_many import Run, run_many, run_name
+from nmfd.runs.run_many import Run, locked, run_many, run_name
 from nmfd.runs.tables import text_table
 from nmfd.studies import plots
 from nmfd.types import Plant, Result
@@ -80,12 +80,13 @@ def benchmark(
         for strategy in strategies
         for seed in seeds
     ]
-    rows = run_many(runs, out, **processes(strategies, workers), progress=progress)
-    done = rows[rows["failure"] == ""]
-    names = [run_name(name, seed) for name, seed in zip(done["controller"], done["seed"], strict=True)]
-    if names:
-        draw_accumulations(out, scenario, [Result.read(out / f"{name}.nc") for name in names])
-        draw_scenario(out, scenario)
+    with locked(out):
+        rows = run_many(runs, out, **processes(strategies, workers), progress=progress)
+        done = rows[rows["failure"] == ""]
+        names = [run_name(name, seed) for name, seed in zip(done["controller"], done["seed"], strict=True)]
+        if names:
+            draw_accumulations(out, scenario, [Result.read(out / f"{name}.nc") for name in names])
+            draw_scenario(out, scenario)
     return rows
 
 

@@ -16,7 +16,7 @@ from nmfd.controllers.strategy import Strategy, parse
 from nmfd.metrics import percent_change, summary
 from nmfd.model.scenario import Scenario, perturbed
 from nmfd.runs.progress import Progress
-from nmfd.runs.run_many import Run, run_many, run_name
+from nmfd.runs.run_many import Run, locked, run_many, run_name
 from nmfd.runs.tables import text_columns
 from nmfd.studies import plots
 from nmfd.studies.benchmark import REFERENCE, closed_loop_of, interval, key_of, processes
@@ -77,9 +77,10 @@ def robustness(
         for number in range(scenarios)
         for strategy in strategies
     ]
-    rows = run_many(runs, out, **processes(strategies, workers), progress=progress)
-    if (rows["failure"] == "").any():
-        draw(out, rows)
+    with locked(out):
+        rows = run_many(runs, out, **processes(strategies, workers), progress=progress)
+        if (rows["failure"] == "").any():
+            draw(out, rows)
     return rows
 
 
