@@ -1,9 +1,9 @@
 """Co-simulation: regional controllers in a SUMO city.
 
-    import cosim
-
-    result = cosim.run("grid7_peak", "dpc-pcrg", seed=1)
-    print(result.mean_trip_time_s, result.to_frame())
+    >>> import cosim
+    >>> result = cosim.run("demo", "pi-gating", seed=1, steps=2)
+    >>> result.accumulation.shape, len(result.to_frame())  # states, regions, destinations; rows
+    ((3, 5, 5), 75)
 
 `run` is one closed loop in SUMO, `read_run` reads one of a run folder, `City` shows a city. Names here are imported at
 their first use; `cosim.api` has a function for every command.

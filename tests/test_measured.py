@@ -1,5 +1,6 @@
 """MFDs from measured counts and occupancies: formulas, doubts, and errors in tables."""
 
+import doctest
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from commands import nmfd as command
 
 import nmfd
 from nmfd.model.mfd import Mfd
+from nmfd.studies import measured
 
 CURVE = Mfd(a=4e-9, b=-8e-6, c=0.004, jam=1000.0)  # of every region, which holds 10 km of lanes
 LANE_KM, TRIP, VEHICLE = 10.0, 1200.0, 6.5
@@ -99,6 +101,12 @@ def test_the_curve_that_made_the_tables_comes_back(tmp_path, made):
     files = {path.name for path in (tmp_path / "city").iterdir()}
     assert files == {"network.toml", "mfd.png", "samples.csv", "fit.csv", "identify.txt"}
     assert "Not in such data" in found.text
+
+
+def test_the_example_in_the_docstring(tmp_path, made, monkeypatch):
+    written(tmp_path, *made)
+    monkeypatch.chdir(tmp_path)
+    assert doctest.testmod(measured, extraglobs={"nmfd": nmfd}) == (0, 2)
 
 
 @pytest.mark.usefixtures("without_pictures")

@@ -23,9 +23,10 @@ REGION_COLUMNS = ["region", "name", "edges", "lane_km", "signals", "gateways", "
 class City:
     """The SUMO city of a network or scenario; nothing is simulated.
 
-        city = cosim.City("scenarios/grid7_peak")
-        city.plot()
-        city.regions, city.gateways
+        >>> city = cosim.City("demo")
+        >>> axes = city.plot()
+        >>> len(city.regions), city.gateways.columns.tolist()[:4]
+        (5, ['source', 'target', 'from_edge', 'to_edge'])
 
     network: the regional model; scenario: None for a network alone
     """

@@ -87,9 +87,12 @@ class Interface:
 class RegionalEnv(gymnasium.Env):
     """One agent for all regions; an episode is the whole scenario and ends by truncation.
 
-        env = RegionalEnv("economic_mpc", guidance=True)
-        env = RegionalEnv(scenario, cosim.SumoPlant(scenario))        # in SUMO; one simulation per process
-        env = gymnasium.make("nmfd/Hexagon7-v0", guidance=True)       # after import nmfd.rl
+        >>> env = nmfd.rl.RegionalEnv("economic_mpc", guidance=True)
+        >>> observation, info = env.reset(seed=1)
+        >>> observation, reward, _, over, info = env.step(env.action_space.sample())
+        >>> env = gymnasium.make("nmfd/Hexagon7-v0", guidance=True)
+        >>> scenario = nmfd.load_scenario("demo")
+        >>> env = nmfd.rl.RegionalEnv(scenario, cosim.SumoPlant(scenario))  # in SUMO; one simulation per process
 
     The reward of an interval is minus the unfinished trips when it begins, in `unit` (the sum of the critical
     accumulations): total time spent = - sum of rewards * unit * scenario.step. `info` holds time_s,

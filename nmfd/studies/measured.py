@@ -77,8 +77,9 @@ def identify(
 ) -> Identified:
     """Fit an MFD to each region; write network.toml, mfd.png, samples.csv, fit.csv and identify.txt.
 
-        identified = nmfd.identify("counts.csv", detectors="detectors.csv", trip_length=1500.0, out="networks/mine")
-        print(identified.text), identified.network.mfds, identified.intervals
+        >>> identified = nmfd.identify("counts.csv", detectors="detectors.csv", trip_length=1500.0, out="mine")
+        >>> (len(identified.fits), identified.intervals["region"].nunique()) == (identified.network.regions,) * 2
+        True
 
     counts, detectors, regions, about: tables (nmfd.model.detector_tables)
     out: folder of the network, whose name it gets
