@@ -218,7 +218,7 @@ def test_the_regions_to_protect_are_proposed_and_written(tmp_path):
     assert _protected(loaded, (), write=True) == _protected(loaded, (1,), write=True) == []
     before = file.read_text()
     (line,) = _protected(loaded, (0, 2), write=False)
-    assert "protects region 1; write protected = [0, 2] into" in line and file.read_text() == before
+    assert "protected = [0, 2] instead of [1] in" in line and file.read_text() == before
     _protected(loaded, (0, 2), write=True)
     assert file.read_text() == before.replace("protected = [1]", "protected = [0, 2]")
     file.write_text(before.replace("protected = [1]\n", ""))

@@ -185,7 +185,12 @@ def test_there_is_no_verdict_before_identification_or_on_congestion_that_no_regi
         (guesses, {"waiting": 584.0, "slowness": 12.0}, "Cannot say yet: the critical", "cosim identify scenarios/x"),
         (guesses, {}, "Cannot say yet", "cosim identify scenarios/x"),
         (network, {"waiting": 584.0}, "Cannot say yet: up to 584 vehicles", "cosim identify scenarios/x --levels"),
-        (network, {"slowness": 12.0}, "Cannot say yet: up to 0 vehicles", "12.0 times its free-flow time"),
+        (
+            network,
+            {"slowness": 12.0},
+            "Cannot say yet: up to 0 vehicles",
+            "There, up to 0 vehicles waited outside at a time, and a trip took 12.0 times its free-flow time",
+        ),
         (network, {"slowness": np.nan}, "No: no region is seen", "no-control+max-pressure --demand 1,1.3,1.6"),
     ):
         found = judged(model, crossing(FLOW, 1.0), *calm, **busy)

@@ -105,7 +105,7 @@ def identify(
         RunFailed: if a loading run failed.
     """
     target, own = loading.target(loaded), network_folder(loaded.network)
-    _check_target(loading, loaded.name, target, own)
+    _check_target(loading, loaded, target, own)
 
     def load(stage: int, **options: object) -> list[Result]:
         """Do the loading runs of a stage at all levels that are not finished; return all of them."""
@@ -172,27 +172,21 @@ def identify(
 
 
 def _protected(scenario: Scenario, regions: tuple[int, ...], *, write: bool) -> list[str]:
-    """Return the proposal to protect `regions`, unless the scenario does; write it into its scenario.toml if told to.
-
-    Raises InputError if the file cannot be changed.
-    """
+    """Return the proposal to protect `regions`, unless the scenario does; if told to, write it. Raises InputError."""
     if not regions or set(regions) == set(scenario.protected):
         return []
-    names = scenario.network.titles
+    now, names, path = ", ".join(map(str, scenario.protected)), scenario.network.titles, Path(scenario.where)
     line = f"protected = [{', '.join(map(str, regions))}]"
-    proposal = f"Regions to protect: {', '.join(names[r] for r in regions)}. The scenario protects "
-    proposal += f"{', '.join(names[r] for r in scenario.protected) or 'none'}"
-    if not write:
-        return [f"{proposal}; write {line} into {scenario.where}, or use --protect."]
-    path = shipped.beside(Path(scenario.where).parent, "scenario.toml", f"a scenario of your own with {line}")
-    text = path.read_text(encoding="utf-8")
-    top, bracket, tables = (text + "\n").partition("\n[")
-    top, count = re.subn(r"(?m)^protected *=.*$", line, top)
-    changed = (top if count else f"{top.rstrip()}\n{line}\n") + bracket + tables
-    if tomllib.loads(changed) != tomllib.loads(text) | {"protected": list(regions)}:
-        raise InputError(f"{path}: protected: cannot be changed here; write {line} yourself")
-    files.write_text(path, changed.rstrip("\n") + "\n")
-    return [f"{proposal.replace('protects', 'protected')}; {path} has {line} now."]
+    if write:
+        text = path.read_text(encoding="utf-8")
+        top, bracket, tables = text.partition("\n[")
+        top, count = re.subn(r"(?m)^protected\s*=\s*\[[^\]]*\].*$", line, top)
+        changed = top + f"\n{line}\n" * (not count) + bracket + tables
+        if tomllib.loads(changed) != tomllib.loads(text) | {"protected": list(regions)}:
+            raise InputError(f"{path}: protected: cannot be changed here; write {line} yourself")
+        files.write_text(path, changed)
+    what = "was written there" if write else "with --protect it is written there"
+    return [f"Protect {', '.join(names[r] for r in regions)}: {line} instead of [{now}] in {path}; {what}."]
 
 
 def _named(progress: Callable[[int, int, str], None] | None, stage: str) -> Callable[..., None] | None:
@@ -202,15 +196,17 @@ def _named(progress: Callable[[int, int, str], None] | None, stage: str) -> Call
     return lambda done, total, note="": progress(done, total, stage + note)
 
 
-def _check_target(loading: Loading, name: str, target: Path, own: Path) -> None:
+def _check_target(loading: Loading, scenario: Scenario, target: Path, own: Path) -> None:
     """Raise InputError for a target that cannot or must not be written, before hours of loading."""
     if (loading.guided or loading.options) and target.resolve() == own.resolve():
         raise InputError(
-            f"--with: {name} runs on {target}, whose model must stay that of its own drivers and signals; name another "
-            "folder with --network"
+            f"--with: {scenario.name} runs on {target}, whose model must stay that of its own drivers and signals; name "
+            "another folder with --network"
         )
     if shipped.installed(target):
         shipped.beside(own, "network.toml", "another folder with --network")
+    if loading.protect:
+        shipped.beside(scenario.folder or Path(), "scenario.toml", "a scenario of your own")
     there = next(folder for folder in (target, *target.absolute().parents) if folder.exists())
     if not there.is_dir() or not os.access(there, os.W_OK):
         raise InputError(f"--network: {there} is no folder that can be written to; choose another")
@@ -282,18 +278,19 @@ def run_verdict(scenario: Scenario, network: RegionalModel, results: Sequence[Re
         reached = not np.isnan(results[0]["gateway_original_green"][0, n])  # NaN without a signal under control
         gateways.append((gateway.source, gateway.target, passed, reached))
     boundaries = authority.Boundaries.of_gateways(network.regions, gateways)
-    most = np.max([result.accumulation.sum(axis=2).max(axis=0) for result in results], axis=0)
-    times = ("mean_trip_time_s", "mean_departure_delay_s", "mean_time_loss_s")
-    trip, delay, loss = (np.mean([getattr(result, name) for result in results]) for name in times)
+    trip, delay = (
+        sum(r.trips * getattr(r, f"mean_{what}_s") for r in results) for what in ("trip_time", "departure_delay")
+    )
+    lost = delay + sum(r.departed_veh * r.mean_time_loss_s for r in results)
     started = np.sum([result["departures"].sum(axis=(0, 2)) for result in results], axis=0).astype(float)
     where = f"in {len(results)} loading run{'s' * (len(results) > 1)} under {results[0].controller}"
     return authority.verdict(
         network,
         boundaries,
-        most=most,
+        most=np.max([result.accumulation.sum(axis=2).max(axis=0) for result in results], axis=0),
         started=started,
         waiting=max(float(result.backlog.sum(axis=(1, 2)).max()) for result in results),
-        slowness=trip / max(trip - delay - loss, 1e-9),
+        slowness=trip / (trip - lost) if trip > lost else np.nan,
         where=where,
         scenario=os.path.relpath(scenario.folder) if scenario.folder else scenario.name,
     )

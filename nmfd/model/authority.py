@@ -25,10 +25,7 @@ PARTITION = "cosim import SUMOCFG --regions N --out networks/OTHER"
 
 Counts = Real[np.ndarray, "R R"]
 FILE = "verdict.txt"
-NO_GATEWAY = (
-    "no gateway has a signal that perimeter control can use, so that only route guidance can help here; other regions "
-    "(cosim import --regions, or your own) may have signals between them"
-)
+NO_GATEWAY = "no gateway has a signal that perimeter control can use; other regions may have (cosim import --regions)"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,15 +44,11 @@ class Boundaries:
     @classmethod
     def of_gateways(cls, regions: int, gateways: Iterable[tuple[int, int, float, bool]]) -> "Boundaries":
         """Sum over gateways: source, target, crossings [veh], with a signal under control."""
-        flow, controlled = np.zeros((2, regions, regions))
-        count, controllable = np.zeros((2, regions, regions), dtype=int)
+        sums = np.zeros((4, regions, regions))
         for source, target, vehicles, reached in gateways:
-            pair = source, target
-            flow[pair] += vehicles
-            controlled[pair] += vehicles * reached
-            count[pair] += 1
-            controllable[pair] += reached
-        return cls(flow=flow, controlled=controlled, gateways=count, controllable=controllable)
+            sums[:, source, target] += vehicles, vehicles * reached, 1, reached
+        count, controllable = sums[2:].astype(int)
+        return cls(flow=sums[0], controlled=sums[1], gateways=count, controllable=controllable)
 
     @property
     def shares(self) -> PerPair:
@@ -106,22 +99,20 @@ def verdict(
     where: the runs, such as "in 6 loading runs"; scenario: its folder, for commands
     """
     names, flow, load = network.titles, boundaries.flow.sum(), most / network.seen_critical
-    passed = (
-        f"; {boundaries.controlled.sum() / flow:.0%} of the {flow:,.0f} crossings {where} passed one" if flow else ""
-    )
+    passed = f"; {boundaries.controlled.sum() / max(flow, 1):.0%} of the {flow:,.0f} crossings {where} passed one"
     guess = ", a guess" if network.placeholder else ""
     ratios = ", ".join(
         f"{name} above {network.critical_above[r]:.0f} veh, not seen" if np.isnan(ratio) else f"{name} {ratio:.2f}"
         for r, (name, ratio) in enumerate(zip(names, load, strict=True))
     )
     crowded = waiting > WAITING_SHARE * started.sum() or slowness > SLOW
-    slow = "" if np.isnan(slowness) else f", and a trip took {slowness:.1f} times its free-flow time"
-    traffic = f"up to {waiting:,.0f} vehicles waited outside at a time{slow}"
+    traffic = f"up to {waiting:,.0f} vehicles waited outside at a time"
+    traffic += "" if np.isnan(slowness) else f", and a trip took {slowness:.1f} times its free-flow time"
     details = [
         f"Of {boundaries.gateways.sum()} gateways {boundaries.controllable.sum()} have a signal that perimeter control "
-        f"can use{passed}.",
+        f"can use{passed * bool(flow)}.",
         f"Highest accumulation {where}, as a multiple of the critical one{guess}: {ratios}.",
-        f"{traffic[0].upper()}{traffic[1:]} {where}.",
+        f"There, {traffic}.",
     ]
     critical = np.flatnonzero(load >= 1.0)
     came, held = boundaries.flow.sum(axis=0), boundaries.controlled.sum(axis=0)
@@ -139,9 +130,9 @@ def verdict(
         answer = f"Cannot say yet: {traffic}, but no region is seen to become critical."
         remedies = [f"other demand shows more: {IDENTIFY} --levels 0.8,1,1.3", *remedies]
     elif not len(critical):
-        ratio = np.nanmax(load, initial=0.0)
-        near = f", {names[int(np.nanargmax(load))]} comes nearest with {ratio:.2f}" if ratio else ""
-        answer = f"No: no region is seen to become critical{near}; more demand may change that."
+        near = int(np.argmax(np.nan_to_num(load)))
+        nearest = f", {names[near]} comes nearest with {load[near]:.2f}" if load[near] > 0 else ""
+        answer = f"No: no region is seen to become critical{nearest}; more demand may change that."
         remedies.append(f"more demand: {EVALUATE}{PRESSURE} --demand 1,1.3,1.6")
     else:
         details += [

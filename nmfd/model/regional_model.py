@@ -195,12 +195,7 @@ class RegionTable(Settings):
         "share of the flow into each adjacent region that passes signals under control", None, unit="-"
     )
     critical_above: float | None = setting(
-        "largest accumulation in data that show no falling branch: the critical one is above, and that of the MFD a "
-        "guess for control",
-        None,
-        unit="veh",
-        ge=0.0,
-        le=MOST_VEHICLES,
+        "largest accumulation of data without falling branch; the critical one is above", None, unit="veh", ge=0.0
     )
     doubts: config.Texts = setting("warnings of cosim identify about the fit", ())
     observed_split_ratios: dict[str, dict[str, Share]] = setting(

@@ -41,22 +41,16 @@ HELD_OUT = (
 def without_fall(
     network: RegionalModel, samples: Sequence[Mapping[str, Points]], accumulations: Sequence[StatesOverTime] = ()
 ) -> dict[int, float]:
-    """Return region -> largest accumulation [veh] where the fitted curve hardly falls up to there.
-
-    samples, accumulations: as of `region_fits`
-    """
-    most = largest(samples, accumulations)
+    """Return region -> largest accumulation [veh], as of `region_fits`, where its curve hardly falls up to there."""
+    empty, most = nearly_empty(samples), _largest(samples, accumulations)
     return {
-        region: float(most[region])
-        for region, curve in enumerate(network.mfds)
-        if region in nearly_empty(samples)
-        or most[region] <= curve.critical
-        or curve.outflow(most[region]) > (1.0 - FALL) * curve.capacity
+        n: float(most[n])
+        for n, curve in enumerate(network.mfds)
+        if n in empty or most[n] <= curve.critical or curve.outflow(most[n]) > (1.0 - FALL) * curve.capacity
     }
 
 
-def largest(samples: Sequence[Mapping[str, Points]], accumulations: Sequence[StatesOverTime] = ()) -> PerRegion:
-    """Return the largest accumulation (R,) [veh] of the runs, without any of the samples."""
+def _largest(samples: Sequence[Mapping[str, Points]], accumulations: Sequence[StatesOverTime]) -> PerRegion:
     if len(accumulations):
         return np.max([state.sum(axis=2).max(axis=0) for state in accumulations], axis=0)
     return np.array([max((part[:, 0].max() for part in cloud.values() if len(part)), default=0.0) for cloud in samples])
@@ -71,15 +65,15 @@ def region_fits(
 ) -> pd.DataFrame:
     """Return the fit of each region, a row each.
 
-    Columns: region, name; critical_veh, jam_veh, storage_veh, max_outflow_veh_s of the model, the critical one NaN
-    where it was not seen, then critical_above_veh; samples; r2; spread of samples around the curve, as a share of its
-    maximum; hysteresis [-]; most_share, the largest accumulation in any run over the critical one [-]; doubts, each of
-    which begins with a key of MEANINGS. NaN where unknown.
+    Columns: region, name; critical_veh or critical_above_veh, jam_veh, storage_veh, max_outflow_veh_s of the model;
+    samples; r2; spread of samples around the curve, as a share of its maximum; hysteresis [-]; most_share, the largest
+    accumulation in any run over the critical one [-]; doubts, each of which begins with a key of MEANINGS. NaN where
+    unknown.
 
     samples: by region, label -> (n, 2) of accumulation [veh] and outflow [veh/s]; accumulations: (T+1, R, R) [veh] of
     each run; seeds: of the loading runs; lane_km: (R,)
     """
-    most, critical, rows = largest(samples, accumulations), network.seen_critical, []
+    most, critical, rows = _largest(samples, accumulations), network.seen_critical, []
     density = critical / (np.full(network.regions, np.nan) if lane_km is None else lane_km)
     for region, (curve, cloud) in enumerate(zip(network.mfds, samples, strict=True)):
         points, above = own_points(cloud), network.critical_above.get(region, np.nan)
