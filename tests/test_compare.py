@@ -9,14 +9,14 @@ import tiny
 import torch
 import trajectories
 
-from cosim.evaluation.identify import _protected, as_it_was, samples_of, static_model, with_guesses
+from cosim.evaluation.identify import _protected, as_it_was, samples_of, static_model
 from cosim.evaluation.model_validation import error_table, errors, held_up, outflow_samples, predict
 from nmfd.api import load_scenario
 from nmfd.controllers.strategy import parse
 from nmfd.model import dynamics, mfd
 from nmfd.model.identification import observed_split_ratios
 from nmfd.model.regional_model import load_network, network_toml
-from nmfd.studies.fit_quality import fit_table, nearly_empty, region_fits, without_fall
+from nmfd.studies.fit_quality import fit_table, nearly_empty, region_fits, with_guesses
 
 ROOT = Path(__file__).parents[1]
 
@@ -175,9 +175,12 @@ def test_regions_that_no_loading_run_filled_are_named(scenario):
     state[2] = np.diag(critical * [1.1, 0.4, 1.2, 1.3, 1.5, 1.01, 2.0])
     empty = [{"loading": np.empty((0, 2))}] * 7
     full = [{"loading": np.stack([np.linspace(1.0, 9e3, 20)] * 2, axis=1)}] * 7
-    above = without_fall(network, full, [state, 0.5 * state])
-    assert above == pytest.approx({n: state[2, n, n] for n in (0, 1, 2, 5)})  # at 1.3 times it has fallen by 5 %
-    assert set(without_fall(network, empty, [state])) == set(range(7))
+    lanes = np.full(7, 20.0)
+    assert with_guesses(network, full, lanes, [state, 0.5 * state]).critical_above == pytest.approx(
+        {n: state[2, n, n] for n in (0, 1, 2, 5)}
+    )  # at 1.3 times it has fallen by 5 %
+    blank = with_guesses(network, empty, lanes, [state])
+    assert set(blank.critical_above) == set(range(7)) and blank.mfds == network.mfds
 
 
 def test_beyond_the_data_a_guess_from_lanes_is_for_control(scenario):
@@ -185,12 +188,12 @@ def test_beyond_the_data_a_guess_from_lanes_is_for_control(scenario):
     network = replace(scenario.network, exit_rates=np.ones((7, 7)), storage=np.full(7, 500.0))
     full = [{"loading": np.stack([np.linspace(1.0, 9e3, 20)] * 2, axis=1)}] * 7
     state = np.repeat(np.diag([9000.0, 900.0, *[9000.0] * 5])[None], 2, axis=0)
-    model = with_guesses(network, full, [state], np.full(7, 20.0), 1.0 / 30.0)
+    model = with_guesses(network, full, np.full(7, 20.0), [state], fastest=1.0 / 30.0)
     assert model.critical_above == {1: 900.0} and np.isnan(model.seen_critical).tolist() == [False, True, *[False] * 5]
     assert 900.0 <= model.critical[1] < 920.0 and model.storage[1] == model.mfds[1].jam > 2000.0
     assert model.mfds[1].outflow(900.0) == pytest.approx(network.mfds[1].outflow(900.0))
     assert model.mfds[0] == network.mfds[0] and model.mfds[1].problem() is None
-    slow = with_guesses(network, full, [state], np.full(7, 20.0), 1.0 / 300.0)
+    slow = with_guesses(network, full, np.full(7, 20.0), [state], fastest=1.0 / 300.0)
     assert slow.mfds[1].c == pytest.approx(1.0 / 300.0)
 
 

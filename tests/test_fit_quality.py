@@ -18,7 +18,7 @@ from nmfd.studies.fit_quality import (
     prediction_table,
     predictions,
     region_fits,
-    without_fall,
+    with_guesses,
     write_fits,
 )
 
@@ -35,7 +35,7 @@ def cloud(x, outflow):
 
 def doubts(network, samples, most=2.0, seeds=2):
     state = np.repeat(np.diag([most * mfd.critical for mfd in network.mfds])[None], 3, axis=0)
-    network = replace(network, critical_above=without_fall(network, samples, [state]))
+    network = replace(network, critical_above=with_guesses(network, samples, np.ones(3), [state]).critical_above)
     return list(region_fits(network, samples, [state], seeds)["doubts"])
 
 

@@ -20,7 +20,7 @@ from cosim.evaluation.runs import runs_of
 from cosim.sumo.arrays import Points
 from cosim.sumo.build import network_folder
 from cosim.sumo.net import City, city_of
-from nmfd.arrays import PerRegion, StatesOverTime
+from nmfd.arrays import PerRegion
 from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
 from nmfd.model import authority, identification, mfd
@@ -39,7 +39,7 @@ from nmfd.studies.fit_quality import (
     prediction_table,
     predictions,
     region_fits,
-    without_fall,
+    with_guesses,
     write_fits,
 )
 from nmfd.types import Result
@@ -136,7 +136,7 @@ def identify(
     samples = samples_of(network, runs)
     model = fitted(runs, samples)
     states, lane_km = [run.accumulation for run in runs], city_lane_km(city_of(network))
-    model = with_guesses(model, samples, states, lane_km, loaded.substeps / loaded.step)
+    model = with_guesses(model, samples, lane_km, states, fastest=loaded.substeps / loaded.step)
     fits = region_fits(model, samples, states, seeds=len(loading.seeds), lane_km=lane_km)
     text, errors = fit_table(model, fits), None
     if len(loading.seeds) > 1:  # the last seed is held out once
@@ -200,8 +200,8 @@ def _check_target(loading: Loading, scenario: Scenario, target: Path, own: Path)
     """Raise InputError for a target that cannot or must not be written, before hours of loading."""
     if (loading.guided or loading.options) and target.resolve() == own.resolve():
         raise InputError(
-            f"--with: {scenario.name} runs on {target}, whose model must stay that of its own drivers and signals; name "
-            "another folder with --network"
+            f"--with: {scenario.name} runs on {target}, the model of its own drivers and signals; name another folder "
+            "with --network"
         )
     if shipped.installed(target):
         shipped.beside(own, "network.toml", "another folder with --network")
@@ -253,21 +253,6 @@ def city_lane_km(city: City) -> PerRegion:
     """Return the lane-kilometres (R,) of the regions."""
     metres = [city.length[edge] * city.lanes[edge] for edge in city.edges]
     return np.bincount([city.region_of[edge] for edge in city.edges], metres, city.regions) / 1000.0
-
-
-def with_guesses(
-    model: RegionalModel, samples: Sequence[dict], states: Sequence[StatesOverTime], lane_km: PerRegion, fastest: float
-) -> RegionalModel:
-    """Return `model` with guesses from lanes (R,) [km] beyond data that show no falling branch.
-
-    samples, states: as of `without_fall`; fastest: largest rate of any vehicle [1/s]
-    """
-    above, mfds = without_fall(model, samples, states), list(model.mfds)
-    most = np.full(model.regions, fastest) if model.exit_rates is None else fastest / model.exit_rates.max(axis=1)
-    for n in set(above) - set(nearly_empty(samples)):
-        mfds[n] = mfd.guess_beyond(mfds[n], mfd.JAM_DENSITY * lane_km[n], above[n], max_rate=most[n])
-    storage = None if model.storage is None else np.maximum(model.storage, [curve.jam for curve in mfds])
-    return replace(model, mfds=tuple(mfds), storage=storage, critical_above=above)
 
 
 def run_verdict(scenario: Scenario, network: RegionalModel, results: Sequence[Result]) -> authority.Verdict:

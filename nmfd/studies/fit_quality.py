@@ -1,13 +1,14 @@
 """Quality of the fit of each region, and doubts about it, as tables and files."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from nmfd.arrays import PerRegion, Points, StatesOverTime
-from nmfd.model import identification
+from nmfd.model import identification, mfd
 from nmfd.model.identification import Observed
 from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import files
@@ -38,16 +39,28 @@ HELD_OUT = (
 )
 
 
-def without_fall(
-    network: RegionalModel, samples: Sequence[Mapping[str, Points]], accumulations: Sequence[StatesOverTime] = ()
-) -> dict[int, float]:
-    """Return region -> largest accumulation [veh], as of `region_fits`, where its curve hardly falls up to there."""
-    empty, most = nearly_empty(samples), _largest(samples, accumulations)
-    return {
-        n: float(most[n])
-        for n, curve in enumerate(network.mfds)
-        if n in empty or most[n] <= curve.critical or curve.outflow(most[n]) > (1.0 - FALL) * curve.capacity
-    }
+def with_guesses(
+    model: RegionalModel,
+    samples: Sequence[Mapping[str, Points]],
+    lane_km: PerRegion,
+    accumulations: Sequence[StatesOverTime] = (),
+    *,
+    fastest: float = np.inf,
+) -> RegionalModel:
+    """Return `model` with `critical_above` where its curve hardly falls up to the largest accumulation.
+
+    The curve is a guess from lanes (R,) [km] there, unless the region is nearly empty. samples, accumulations: as of
+    `region_fits`; fastest: largest rate of any vehicle [1/s]
+    """
+    empty, most, above, mfds = nearly_empty(samples), _largest(samples, accumulations), {}, list(model.mfds)
+    for n, curve in enumerate(model.mfds):
+        if n in empty or most[n] <= curve.critical or curve.outflow(most[n]) > (1.0 - FALL) * curve.capacity:
+            above[n] = float(most[n])
+            if n not in empty:
+                rate = fastest if model.exit_rates is None else fastest / model.exit_rates[n].max()
+                mfds[n] = mfd.guess_beyond(curve, mfd.JAM_DENSITY * lane_km[n], above[n], max_rate=rate)
+    storage = None if model.storage is None else np.maximum(model.storage, [curve.jam for curve in mfds])
+    return replace(model, mfds=tuple(mfds), storage=storage, critical_above=above)
 
 
 def _largest(samples: Sequence[Mapping[str, Points]], accumulations: Sequence[StatesOverTime]) -> PerRegion:

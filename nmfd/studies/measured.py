@@ -99,11 +99,8 @@ def identify(
     rows, left = detector_tables.read_counts(counts, city=city, skip_bad=skip_bad)
     stations = detector_tables.read_detectors(paths[0], paths[1], rows, counts, city=city)
     base = _base_network(paths[3], stations)
-    names = (
-        list(base.region_names)
-        if base
-        else sorted(set(stations["region"]), key=lambda name: name.rjust(9) if name.isdecimal() else name)
-    )
+    names = sorted(set(stations["region"]), key=lambda name: name.rjust(9) if name.isdecimal() else name)
+    names = list(base.region_names) if base else names
     speed = rows["flow"].sum() * VEHICLE_LENGTH_M / 3600.0 / max(rows["occ"].sum(), 1e-9)
     if not detector_tables.SPEEDS_M_S[0] <= speed <= detector_tables.SPEEDS_M_S[1]:
         raise InputError(
@@ -158,12 +155,7 @@ def identify(
             f"{adjacency or counts}: region {names[j]} cannot be reached from {names[i]}; give all pairs of "
             "neighbours, region,neighbour, with --adjacency"
         )
-    above = fit_quality.without_fall(network, samples)
-    curves = [
-        mfd.guess_beyond(curve, mfd.JAM_DENSITY * lane_km[n], above[n]) if n in above else curve
-        for n, curve in enumerate(network.mfds)
-    ]
-    network = replace(network, mfds=tuple(curves), critical_above=above)
+    network = fit_quality.with_guesses(network, samples, lane_km)
     fits = fit_quality.region_fits(network, samples, lane_km=lane_km)
     lengths = np.where(assumed, trip_km, np.nan)
     fits["doubts"] = [
@@ -177,12 +169,8 @@ def identify(
         f"{detector_tables.omitted(left)}; share of the lane-km with detectors: {share}; trip length within a region: "
         f"{1000 * trip_km.min():,.0f} to {1000 * trip_km.max():,.0f} m"
     )
-    report = "\n".join(
-        [
-            fit_quality.fit_table(network, fits, MEANINGS),
-            *wrapped("\n".join([*(f"WARNING, {line}" for line in broken), facts, UNKNOWN_PARTS])),
-        ]
-    )
+    notes = wrapped("\n".join([*(f"WARNING, {line}" for line in broken), facts, UNKNOWN_PARTS]))
+    report = "\n".join([fit_quality.fit_table(network, fits, MEANINGS), *notes])
     text = network_toml(network, {}, f"Regional model: written by nmfd identify from {counts.name}; see identify.txt.")
     config.checked(NetworkTable, tomllib.loads(text), out / "network.toml")
     out.mkdir(parents=True, exist_ok=True)
