@@ -9,6 +9,7 @@ import numpy as np
 
 from nmfd import faults
 from nmfd.arrays import PerPair
+from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
 from nmfd.tensors import one_thread
 from nmfd.types import Controller, Controls, Observation, Plant, Result, State, Status
@@ -31,14 +32,14 @@ def run(
     controller's own `deadline` (s).
 
     progress: is called with the intervals done and `scenario.steps` after every interval
+    Raises: InputError if a number of a command is not finite
     """
     network = scenario.network
-    opened = np.where(network.adjacency, network.u_max, 0.0)
     controller.reset(seed)
     sensors, random = faults.Sensors(scenario.ordered_faults), noise_of(seed)
 
     def observe() -> tuple[Observation, str]:
-        noise = scenario.measurement_std * random.standard_normal(opened.shape)
+        noise = scenario.measurement_std * random.standard_normal(network.adjacency.shape)
         estimate = plant.observe()
         return sensors.see(noisy(states[-1], noise) if estimate is None else estimate)
 
@@ -55,7 +56,8 @@ def run(
         command = controller.act(given)
         decision_time.append(time.process_time() - processor)
         late = time.perf_counter() - before > deadline
-        command = faults.checked(_copied(command), opened, problem)
+        command = faults.with_problem(_copied(command), problem)
+        check_finite(command, f"{controller.name}: interval {k}")
         if late:
             command = _with_status(command, Status.LATE, f"later than its deadline of {deadline:g} s")
         states.append(plant.step(command))
@@ -87,6 +89,14 @@ def run(
         removed=np.stack([np.zeros_like(s.backlog) if s.removed is None else s.removed for s in states]),
         prices=np.stack([np.zeros(network.regions) if c.prices is None else c.prices for c in controls]),
     )
+
+
+def check_finite(controls: Controls, where: str) -> None:
+    """Raise InputError, which begins with `where`, for the first number that is not finite."""
+    for name in ("perimeter", "splits", "prices", "metering"):
+        if (values := getattr(controls, name)) is not None and (wrong := np.argwhere(~np.isfinite(values))).size:
+            at = wrong[0].tolist()
+            raise InputError(f"{where}: {name}{at}: expected a finite number, got {values[*at]} instead")
 
 
 def noise_of(seed: int) -> np.random.Generator:

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from nmfd.arrays import PerPair
 from nmfd.errors import InputError
 from nmfd.types import Controls, Observation, Status
 
@@ -80,16 +79,8 @@ class Sensors:
         return observation, f"measurement {', '.join(problems)}" if problems else ""
 
 
-def checked(controls: Controls, opened: PerPair, problem: str) -> Controls:
-    """Return controls with the problem of their observation; opened: (R, R) [-], in place of an infinite perimeter."""
-    arrays = (controls.perimeter, controls.splits, controls.prices, controls.metering)
-    if not all(np.isfinite(values).all() for values in arrays if values is not None):
-        controls = Controls(
-            perimeter=opened,
-            splits=None,
-            status=Status.SOLVER_FAILURE | Status.FALLBACK,
-            note="the controls were no numbers: perimeter opened",
-        )
+def with_problem(controls: Controls, problem: str) -> Controls:
+    """Return controls with the problem of their observation in status and note."""
     if not problem:
         return controls
     note = "; ".join(filter(None, (problem, controls.note)))

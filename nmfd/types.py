@@ -21,8 +21,7 @@ if TYPE_CHECKING:
 class Status(Flag):
     """Status of one decision: OK, or a combination of these. `Controls.note` gives the reason.
 
-    SOLVER_FAILURE: the solver failed, diverged or stopped short of its tolerance; or the numbers of a policy or
-        controller are not finite
+    SOLVER_FAILURE: the solver failed, diverged or stopped short of its tolerance
     FALLBACK: the controls are those of a fallback, not of the controller
     SENSOR_FAULT: the observation was wrong, late or incomplete
     PLANT_FAULT: the city could not execute the command, or was not whole, during the interval

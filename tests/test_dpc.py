@@ -9,6 +9,7 @@ import pytest
 import tiny
 import torch
 
+import nmfd
 from nmfd.api import load_scenario
 from nmfd.controllers import training
 from nmfd.controllers.dpc.policy import Architecture, DpcController, Policy
@@ -63,10 +64,11 @@ def test_forbidden_regions_have_no_gradient_and_no_nan():
     assert (gradient[torch.tensor(~NETWORK.split_mask)] == 0.0).all() and gradient.abs().max() > 0.0
 
 
-def test_a_policy_that_returns_nan_opens_the_perimeter_and_says_so():
-    controls = DpcController(policy(guidance=True)).act(measurement(np.full((7, 7), np.nan)))
-    assert controls.note == "dpc: policy returned NaN, perimeter opened"
-    np.testing.assert_allclose(controls.perimeter, np.where(NETWORK.adjacency, NETWORK.u_max, 0.0))
+def test_a_policy_that_returns_nan_ends_the_run_in_one_line():
+    made = policy(guidance=True)
+    torch.nn.init.constant_(made.splits_decoder.bias, torch.nan)
+    with pytest.raises(InputError, match=r"^dpc-pcrg: interval 0: splits\[0, 0, 0\]: expected a finite number"):
+        nmfd.run("economic_mpc", DpcController(made), steps=1)
 
 
 def test_a_batch_is_the_same_as_one_by_one():
@@ -238,8 +240,6 @@ def test_a_sparse_policy_is_the_dense_one_with_the_same_weights(guidance):
     np.testing.assert_allclose(both[0].perimeter, both[1].perimeter, rtol=1e-6)
     if guidance:
         np.testing.assert_allclose(both[0].splits, both[1].splits, atol=1e-7)
-    stuck = DpcController(sparse).act(measurement(np.full((7, 7), np.nan)))
-    np.testing.assert_allclose(stuck.perimeter, np.where(NETWORK.adjacency, NETWORK.u_max, 0.0))
 
 
 def test_a_local_policy_looks_around_every_boundary():

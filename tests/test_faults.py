@@ -1,6 +1,7 @@
 """Faults of sensors, streets and signals: their effect, the status of the decisions under them, and wrong ones."""
 
 import itertools
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -20,7 +21,7 @@ from nmfd.closed_loop import run
 from nmfd.controllers.rules import NoControl
 from nmfd.errors import InputError
 from nmfd.model.planning import planning_model
-from nmfd.model.plant import NmfdPlant
+from nmfd.model.plant import AcyclicPlant, NmfdPlant
 from nmfd.types import Controls
 
 STEPS = 8
@@ -78,16 +79,27 @@ def test_a_region_without_measurements(scenario):
 
 
 class Mad(NoControl):
-    """A controller whose controls are infinite."""
+    """A controller of which one number is not finite in interval 3."""
 
     def act(self, measurement):
-        return Controls(perimeter=np.full((2, 2), np.inf), splits=None)
+        shapes = {"perimeter": (2, 2), "splits": (2, 2, 2), "prices": (2,), "metering": (2,)}
+        arrays = {"perimeter": np.ones((2, 2)), "splits": None, self.wrong: np.ones(shapes[self.wrong])}
+        if measurement.step == 3:
+            arrays[self.wrong][self.at] = self.value
+        return Controls(**arrays)
 
 
-def test_controls_that_are_not_finite_open_the_perimeter(scenario):
-    result = run(NmfdPlant(scenario), Mad(planning_model(scenario)), scenario, seed=0)
-    assert set(result.note) == {"the controls were no numbers: perimeter opened"}
-    assert result.perimeter[:, 0, 1] == pytest.approx(scenario.network.u_max)
+@pytest.mark.parametrize("plant", [NmfdPlant, AcyclicPlant])
+@pytest.mark.parametrize(
+    "wrong, at", [("perimeter", (0, 1)), ("splits", (1, 0, 0)), ("prices", (1,)), ("metering", (0,))]
+)
+@pytest.mark.parametrize("value", [np.nan, -np.inf])
+def test_a_number_that_is_not_finite_is_named(scenario, plant, wrong, at, value):
+    controller = Mad(planning_model(scenario))
+    controller.wrong, controller.at, controller.value = wrong, at, value
+    expected = f"no-control: interval 3: {wrong}{list(at)}: expected a finite number, got {value} instead"
+    with pytest.raises(InputError, match=f"^{re.escape(expected)}$"):
+        run(plant(scenario), controller, scenario, seed=0)
 
 
 @pytest.mark.parametrize(

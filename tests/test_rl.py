@@ -11,6 +11,7 @@ import tiny
 from cosim import SumoPlant
 from nmfd import api
 from nmfd.api import load_scenario
+from nmfd.errors import InputError
 from nmfd.metrics import total_time_spent
 from nmfd.model.plant import AcyclicPlant
 from nmfd.model.scenario import with_demand
@@ -140,6 +141,18 @@ def test_agents_together_do_what_one_agent_does(hexagon):
         _, rewards, *_ = many.step(actions)
         np.testing.assert_allclose(many.state(), seen, rtol=1e-6)
         assert list(rewards.values()) == pytest.approx([reward] * 7)
+
+
+def test_an_action_that_is_no_number_is_named(hexagon):
+    one, many = rl.RegionalEnv(hexagon, guidance=True), rl.RegionsEnv(hexagon)
+    one.reset(seed=3), many.reset(seed=3)
+    action = np.zeros(one.interface.action_size)
+    one.step(action)
+    action[30] = np.nan
+    with pytest.raises(InputError, match=r"^RegionalEnv: interval 1: action\[30\]: expected a number from -1 to 1"):
+        one.step(action)
+    with pytest.raises(InputError, match=r"^region_2: interval 0: action\[0\]: expected a number"):
+        many.step({"region_2": np.full(many.interfaces["region_2"].action_size, np.nan)})
 
 
 def test_ppo_of_stable_baselines3_learns_on_it(scenario):

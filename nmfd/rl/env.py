@@ -12,6 +12,7 @@ from pettingzoo import ParallelEnv
 
 from nmfd.arrays import PerPair, PerRegion
 from nmfd.closed_loop import noise_of, noisy
+from nmfd.errors import InputError
 from nmfd.model.plant import NmfdPlant
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario, read_scenario
@@ -70,10 +71,15 @@ class Interface:
         """Vectors (action_size,) in [-1, 1]."""
         return Box(-1.0, 1.0, (self.action_size,), np.float32)
 
-    def controls(self, action: Vector) -> Controls:
-        """Return the controls of an action: u_max at the boundaries and theta = 0 in the other regions."""
+    def controls(self, action: Vector, where: str = "") -> Controls:
+        """Return the controls of an action: u_max at the boundaries and theta = 0 in the other regions.
+
+        Raises: InputError, which begins with `where`, for a number that is not finite
+        """
         low, high = self._network.u_min, self._network.u_max
         action = np.clip(np.asarray(action, dtype=float), -1.0, 1.0)
+        if (wrong := np.flatnonzero(np.isnan(action))).size:
+            raise InputError(f"{where}action[{wrong[0]}]: expected a number from -1 to 1, got nan instead")
         perimeter = self._open.copy()
         perimeter[self._boundaries] = low + (high - low) * 0.5 * (action[: self._gates] + 1.0)
         if self._turns is None:
@@ -132,7 +138,8 @@ class RegionalEnv(gymnasium.Env):
 
     def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict]:
         """Advance by one control interval."""
-        observation, vehicles, over = self.advance(self.interface.controls(action))
+        controls = self.interface.controls(action, f"RegionalEnv: interval {self._k}: ")
+        observation, vehicles, over = self.advance(controls)
         return self._clipped(observation), -float(vehicles.sum()) / self.unit, False, over, self._info()
 
     def close(self) -> None:
@@ -193,7 +200,8 @@ class RegionsEnv(ParallelEnv):
         network = self._env.scenario.network
         perimeter, splits = np.where(network.adjacency, network.u_max, 0.0), network.nominal_splits.copy()
         for agent, action in actions.items():
-            region, controls = self.possible_agents.index(agent), self.interfaces[agent].controls(action)
+            region, where = self.possible_agents.index(agent), f"{agent}: interval {self._env._k}: "
+            controls = self.interfaces[agent].controls(action, where)
             perimeter[region] = controls.perimeter[region]
             if controls.splits is not None:
                 splits[region] = controls.splits[region]

@@ -4,7 +4,6 @@ As in Tumu et al.: an MLP backbone with one decoder for the perimeter (scaled si
 (masked softmax), so that every output satisfies the constraints by construction.
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +14,7 @@ from torch import nn
 from nmfd.arrays import Adjacency
 from nmfd.model.regional_model import RegionalModel
 from nmfd.tensors import PerPair, PerRegion, PerTurn
-from nmfd.types import Controls, Observation, Status
+from nmfd.types import Controls, Observation
 
 FEATURES = 6  # of a boundary, inputs of a local policy
 Memory = Float[torch.Tensor, "*#B N R"]  # N numbers per region
@@ -151,7 +150,6 @@ class DpcController:
         self.policy = policy.eval()
         self.name = "dpc-pcrg" if policy.architecture.guidance else "dpc-pc"
         self._onward = policy.onward.numpy() if policy.architecture.listed else None
-        self._u_max = self._full(policy.u_max * policy.adjacency.numpy())
         self.reset()
 
     def reset(self, seed: int = 0) -> None:
@@ -172,11 +170,6 @@ class DpcController:
         if splits is not None:
             splits = splits.numpy().astype(float)
             splits = self._full(splits / np.maximum(splits.sum(axis=1, keepdims=True), 1e-9))  # float32 misses 1
-        # The sum is finite if every number is: they are bounded unless they are NaN.
-        if not math.isfinite(perimeter.sum() + (0.0 if splits is None else splits.sum())):
-            failed = Status.SOLVER_FAILURE | Status.FALLBACK
-            note = "dpc: policy returned NaN, perimeter opened"
-            return Controls(perimeter=self._u_max, splits=None, status=failed, note=note)
         return Controls(perimeter=self._full(perimeter), splits=splits, prices=prices, metering=metering)
 
     def _full(self, listed: np.ndarray) -> np.ndarray:
