@@ -367,28 +367,28 @@ def identify(
     loaded = load_scenario(scenario, settings)
     strategy = parse("no-control", "" if city == "own" else city or "")
     kinds = [False, True] if city is None and network is None and identification.without_model(loaded) else []
-    report = []
+    report: list[str] = []
     for guided in kinds or [strategy.guides]:
         loaded = load_scenario(scenario, settings)  # the second model takes the split ratios of the first
         folder = Path("runs") / f"{file_name(loaded.name)}-identify{'-guided' * guided}"
         if out is not None:
             folder = out / "guided" if len(kinds) > 1 and guided else out
-        loading = identification.Loading(
-            levels=levels,
-            seeds=range(1000, 1000 + seeds),
-            guided=guided,
-            options=[word for word in strategy.words if word != "guided"],
-            network=network,
-            iterations=iterations,
-            protect=protect and guided == (kinds or [guided])[0],
-        )
         with locked(folder), watched("identify", None) as show:
             text = identification.identify(
-                loaded, loading, out=folder, workers=workers, scheduler=scheduler, progress=show
+                loaded,
+                levels=levels,
+                seeds=range(1000, 1000 + seeds),
+                guided=guided,
+                options=[word for word in strategy.words if word != "guided"],
+                network=network,
+                iterations=iterations,
+                protect=protect and not report,
+                out=folder,
+                workers=workers,
+                scheduler=scheduler,
+                progress=show,
             )
         report.append(text)
-        target = os.path.normpath(loading.target(loaded) / "network.toml")
-        report.append(f"Written to {target}; samples and figures to {folder}")
     return "\n".join(report)
 
 

@@ -248,7 +248,7 @@ def test_the_command(tmp_path, made):
         ("adjacency", "region,neighbour\nnorth,west\n", "line 2: region 'west' has no detector"),
         ("adjacency", "region,neighbour\n", "region south cannot be reached from north"),
         ("adjacency", "a,b\n", "column region is missing"),
-        ("about", "", "is empty"),
+        ("about", "", "cannot be read as a csv file"),
     ],
     ids=str,
 )

@@ -9,7 +9,7 @@ import os
 import re
 import tomllib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -47,40 +47,6 @@ from nmfd.types import Result
 PATHS = ("recipe", "net", "regions")  # keys of [sumo] in network.toml
 
 
-@dataclass(frozen=True, kw_only=True)
-class Loading:
-    """Plan of the loading runs.
-
-    levels: multiples of the scenario's demand; seeds: of the runs at every level
-    guided: with route guidance, first towards the drivers' own split ratios, then probing
-    options: words of the strategies, such as max-pressure
-    network: folder whose network.toml is written; None for the scenario's own or, if guided, its folder GUIDED
-    iterations: of the fit
-    protect: write the regions to protect into the scenario
-    """
-
-    levels: Sequence[float]
-    seeds: Sequence[int]
-    guided: bool = False
-    options: Sequence[str] = ()
-    network: Path | None = None
-    iterations: int = identification.ITERATIONS
-    protect: bool = False
-
-    @property
-    def stages(self) -> tuple[str, str]:
-        """Strategies of the two stages."""
-        first, second = ("route-guidance", "probing-pcrg") if self.guided else ("no-control", "probing-pc")
-        return "+".join([first, *self.options]), "+".join([second, *self.options])
-
-    def target(self, scenario: Scenario) -> Path:
-        """Return the folder whose network.toml is written. Raises InputError for a network without one."""
-        if self.network is not None:
-            return self.network
-        own = network_folder(scenario.network)
-        return own / GUIDED if self.guided and not self.options and without_model(scenario) else own
-
-
 def without_model(scenario: Scenario) -> bool:
     """Return True if no table of a guiding controller names a model."""
     tables = scenario.controller_options.items()
@@ -89,60 +55,79 @@ def without_model(scenario: Scenario) -> bool:
 
 def identify(
     loaded: Scenario,
-    loading: Loading,
     *,
+    levels: Sequence[float],
+    seeds: Sequence[int],
+    guided: bool,
+    options: Sequence[str],
+    network: Path | None,
+    iterations: int,
+    protect: bool,
     out: Path,
-    workers: int = 1,
-    scheduler: str | None = None,
-    progress: Callable[[int, int, str], None] | None = None,
+    workers: int,
+    scheduler: str | None,
+    progress: Callable[..., None] | None,
 ) -> str:
     """Load a city, fit its regional model, and write its network.toml and verdict.txt; return the fit as text.
 
     Samples, figures and loading runs go to `out`; the same call continues after an interruption.
 
+    levels: multiples of the scenario's demand; seeds: of the runs at every level
+    guided: with route guidance, first towards the drivers' own split ratios, then probing
+    options: words of the strategies, such as max-pressure
+    network: folder whose network.toml is written; None for the scenario's own or, if guided, its folder GUIDED
+    iterations: of the fit; protect: write the regions to protect into the scenario
+
     Raises:
         InputError: for a network without a folder, or a target that must not be written.
         RunFailed: if a loading run failed.
     """
-    target, own = loading.target(loaded), network_folder(loaded.network)
-    _check_target(loading, loaded, target, own)
+    own = network_folder(loaded.network)
+    target = network or (own / GUIDED if guided and not options and without_model(loaded) else own)
+    if (guided or options) and target.resolve() == own.resolve():
+        what = f"--with: {loaded.name} runs on {target}, the model of its own drivers and signals"
+        raise InputError(f"{what}; name another folder with --network")
+    _check_target(target, own)
+    if protect:
+        shipped.beside(loaded.folder or Path(), "scenario.toml", "a scenario of your own")
+    stages = ("route-guidance", "probing-pcrg") if guided else ("no-control", "probing-pc")
 
-    def load(stage: int, **options: object) -> list[Result]:
+    def load(stage: int, **setup: object) -> list[Result]:
         """Do the loading runs of a stage at all levels that are not finished; return all of them."""
-        show = _named(progress, f"loading runs {stage + 1} of 2; ")
-        strategy, tables = parse(loading.stages[stage]), loaded.controller_options
+        strategy, tables = parse("+".join([stages[stage], *options])), loaded.controller_options
         table = strategy.table(loaded)
-        tuned = replace(loaded, controller_options={**tables, table: {**tables.get(table, {}), **options}})
+        tuned = replace(loaded, controller_options={**tables, table: {**tables.get(table, {}), **setup}})
         runs = [
             run
-            for level in loading.levels
-            for run in runs_of(tuned, [strategy], loading.seeds, demand=level, folder=f"level-{level:g}")
+            for level in levels
+            for run in runs_of(tuned, [strategy], seeds, demand=level, folder=f"level-{level:g}")
         ]
+        show = _named(progress, f"loading runs {stage + 1} of 2; ")
         raise_failures(run_many(runs, out, workers=workers, scheduler=scheduler, progress=show))
         return [Result.read(out / run.file) for run in runs]
 
     first = load(0)
-    network = static_model(loaded, first, guided=loading.guided)
-    second = load(1, set_point=tuple(network.mfds[region].critical for region in loaded.protected))
+    static = static_model(loaded, first, guided=guided)
+    second = load(1, set_point=tuple(static.mfds[region].critical for region in loaded.protected))
     runs = [*first, *second]
     scheme: dict = {"step": loaded.step, "substeps": loaded.substeps, "integrator": loaded.integrator}
 
     def fitted(runs: Sequence[Result], samples: Sequence[dict]) -> RegionalModel:
         fitting = _named(progress, "fitting, ")
         seen = [observed(run) for run in runs]
-        model = identification.fit(network, seen, iterations=loading.iterations, progress=fitting, **scheme)
-        return as_it_was(network, model, nearly_empty(samples))
+        model = identification.fit(static, seen, iterations=iterations, progress=fitting, **scheme)
+        return as_it_was(static, model, nearly_empty(samples))
 
-    samples = samples_of(network, runs)
+    samples = samples_of(static, runs)
     model = fitted(runs, samples)
-    states, lane_km = [run.accumulation for run in runs], city_lane_km(city_of(network))
+    states, lane_km = [run.accumulation for run in runs], city_lane_km(city_of(static))
     model = with_guesses(model, samples, lane_km, states, fastest=loaded.substeps / loaded.step)
-    fits = region_fits(model, samples, states, seeds=len(loading.seeds), lane_km=lane_km)
+    fits = region_fits(model, samples, states, seeds=len(seeds), lane_km=lane_km)
     text, errors = fit_table(model, fits), None
-    if len(loading.seeds) > 1:  # the last seed is held out once
-        kept = [run for run in runs if run.seed != loading.seeds[-1]]
-        without = replace(fitted(kept, samples_of(network, kept)), critical_above=model.critical_above)
-        unseen = [observed(run) for run in runs if run.seed == loading.seeds[-1]]
+    if len(seeds) > 1:  # the last seed is held out once
+        kept = [run for run in runs if run.seed != seeds[-1]]
+        without = replace(fitted(kept, samples_of(static, kept)), critical_above=model.critical_above)
+        unseen = [observed(run) for run in runs if run.seed == seeds[-1]]
         errors = predictions(without, unseen, scheme)
         text += "\n" + prediction_table(without, errors, loaded.step)
     files.write_text(out / "fit.txt", text + "\n")
@@ -160,15 +145,15 @@ def identify(
     comment = (
         f"Written by cosim identify from {len(runs)} runs of {loaded.name} under "
         f"{', '.join(dict.fromkeys(run.controller for run in runs))};\n"
-        f"# loading runs: demand times {', '.join(map('{:g}'.format, loading.levels))}, seeds {min(loading.seeds)} to "
-        f"{max(loading.seeds)}."
+        f"# loading runs: demand times {', '.join(map('{:g}'.format, levels))}, seeds {min(seeds)} to {max(seeds)}."
     )
     sumo = config.read(own / "network.toml").get("sumo", {})
     sumo |= {key: files.relative(own / sumo[key], target) for key in PATHS if isinstance(sumo.get(key), str)}
     files.write_text(target / "network.toml", network_toml(model, sumo, comment))
     files.write_text(target / authority.FILE, verdict.text())
-    proposed = _protected(loaded, verdict.protect, write=loading.protect)
-    return "\n".join([text, *wrapped("\n".join([*verdict.sentences, *proposed]))])
+    proposed = _protected(loaded, verdict.protect, write=protect)
+    where = f"Written to {os.path.normpath(target / 'network.toml')}; samples and figures to {out}"
+    return "\n".join([text, *wrapped("\n".join([*verdict.sentences, *proposed])), where])
 
 
 def _protected(scenario: Scenario, regions: tuple[int, ...], *, write: bool) -> list[str]:
@@ -189,24 +174,15 @@ def _protected(scenario: Scenario, regions: tuple[int, ...], *, write: bool) -> 
     return [f"Protect {', '.join(names[r] for r in regions)}: {line} instead of [{now}] in {path}; {what}."]
 
 
-def _named(progress: Callable[[int, int, str], None] | None, stage: str) -> Callable[..., None] | None:
+def _named(progress: Callable[..., None] | None, stage: str) -> Callable[..., None] | None:
     """Return a progress function whose notes begin with the stage."""
-    if progress is None:
-        return None
-    return lambda done, total, note="": progress(done, total, stage + note)
+    return progress and (lambda done, total, note="": progress(done, total, stage + note))
 
 
-def _check_target(loading: Loading, scenario: Scenario, target: Path, own: Path) -> None:
-    """Raise InputError for a target that cannot or must not be written, before hours of loading."""
-    if (loading.guided or loading.options) and target.resolve() == own.resolve():
-        raise InputError(
-            f"--with: {scenario.name} runs on {target}, the model of its own drivers and signals; name another folder "
-            "with --network"
-        )
+def _check_target(target: Path, own: Path) -> None:
+    """Raise InputError for a target that cannot be written, before hours of loading."""
     if shipped.installed(target):
         shipped.beside(own, "network.toml", "another folder with --network")
-    if loading.protect:
-        shipped.beside(scenario.folder or Path(), "scenario.toml", "a scenario of your own")
     there = next(folder for folder in (target, *target.absolute().parents) if folder.exists())
     if not there.is_dir() or not os.access(there, os.W_OK):
         raise InputError(f"--network: {there} is no folder that can be written to; choose another")

@@ -63,10 +63,7 @@ def read_counts(path: Path, *, city: str | None = None, skip_bad: bool = False) 
     """
     parts, left, cities = [], {MARKED: 0, BAD: 0, DOUBLED: 0}, set[str]()
     for chunk in _chunks(path, COUNTS, ("error", "city", "region")):
-        for name in ("day", "detid"):
-            if chunk[name].isna().any():
-                line = chunk[name].isna().idxmax() + 2
-                raise InputError(f"{path}: line {line}: {name} is missing; add it or remove the line")
+        _present(_present(chunk, "day", path), "detid", path)
         if "city" in chunk:
             cities |= set(chunk["city"].dropna().astype(str))
             chunk = chunk if city is None else chunk[chunk["city"] == city]
@@ -80,20 +77,18 @@ def read_counts(path: Path, *, city: str | None = None, skip_bad: bool = False) 
         left[BAD] += len(chunk) - len(good)
         parts.append(good[[*COUNTS, *(["region"] if "region" in good else [])]])
     if (city is None and len(cities) > 1) or (city is not None and city not in cities):
-        hint = did_you_mean(city, cities) if city else ""
-        raise InputError(f"{path}: city: choose one of {', '.join(sorted(cities)) or 'none'} with --city{hint}")
+        known = f"{', '.join(sorted(cities)) or 'none'} with --city{did_you_mean(city or '', cities)}"
+        raise InputError(f"{path}: city: choose one of {known}")
     rows = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
     if len(rows) == 0 or left[BAD] > len(rows):
-        units = "is flow in veh/h per lane, and occ a share?"
-        raise InputError(f"{path}: {len(rows)} good rows, and left out: {omitted(left)}; {units}")
+        what = f"{len(rows)} good rows, and left out: {omitted(left)}"
+        raise InputError(f"{path}: {what}; is flow in veh/h per lane, and occ a share?")
     if (doubled := rows.duplicated(["day", "interval", "detid"])).any():
         day, interval, detid = rows.loc[doubled.idxmax(), ["day", "interval", "detid"]]
-        if not skip_bad:
-            raise InputError(
-                f"{path}: detector {detid} has two rows of {day}, {interval:g} s ({doubled.sum():,} such rows; do "
-                "clocks go back?); keep one, or leave the second ones out with --skip-bad"
-            )
         left[DOUBLED] = int(doubled.sum())
+        if not skip_bad:
+            what = f"two rows of {day}, {interval:g} s ({left[DOUBLED]:,} such rows; do clocks go back?)"
+            raise InputError(f"{path}: detector {detid} has {what}; keep one, or leave them out with --skip-bad")
     return rows[~doubled].reset_index(drop=True), left
 
 
@@ -104,8 +99,9 @@ def screened(rows: pd.DataFrame, region: pd.Series) -> tuple[pd.DataFrame, dict[
     """
     rows = rows.sort_values(["detid", "day", "interval"])
     keys, flow, occ = ["detid", "day"], rows["flow"], rows["occ"]
-    mean = rows.groupby([rows["detid"].map(region), "day", "interval"])["flow"].transform("mean")
-    busy = mean >= 0.5 * mean.groupby([rows["detid"].map(region), rows["day"]]).transform("max").clip(lower=1e-9)
+    own = rows["detid"].map(region)
+    mean = rows.groupby([own, "day", "interval"])["flow"].transform("mean")
+    busy = mean >= 0.5 * mean.groupby([own, rows["day"]]).transform("max").clip(lower=1e-9)
     speed = flow * VEHICLE_LENGTH_M / 3600.0 / occ.where(occ > 0, 1e-9)
     values = rows.groupby(keys)[["flow", "occ"]].transform("nunique").min(axis=1)
     constant = (_held(rows, "flow") & (flow >= LEAST_FLOW)) | (_held(rows, "occ") & (occ >= LEAST_OCC)) | (values == 1)
@@ -117,15 +113,14 @@ def screened(rows: pd.DataFrame, region: pd.Series) -> tuple[pd.DataFrame, dict[
     }
     shares = pd.DataFrame(tests).astype(float).groupby([rows[key] for key in keys]).mean()
     failed = (shares > FAULTY_SHARE) & (rows.groupby(keys).size().to_numpy() >= HELD_ROWS)[:, None]
-    reasons = failed.idxmax(axis=1)[failed.any(axis=1)].reset_index(name="reason")
-    bad = reasons.groupby("detid").agg(reason=("reason", lambda part: part.mode()[0]), days=("day", "size"))
-    whole = bad[bad["days"] >= 0.5 * rows.groupby("detid")["day"].nunique()[bad.index]].index
-    wrong_days = pd.MultiIndex.from_frame(reasons[keys])
-    rows = rows[~rows["detid"].isin(whole) & ~pd.MultiIndex.from_frame(rows[keys]).isin(wrong_days)]
+    reasons, days = failed.idxmax(axis=1)[failed.any(axis=1)], rows.groupby("detid")["day"].nunique()
+    bad = reasons.groupby("detid").agg(reason=lambda part: part.mode()[0], days="size")
+    whole = bad.index[bad["days"] >= 0.5 * days[bad.index]]
+    rows = rows[~rows["detid"].isin(whole) & ~pd.MultiIndex.from_frame(rows[keys]).isin(reasons.index)]
     left = {reason: part["days"].to_dict() for reason, part in bad.groupby("reason")}
-    for part in [part for _, part in rows.groupby(rows["detid"].map(region))]:
+    for _, part in rows.groupby(own):
         for reason, names in _against_neighbours(part):
-            left.setdefault(reason, {}).update(part.groupby("detid")["day"].nunique()[names].to_dict())
+            left.setdefault(reason, {}).update(days[names].to_dict())
             rows = rows[~rows["detid"].isin(names)]
     return rows.sort_index(), left
 
@@ -196,8 +191,8 @@ def read_detectors(
     table = table.set_index("detid")
     table = table[table["region"].notna() & (table["region"].str.strip() != "")]
     if missing := set(detids) - set(table.index):
-        count = f"{len(missing)} such"
-        raise InputError(f"{where}: detector {min(missing)}, which has counts, has no row or region ({count}); add it")
+        what = f"detector {min(missing)}, which has counts, has no row or region ({len(missing)} such)"
+        raise InputError(f"{where}: {what}; add it")
     table = table.loc[detids]
     columns = {
         name: pd.to_numeric(table[name], errors="coerce") if name in table else np.nan
@@ -263,11 +258,9 @@ def _chunks(path: Path, needed: Sequence[str], optional: Sequence[str] = ()) -> 
             )
         names = [name for name in header if name in (*needed, *optional)]
         yield from pd.read_csv(path, dtype=str, chunksize=CHUNK_ROWS, usecols=names, skipinitialspace=True)
-    except pd.errors.EmptyDataError:
-        raise InputError(f"{path}: is empty; expected the columns {', '.join(needed)}") from None
-    except (OSError, UnicodeDecodeError, pd.errors.ParserError) as error:
+    except (OSError, UnicodeDecodeError, pd.errors.ParserError, pd.errors.EmptyDataError) as error:
         text = " ".join(str(error).split())
-        raise InputError(f"{path}: cannot be read as a csv file ({text}); give one") from None
+        raise InputError(f"{path}: cannot be read as a csv file ({text}); expected {', '.join(needed)}") from None
 
 
 def _numbers(table: pd.DataFrame, limits: Limits) -> tuple[pd.DataFrame, str]:
@@ -276,23 +269,25 @@ def _numbers(table: pd.DataFrame, limits: Limits) -> tuple[pd.DataFrame, str]:
     bad = {name: ~values[name].between(low, high) for name, (low, high, _, _) in limits.items()}
     good = table.assign(**values)[~pd.concat(bad, axis=1).any(axis=1)]
     for name, (low, high, what, hint) in limits.items():
-        if bad[name].any():
+        if count := int(bad[name].sum()):
             line = bad[name].idxmax()
             got = "nothing" if pd.isna(table.loc[line, name]) else repr(table.loc[line, name])
             hint = f"; {hint}" if values[name][line] > high and hint else ""
-            count = int(bad[name].sum())
-            return good, (
-                f"line {line + 2}: {name}: expected {what}, from {low:g} to {high:g}, got {got} instead "
-                f"({count:,} such rows){hint}"
-            )
+            problem = f"line {line + 2}: {name}: expected {what}, from {low:g} to {high:g}, got {got} instead"
+            return good, f"{problem} ({count:,} such rows){hint}"
     return good, ""
 
 
 def _unique(table: pd.DataFrame, key: str, path: Path) -> pd.DataFrame:
     """Return `table`. Raises InputError for a key that is missing or doubled."""
-    if table[key].isna().any():
-        raise InputError(f"{path}: line {table[key].isna().idxmax() + 2}: {key} is missing; add it or remove the line")
-    if (twice := table[key].duplicated()).any():
+    if (twice := _present(table, key, path)[key].duplicated()).any():
         line = twice.idxmax()
         raise InputError(f"{path}: line {line + 2}: {key} {table[key][line]} is there twice; remove one of the lines")
+    return table
+
+
+def _present(table: pd.DataFrame, key: str, path: Path) -> pd.DataFrame:
+    """Return `table`. Raises InputError for a key that is missing."""
+    if (missing := table[key].isna()).any():
+        raise InputError(f"{path}: line {missing.idxmax() + 2}: {key} is missing; add it or remove the line")
     return table

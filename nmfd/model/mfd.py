@@ -80,22 +80,18 @@ class Mfd:
         return None
 
 
-def guess(rate: float, jam: float, *, seen: float = 0.0) -> Mfd:
-    """Return a curve of the published shape with q(0) = `rate` [1/s].
-
-    jam: of the region's lanes [veh], raised if the critical accumulation is less than `seen` [veh]
-    """
-    unit = Mfd(a=ALPHA * rate / jam**2, b=BETA * rate / jam, c=rate, jam=jam)
-    return unit if seen <= unit.critical else guess(rate, 1.0001 * jam * seen / unit.critical)
+def guess(rate: float, jam: float) -> Mfd:
+    """Return a curve of the published shape with q(0) = `rate` [1/s]."""
+    return Mfd(a=ALPHA * rate / jam**2, b=BETA * rate / jam, c=rate, jam=jam)
 
 
 def guess_beyond(curve: Mfd, jam: float, seen: float, *, max_rate: float = np.inf) -> Mfd:
     """Return the guess with the outflow of `curve`, fitted to data without a falling branch, at their end `seen` [veh].
 
-    jam: of the region's lanes [veh]; max_rate: [1/s]
+    jam: of the region's lanes [veh], raised so that the critical accumulation is above `seen`; max_rate: [1/s]
     """
-    shape = guess(1.0, jam, seen=seen)
-    return guess(float(min(curve.outflow(seen) / shape.outflow(seen), max_rate)), shape.jam)
+    jam *= max(1.0, 1.0001 * seen / guess(1.0, jam).critical)
+    return guess(float(min(curve.outflow(seen) / guess(1.0, jam).outflow(seen), max_rate)), jam)
 
 
 def fit(accumulation: Samples, outflow: Samples, *, max_rate: float = np.inf, bins: int = 24) -> Mfd:
