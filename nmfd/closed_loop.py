@@ -56,13 +56,14 @@ def run(
         command = controller.act(given)
         decision_time.append(time.process_time() - processor)
         late = time.perf_counter() - before > deadline
-        command = faults.with_problem(_copied(command), problem)
-        check_finite(command, f"{controller.name}: interval {k}")
+        command = _checked(command, f"{controller.name}: interval {k}")
+        if problem:
+            command = _with_status(command, Status.SENSOR_FAULT, problem, command.note)
         if late:
-            command = _with_status(command, Status.LATE, f"later than its deadline of {deadline:g} s")
+            command = _with_status(command, Status.LATE, command.note, f"later than its deadline of {deadline:g} s")
         states.append(plant.step(command))
         fault = states[-1].problem
-        controls.append(_with_status(command, Status.PLANT_FAULT, fault) if fault else command)
+        controls.append(_with_status(command, Status.PLANT_FAULT, command.note, fault) if fault else command)
         observed, problem = observe()
         observations.append(observed)
         if progress:
@@ -91,14 +92,6 @@ def run(
     )
 
 
-def check_finite(controls: Controls, where: str) -> None:
-    """Raise InputError, which begins with `where`, for the first number that is not finite."""
-    for name in ("perimeter", "splits", "prices", "metering"):
-        if (values := getattr(controls, name)) is not None and (wrong := np.argwhere(~np.isfinite(values))).size:
-            at = wrong[0].tolist()
-            raise InputError(f"{where}: {name}{at}: expected a finite number, got {values[*at]} instead")
-
-
 def noise_of(seed: int) -> np.random.Generator:
     """Return the random generator of the measurement noise of a run."""
     return np.random.default_rng([seed, 0x6E6F6973])
@@ -109,13 +102,17 @@ def noisy(state: State, noise: PerPair) -> Observation:
     return Observation(step=state.step, time=state.time, accumulation=state.accumulation + noise, backlog=state.backlog)
 
 
-def _copied(controls: Controls) -> Controls:
-    """Return a copy with its own arrays: the controller may write into those that it returned."""
-    splits, prices, metering = (
-        None if values is None else np.array(values) for values in (controls.splits, controls.prices, controls.metering)
-    )
-    return replace(controls, perimeter=np.array(controls.perimeter), splits=splits, prices=prices, metering=metering)
+def _checked(controls: Controls, where: str) -> Controls:
+    """Return controls with copied arrays, into which no controller writes; raise InputError if one is not finite."""
+    arrays = {}
+    for name in ("perimeter", "splits", "prices", "metering"):
+        if (values := getattr(controls, name)) is not None:
+            arrays[name] = values = np.array(values)
+            if wrong := np.argwhere(~np.isfinite(values)).tolist():
+                got = f"expected a finite number, got {values[*wrong[0]]} instead"
+                raise InputError(f"{where}: {name}{wrong[0]}: {got}")
+    return replace(controls, **arrays)
 
 
-def _with_status(controls: Controls, status: Status, note: str) -> Controls:
-    return replace(controls, status=controls.status | status, note="; ".join(filter(None, (controls.note, note))))
+def _with_status(controls: Controls, status: Status, *notes: str) -> Controls:
+    return replace(controls, status=controls.status | status, note="; ".join(filter(None, notes)))

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from nmfd.errors import InputError
-from nmfd.types import Controls, Observation, Status
+from nmfd.types import Observation
 
 FORMS = "frozen, delayed:INTERVALS, missing:REGION, closed:EDGE or signal:SIGNAL, with @FROM-TO for some intervals only"
 FORM = re.compile(r"(frozen|(?:delayed|missing):\d{1,3}|(?:closed|signal):[^@]+)(?:@(\d{1,6})-(\d{1,6}))?")
@@ -77,11 +77,3 @@ class Sensors:
             problems.append(f"{missing} of {x.size} entries missing, last ones used")
         self._last = observation.accumulation
         return observation, f"measurement {', '.join(problems)}" if problems else ""
-
-
-def with_problem(controls: Controls, problem: str) -> Controls:
-    """Return controls with the problem of their observation in status and note."""
-    if not problem:
-        return controls
-    note = "; ".join(filter(None, (problem, controls.note)))
-    return replace(controls, status=controls.status | Status.SENSOR_FAULT, note=note)

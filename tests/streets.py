@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -9,12 +10,6 @@ import numpy as np
 from cosim.plant.sampling import StreetMeans
 from cosim.sumo.net import City, Gateway
 
-# Of a session: nobody stands, or is near the end of a lane.
-FAR_FROM_THE_END = {
-    "standing_time": lambda vehicle: 0.0,
-    "place": lambda vehicle: ("lane", 0.0),
-    "lane": lambda lane: (1e9, frozenset()),
-}
 MANY = 1e5  # veh: so many that nothing else counts
 
 
@@ -44,6 +39,21 @@ def city(region_of: Mapping[str, int], successors: Mapping[str, Sequence[str]], 
         signals={},
         **(properties | others),
     )
+
+
+def session(routes: dict[str, tuple[str, ...]], **others: Any) -> SimpleNamespace:
+    """Return a session of drivers on the first edges of their `routes`, none of whom is near the end of a lane."""
+    calls = {
+        "road": lambda vehicle: routes[vehicle][0],
+        "route": routes.get,
+        "route_index": lambda vehicle: 0,
+        "step_length": 1.0,
+        "set_route": lambda vehicle, way: routes.update({vehicle: tuple(way)}) or True,
+        "standing_time": lambda vehicle: 0.0,
+        "place": lambda vehicle: ("lane", 0.0),
+        "lane": lambda lane: (1e9, frozenset()),
+    }
+    return SimpleNamespace(**calls | others)
 
 
 def seen(

@@ -2,12 +2,11 @@
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import streets
-from streets import FAR_FROM_THE_END, seen
+from streets import seen
 
 from cosim.evaluation.simulate import Simulation, simulate
 from cosim.plant import guidance
@@ -47,16 +46,8 @@ class Town:
         for shares, to_a in zip(self.shares, (own, theta), strict=True):
             shares[0, 1, 3], shares[0, 2, 3] = to_a, 1.0 - to_a
             shares[1, 3, 3] = shares[2, 3, 3] = 1.0
-        session = SimpleNamespace(
-            road=lambda vehicle: self.routes[vehicle][0],
-            route=self.routes.get,
-            route_index=lambda vehicle: 0,
-            step_length=1.0,
-            set_route=self._set_route,
-            **FAR_FROM_THE_END,
-        )
         self.guide = Guide(
-            session,
+            streets.session(self.routes, set_route=self._set_route),
             city,
             self.shares[0],
             compliance=compliance,

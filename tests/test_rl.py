@@ -153,10 +153,3 @@ def test_an_action_that_is_no_number_is_named(hexagon):
         one.step(action)
     with pytest.raises(InputError, match=r"^region_2: interval 0: action\[0\]: expected a number"):
         many.step({"region_2": np.full(many.interfaces["region_2"].action_size, np.nan)})
-
-
-def test_ppo_of_stable_baselines3_learns_on_it(scenario):
-    sb3 = pytest.importorskip("stable_baselines3")
-    env = rl.RegionalEnv(scenario)
-    model = sb3.PPO("MlpPolicy", env, n_steps=20, batch_size=20, n_epochs=1, seed=0, device="cpu").learn(40)
-    assert model.predict(env.reset(seed=0)[0], deterministic=True)[0] in env.action_space

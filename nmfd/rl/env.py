@@ -74,7 +74,7 @@ class Interface:
     def controls(self, action: Vector, where: str = "") -> Controls:
         """Return the controls of an action: u_max at the boundaries and theta = 0 in the other regions.
 
-        Raises: InputError, which begins with `where`, for a number that is not finite
+        Raises: InputError, which begins with `where`, for NaN
         """
         low, high = self._network.u_min, self._network.u_max
         action = np.clip(np.asarray(action, dtype=float), -1.0, 1.0)
