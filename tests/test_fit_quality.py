@@ -123,53 +123,17 @@ def judged(network, boundaries, most, started, waiting=0.0, slowness=1.3):
 
 
 @pytest.mark.parametrize(
-    "most, started, share, answer, protect, commands",
+    "load, started, share, answer, protect, commands",
     [
-        (
-            (0.5, 0.9, 0.2),
-            (10, 10, 10),
-            1.0,
-            "No: no region is seen to become critical, region 1 comes nearest with 0.90",
-            (),
-            3,
-        ),
-        ((0.5, 1.9, 0.2), (10, 10, 10), 0.0, "No: no gateway has a signal", (), 2),
-        (
-            (0.5, 1.9, 0.2),
-            (10, 600, 10),
-            1.0,
-            "It may: region 1 becomes critical, and gateways could hold 50%",
-            (1,),
-            0,
-        ),
-        (
-            (1.5, 1.9, 1.2),
-            (99, 99, 9),
-            1.0,
-            "It may: region 2 becomes critical, and gateways could hold 92%",
-            (0, 1, 2),
-            0,
-        ),
-        (
-            (0.5, 1.9, 0.2),
-            (10, 5400, 10),
-            1.0,
-            "Hardly: regions become critical, but gateways could hold no more than 10",
-            (1,),
-            0,
-        ),
-        (
-            (0.5, 1.9, 0.2),
-            (10, 600, 10),
-            0.06,
-            "No: regions become critical, but gateways could hold no more than 3%",
-            (),
-            2,
-        ),
+        (0.9, 10, 1.0, "No: no region is seen to become critical, region 1 comes nearest with 0.90", (), 3),
+        (1.9, 10, 0.0, "No: no gateway has a signal", (), 2),
+        (1.9, 600, 1.0, "It may: region 1 becomes critical, and gateways could hold 50%", (1,), 0),
+        (1.9, 5400, 1.0, "Hardly: regions become critical, but gateways could hold no more than 10", (1,), 0),
+        (1.9, 600, 0.06, "No: regions become critical, but gateways could hold no more than 3%", (), 2),
     ],
 )
-def test_the_verdict_has_reasons_numbers_and_commands(network, most, started, share, answer, protect, commands):
-    found = judged(network, crossing(FLOW, share), most, started)
+def test_the_verdict_has_reasons_numbers_and_commands(network, load, started, share, answer, protect, commands):
+    found = judged(network, crossing(FLOW, share), (0.5, load, 0.2), (10, started, 10))
     assert found.sentences[0].startswith(f"Can perimeter control help? {answer}"), found.sentences
     assert found.protect == protect and sum("cosim " in each for each in found.sentences[1:]) == commands
     text = found.text()
@@ -178,36 +142,30 @@ def test_the_verdict_has_reasons_numbers_and_commands(network, most, started, sh
     assert len(table) == 1 + (crossing(FLOW, 1.0).gateways > 0).sum()
 
 
-def test_there_is_no_verdict_before_identification_or_on_congestion_that_no_region_explains(network):
+CROWDED = "There, up to 0 vehicles waited outside at a time, and a trip took 12.0 times its free-flow time"
+
+
+@pytest.mark.parametrize(
+    "changes, busy, answer, words",
+    [
+        ({"placeholder": True}, {"waiting": 584.0}, "Cannot say yet: the critical", "cosim identify scenarios/x"),
+        ({"placeholder": True}, {}, "Cannot say yet", "cosim identify scenarios/x"),
+        ({}, {"waiting": 584.0}, "Cannot say yet: up to 584 vehicles", "cosim identify scenarios/x --levels"),
+        ({}, {"slowness": 12.0}, "Cannot say yet: up to 0 vehicles", CROWDED),
+        ({}, {"slowness": np.nan}, "No: no region is seen", "no-control+max-pressure --demand 1,1.3,1.6"),
+        ({"critical_above": {1: 480.0}}, {}, "No: no region is seen", "region 1 above 480 veh, not seen"),
+        ({"critical_above": dict.fromkeys(range(3), 9.0)}, {}, "No: no region is seen to become critical; more", ""),
+    ],
+)
+def test_no_verdict_on_guesses_or_on_congestion_that_no_region_explains(network, changes, busy, answer, words):
     """584 vehicles outside and trips of 12 times the free-flow time are no "No: nothing to protect"."""
-    calm, guesses = ((0.5, 0.4, 0.2), (4000, 10, 10)), replace(network, placeholder=True)
-    for model, busy, answer, command in (
-        (guesses, {"waiting": 584.0, "slowness": 12.0}, "Cannot say yet: the critical", "cosim identify scenarios/x"),
-        (guesses, {}, "Cannot say yet", "cosim identify scenarios/x"),
-        (network, {"waiting": 584.0}, "Cannot say yet: up to 584 vehicles", "cosim identify scenarios/x --levels"),
-        (
-            network,
-            {"slowness": 12.0},
-            "Cannot say yet: up to 0 vehicles",
-            "There, up to 0 vehicles waited outside at a time, and a trip took 12.0 times its free-flow time",
-        ),
-        (network, {"slowness": np.nan}, "No: no region is seen", "no-control+max-pressure --demand 1,1.3,1.6"),
-    ):
-        found = judged(model, crossing(FLOW, 1.0), *calm, **busy)
-        assert found.sentences[0].startswith(f"Can perimeter control help? {answer}") and command in found.text()
+    load = (0.5, 1.9 if "critical_above" in changes else 0.4, 0.2)
+    found = judged(replace(network, **changes), crossing(FLOW, 1.0), load, (4000, 10, 10), **busy)
+    assert found.sentences[0].startswith(f"Can perimeter control help? {answer}")
+    assert words in found.text() and found.protect == ()
 
 
-def test_a_critical_accumulation_that_was_not_seen_is_not_called_so(network):
-    seen = replace(network, critical_above={1: 480.0})
-    found = judged(seen, crossing(FLOW, 1.0), (0.5, 1.9, 0.2), (10, 10, 10))
-    assert found.sentences[0].endswith("region 0 comes nearest with 0.50; more demand may change that.")
-    assert "region 1 above 480 veh, not seen" in found.text() and found.protect == ()
-    found = judged(
-        replace(network, critical_above=dict.fromkeys(range(3), 9.0)), crossing(FLOW, 1.0), (9, 9, 9), (1, 1, 1)
-    )
-    assert "No: no region is seen to become critical; more demand" in found.sentences[0]
-
-
-def test_nobody_crosses(network):
+def test_all_regions_that_gates_can_hold_are_to_be_protected_and_none_if_nobody_crosses(network):
+    assert judged(network, crossing(FLOW, 1.0), (1.5, 1.9, 1.2), (99, 99, 9)).protect == (0, 1, 2)
     found = judged(network, crossing(np.zeros((3, 3)), 1.0), np.ones(3), np.ones(3))
-    assert "No: no vehicle crosses" in found.sentences[0]
+    assert "No: no vehicle crosses" in found.sentences[0] and found.protect == ()
