@@ -1,12 +1,16 @@
 """Facts of a run: trips as SUMO tells of them, queues before gateways, what is recorded per edge."""
 
+import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
+import tiny_city
 
+import cosim
 from cosim.evaluation import simulate
 from cosim.plant.meter import Trip
 from cosim.plant.plant import SumoPlant
@@ -29,24 +33,17 @@ def test_vehicles_under_way_have_emitted_too(tmp_path):
 
 
 def test_trips_that_never_began_count_with_what_they_have_waited():
-    row = simulate.trip_measures(
-        [
-            Trip(0, True, "completed", 5.0, 105.0, 30.0),
-            Trip(0, True, "under way", 0.0, 70.0, 10.0),
-            Trip(1, True, "waiting", 400.0, 400.0),
-            Trip(1, True, "given up", 25.0, 25.0),
-            Trip(0, False, "waiting", 9000.0, 9000.0),
-            Trip(1, False, "removed", 10.0, 90.0, 7.0),
-        ]
-    )
-    assert row.pop("lost_time_gini") == pytest.approx((212.5 - 22.5) / (2 * (212.5 + 22.5)))
-    assert row == pytest.approx(
-        dict(trips=4, departed_veh=2, completed_veh=1, removed_veh=1, removed_waiting_veh=1, final_backlog_veh=1)
-        | dict(mean_trip_time_s=150.0, mean_finished_trip_time_s=105.0, median_trip_time_s=87.5)
-        | dict(p95_trip_time_s=105.0 + 0.85 * 295.0, mean_departure_delay_s=107.5, total_backlog_veh_s=430.0)
-        | dict(mean_time_loss_s=20.0)
-        | dict(other_trips=2, other_time_spent_veh_s=9090.0, other_departure_delay_veh_s=9010.0)
-    )
+    trips = [
+        Trip(0, True, "completed", 5.0, 105.0, 30.0),
+        Trip(0, True, "under way", 0.0, 70.0, 10.0),
+        Trip(1, True, "waiting", 400.0, 400.0),
+        Trip(1, True, "given up", 25.0, 25.0),
+        Trip(0, False, "waiting", 9000.0, 9000.0),
+    ]
+    row = simulate.trip_measures(trips)
+    assert (row["trips"], row["removed_veh"], row["removed_waiting_veh"], row["other_trips"]) == (4, 1, 1, 1)
+    assert (row["mean_trip_time_s"], row["mean_departure_delay_s"], row["mean_time_loss_s"]) == (150.0, 107.5, 20.0)
+    assert row["lost_time_gini"] == pytest.approx((212.5 - 22.5) / (2 * (212.5 + 22.5)))
     nobody = simulate.trip_measures([])
     assert nobody["trips"] == nobody["other_time_spent_veh_s"] == 0 and np.isnan(nobody["mean_trip_time_s"])
 
@@ -78,6 +75,33 @@ def test_time_on_the_road_is_that_of_the_vehicles_seen_second_by_second(run):
     assert len(trips) >= record.departures.sum()
     lost = [sum(trip.time_loss for trip in trips if trip.origin == origin) for origin in range(7)]
     assert ((np.array(lost) > 0.0) == (record.departures.sum(axis=(0, 2)) > 0)).all() and sum(lost) < sum(running)
+
+
+@pytest.mark.parametrize("steps", [3, 10])
+def test_measures_of_a_city_are_those_of_tripinfo(tmp_path, steps):
+    """Cars and buses that cannot all enter, in a run that ends before their trips."""
+    config, info = tiny_city.city(tmp_path), tmp_path / "trips.xml"
+    crowd = '<flow id="{0}" {1} begin="600.3" end="900" period="0.7" from="{2}" to="{3}"/>'
+    crowds = crowd.format("cars", "", "A1B1", "C1D1") + crowd.format("line9", 'type="citybus"', "A2B2", "C2D2")
+    (tmp_path / "buses.rou.xml").write_text(tiny_city.BUSES.replace("</routes>", crowds + "</routes>"))
+    scenario = tiny_city.imported(tmp_path, source=config)
+    result = cosim.run(scenario, "no-control", steps=steps, seed=1, sumo_output={"tripinfo": info})
+    row = metrics.summary(result)
+    trips = pd.DataFrame([trip.attrib for trip in ElementTree.parse(info).iter("tripinfo")])
+    trips = trips.astype({name: float for name in ("depart", "arrival", "duration", "departDelay", "timeLoss")})
+    time, other = trips["duration"] + trips["departDelay"], trips["vType"].str.startswith("citybus")
+    begun, ended = ~other & (trips["depart"] >= 0), ~other & (trips["arrival"] >= 0)
+    private, delay = time[~other], trips["departDelay"]
+    expected = {"total_time_spent_veh_s": private.sum(), "trips": len(private), "departed_veh": sum(begun)}
+    expected |= {"completed_veh": sum(ended), "final_backlog_veh": sum(~other & ~begun)}
+    expected |= {"mean_trip_time_s": private.mean(), "mean_finished_trip_time_s": time[ended].mean()}
+    expected |= {"median_trip_time_s": np.percentile(private, 50), "p95_trip_time_s": np.percentile(private, 95)}
+    expected |= {"mean_departure_delay_s": delay[~other].mean(), "mean_time_loss_s": trips["timeLoss"][begun].mean()}
+    expected |= {"other_trips": sum(other), "other_time_spent_veh_s": time[other].sum()}
+    expected |= {"other_departure_delay_veh_s": delay[other].sum()}
+    assert {name: row[name] for name in expected} == pytest.approx(expected, rel=1e-6)
+    assert result.time_spent.shape == (steps,) and min(expected.values()) > 0
+    assert result.other_time_spent.sum() == pytest.approx(time[other].sum())
 
 
 def test_gini_coefficients():

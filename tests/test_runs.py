@@ -16,18 +16,21 @@ from functools import partial
 import numpy as np
 import pandas as pd
 import pytest
+import tiny
 import trajectories
 import xarray as xr
 from filelock import FileLock
 from trajectories import trajectory
 
 from cosim.plant.record import RECORD
-from nmfd import metrics
+from nmfd import closed_loop, metrics
+from nmfd.api import load_scenario
 from nmfd.errors import InputError, RunFailed
+from nmfd.model.plant import NmfdPlant
 from nmfd.runs import files
 from nmfd.runs import run_many as module
 from nmfd.runs.run_many import Run, raise_failures, read_manifest, run_many, run_name
-from nmfd.types import VARIABLES, Result
+from nmfd.types import VARIABLES, Controls, Result
 
 
 def test_a_result_is_read_as_it_was_written(tmp_path):
@@ -94,6 +97,31 @@ def test_a_row_holds_the_figures_and_the_facts_of_a_run():
     facts = Result(xr.Dataset(attrs={"controller": "x", "seed": 1, "trips_veh": 2.0, "key": "{}"}))
     assert metrics.summary(facts) == {"controller": "x", "seed": 1, "trips_veh": 2.0}
     assert "accumulation" in trajectory()._repr_html_()
+
+
+def test_decision_times_are_processor_times_of_all_threads(tmp_path):
+    scenario = load_scenario(tiny.write(tmp_path))
+
+    def burn():
+        while time.thread_time() < 0.06:
+            pass
+
+    class Sleeper:
+        name = "sleeper"
+
+        def reset(self, seed=0):
+            self.begun = False
+
+        def act(self, observation):
+            if not self.begun:
+                self.begun, thread = True, threading.Thread(target=burn)
+                thread.start()
+                thread.join()
+            time.sleep(0.03)
+            return Controls(perimeter=np.where(scenario.network.adjacency, 0.5, 0.0), splits=None)
+
+    row = metrics.summary(closed_loop.run(NmfdPlant(scenario), Sleeper(), scenario, seed=0))
+    assert row["control_step_ms_first"] == row["control_step_ms_max"] >= 60.0 > 20.0 > row["control_step_ms_median"]
 
 
 @pytest.mark.parametrize("damage", ["missing", "cut off", "empty", "a table"])
