@@ -50,12 +50,11 @@ def plain(scenario, strategy):
 
 @pytest.fixture(scope="module")
 def seen(scenario, strategy, drawn):
-    """The messages and the result of a run that is held at the end of its first interval for a while."""
+    """The messages and the result of a run that is held at its start for a while."""
     messages, context = queue.Queue(), multiprocessing.get_context("spawn")
-    limit, delay = context.Value("d", drawn.step), context.Value("d", 0.0)
-    release = threading.Timer(1.0, lambda: setattr(limit, "value", live.FOREVER))
-    reporter, begin = live.Reporter(0, scenario, messages, limit, delay), time.perf_counter()
-    release.start()
+    going, delay = context.Event(), context.Value("d", 0.0)
+    reporter, begin = live.Reporter(0, scenario, messages, going, delay), time.perf_counter()
+    threading.Timer(1.0, going.set).start()
     result = simulate(Simulation(scenario, strategy, seed=3), observer=reporter)
     assert time.perf_counter() - begin > 1.0
     return [messages.get()[1] for _ in range(messages.qsize())], result
@@ -154,7 +153,7 @@ def test_runs_in_processes_of_their_own(scenario, strategy, tmp_path):
         wait(lambda: show.picture is not None)
         viewer = live.Viewer(show, Document())
         viewer._toggle()
-        assert show.limit.value == 0.0
+        assert not show.going.is_set()
         wait(lambda: show.runs[1].over)
         viewer._toggle()
         wait(lambda: show.over)

@@ -7,22 +7,11 @@ from pathlib import Path
 
 from cosim.plant.detectors import Layout, write_loops
 from cosim.plant.programmes import CitySignals, optimised_plans, write_actuated
-from cosim.plant.settings import ACTUATED, ESTIMATE, WEBSTER, Settings, own_files, scenario_file
+from cosim.plant.settings import ACTUATED, ESTIMATE, WEBSTER, Settings, own_files
 from cosim.sumo import outputs
+from cosim.sumo import recorded_trips as recorded
 from cosim.sumo.net import City
-from cosim.sumo.recorded_trips import (
-    MESOSCOPIC,
-    ORDERED,
-    RecordedTrips,
-    check_edges,
-    draw,
-    edges_of,
-    own_flows,
-    read_recorded_trips,
-    read_routes,
-    write_held_trips,
-    write_recorded_trips,
-)
+from cosim.sumo.recorded_trips import RecordedTrips
 from cosim.sumo.session import Session
 from cosim.sumo.trips import PLANNING_SEEDS, HeldTrips, held, make_trips, turning_flows, write_trips
 from cosim.sumo.xml_files import file_list
@@ -40,8 +29,8 @@ DEPARTURE_JITTER_S = 10.0  # departures of recorded trips are moved by up to thi
 
 def own_vehicles(scenario: Scenario, settings: Settings, city: City) -> RecordedTrips:
     """Return the recorded trips of the city. Raises InputError."""
-    originals = read_recorded_trips(own_files(scenario, settings.routes))
-    check_edges(originals, city, f"{scenario_file(scenario)}: sumo.routes")
+    originals = recorded.read_recorded_trips(own_files(scenario, settings.routes))
+    recorded.check_edges(originals, city, f"{scenario.where}: sumo.routes")
     return originals
 
 
@@ -90,7 +79,7 @@ class Launch:
         """Return (edge, next edge) -> flow [veh/s] of the vehicles; call it after a `start`."""
         if self._originals is None:
             return turning_flows(self._city, self._scenario.demand, self._scenario.step)
-        return own_flows(self._city, self._originals, self._shared_routes, self._scenario.demand_factor)
+        return recorded.own_flows(self._city, self._originals, self._shared_routes, self._scenario.demand_factor)
 
     def close(self) -> None:
         """Remove the temporary folder."""
@@ -103,7 +92,7 @@ class Launch:
         if settings.rerouting > 0:
             options += [*REROUTING, "--device.rerouting.probability", str(settings.rerouting)]
         if settings.mesoscopic:
-            options += MESOSCOPIC
+            options += recorded.MESOSCOPIC
         if additional := self._additional():
             options += ["--additional-files", file_list(additional)]
         return options
@@ -134,23 +123,23 @@ class Launch:
             return [f"v{n}" for n in range(len(trips.routes))]
         if self._originals is None:
             self._originals = own_vehicles(scenario, settings, self._city)
-        drawn = draw(
-            self._originals, seed=seed, factor=scenario.demand_factor, jitter=DEPARTURE_JITTER_S, begin=settings.begin
-        )
+        how = {"factor": scenario.demand_factor, "jitter": DEPARTURE_JITTER_S, "begin": settings.begin}
+        drawn = recorded.draw(self._originals, seed=seed, **how)
         if metered:
-            self.held = write_held_trips(self._originals, drawn, path, self._shared_routes, self._city.region_of)
+            self.held = recorded.write_held_trips(
+                self._originals, drawn, path, self._shared_routes, self._city.region_of
+            )
             if not self.held.orders:
-                raise InputError(
-                    f"{scenario_file(scenario)}: sumo.metering: none of the vehicles in sumo.routes can wait: only "
-                    f"those without stops, via edges and attributes other than {', '.join(ORDERED)} can; omit it"
-                )
+                some = f"those without stops, via edges and attributes other than {', '.join(recorded.ORDERED)}"
+                none = "none of the vehicles in sumo.routes can wait: only"
+                raise InputError(f"{scenario.where}: sumo.metering: {none} {some} can; omit it")
         else:
-            write_recorded_trips(self._originals, drawn, path)
+            recorded.write_recorded_trips(self._originals, drawn, path)
         return [name for _, _, name in drawn]
 
     @cached_property
     def _shared_routes(self) -> Mapping[str, tuple[str, ...]]:
-        return read_routes(own_files(self._scenario, self._settings.additional))
+        return recorded.read_routes(own_files(self._scenario, self._settings.additional))
 
     def _planning_trips(self) -> Iterator[tuple[float, Sequence[str]]]:
         """Yield departure [s] and edges of the trips that Webster's plan is made for."""
@@ -159,6 +148,6 @@ class Launch:
             yield from zip(trips.depart.tolist(), trips.routes, strict=True)
         else:
             for depart, element in zip(self._originals.depart.tolist(), self._originals.elements, strict=True):
-                edges, driven = edges_of(element, self._shared_routes)
+                edges, driven = recorded.edges_of(element, self._shared_routes)
                 if driven:
                     yield depart, edges

@@ -58,18 +58,13 @@ class Settings(config.Settings):
         return self
 
 
-def scenario_file(scenario: "Scenario") -> Path:
-    """Return the scenario.toml, for messages."""
-    return (scenario.folder or Path()) / "scenario.toml"
-
-
 def settings(scenario: "Scenario") -> Settings:
     """Return the table [sumo] of the scenario. Raises InputError.
 
     >>> settings(nmfd.load_scenario("grid7_peak")).signals
     'fixed'
     """
-    path = scenario_file(scenario)
+    path = scenario.where
     if scenario.initial is not None:
         raise config.error(path, "initial", "a city in SUMO begins empty; remove it, or use the regional model (nmfd)")
     result = config.checked(Settings, scenario.sumo, path, "sumo.")
@@ -96,4 +91,4 @@ def check_lanes(scenario: "Scenario", settings: Settings) -> None:
     ):
         if settings.mesoscopic and (value := getattr(settings, key)) in values:
             what += ", but SUMO's mesoscopic model has no lanes; omit it, or import the city without --mesoscopic"
-            raise InputError(f"{scenario_file(scenario)}: sumo.{key}: {value} {what}")
+            raise InputError(f"{scenario.where}: sumo.{key}: {value} {what}")

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from bokeh.models import ColorBar, ColumnDataSource, FixedTicker, HoverTool, LinearColorMapper, ScaleBar
 from bokeh.plotting import figure
+from bokeh.transform import linear_cmap
 
 from cosim.sumo.arrays import Points
 from cosim.view import colours
@@ -44,32 +45,27 @@ class CityMap:
 
     def show(self, frame: Frame) -> None:
         """Draw a frame."""
-        patch(self.streets, density=frame.density.astype(np.float32))
+        patch(self.streets, density=frame.density)
         members = [list(gate.gateways) for gate in self._picture.gates]
         share, queue = (np.array([mean(x[n]) for n in members]) for x in (frame.green, frame.queue))
         patch(
             self.gates,
-            end=_wedge_end(np.nan_to_num(np.clip(share, 0.0, 1.0), nan=1.0)).astype(np.float32),
+            end=_wedge_end(np.nan_to_num(np.clip(share, 0.0, 1.0), nan=1.0)),
             green=["not controlled" if np.isnan(one) else f"{one:.0%}" for one in share],
-            queue=queue.astype(np.float32),
-            halo=np.where(queue >= 0.5, 2.0 * self._radius + 4.0 * np.sqrt(queue), 0.0).astype(np.float32),
+            queue=queue,
+            halo=np.where(queue >= 0.5, 2.0 * self._radius + 4.0 * np.sqrt(queue), 0.0),
         )
         # A driver who is sent elsewhere when asked again counts negative on the earlier way.
         guided = np.maximum([frame.guided[pair] for pair in self._pairs], 0.0)
         width = ARROW_WIDTH * np.sqrt(guided / max(guided.max(initial=0.0), 1.0))
-        patch(
-            self.arrows,
-            width=width.astype(np.float32),
-            head=np.where(guided > 0, 6.0 + 1.5 * width, 0.0).astype(np.float32),
-            guided=guided.astype(np.float32),
-        )
+        patch(self.arrows, width=width, head=np.where(guided > 0, 6.0 + 1.5 * width, 0.0), guided=guided)
 
     def choose(self, region: int) -> None:
         """Highlight a region."""
         marked = [r == region for r in self.regions.data["region"]]
         patch(
             self.regions,
-            width=np.where(marked, 2.5, 1.0).astype(np.float32),
+            width=np.where(marked, 2.5, 1.0),
             line=[colours.CHOSEN if one else colours.FAINT for one in marked],
             fill=[colours.CHOSEN_LAND if one else colours.LAND for one in marked],
         )
@@ -100,9 +96,8 @@ class CityMap:
                 "width": _floats(thin + per_lane * picture.lanes),
             }
         )
-        mapper = LinearColorMapper(palette=colours.SCALE, low=0.0, high=JAM_DENSITY)
-        self.plot.add_layout(colour_bar(mapper, "density [veh/km and lane]", [0.0, 50.0, 100.0]), "below")
-        colour = {"field": "density", "transform": mapper}
+        colour = linear_cmap("density", colours.SCALE, 0.0, JAM_DENSITY)
+        self.plot.add_layout(colour_bar(colour.transform, "density [veh/km and lane]", [0.0, 50.0, 100.0]), "below")
         drawn = self.plot.multi_line("xs", "ys", source=source, line_width="width", line_cap="round", line_color=colour)
         self._hover(drawn, ("street", "@edge"), ("density [veh/km and lane]", "@density{0.0}"))
         return source
@@ -165,9 +160,12 @@ class CityMap:
 
 
 def patch(source: ColumnDataSource, **columns: Any) -> None:
-    """Replace the values of whole columns without sending the others again."""
+    """Replace whole columns, numbers as float32, without sending the others again."""
     if len(next(iter(columns.values()))):
-        source.patch({name: [(slice(len(values)), values)] for name, values in columns.items()})
+        floats = {
+            name: _floats(values) if isinstance(values, np.ndarray) else values for name, values in columns.items()
+        }
+        source.patch({name: [(slice(len(values)), values)] for name, values in floats.items()})
 
 
 def mean(values: np.ndarray) -> float:

@@ -31,10 +31,9 @@ from nmfd.types import Controls, State
 
 REFRESH_MS = 250  # between two pictures
 FRAME_RATE = 8.0  # frames per second of wall time within control intervals, at most
-HOLD_PERIOD_S = 0.05  # between two looks at the limit of a run that is held
+HOLD_PERIOD_S = 0.05  # between two looks at the page by a run that is held
 OPENING_S = 10.0  # time to open the page of runs that have ended
 PACES = {"as fast as possible": 0.0, "slow": 0.02, "slower": 0.1, "slowest": 0.5}  # wall time per simulated second [s]
-FOREVER = float("inf")
 
 
 @dataclass
@@ -62,7 +61,7 @@ class Seen:
 class Show:
     """Runs side by side, each in its own process, at a common pace.
 
-    limit: time [s] at which the runs wait; delay: least wall time per simulated second [s]; both are shared values
+    going: event that is clear while the runs are held; delay: shared value, least wall time per simulated second [s]
     """
 
     def __init__(self, jobs: Sequence[Simulation]):
@@ -70,9 +69,10 @@ class Show:
         self.runs = [Seen(job.strategy.name) for job in jobs]
         self.picture: CityPicture | None = None
         self._messages = spawn.Queue()
-        self.limit, self.delay = spawn.Value("d", FOREVER), spawn.Value("d", 0.0)
+        self.going, self.delay = spawn.Event(), spawn.Value("d", 0.0)
+        self.going.set()
         self._processes = [
-            spawn.Process(target=run, args=(n, job, self._messages, self.limit, self.delay), daemon=True)
+            spawn.Process(target=run, args=(n, job, self._messages, self.going, self.delay), daemon=True)
             for n, job in enumerate(jobs)
         ]
         for process in self._processes:
@@ -115,11 +115,11 @@ class Show:
         self._messages.close()
 
 
-def run(n: int, job: Simulation, messages: Any, limit: Any, delay: Any) -> None:
+def run(n: int, job: Simulation, messages: Any, going: Any, delay: Any) -> None:
     """Do a job as number n, and send its picture, frames, and summary or error."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the server ends the runs
     try:
-        result = simulate(job, observer=Reporter(n, job.scenario, messages, limit, delay))
+        result = simulate(job, observer=Reporter(n, job.scenario, messages, going, delay))
         messages.put((n, summary(result)))
     except (InputError, RunFailed) as error:
         messages.put((n, error))
@@ -128,9 +128,9 @@ def run(n: int, job: Simulation, messages: Any, limit: Any, delay: Any) -> None:
 class Reporter:
     """The observer of one run: it sends frames and holds the run to the pace; the run stays the same otherwise."""
 
-    def __init__(self, n: int, scenario: Scenario, messages: Any, limit: Any, delay: Any):
-        """limit, delay: shared values, as in `Show`"""
-        self._n, self._messages, self._limit, self._delay = n, messages, limit, delay
+    def __init__(self, n: int, scenario: Scenario, messages: Any, going: Any, delay: Any):
+        """going, delay: as in `Show`"""
+        self._n, self._messages, self._going, self._delay = n, messages, going, delay
         self._scenario, self._begin = scenario, settings(scenario).begin
         self._sent = self._time = 0.0
 
@@ -146,7 +146,7 @@ class Reporter:
         """Send a frame within a control interval if the last one is old enough."""
         now = time_ - self._begin
         if now < (self._state.step + 1) * self._picture.step - 1e-6:  # else `recorded` follows
-            if now >= self._limit.value or time.perf_counter() - self._sent > 1.0 / FRAME_RATE:
+            if not self._going.is_set() or time.perf_counter() - self._sent > 1.0 / FRAME_RATE:
                 self._send(between(self._picture, self._frame, now, vehicles))
             self._wait(now)
 
@@ -169,8 +169,7 @@ class Reporter:
             if parent is not None and not parent.is_alive():
                 self._messages.cancel_join_thread()  # nobody reads them
                 raise RunFailed("the page was closed")
-            if held := now >= self._limit.value:
-                time.sleep(HOLD_PERIOD_S)
+            held = not self._going.wait(HOLD_PERIOD_S)
 
 
 class Viewer:
@@ -193,7 +192,7 @@ class Viewer:
     def refresh(self) -> None:
         """Draw what has changed."""
         show, now = self._show, self._show.now
-        self._pause.label = "Finished" if show.over else ("Go on" if show.limit.value == 0.0 else "Pause")
+        self._pause.label = "Finished" if show.over else ("Pause" if show.going.is_set() else "Go on")
         self._pause.disabled = show.over
         self._page.show([seen.at(now) for seen in show.runs], now)
         runs = [[frame for frame in seen.whole if frame.time <= now] for seen in show.runs]
@@ -202,7 +201,8 @@ class Viewer:
             self._traced = traced
 
     def _toggle(self) -> None:
-        self._show.limit.value = 0.0 if self._show.limit.value else FOREVER
+        going = self._show.going
+        going.clear() if going.is_set() else going.set()
         self.refresh()
 
     def _choose(self, region: int) -> None:
