@@ -12,11 +12,11 @@ from nmfd import api, closed_loop
 from nmfd.api import load_scenario
 from nmfd.controllers import open_loop
 from nmfd.controllers.rules import NoControl, PiGating
-from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
 from nmfd.metrics import total_time_spent
 from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
+from nmfd.model.scenario import with_demand
 from nmfd.studies import bound
 
 ECONOMIC = Path(__file__).parents[1] / "scenarios" / "economic_mpc"
@@ -37,8 +37,8 @@ def closed(scenario, controller):
 
 
 def test_where_nothing_congests_the_bound_is_an_open_perimeter(scenario):
-    free = replace(scenario, demand=0.01 * scenario.demand)
-    plan = bound.compute(free, "bound-pc", starts=[], iterations=100)
+    free = replace(scenario, demand=0.01 * scenario.demand, protected=())
+    plan = bound.compute(free, "bound-pc", iterations=100)
     assert plan.perimeter[:8, 0, 1].min() > 0.85  # later intervals move vehicles that the horizon does not count
     uncontrolled = closed(free, NoControl(planning_model(free)))
     assert closed(free, plan) == pytest.approx(uncontrolled, rel=1e-3)
@@ -46,17 +46,14 @@ def test_where_nothing_congests_the_bound_is_an_open_perimeter(scenario):
 
 @pytest.mark.parametrize("name", bound.NAMES)
 def test_plans_are_admissible_and_replayed_exactly(name):
-    scenario = replace(load_scenario(ECONOMIC), steps=40)
-    scenario = replace(scenario, demand=scenario.demand[:40])
-    plan = bound.compute(scenario, name, starts=[parse("pi-gating")], iterations=20)
+    scenario = replace(with_demand(load_scenario(ECONOMIC), steps=40), folder=None)  # without its policies
+    plan = bound.compute(scenario, name, iterations=20)
     network = scenario.network
     u = plan.perimeter[:, network.adjacency]
     assert u.min() >= network.u_min and u.max() <= network.u_max and (plan.perimeter[:, ~network.adjacency] == 0).all()
     if plan.splits is not None:
         assert (plan.splits[:, ~network.split_mask] == 0.0).all()
-        np.testing.assert_allclose(
-            plan.splits.sum(axis=2), np.broadcast_to(1.0 - np.eye(7), (40, 7, 7)), rtol=0.0, atol=1e-12
-        )
+        np.testing.assert_allclose(plan.splits.sum(axis=2), [1.0 - np.eye(7)] * 40, rtol=0.0, atol=1e-12)
     assert closed(scenario, plan) == pytest.approx(plan.totals[plan.start], rel=1e-12)
     assert plan.totals[plan.start] == min(plan.totals.values())
     assert set(plan.totals) == {"open", "middle", "pi-gating"}
@@ -64,7 +61,7 @@ def test_plans_are_admissible_and_replayed_exactly(name):
 
 def test_the_bound_is_not_above_the_closed_loop_it_started_from(scenario):
     crowded = replace(scenario, demand=3.0 * scenario.demand)
-    plan = bound.compute(crowded, "bound-pc", starts=[parse("pi-gating")], iterations=200)
+    plan = bound.compute(crowded, "bound-pc", iterations=200)
     # A sigmoid never quite reaches the bounds of u.
     assert plan.totals[plan.start] <= (1.0 + 1e-4) * closed(crowded, PiGating(planning_model(crowded)))
 

@@ -33,10 +33,9 @@ def load(name: str) -> Any:
         module = sys.modules[key] = ModuleType(key)  # dataclasses look up their module there
         module.__file__ = str(path)
         sys.path.append(str(path.parent))  # for modules beside it
+        source = path.read_text(encoding="utf-8")
         try:
-            _located(
-                name, "import", lambda: exec(compile(path.read_text(encoding="utf-8"), path, "exec"), vars(module))
-            )
+            _located(name, "import", lambda: exec(compile(source, path, "exec"), vars(module)))
         except InputError:
             del sys.modules[key]
             raise

@@ -57,13 +57,13 @@ class ControllerType:
 
 def _pair(name: str, text: str, make: Callable, **more: Any) -> list[ControllerType]:
     """Return a controller without ("pc" in its name) and with route guidance ("pcrg")."""
-    variants = ((False, "pc", "perimeter control"), (True, "pcrg", "perimeter control and route guidance"))
-    return [
-        ControllerType(
-            name=name.format(end), text=f"{text}, {acts}", make=partial(make, guidance=guides), guides=guides, **more
-        )
-        for guides, end, acts in variants
-    ]
+    alone: dict[str, Any] = {
+        "name": name.format("pc"),
+        "text": f"{text}, perimeter control",
+        "make": partial(make, guidance=False),
+    }
+    both: dict[str, Any] = {"name": name.format("pcrg"), "text": f"{alone['text']} and route guidance", "guides": True}
+    return [ControllerType(**alone, **more), ControllerType(**both, make=partial(make, guidance=True), **more)]
 
 
 CONTROLLERS: Mapping[str, ControllerType] = {
@@ -129,10 +129,8 @@ class Strategy:
     def regional(self) -> "Strategy":
         """Return the strategy itself. Raise InputError if it has words for a city in SUMO."""
         if self.words:
-            raise InputError(
-                f"strategy {self.name!r}: +{'+'.join(self.words)} needs a city in SUMO (cosim); on the regional model "
-                f"use {self.controller.name}"
-            )
+            remedy = f"needs a city in SUMO (cosim); on the regional model use {self.controller.name}"
+            raise InputError(f"strategy {self.name!r}: +{'+'.join(self.words)} {remedy}")
         return self
 
     def table(self, scenario: Scenario) -> str:
@@ -145,10 +143,8 @@ class Strategy:
         best = [table for table, count in counts.items() if count and count == max(counts.values())]
         if len(best) > 1:
             tables = " and ".join(f'[controllers."{table}"]' for table in best)
-            raise InputError(
-                f"scenario.toml: strategy {self.name!r}: the tables {tables} fit it equally well; add a table "
-                f'[controllers."{self.name}"]'
-            )
+            problem = f'the tables {tables} fit it equally well; add a table [controllers."{self.name}"]'
+            raise InputError(f"scenario.toml: strategy {self.name!r}: {problem}")
         return best[0] if best else name
 
     def make(self, scenario: Scenario, policy: Path | None = None) -> Controller:
@@ -259,8 +255,7 @@ def parse_many(given: str | Sequence[str], scenario: Scenario, *, regional: bool
     """Return the strategies of names and patterns (*, ?, [...]), as a sequence or separated by commas.
 
     A pattern stands for all `ready` strategies that match and are not named besides.
-    regional: for the regional model, without words for a city
-    Raises: InputError for an unknown name, none at all, or a pattern without a match
+    regional: without words for a city; Raises: InputError for an unknown name, none, or a pattern without a match
     """
     names = [name.strip() for name in given.split(",")] if isinstance(given, str) else list(given)
     if not any(names):
@@ -282,9 +277,9 @@ def parse_many(given: str | Sequence[str], scenario: Scenario, *, regional: bool
 def ready(scenario: Scenario) -> list[Strategy]:
     """Return the strategies that can be made for `scenario`: built-in ones, and those with tables or policies."""
     files = sorted(scenario.folder.glob("*+*.pt")) if scenario.folder else []
-    variants = dict.fromkeys([*(file.stem for file in files), *scenario.controller_options])
+    tables = [name for name in scenario.controller_options if "+" in name]
     result = []
-    for name in (*CONTROLLERS, *(name for name in variants if "+" in name)):
+    for name in dict.fromkeys([*CONTROLLERS, *(file.stem for file in files), *tables]):
         try:
             strategy = parse(name)
             strategy.file(scenario)

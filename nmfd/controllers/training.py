@@ -49,10 +49,8 @@ def settings(scenario: Scenario, strategy: Strategy, steps: int | None = None) -
     if kind.options is not Training:
         raise InputError(f"--controller: {strategy.name!r} cannot be trained; choose dpc-pc or dpc-pcrg")
     if table != strategy.name:
-        raise InputError(
-            f'--controller: {strategy.name!r} needs a table [controllers."{strategy.name}"] in {scenario.folder}/'
-            f"scenario.toml with what is different from {kind.name}; add one, or train {kind.name}"
-        )
+        needs = f'needs a table [controllers."{strategy.name}"] in {scenario.where} with its differences'
+        raise InputError(f"--controller: {strategy.name!r} {needs}; add one, or train {kind.name}")
     planning = planning_model(scenario, kind.name, table)
     setup = options(Training, planning, kind.name, table)
     if setup.local and kind.guides:
@@ -63,16 +61,18 @@ def settings(scenario: Scenario, strategy: Strategy, steps: int | None = None) -
 def check(scenario: Scenario, strategy: Strategy) -> RegionalModel:
     """Return the model to train on. Raise InputError without gateways, or for placeholder MFDs."""
     city, believed = scenario.network, strategy.planning(scenario).network
-    file = city.name if city.folder is None else city.folder / "network.toml"
     still = "nmfd.train(..., anyway=True) trains all the same"
     if city.controllable is not None and not city.controllable.any():
-        raise InputError(f"{file}: controllable: is 0 at every boundary: {NO_GATEWAY}; {still}")
+        raise InputError(f"{_file(city)}: controllable: is 0 at every boundary: {NO_GATEWAY}; {still}")
     if believed.placeholder:
-        raise InputError(
-            f"{file if believed.folder is None else believed.folder / 'network.toml'}: placeholder: is true: its MFDs "
-            f"are guesses from lanes and speed limits; run 'cosim identify {city.folder}' or put in your own; {still}"
-        )
+        guess = "is true: its MFDs are guesses from lanes and speed limits"
+        remedy = f"run 'cosim identify {city.folder}' or put in your own"
+        raise InputError(f"{_file(believed)}: placeholder: {guess}; {remedy}; {still}")
     return believed
+
+
+def _file(network: RegionalModel) -> Path | str:
+    return network.name if network.folder is None else network.folder / "network.toml"
 
 
 def available(device: str) -> str:

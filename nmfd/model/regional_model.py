@@ -306,11 +306,9 @@ def check_step(network: RegionalModel, step: float, where: str) -> None:
         if network.exit_rates is not None:
             fastest *= float(network.exit_rates[region].max())
         if step * fastest > 1.0:
-            raise InputError(
-                f"{where}: step: an integration step of {step:g} s is too long for region {region} of network "
-                f"{network.name}, whose vehicles leave at up to {fastest:.3g} 1/s; allowed is at most "
-                f"{1.0 / fastest:.3g} s: raise substeps or shorten step"
-            )
+            problem = f"an integration step of {step:g} s is too long for region {region} of network {network.name}"
+            allowed = f"allowed is at most {1.0 / fastest:.3g} s: raise substeps or shorten step"
+            raise InputError(f"{where}: step: {problem}, whose vehicles leave at {fastest:.3g} 1/s; {allowed}")
 
 
 def network_toml(network: RegionalModel, sumo: Mapping[str, str], comment: str) -> str:

@@ -5,7 +5,7 @@ is not convex: the result is the least total time spent known to be possible, no
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from nmfd import closed_loop
 from nmfd.controllers.open_loop import NAMES, Plan
-from nmfd.controllers.strategy import Strategy, parse
+from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
 from nmfd.model import dynamics
 from nmfd.model.plant import NmfdPlant
@@ -23,34 +23,23 @@ from nmfd.tensors import one_thread
 
 ITERATIONS = 1500
 LEARNING_RATE = 0.15  # of Adam, on logits; decays along a cosine
+Note = Callable[[int, int, str], None]  # takes done, all, note
 INSIDE = 0.02  # distance of starts from the edge of the admissible set, where the gradient is zero
 
 
-def compute(
-    scenario: Scenario,
-    name: str,
-    *,
-    starts: Sequence[Strategy] | None = None,
-    iterations: int = ITERATIONS,
-    progress: Callable[[int, int, str], None] | None = None,
-) -> Plan:
-    """Return the bound `name` ("bound-pc" or "bound-pcrg"), from neutral starts and closed loops.
-
-    starts: strategies of these closed loops; default PI gating and the scenario's own policies
-    """
+def compute(scenario: Scenario, name: str, *, iterations: int = ITERATIONS, progress: Note | None = None) -> Plan:
+    """Return the bound `name` ("bound-pc" or "bound-pcrg"), from neutral starts, PI gating and trained policies."""
     if name not in NAMES:
         raise InputError(f"--controller: {name!r} is no bound; choose one of {', '.join(NAMES)}")
-    guidance, network, steps = NAMES[name], scenario.network, scenario.steps
-    begin = neutral_starts(network, steps, guidance=guidance)
-    if starts is None:
-        policies = ["dpc-pc", "dpc-pcrg"] if guidance else ["dpc-pc"]
-        trained = [policy for policy in policies if scenario.folder and (scenario.folder / f"{policy}.pt").is_file()]
-        starts = [parse(start) for start in [*(["pi-gating"] if scenario.protected else []), *trained]]
-    for strategy in starts:
+    guidance, steps = NAMES[name], scenario.steps
+    begin = neutral_starts(scenario.network, steps, guidance=guidance)
+    policies = ["dpc-pc", "dpc-pcrg"] if guidance else ["dpc-pc"]
+    trained = [policy for policy in policies if scenario.folder and (scenario.folder / f"{policy}.pt").is_file()]
+    for start in [*(["pi-gating"] if scenario.protected else []), *trained]:
         if progress:
-            progress(0, steps, f"closed loop {strategy.name}")
-        result = closed_loop.run(NmfdPlant(scenario), strategy.make(scenario), scenario, seed=0)
-        begin[strategy.name] = result.perimeter, result.splits
+            progress(0, steps, f"closed loop {start}")
+        result = closed_loop.run(NmfdPlant(scenario), parse(start).make(scenario), scenario, seed=0)
+        begin[start] = result.perimeter, result.splits
     return solve(scenario, begin, guidance=guidance, iterations=iterations, progress=progress)
 
 
@@ -76,7 +65,7 @@ def solve(
     *,
     guidance: bool,
     iterations: int = ITERATIONS,
-    progress: Callable[[int, int, str], None] | None = None,
+    progress: Note | None = None,
 ) -> Plan:
     """Return the best plan by separate descents from `starts`: name -> perimeter (T, R, R) and splits (T, R, R, R).
 

@@ -84,9 +84,8 @@ def legend_below(drawing: Figure, axes: Sequence[Axes], columns: int = 4) -> Non
     entries = {label: handle for ax in axes for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
     entries |= {label: entries.pop(label) for label in LAST if label in entries}
     for number in range(min(columns, len(entries)), 0, -1):
-        legend = drawing.legend(
-            entries.values(), entries.keys(), loc="outside lower center", ncols=number, frameon=False
-        )
+        place = dict(loc="outside lower center", ncols=number, frameon=False)
+        legend = drawing.legend(entries.values(), entries.keys(), **place)
         if number == 1 or legend.get_window_extent(drawing.canvas.get_renderer()).width <= drawing.bbox.width:
             return
         legend.remove()
@@ -129,9 +128,8 @@ def mfd(ax: Axes, mfd: Mfd, samples: Mapping[str, np.ndarray] | None = None, *, 
     if clouds:
         largest = max(cloud[:, 0].max() for cloud in clouds.values())
         right = min(right, max(1.5 * mfd.critical, 1.1 * largest))
-        ax.axvspan(
-            largest, max(right, largest), facecolor="none", edgecolor="0.75", hatch="///", linewidth=0, label=UNSEEN
-        )
+        style = dict(facecolor="none", edgecolor="0.75", hatch="///", linewidth=0)
+        ax.axvspan(largest, max(right, largest), label=UNSEEN, **style)
     if seen:
         ax.axvline(mfd.critical, color="0.35", linewidth=1.0, linestyle=":", label=CRITICAL, zorder=1)
     for (label, cloud), tone in zip(clouds.items(), _tones(len(clouds)), strict=True):
@@ -227,14 +225,9 @@ def _curves(
         label = [controller] * (len(groups) > len(plants) or len(plants) == 1)
         label += [PLANT_LABELS.get(plant, plant)] * (len(plants) > 1)
         one = next((row for row, member in zip(values, members, strict=True) if member.seed == seed), None)
-        ax.plot(
-            time,
-            values.mean(axis=0) if one is None else one,
-            color=tones[controller],
-            linewidth=1.6,
-            label=", ".join(label),
-            linestyle=LINE_STYLES[plants.index(plant) % len(LINE_STYLES)],
-        )
+        style = dict(linewidth=1.6, linestyle=LINE_STYLES[plants.index(plant) % len(LINE_STYLES)])
+        shown = values.mean(axis=0) if one is None else one
+        ax.plot(time, shown, color=tones[controller], label=", ".join(label), **style)
         if len(members) > 1:
             low, high, alpha = values.min(axis=0), values.max(axis=0), 0.2 if len(groups) < 4 else 0.1
             ax.fill_between(time, low, high, color=tones[controller], alpha=alpha, linewidth=0)

@@ -100,11 +100,8 @@ class CompactPolicy(Policy):
         if not self.architecture.guidance:
             return None
         numbers, full = self._read(), self._full(x)
-        return torch.where(
-            self.held,
-            numbers.price * (full - numbers.price_from).clamp(min=0.0),
-            numbers.elsewhere * (full - numbers.elsewhere_from).clamp(min=0.0),
-        )
+        elsewhere = numbers.elsewhere * (full - numbers.elsewhere_from).clamp(min=0.0)
+        return torch.where(self.held, numbers.price * (full - numbers.price_from).clamp(min=0.0), elsewhere)
 
     def metering(self, x: PerPair) -> PerRegion | None:
         """Return the largest rates of departures in each region (veh/s, (..., R)); None without metering."""
@@ -147,7 +144,6 @@ class CompactPolicy(Policy):
             extra = here + torch.einsum("hgj,...gj->...hj", self.own, extra) * p.off_diagonal
         costs = extra.unsqueeze(-3) + torch.zeros_like(self.own)
         least = torch.where(self.own > 0, costs, torch.inf).amin(-2, keepdim=True)
-        weight = self.own * torch.exp(
-            -(costs - torch.where(least.isfinite(), least, 0.0)).clamp(min=0.0) / DISPERSION_S
-        )
+        more = (costs - torch.where(least.isfinite(), least, 0.0)).clamp(min=0.0)
+        weight = self.own * torch.exp(-more / DISPERSION_S)
         return weight / weight.sum(-2, keepdim=True).clamp(min=1e-9)

@@ -90,13 +90,11 @@ class Policy(nn.Module):
         perimeter, splits = self.listed(x)
         if not self.architecture.listed:
             return perimeter, splits
-        onward, shape = self.onward, (self.regions,) * 2
-        perimeter = perimeter.new_zeros(*x.shape[:-2], *shape).scatter_add(-1, onward.expand_as(perimeter), perimeter)
+        onward, empty = self.onward, perimeter.new_zeros(*x.shape[:-2], self.regions, self.regions)
         if splits is not None:
-            splits = splits.new_zeros(*x.shape[:-2], self.regions, *shape).scatter_add(
-                -2, onward.unsqueeze(-1).expand_as(splits), splits
-            )
-        return perimeter, splits
+            turns = empty.unsqueeze(-1).repeat_interleave(self.regions, -1)
+            splits = turns.scatter_add(-2, onward.unsqueeze(-1).expand_as(splits), splits)
+        return empty.scatter_add(-1, onward.expand_as(perimeter), perimeter), splits
 
     def listed(
         self, x: PerPair, memory: Memory | None = None
@@ -162,10 +160,8 @@ class DpcController:
             x = torch.from_numpy(accumulation if policy.architecture.local else accumulation.astype(np.float32))
             self._memory = policy.remember(x, self._memory)
             perimeter, splits = policy.listed(x, self._memory)
-            prices, metering = (
-                None if values is None else values.numpy().astype(float)
-                for values in (policy.prices(x), policy.metering(x))
-            )
+            rates = policy.prices(x), policy.metering(x)
+            prices, metering = (None if values is None else values.numpy().astype(float) for values in rates)
         perimeter = perimeter.numpy()
         if splits is not None:
             splits = splits.numpy().astype(float)

@@ -46,11 +46,10 @@ def load_policy(path: Path, network: RegionalModel) -> tuple[Policy, dict]:
     try:
         names = {field.name for field in fields(Architecture)}
         architecture = Architecture(**{key: value for key, value in content["architecture"].items() if key in names})
-        if content["network_hash"] != network.hash and not architecture.local:
-            raise InputError(
-                f"{path}: network_hash: the policy was trained for network {content['network']!r} "
-                f"({content['network_hash']}), not for {network.name!r} ({network.hash}); train one with 'nmfd train'"
-            )
+        if (trained := content["network_hash"]) != network.hash and not architecture.local:
+            other = f"the policy was trained for network {content['network']!r} ({trained}), not for"
+            remedy = "train one with 'nmfd train'"
+            raise InputError(f"{path}: network_hash: {other} {network.name!r} ({network.hash}); {remedy}")
         policy = new_policy(network, architecture)
         policy.load_state_dict(content["weights"])
     except (KeyError, TypeError, RuntimeError):
