@@ -15,7 +15,7 @@ from streets import seen
 from cosim.plant import guidance
 from cosim.plant.guidance import Guide
 from cosim.plant.meter import Event
-from cosim.plant.routes import MOST_NODES, Home, Moves, Searches, Trees, Ways
+from cosim.plant.routes import MOST_NODES, Moves, Searches, Trees, Ways
 
 EDGES, REGION = 40, np.repeat([0, 1, 2, 3], 10)
 
@@ -137,19 +137,19 @@ def test_ways_that_come_back_are_found_where_they_are_the_fastest_of_all(city, w
 def test_ways_home_are_the_fastest_up_to_a_limit(city, kept):
     first, second, turn, time = city
     exact = least(city, np.full(EDGES, True))
-    home = Home(Moves(first, second, allowed=np.full(EDGES, True), reverse=True), time, turn, Searches(kept))
+    home = Trees(Moves(first, second, allowed=np.full(EDGES, True), reverse=True), time, turn, Searches(kept))
     turns = {(int(a), int(b)): extra for a, b, extra in zip(first, second, turn, strict=True)}
     for most in (60.0, np.inf, 100.0):
         for here in range(EDGES):
             for target in range(EDGES):
-                expected = exact[here, target] if exact[here, target] <= most else np.inf
-                assert home.cost(here, target, most) == pytest.approx(expected)
-                if np.isfinite(expected):
-                    way = home.route(here, target)
+                cost = home.costs(target, most)[here]
+                if exact[here, target] > most:
+                    assert cost > most
+                elif np.isfinite(exact[here, target]):
+                    way = home.back(target, here)
                     assert (way[0], way[-1]) == (here, target)
-                    assert sum(turns[move] + time[move[1]] for move in zip(way[:-1], way[1:], strict=True)) == (
-                        pytest.approx(expected)
-                    )
+                    takes = sum(turns[move] + time[move[1]] for move in zip(way[:-1], way[1:], strict=True))
+                    assert cost == pytest.approx(exact[here, target]) == takes
 
 
 # A main road a m b t of 10 s each, of which m is in another region, and the side street s of `side` s from a to t.

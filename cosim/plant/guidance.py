@@ -25,7 +25,7 @@ from typing import TypeAlias
 import numpy as np
 
 from cosim.plant.meter import Event
-from cosim.plant.routes import Home, Moves, Searches, TravelTimes, Trees, Ways
+from cosim.plant.routes import Moves, Searches, TravelTimes, Trees, Ways
 from cosim.plant.sampling import StreetMeans
 from cosim.plant.stuck import QUEUE_END_M, Lanes
 from cosim.sumo.arrays import PerEdge, PerGateway
@@ -211,14 +211,14 @@ class Guide:
         event, region = visit.event, 0 if self._ways_return else visit.event.region
         told, true = (self._home(region, visit.taste, free) for free in (self._free(event.destination), self._unpriced))
         present = self._present(event.vehicle, here, told.time)
-        cost = told.cost(here, target, self._worth(present) + 1.0)
+        cost = told.costs(target, self._worth(present) + 1.0)[told.number[here]]
         if here == target or not np.isfinite(cost) or self._keeps(present, cost):
             return
-        way = told.route(here, target)
+        way = told.back(target, here)
         if told is not true:
             takes = self._takes(way, true.time)
-            if true.cost(here, target, takes) < takes - self._most_detour:
-                way = true.route(here, target)
+            if true.costs(target, takes)[true.number[here]] < takes - self._most_detour:
+                way = true.back(target, here)
         self._send(event.vehicle, way)
 
     def _guide_on(self, visit: _Visit, here: int, target: int) -> None:
@@ -372,8 +372,8 @@ class Guide:
         prices[list(free)] = 0.0
         return self._times.edges * (1.0 + prices)[self._region] * self._taste[taste]
 
-    def _home_from(self, region: int, taste: int, free: tuple[int, ...]) -> Home:
-        return Home(self._homeward[region], self._seen(taste, free), self._times.turns, self._searches)
+    def _home_from(self, region: int, taste: int, free: tuple[int, ...]) -> Trees:
+        return Trees(self._homeward[region], self._seen(taste, free), self._times.turns, self._searches)
 
     def _ways_from(self, region: int, taste: int, free: tuple[int, ...]) -> Ways:
         first, second, move, following = self._gateways[region]

@@ -178,19 +178,6 @@ class Trees:
         return self._moves.path(tree[2], int(self.number[end]), int(self.number[begin]))
 
 
-class Home(Trees):
-    """Fastest ways to single edges, by reversed moves."""
-
-    def cost(self, here: int, target: int, most: float) -> float:
-        """Return [s] from the end of edge `here` to the end of edge `target`, infinite above `most`."""
-        cost = self.costs(target, most)[self.number[here]]
-        return float(cost) if cost <= most else np.inf
-
-    def route(self, here: int, target: int) -> list[int]:
-        """Return the edges from `here` to `target`, after `cost`."""
-        return self.back(target, here)
-
-
 class Ways:
     """Fastest ways out of one region by each of its G gateways (first[g] -> second[g], into next_region[g]).
 
