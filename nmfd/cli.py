@@ -344,7 +344,7 @@ def new_controller(file: Path) -> None:
 @click.option("--adjacency", type=FILE, metavar="CSV|TOML", help="Table region,neighbour, or a network.toml.")
 @click.option("--trip-length", type=float, metavar="M", help="Mean trip length in a region. [default: from its size]")
 @click.option("--city", metavar="NAME", help="City, if the tables hold several.")
-@click.option("--skip-bad", is_flag=True, help="Leave out rows with a missing or impossible number, and count them.")
+@click.option("--skip-bad", is_flag=True, help="Leave out doubled rows and impossible numbers, and count them.")
 @click.option("--out", type=FOLDER, required=True, metavar="DIR", help="Folder of the network, a new one.")
 def identify(counts: Path, out: Path, **options: Any) -> None:
     """Fit a network to counts and occupancies of detectors.

@@ -120,10 +120,9 @@ def _reasons(level: Level, scenario: Scenario, name: str, against: str, *, gains
 
 def _never_reached(strategy: Strategy, scenario: Scenario, runs: Sequence[Result]) -> list[str]:
     """Return the gates whose region never reached its set point, in any run."""
-    if not issubclass(strategy.controller.options, Gating):
+    gate = strategy.make(scenario) if strategy.controller.options is Gating else None
+    if not isinstance(gate, PiGating):
         return []
-    gate = strategy.make(scenario)
-    assert isinstance(gate, PiGating)
     most = np.max([run.accumulation.sum(axis=2).max(axis=0) for run in runs], axis=0)
     return [
         f"{scenario.network.region_names[region]} never reaches the set point of its gate, {goal:.0f} vehicles, with "

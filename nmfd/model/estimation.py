@@ -10,11 +10,9 @@ demand, and of the expansion of the loop detectors. The readings of a control in
 counts, probes) are predicted together with the state at its end. The covariance follows from counting vehicles: every
 flow is Poisson, and a probe that moves is one of the vehicles that move.
 
-Bounds: no cell holds fewer vehicles than its probes. An estimate below is projected on the bounds in the metric of its
-covariance (Simon, "Kalman filtering with state constraints", IET Control Theory and Applications 4, 2010).
-
-Integrated by forward Euler in the scenario's substeps. The Jacobian is taken by forward differences in one batch of R^2
-rollouts: a few milliseconds for 7 regions, not meant for hundreds.
+Bounds: no cell holds fewer vehicles than its probes (Simon, "Kalman filtering with state constraints", IET Control
+Theory and Applications 4, 2010). Forward Euler in the scenario's substeps; the Jacobian by forward differences in one
+batch of R^2 rollouts: a few milliseconds for 7 regions, not meant for hundreds.
 """
 
 from dataclasses import dataclass

@@ -85,7 +85,7 @@ def identify(
     out: folder of the network, whose name it gets
     adjacency: csv file region,neighbour, or a network.toml of the same regions; None: by the detectors' positions
     city: of several in the tables
-    skip_bad: leave out rows with missing or impossible numbers
+    skip_bad: leave out doubled rows and those with missing or impossible numbers
     trip_length: mean trip length within a region [m]; None: assumed from the size of the region
 
     Raises InputError, before anything is written.
