@@ -16,6 +16,7 @@ from cosim.evaluation import evaluate as evaluation
 from cosim.evaluation import identify as identification
 from cosim.evaluation import model_validation, results, statistics
 from cosim.evaluation.runs import runs_of
+from cosim.evaluation.signal_proof import sheets
 from cosim.evaluation.simulate import Simulation, simulate
 from cosim.importing import get as cities
 from cosim.importing.case import parse_box, seconds
@@ -115,7 +116,13 @@ def run_controllers(
         finished = results.read(out)
         there = [level.read(*name) for level in finished.levels for name in level.runs]
         draw_accumulations(out, loaded, there)
-    return f"{statistics.text(finished.rows)}\nWritten to {out}"
+        write_table(out / "signals.csv", sheets(there), float_format="%g")
+    wrong = [
+        f"{run.controller}: signals break their rules {run.signal_violations} times, see {out / 'signals.csv'}"
+        for run in there
+        if run.signal_violations
+    ]
+    return "\n".join([statistics.text(finished.rows), *wrong, f"Written to {out}"])
 
 
 def demo(out: Path, *, seed: int = 1000) -> str:

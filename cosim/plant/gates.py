@@ -46,7 +46,7 @@ class GatewaySignal:
         self._original = [phase.duration for phase in programme.phases]
         self._movements = {link: _Movement(pair) for link, pair in movements.items()}
         self._redistribute, self._cycle = redistribute, programme.cycle
-        self._walking = walking(programme.phases)
+        self._least = least_times(programme.phases)
         self._windows = {link: _windows(programme, link) for link in movements}
         self._yellow = {link: yellow_time(programme.phases, link) for link in movements}
         self._cycle_start = start - programme.position
@@ -85,14 +85,14 @@ class GatewaySignal:
         shares: dict[int, float] = {}
         for link, movement in self._movements.items():
             for phase, state in enumerate(self._states):
-                if state[link] in GREEN and "y" not in state and phase not in self._walking:
+                if state[link] in GREEN and "y" not in state:
                     shares[phase] = max(shares.get(phase, 0.0), movement.share)
         takers = [phase for phase, state in enumerate(self._states) if phase not in shares and is_stage(state)]
         if not takers:
             return self._original
         durations = list(self._original)
         for phase, share in shares.items():
-            least = min(MIN_GREEN_S, durations[phase])
+            least = self._least[phase]
             durations[phase] = least + float(round(share * (durations[phase] - least)))
         freed = sum(self._original) - sum(durations)
         weights = [self._original[phase] for phase in takers]
@@ -109,7 +109,8 @@ class GatewaySignal:
                 movement.open, movement.cut_at = True, NEVER
                 if self._shown:  # the window during which control starts is left whole
                     least = min(MIN_GREEN_S, full)
-                    kept = full if movement.share >= 1.0 else least + round(movement.share * (full - least))
+                    most = full - self._yellow[link] if always else full  # its yellow ends with the cycle
+                    kept = full if movement.share >= 1.0 else min(least + round(movement.share * (full - least)), most)
                     movement.opened_at, movement.cut_at = now, now + kept
             if now < movement.cut_at:
                 return base, movement.cut_at
@@ -154,11 +155,14 @@ def ends_bare(phases: Sequence[Phase]) -> set[int]:
     return {k for a, b in changes for k in range(len(b)) if a[k] in GREEN and b[k] == "r"}
 
 
-def walking(phases: Sequence[Phase]) -> set[int]:
-    """Return the phases in which a crossing is green, or has just been green: they last as long as originally."""
+def least_times(phases: Sequence[Phase]) -> list[float]:
+    """Return the least time of every phase [s]: of a stage the minimum green, if no crossing is green or cleared."""
     bare = ends_bare(phases)
-    green = {n for n, phase in enumerate(phases) if any(phase.state[link] in GREEN for link in bare)}
-    return green | {(n + 1) % len(phases) for n in green}
+    walks = [any(phase.state[link] in GREEN for link in bare) for phase in phases]
+    return [
+        min(phase.duration, MIN_GREEN_S if is_stage(phase.state) and not (walks[n] or walks[n - 1]) else NEVER)
+        for n, phase in enumerate(phases)
+    ]
 
 
 def run_length(phases: Sequence[Phase], first: int, link: int, lights: Collection[str]) -> float:
@@ -277,7 +281,7 @@ class ResponsiveSignal:
             )
             for link, pair in movements.items()
         }
-        self._walking = walking(phases)
+        self._least = least_times(phases)
         self._always = {link for link in movements if all(phase.state[link] in GREEN for phase in phases)}
         self._base, self._since, self._next, self._held, self._limited = "", start, start, False, False
 
@@ -317,13 +321,10 @@ class ResponsiveSignal:
     def _hold(self, state: str, now: float) -> None:
         """Show `state` from the first limit on; give the signal back to SUMO in the midst of a stage after the last."""
         # A stage that has just begun could end too early, one step behind SUMO.
-        crossed = [self.phases[n].duration for n in self._walking if self.phases[n].state == state]
+        least = [time for phase, time in zip(self.phases, self._least, strict=True) if phase.state == state]
         limited = self._limited or any(ration.limited for ration in self._rations.values())
-        again = (
-            NEVER
-            if limited or state != self._base or not is_stage(state)
-            else self._since + max(MIN_GREEN_S, *crossed, 0.0)
-        )
+        ends = not limited and state == self._base and is_stage(state)
+        again = self._since + max(MIN_GREEN_S, *least, 0.0) if ends else NEVER
         self._held = now < again - 1e-6
         if self._held:
             self._show(self.signal, state)

@@ -215,7 +215,7 @@ class SumoPlant:
 
     def signal_states(self) -> dict[str, list[tuple[float, str]]]:
         """Return signal -> time [s] and state at every change since the reset."""
-        return {signal: states[1:] for signal, states in self._actuation.states.items()}
+        return self._actuation.states
 
     def leaks(self) -> list[Gateway]:
         """Return the gateways that no command reaches."""

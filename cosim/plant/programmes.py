@@ -8,19 +8,18 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from xml.etree.ElementTree import ElementTree
+from xml.etree.ElementTree import Element, ElementTree
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import sumo
 
-from cosim.plant.gates import MIN_GREEN_S, walking
+from cosim.plant.gates import MIN_GREEN_S, least_times
 from cosim.plant.settings import ACTUATED, FIXED, PRESSURES, Settings, check_lanes, own_files, settings
 from cosim.sumo.build import network_folder
 from cosim.sumo.net import City
-from cosim.sumo.session import Phase
 from cosim.sumo.signals import FIXED as FIXED_TIME
-from cosim.sumo.signals import HELD, Signal, is_stage, read_signals
+from cosim.sumo.signals import HELD, Signal, phases_of, read_signals
 from cosim.sumo.xml_files import attribute, read_xml
 from nmfd.controllers.strategy import Strategy
 from nmfd.errors import InputError
@@ -28,7 +27,7 @@ from nmfd.model.scenario import Scenario
 from nmfd.runs import shipped
 from nmfd.runs.files import temporary_folder, write_text
 
-ACTUATED_MIN_GREEN_S, ACTUATED_MAX_GREEN_S = 5.0, 50.0  # netconvert's defaults
+ACTUATED_MAX_GREEN_S = 50.0  # netconvert's default
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,10 +82,9 @@ def write_actuated(path: Path, signals: Iterable[Signal]) -> None:
         rows.append(
             f'  <tlLogic id={quoteattr(signal.id)} type="actuated" programID="plan" offset="{signal.offset:g}">\n'
         )
-        for n, phase in enumerate(signal.phases):
+        for n, (phase, low) in enumerate(zip(signal.phases, least_times(signal.phases), strict=True)):
             fixed, limits = phase.duration, ""
-            low = fixed if n in walking(signal.phases) else min(ACTUATED_MIN_GREEN_S, fixed)
-            high = max(min(1.5 * fixed, ACTUATED_MAX_GREEN_S), ACTUATED_MIN_GREEN_S)
+            high = max(min(1.5 * fixed, ACTUATED_MAX_GREEN_S), MIN_GREEN_S, low)
             if n in signal.stages and low != high:
                 limits = f' minDur="{low:g}" maxDur="{high:g}"'
             rows.append(f'    <phase duration="{fixed:g}"{limits} state="{phase.state}"/>\n')
@@ -146,29 +144,22 @@ def optimised_plans(
 
 
 def _keep_times(plan: Path, net_file: Path) -> None:
-    """Lengthen yellow and red to those of the network's programmes, and greens to the minimum, within the same cycle.
+    """Lengthen phases of a plan to their least times in the network's programmes, within the same cycle.
 
-    The seconds come from the phases that exceed their least time most.
+    The seconds come from the phases that exceed theirs most.
     """
-    originals: dict[tuple[str, ...], list[Phase]] = {}
-    for logic in read_xml(net_file).iter("tlLogic"):
-        phases = [Phase(duration=float(attribute(row, "duration")), state=attribute(row, "state")) for row in logic]
-        originals[(attribute(logic, "id"), *(phase.state for phase in phases))] = phases
+
+    def key(logic: Element) -> tuple[str, ...]:
+        return attribute(logic, "id"), *(phase.state for phase in phases_of(logic))
+
+    least_of = {key(logic): np.array(least_times(phases_of(logic))) for logic in read_xml(net_file).iter("tlLogic")}
     root = read_xml(plan)
     for logic in root.iter("tlLogic"):
-        rows = list(logic)
-        phases = originals[(attribute(logic, "id"), *(attribute(row, "state") for row in rows))]
-        planned, kept = [float(attribute(row, "duration")) for row in rows], walking(phases)
-        least = np.array(
-            [
-                min(phase.duration, MIN_GREEN_S) if is_stage(phase.state) and n not in kept else phase.duration
-                for n, phase in enumerate(phases)
-            ]
-        )
+        planned, least = np.array([phase.duration for phase in phases_of(logic)]), least_of[key(logic)]
         seconds = np.maximum(planned, least)
-        while (missing := seconds.sum() - sum(planned)) > 1e-6 and (seconds > least).any():
+        while seconds.sum() > planned.sum() + 1e-6 and (seconds > least).any():
             longest = np.argmax(seconds - least)
-            seconds[longest] -= min(1.0, missing, seconds[longest] - least[longest])
-        for row, duration in zip(rows, seconds, strict=True):
+            seconds[longest] -= min(1.0, seconds.sum() - planned.sum(), seconds[longest] - least[longest])
+        for row, duration in zip(logic.iter("phase"), seconds, strict=True):
             row.set("duration", f"{duration:g}")
     ElementTree(root).write(plan)

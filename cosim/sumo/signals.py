@@ -88,13 +88,19 @@ def read_signals(
     return [signal for signal in signals.values() if signal], [name for name, s in signals.items() if s is None]
 
 
+def phases_of(logic: ElementTree.Element) -> tuple[Phase, ...]:
+    """Return the phases of a <tlLogic>."""
+    rows = logic.iter("phase")
+    return tuple(Phase(duration=float(attribute(row, "duration")), state=attribute(row, "state")) for row in rows)
+
+
 def _simple(
     logic: ElementTree.Element, links: tuple[Link, ...], others: tuple[Link, ...], kinds: Collection[str]
 ) -> Signal | None:
     rows = list(logic.iter("phase"))
     if logic.get("type", FIXED) not in kinds or any(row.get("next") for row in rows) or not links:
         return None
-    phases = tuple(Phase(duration=float(attribute(row, "duration")), state=attribute(row, "state")) for row in rows)
+    phases = phases_of(logic)
     signal = Signal(
         id=attribute(logic, "id"), offset=float(logic.get("offset", 0.0)), phases=phases, links=links, others=others
     )
