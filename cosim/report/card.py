@@ -11,11 +11,11 @@ from cosim.report.figures import ranked
 from nmfd.studies.benchmark import REFERENCE
 
 MINUTE, HOUR = 60.0, 3600.0  # s
-QUANTITIES = {  # label -> format of a value, sign of an improvement, meaning
-    "Time per trip": ("{:.1f} min", -1, "mean of all trips, from the wanted departure to the arrival or end of run"),
-    "Trips served": ("{:,.0f}", 1, "completed trips, mean over seeds"),
-    "CO2": ("{:.2f} t", -1, "of all vehicles while the run lasted, by SUMO's HBEFA4 petrol car"),
-    "Total time spent": ("{:,.0f} veh h", -1, "private vehicles on the road and waiting to enter, mean over seeds"),
+QUANTITIES = {  # label -> column, its unit on the card, format of a value, sign of an improvement, meaning
+    "Time per trip": ("mean_trip_time_s", MINUTE, "{:.1f} min", -1, "from wanted departure to end of trip or run"),
+    "Trips served": ("completed_veh", 1.0, "{:,.0f}", 1, "completed trips, mean over seeds"),
+    "CO2": ("co2_kg", 1000.0, "{:.2f} t", -1, "of all vehicles while the run lasted, by SUMO's HBEFA4 petrol car"),
+    "Total time spent": (statistics.TTS, HOUR, "{:,.0f} veh h", -1, "private vehicles on the road or waiting to enter"),
 }
 
 
@@ -38,24 +38,17 @@ def card(rows: pd.DataFrame) -> tuple[str, list[Figure], str]:
     """
     against, level = statistics.compared_with(rows), rows["demand"].iloc[0]
     name = next((name for name in ranked(rows) if name != against), against)
-    values = (
-        rows["mean_trip_time_s"] / MINUTE,
-        rows["completed_veh"],
-        rows["co2_kg"] / 1000.0,
-        rows[statistics.TTS] / HOUR,
-    )
-    table = rows.assign(**dict(zip(QUANTITIES, values, strict=True)))
-    figures = [_figure(table, level, name, against, label) for label in QUANTITIES]
+    figures = [_figure(rows, level, name, against, label) for label in QUANTITIES]
     heading = name if name == against else f"{name} compared with {against.replace('-', ' ')}"
     return heading, [figure for figure in figures if figure is not None], name
 
 
-def _figure(table: pd.DataFrame, level: float, name: str, against: str, label: str) -> Figure | None:
+def _figure(rows: pd.DataFrame, level: float, name: str, against: str, label: str) -> Figure | None:
     """Return one figure, None if it was not recorded."""
-    form, good, meaning = QUANTITIES[label]
-    now, before = (statistics.by_seed(table, level, one, label) for one in (name, against))
+    column, unit, form, good, meaning = QUANTITIES[label]
+    now, before = (statistics.by_seed(rows, level, one, column) for one in (name, against))
     common = [seed for seed in now if seed in before]
-    value = mean([now[seed] for seed in common or now])
+    value = mean([now[seed] for seed in common or now]) / unit
     if math.isnan(value):
         return None
     pair = statistics.paired(now, before)
@@ -67,7 +60,7 @@ def _figure(table: pd.DataFrame, level: float, name: str, against: str, label: s
     than = "without control" if against == REFERENCE else f"under {against}"
     return replace(
         figure,
-        before=f"{form.format(mean([before[seed] for seed in common]))} {than}",
+        before=f"{form.format(mean([before[seed] for seed in common]) / unit)} {than}",
         change=f"{pair.percent:+.0f} %{spread}",
         better=pair.percent * good > 0 if pair.excludes_zero else None,
     )

@@ -102,7 +102,7 @@ class RegionalEnv(gymnasium.Env):
 
     The reward of an interval is minus the unfinished trips when it begins, in `unit` (the sum of the critical
     accumulations): total time spent = - sum of rewards * unit * scenario.step. `info` holds time_s,
-    total_time_spent_veh_s and completed_veh. A seed gives the closed loop of nmfd.run with the same seed.
+    total_time_spent_veh_s (in SUMO sampled per interval) and completed_veh. A seed gives the closed loop of nmfd.run.
 
     scenario: or its folder; plant: the NMFD if None, closed with the environment; guidance: see Interface
     """
