@@ -1,13 +1,11 @@
 """Proof sheet of the signals of a run: what each showed, against its original programmes.
 
 A green lasts MIN_GREEN_S or as long as originally, that of a crossing as long as originally. After a green comes the
-original yellow, YELLOW_S where the programme ends no green. Links are green together, and have the right of way
-together, only if a programme shows it. Between the greens of others lies the original time. Of several
-programmes the one counts that fits best. The sheet shares no code with the controllers, and reads what SUMO shows. It
-leaves out signals whose states are not phases, such as NEMA's.
+original yellow, YELLOW_S where the programme ends no green. Links are green, and have the right of way, together only
+if the programme shows it. Between the greens of others lies the original time. Of several programmes, the one that fits
+best counts. The sheet shares no code with the controllers, and leaves out signals whose states are no phases (NEMA).
 """
 
-from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from xml.etree.ElementTree import Element
@@ -86,9 +84,8 @@ class Rules:
         green, yellow = np.isin(lights, ["G", "g"]), lights == "y"
         shortest = "duration" if logic.get("type") == "static" else "minDur"
         duration = [float(phase.get(shortest) or attribute(phase, "duration")) for phase in phases]
-        after = [
-            [*map(int, phase.get("next", "").split())] or [(n + 1) % len(phases)] for n, phase in enumerate(phases)
-        ]
+        after = [list(map(int, phase.get("next", "").split())) for phase in phases]
+        after = [others or [(n + 1) % len(phases)] for n, others in enumerate(after)]
         steps = [(n, m) for n, others in enumerate(after) for m in others]
 
         def least(first: np.ndarray, then: np.ndarray) -> np.ndarray:
@@ -147,10 +144,9 @@ class Rules:
             gap = time[rows] - ended[rows]
             early += np.count_nonzero((apart & ~green[rows] & (gap < self.between[:, link])).any(axis=1))
         conflicts = 0
-        for state, count in Counter(state for _, state in states).items():
-            on, first = (np.isin(list(state), kinds) for kinds in (["G", "g"], ["G"]))
+        for on, first in zip(green, lights == "G", strict=True):
             pairs = self.apart & np.outer(on, on) | self.yielding & np.outer(first, first)
-            conflicts += count * np.count_nonzero(np.triu(pairs, 1))
+            conflicts += np.count_nonzero(np.triu(pairs, 1))
         return (
             _least(lasted[ends]),
             _least(lasted[over]),
@@ -173,4 +169,4 @@ def _latest(events: np.ndarray, time: np.ndarray) -> np.ndarray:
 
 
 def _least(times: np.ndarray) -> float:
-    return float(times.min(initial=np.inf, where=np.isfinite(times))) if np.isfinite(times).any() else np.nan
+    return float(min(times[np.isfinite(times)], default=np.nan))

@@ -134,8 +134,8 @@ class MaxPressure:
     def _pressure(self, present: np.ndarray) -> np.ndarray:
         weight = np.maximum(self._weights @ present, 0.0)
         for junction in self._rationed:
-            for movement in junction.exhausted():
-                weight[self._movements[movement]] = 0.0
+            for link in junction.exhausted_links():
+                weight[self._movements[junction.movement[link]]] = 0.0
         return self._gain @ weight + self._apart @ present
 
 
@@ -143,6 +143,7 @@ class Junction:
     """The states of one signal, second by second: a stage, or the transition between two stages.
 
     stages: their number; stage: the present or coming one; stage_since: time at which it begins [s]
+    movement: link index -> (edge, next edge)
     rations: link index -> limit of the green of a gateway link
     lost: [s] between stages so far; next_change: time of the next `advance` [s]
     """
@@ -152,18 +153,11 @@ class Junction:
         self.signal, self._phases, self._numbers = signal.id, signal.phases, stages_of(signal)
         self.stages, self.stage = len(self._numbers), 0
         self._base = signal.phases[self._numbers[0]].state
-        phases, bare = signal.phases, ends_bare(signal.phases)
-        self._least = [  # time of a stage: the longest green of its crossings
-            max(
-                [MIN_GREEN_S]
-                + [
-                    run_length(phases, n, k, GREEN)
-                    for n in range(len(phases))
-                    for k in bare
-                    if phases[stage].state[k] in GREEN
-                ]
-            )
-            for stage in self._numbers
+        phases = signal.phases
+        crossed = {k: max(run_length(phases, n, k, GREEN) for n in range(len(phases))) for k in ends_bare(phases)}
+        self._least = [  # of every stage [s]
+            max([MIN_GREEN_S, *(green for k, green in crossed.items() if phases[n].state[k] in GREEN)])
+            for n in self._numbers
         ]
         self._green_since, self.stage_since = now, now
         cycle = sum(phase.duration for phase in signal.phases)
@@ -171,7 +165,7 @@ class Junction:
             link: Ration(pair, cycle=cycle, yellow=yellow_time(signal.phases, link), start=now)
             for link, pair in (gateways or {}).items()
         }
-        self._movement = {link.index: (link.from_edge, link.to_edge) for link in signal.links}
+        self.movement = {link.index: (link.from_edge, link.to_edge) for link in signal.links}
         self._coming: list[tuple[float, str]] = []
         self._between: dict[tuple[int, int], list[Phase]] = {}  # stage, next stage -> phases between them
         self.lost, self.state = 0.0, self._base
@@ -185,10 +179,6 @@ class Junction:
     def green_time(self, now: float) -> dict[int, float]:
         """Return the green of every gateway link before `now` [s]."""
         return {link: ration.green_time(now) for link, ration in self.rations.items()}
-
-    def exhausted(self) -> set[tuple[str, str]]:
-        """Return (edge, next edge) of the gateway movements without more green in this cycle."""
-        return {self._movement[link] for link in self.exhausted_links()}
 
     def exhausted_links(self) -> list[int]:
         """Return the gateway links without more green in this cycle."""
