@@ -10,6 +10,7 @@ import re
 import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -31,17 +32,7 @@ from nmfd.model.scenario import Scenario
 from nmfd.runs import config, files, shipped
 from nmfd.runs.run_many import raise_failures, run_many
 from nmfd.runs.tables import wrapped
-from nmfd.studies import plots
-from nmfd.studies.fit_quality import (
-    fit_table,
-    nearly_empty,
-    own_points,
-    prediction_table,
-    predictions,
-    region_fits,
-    with_guesses,
-    write_fits,
-)
+from nmfd.studies import fit_quality, plots
 from nmfd.types import Result
 
 PATHS = ("recipe", "net", "regions")  # keys of [sumo] in network.toml
@@ -97,11 +88,8 @@ def identify(
         strategy, tables = parse("+".join([stages[stage], *options])), loaded.controller_options
         table = strategy.table(loaded)
         tuned = replace(loaded, controller_options={**tables, table: {**tables.get(table, {}), **setup}})
-        runs = [
-            run
-            for level in levels
-            for run in runs_of(tuned, [strategy], seeds, demand=level, folder=f"level-{level:g}")
-        ]
+        each = (runs_of(tuned, [strategy], seeds, demand=level, folder=f"level-{level:g}") for level in levels)
+        runs = list(chain.from_iterable(each))
         show = _named(progress, f"loading runs {stage + 1} of 2; ")
         raise_failures(run_many(runs, out, workers=workers, scheduler=scheduler, progress=show))
         return [Result.read(out / run.file) for run in runs]
@@ -110,28 +98,26 @@ def identify(
     static = static_model(loaded, first, guided=guided)
     second = load(1, set_point=tuple(static.mfds[region].critical for region in loaded.protected))
     runs = [*first, *second]
-    scheme: dict = {"step": loaded.step, "substeps": loaded.substeps, "integrator": loaded.integrator}
 
     def fitted(runs: Sequence[Result], samples: Sequence[dict]) -> RegionalModel:
-        fitting = _named(progress, "fitting, ")
-        seen = [observed(run) for run in runs]
-        model = identification.fit(static, seen, iterations=iterations, progress=fitting, **scheme)
-        return as_it_was(static, model, nearly_empty(samples))
+        fitting, seen = _named(progress, "fitting, "), list(map(observed, runs))
+        model = identification.fit(static, seen, iterations=iterations, progress=fitting, **loaded.scheme)
+        return as_it_was(static, model, fit_quality.nearly_empty(samples))
 
     samples = samples_of(static, runs)
     model = fitted(runs, samples)
     states, lane_km = [run.accumulation for run in runs], city_lane_km(city_of(static))
-    model = with_guesses(model, samples, lane_km, states, fastest=loaded.substeps / loaded.step)
-    fits = region_fits(model, samples, states, seeds=len(seeds), lane_km=lane_km)
-    text, errors = fit_table(model, fits), None
+    model = fit_quality.with_guesses(model, samples, lane_km, states, fastest=loaded.substeps / loaded.step)
+    fits = fit_quality.region_fits(model, samples, states, seeds=len(seeds), lane_km=lane_km)
+    text, errors = fit_quality.fit_table(model, fits), None
     if len(seeds) > 1:  # the last seed is held out once
         kept = [run for run in runs if run.seed != seeds[-1]]
         without = replace(fitted(kept, samples_of(static, kept)), critical_above=model.critical_above)
         unseen = [observed(run) for run in runs if run.seed == seeds[-1]]
-        errors = predictions(without, unseen, scheme)
-        text += "\n" + prediction_table(without, errors, loaded.step)
+        errors = fit_quality.predictions(without, unseen, loaded.scheme)
+        text += "\n" + fit_quality.prediction_table(without, errors, loaded.step)
     files.write_text(out / "fit.txt", text + "\n")
-    write_fits(out / "fit.csv", fits, errors)
+    fit_quality.write_fits(out / "fit.csv", fits, errors)
     rows = [
         (i, branch, *point) for i, cloud in enumerate(samples) for branch, points in cloud.items() for point in points
     ]
@@ -192,16 +178,15 @@ def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool)
     """Return the network with fitted MFDs, and own split ratios unless guided. Raises InputError for empty runs."""
     network = replace(scenario.network, exit_rates=None, capacity=None, storage=None, critical_above={})
     samples = samples_of(network, results)
-    empty = nearly_empty(samples)
+    empty = fit_quality.nearly_empty(samples)
     if len(empty) == network.regions:
         raise InputError("--levels: every region was nearly empty in all loading runs; give higher levels")
-    mfds = tuple(
-        network.mfds[region]
-        if region in empty
-        else mfd.fit(*own_points(cloud).T, max_rate=scenario.substeps / scenario.step)
-        for region, cloud in enumerate(samples)
+    fastest, clouds = scenario.substeps / scenario.step, map(fit_quality.own_points, samples)
+    mfds = (
+        curve if n in empty else mfd.fit(*cloud.T, max_rate=fastest)
+        for n, (curve, cloud) in enumerate(zip(network.mfds, clouds, strict=True))
     )
-    network = replace(network, mfds=mfds)
+    network = replace(network, mfds=tuple(mfds))
     if guided:  # the reference of theta stays that of the plant (cosim.plant.guidance)
         return network
     crossings = sum(result["crossings"].sum(axis=0) for result in results)
@@ -233,16 +218,12 @@ def city_lane_km(city: City) -> PerRegion:
 
 def run_verdict(scenario: Scenario, network: RegionalModel, results: Sequence[Result]) -> authority.Verdict:
     """Judge from runs with open gateways whether perimeter control can help."""
-    gateways = []
-    for n, gateway in enumerate(city_of(network).gateways):
-        passed = sum(float(result["gateway_flow"][:, n].sum()) for result in results)
-        reached = not np.isnan(results[0]["gateway_original_green"][0, n])  # NaN without a signal under control
-        gateways.append((gateway.source, gateway.target, passed, reached))
+    passed = sum(result["gateway_flow"].sum(axis=0, dtype=float) for result in results)
+    reached = ~np.isnan(results[0]["gateway_original_green"][0])  # NaN without a signal under control
+    gateways = [(g.source, g.target, *of) for g, *of in zip(city_of(network).gateways, passed, reached, strict=True)]
     boundaries = authority.Boundaries.of_gateways(network.regions, gateways)
-    trip, delay = (
-        sum(r.trips * getattr(r, f"mean_{what}_s") for r in results) for what in ("trip_time", "departure_delay")
-    )
-    lost = delay + sum(r.departed_veh * r.mean_time_loss_s for r in results)
+    trip = sum(r.trips * r.mean_trip_time_s for r in results)
+    lost = sum(r.trips * r.mean_departure_delay_s + r.departed_veh * r.mean_time_loss_s for r in results)
     started = np.sum([result["departures"].sum(axis=(0, 2)) for result in results], axis=0).astype(float)
     where = f"in {len(results)} loading run{'s' * (len(results) > 1)} under {results[0].controller}"
     return authority.verdict(

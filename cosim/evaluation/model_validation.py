@@ -59,18 +59,8 @@ def predict(scenario: Scenario, result: Result) -> Result:
 def _advanced(scenario: Scenario, result: Result, state: np.ndarray, intervals: int | slice) -> np.ndarray:
     """Return the states (..., R, R) [veh] one interval later under the departures and controls of these intervals."""
     recorded = (result["departures"] / scenario.step, result.perimeter, result.splits)
-    demand, perimeter, splits = (torch.from_numpy(values[intervals]) for values in recorded)
-    following = advance(
-        parameters(scenario.network),
-        torch.from_numpy(state),
-        demand,
-        perimeter,
-        splits,
-        scenario.step,
-        integrator=scenario.integrator,
-        substeps=scenario.substeps,
-    )
-    return following.numpy()
+    given = map(torch.from_numpy, (state, *(values[intervals] for values in recorded)))
+    return advance(parameters(scenario.network), *given, **scenario.scheme).numpy()
 
 
 def errors(scenario: Scenario, result: Result, predicted: Result) -> pd.DataFrame:
@@ -80,9 +70,9 @@ def errors(scenario: Scenario, result: Result, predicted: Result) -> pd.DataFram
     """
     network, simulated = scenario.network, result.accumulation.sum(-1)
     following = _advanced(scenario, result, result.accumulation[:-1], slice(None))
-    off = _with_all(predicted.accumulation.sum(-1) - simulated)
-    next_off = _with_all(following.sum(-1) - simulated[1:])
-    seen, critical = _with_all(simulated), np.append(network.seen_critical, network.seen_critical.sum())
+    parts = (simulated, predicted.accumulation.sum(-1) - simulated, following.sum(-1) - simulated[1:])
+    seen, off, next_off = (np.column_stack([values, values.sum(axis=1)]) for values in parts)
+    critical = np.append(network.seen_critical, network.seen_critical.sum())
     return pd.DataFrame(
         {
             "region": [*range(network.regions), "all"],
@@ -98,10 +88,6 @@ def errors(scenario: Scenario, result: Result, predicted: Result) -> pd.DataFram
             "next_interval_persistence_rmse_veh": _rms(np.diff(seen, axis=0)),
         }
     )
-
-
-def _with_all(values: RegionCounts) -> np.ndarray:
-    return np.column_stack([values, values.sum(axis=1)])
 
 
 def _rms(values: np.ndarray) -> np.ndarray:
@@ -142,9 +128,7 @@ def prediction_errors(found: Finished, model: Path | None = None) -> pd.DataFram
         InputError: if the city has changed since the runs.
     """
     found.map()
-    scenario = found.scenario
-    scheme = {"step": scenario.step, "substeps": scenario.substeps, "integrator": scenario.integrator}
-    tables = []
+    scenario, tables = found.scenario, []
     for level in found.levels:
         for controller, rows in level.rows.groupby("controller", sort=False):
             network = parse(controller).planning(scenario, model).network
@@ -159,7 +143,7 @@ def prediction_errors(found: Finished, model: Path | None = None) -> pd.DataFram
                 "most_share": np.max([run.accumulation.sum(axis=2).max(axis=0) for run in runs], axis=0)
                 / network.seen_critical,
             }
-            tables.append(pd.DataFrame(columns).join(predictions(network, runs, scheme)))
+            tables.append(pd.DataFrame(columns).join(predictions(network, runs, scenario.scheme)))
     return pd.concat(tables, ignore_index=True)
 
 
@@ -167,17 +151,17 @@ def prediction_table(rows: pd.DataFrame) -> str:
     """Return prediction errors as text, one line per strategy and demand level."""
     lines = []
     for (demand, controller), group in rows.groupby(["demand", "controller"], sort=False):
-        mean = (100 * group.filter(like="rmse_share").mean()).map("{:.1f} %".format)
+        mean, first = (100 * group.filter(like="rmse_share").mean()).map("{:.1f} %".format), group.iloc[0]
         lines.append(
             {
                 "demand": f"{demand:g}",
                 "controller": controller,
-                "runs": group["runs"].iloc[0],
-                "model": Path(group["model"].iloc[0]).name,
+                "runs": first["runs"],
+                "model": Path(first["model"]).name,
                 "most": f"{group['most_share'].max():.1f}",
                 "next interval": mean["next_interval_rmse_share"],
                 "if nothing changed": mean["next_interval_persistence_rmse_share"],
-                "later": f"{mean['ahead_rmse_share']} ({group['ahead_s'].iloc[0]:g} s)",
+                "later": f"{mean['ahead_rmse_share']} ({first['ahead_s']:g} s)",
                 "if nothing changed ": mean["ahead_persistence_rmse_share"],
             }
         )
@@ -213,15 +197,10 @@ def held_up(accumulation: RegionCounts, outflow: RegionCounts, adjacency: Adjace
     A collapsed region holds more vehicles (T, R) than when its outflow (T, R) was largest so far, and lets out less
     than COLLAPSED_SHARE of that. Its queues spill back and lower the outflow of the region behind.
     """
-    steps, regions = outflow.shape
-    collapsed = np.zeros((steps, regions), dtype=bool)
-    for i in range(regions):
-        best = 0
-        for k in range(steps):
-            if outflow[k, i] >= outflow[best, i]:
-                best = k
-            fuller = accumulation[k, i] > accumulation[best, i]
-            collapsed[k, i] = fuller and outflow[k, i] < COLLAPSED_SHARE * outflow[best, i]
-    onset = np.where(collapsed.any(axis=0), collapsed.argmax(axis=0), steps)
+    largest, interval = np.maximum.accumulate(outflow), np.arange(len(outflow))[:, None]
+    best = np.maximum.accumulate(np.where(outflow == largest, interval, 0))
+    fuller = accumulation > np.take_along_axis(accumulation, best, axis=0)
+    collapsed = fuller & (outflow < COLLAPSED_SHARE * largest)
+    onset = np.where(collapsed.any(axis=0), collapsed.argmax(axis=0), len(outflow))
     earlier = adjacency & (onset[None, :] < onset[:, None])
     return (collapsed[:, None, :] & earlier[None]).any(axis=2)
