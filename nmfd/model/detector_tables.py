@@ -63,7 +63,8 @@ def read_counts(path: Path, *, city: str | None = None, skip_bad: bool = False) 
     """
     parts, left, cities = [], {MARKED: 0, BAD: 0, DOUBLED: 0}, set[str]()
     for chunk in _chunks(path, COUNTS, ("error", "city", "region")):
-        _present(_present(chunk, "day", path), "detid", path)
+        for key in ("day", "detid"):
+            _keyed(chunk, key, path, once=False)
         if "city" in chunk:
             cities |= set(chunk["city"].dropna().astype(str))
             chunk = chunk if city is None else chunk[chunk["city"] == city]
@@ -71,9 +72,9 @@ def read_counts(path: Path, *, city: str | None = None, skip_bad: bool = False) 
             wrong = chunk["error"].str.strip().str.lower().isin(["1", "1.0", "true"])
             left[MARKED] += int(wrong.sum())
             chunk = chunk[~wrong]
-        good, problem = _numbers(chunk, COUNT_LIMITS)
-        if problem and not skip_bad:
-            raise InputError(f"{path}: {problem}; correct it, or leave such rows out with --skip-bad")
+        good = _numbers(
+            chunk, COUNT_LIMITS, path, "" if skip_bad else "correct it, or leave such rows out with --skip-bad"
+        )
         left[BAD] += len(chunk) - len(good)
         parts.append(good[[*COUNTS, *(["region"] if "region" in good else [])]])
     if (city is None and len(cities) > 1) or (city is not None and city not in cities):
@@ -81,8 +82,8 @@ def read_counts(path: Path, *, city: str | None = None, skip_bad: bool = False) 
         raise InputError(f"{path}: city: choose one of {known}")
     rows = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
     if len(rows) == 0 or left[BAD] > len(rows):
-        what = f"{len(rows)} good rows, and left out: {omitted(left)}"
-        raise InputError(f"{path}: {what}; is flow in veh/h per lane, and occ a share?")
+        what = f"{len(rows)} good rows, and left out: {omitted(left)}; is flow in veh/h per lane, and occ a share?"
+        raise InputError(f"{path}: {what}")
     if (doubled := rows.duplicated(["day", "interval", "detid"])).any():
         day, interval, detid = rows.loc[doubled.idxmax(), ["day", "interval", "detid"]]
         left[DOUBLED] = int(doubled.sum())
@@ -150,8 +151,7 @@ def _against_neighbours(rows: pd.DataFrame) -> Iterator[tuple[str, list[str]]]:
         total &= 1.0 / own < 1e-4 * np.diag(gram)
     with np.errstate(divide="ignore"):
         size = np.log(pd.DataFrame({"flow": flow.mean(), "speed": flow.mean() / wide["occ"].mean()}))
-    off = (size - size.median()).abs()
-    like = flow.corrwith(flow.mean(axis=1))
+    off, like = (size - size.median()).abs(), flow.corrwith(flow.mean(axis=1))
     far = (off > np.maximum(np.log(pd.Series(FAR_OFF)), FAR_OFF_SPREADS * off.median())).any(axis=1)
     far |= (like < ODD) & (like.median() > ALIKE)
     for reason, wrong in ((SUM, total), ("unlike its neighbours", far.to_numpy() & ~total)):
@@ -175,15 +175,13 @@ def read_detectors(
         more = pd.concat(_chunks(path, ("detid", "length"), optional))
         if city is not None and "citycode" in more:
             more = more[more["citycode"] == city]
-        more = _unique(more[more["detid"].isin(detids)], "detid", path)
+        more = _keyed(more[more["detid"].isin(detids)], "detid", path)
         used = ["length", *(["lanes"] if "lanes" in more and more["lanes"].notna().all() else [])]
-        more, problem = _numbers(more, {name: DETECTOR_LIMITS[name] for name in used})
-        if problem:
-            raise InputError(f"{path}: {problem}; correct it")
+        more = _numbers(more, {name: DETECTOR_LIMITS[name] for name in used}, path)
         table = table.drop(columns="region", errors="ignore") if "region" in more else table
         table = more.merge(table, how="left")
     if regions is not None:
-        named = _unique(pd.concat(_chunks(regions, ("detid", "region"))), "detid", regions)
+        named = _keyed(pd.concat(_chunks(regions, ("detid", "region"))), "detid", regions)
         table = table.drop(columns="region", errors="ignore").merge(named, how="left")
     where = regions or path or where
     if "region" not in table:
@@ -194,11 +192,8 @@ def read_detectors(
         what = f"detector {min(missing)}, which has counts, has no row or region ({len(missing)} such)"
         raise InputError(f"{where}: {what}; add it")
     table = table.loc[detids]
-    columns = {
-        name: pd.to_numeric(table[name], errors="coerce") if name in table else np.nan
-        for name in ("length", "lanes", "pos", "long", "lat", "x", "y")
-    }
-    out = pd.DataFrame(columns, index=table.index).assign(region=table["region"].str.strip())
+    numbers = table.reindex(columns=["length", "lanes", "pos", "long", "lat", "x", "y"])
+    out = numbers.apply(pd.to_numeric, errors="coerce").assign(region=table["region"].str.strip())
     link = table["linkid"].fillna(pd.Series(table.index, table.index)) if "linkid" in table else out.index
     stations = out["pos"].round(STATION_DECIMALS).groupby(np.asarray(link)).transform(lambda p: max(1, p.nunique()))
     out["lane_km"] = out["length"] * out["lanes"].fillna(1.0) / stations
@@ -214,13 +209,11 @@ def read_about(path: Path | None, regions: Sequence[str]) -> pd.DataFrame:
     columns = list(ABOUT_LIMITS)
     if path is None:
         return pd.DataFrame(np.nan, index=list(regions), columns=columns)
-    table = _unique(pd.concat(_chunks(path, ("region",), tuple(columns))), "region", path)
+    table = _keyed(pd.concat(_chunks(path, ("region",), tuple(columns))), "region", path)
     for name in table["region"]:
         _check_region(name, regions, path)
     for name in set(columns) & set(table):
-        _, problem = _numbers(table[table[name].notna()], {name: ABOUT_LIMITS[name]})
-        if problem:
-            raise InputError(f"{path}: {problem}; correct it")
+        _numbers(table[table[name].notna()], {name: ABOUT_LIMITS[name]}, path)
     return table.set_index("region").apply(pd.to_numeric).reindex(index=list(regions), columns=columns)
 
 
@@ -263,31 +256,25 @@ def _chunks(path: Path, needed: Sequence[str], optional: Sequence[str] = ()) -> 
         raise InputError(f"{path}: cannot be read as a csv file ({text}); expected {', '.join(needed)}") from None
 
 
-def _numbers(table: pd.DataFrame, limits: Limits) -> tuple[pd.DataFrame, str]:
-    """Return the rows with all columns of `limits` within them, and the first problem of the others."""
+def _numbers(table: pd.DataFrame, limits: Limits, path: Path, remedy: str = "correct it") -> pd.DataFrame:
+    """Return the rows with all columns of `limits` within them. Raises InputError for others, given a `remedy`."""
     values = {name: pd.to_numeric(table[name], errors="coerce") for name in limits}
     bad = {name: ~values[name].between(low, high) for name, (low, high, _, _) in limits.items()}
-    good = table.assign(**values)[~pd.concat(bad, axis=1).any(axis=1)]
     for name, (low, high, what, hint) in limits.items():
-        if count := int(bad[name].sum()):
+        if remedy and (count := int(bad[name].sum())):
             line = bad[name].idxmax()
             got = "nothing" if pd.isna(table.loc[line, name]) else repr(table.loc[line, name])
-            hint = f"; {hint}" if values[name][line] > high and hint else ""
+            remedy = f"{hint}; {remedy}" if values[name][line] > high and hint else remedy
             problem = f"line {line + 2}: {name}: expected {what}, from {low:g} to {high:g}, got {got} instead"
-            return good, f"{problem} ({count:,} such rows){hint}"
-    return good, ""
+            raise InputError(f"{path}: {problem} ({count:,} such rows); {remedy}")
+    return table.assign(**values)[~pd.concat(bad, axis=1).any(axis=1)]
 
 
-def _unique(table: pd.DataFrame, key: str, path: Path) -> pd.DataFrame:
-    """Return `table`. Raises InputError for a key that is missing or doubled."""
-    if (twice := _present(table, key, path)[key].duplicated()).any():
-        line = twice.idxmax()
-        raise InputError(f"{path}: line {line + 2}: {key} {table[key][line]} is there twice; remove one of the lines")
-    return table
-
-
-def _present(table: pd.DataFrame, key: str, path: Path) -> pd.DataFrame:
-    """Return `table`. Raises InputError for a key that is missing."""
+def _keyed(table: pd.DataFrame, key: str, path: Path, *, once: bool = True) -> pd.DataFrame:
+    """Return `table`. Raises InputError for a key that is missing or, if it must be there once, doubled."""
     if (missing := table[key].isna()).any():
         raise InputError(f"{path}: line {missing.idxmax() + 2}: {key} is missing; add it or remove the line")
+    if once and (twice := table[key].duplicated()).any():
+        line = twice.idxmax()
+        raise InputError(f"{path}: line {line + 2}: {key} {table[key][line]} is there twice; remove one of the lines")
     return table

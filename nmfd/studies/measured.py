@@ -131,24 +131,13 @@ def identify(
             f"{100 * LEAST_REPORTING:g} % of its detectors reporting; give more data, or join it to another region"
             + "".join(f"; {line}" for line in broken)
         )
-    network = base or RegionalModel(
-        name="",
-        region_names=tuple(names),
-        positions=_positions(stations, table),
-        u_min=U_MIN,
-        u_max=U_MAX,
-        mfds=(),
-        adjacency=_adjacency(paths[3], stations, names),
-    )
-    network = replace(
-        network,
-        name=out.absolute().name,
-        exit_rates=None,
-        capacity=None,
-        storage=None,
-        placeholder=False,
-        mfds=tuple(mfd.fit(*fit_quality.own_points(cloud).T) for cloud in samples),
-    )
+    new: dict = {"name": out.absolute().name}
+    if base is None:
+        places, pairs = _positions(stations, table), _adjacency(paths[3], stations, names)
+        new |= {"region_names": tuple(names), "positions": places, "adjacency": pairs, "u_min": U_MIN, "u_max": U_MAX}
+    new["mfds"] = tuple(mfd.fit(*fit_quality.own_points(cloud).T) for cloud in samples)
+    fresh = {"exit_rates": None, "capacity": None, "storage": None, "placeholder": False}
+    network = replace(base, **new, **fresh) if base else RegionalModel(**new)
     if (network.hops < 0).any():
         i, j = np.argwhere(network.hops < 0)[0]
         raise InputError(
