@@ -121,25 +121,6 @@ def test_a_policy_of_the_other_kind_is_refused(tmp_path, scenario):
     one_line(caught, path)
 
 
-@pytest.mark.parametrize(
-    "damage, problem",
-    [
-        (lambda path: path.unlink(), "no such policy"),
-        (lambda path: path.write_bytes(b"not a policy"), "is no policy file"),
-        (lambda path: path.write_bytes(path.read_bytes()[:2000]), "is no policy file"),
-        (lambda path: torch.save({}, path), "is damaged"),
-        (lambda path: torch.save([1, 2], path), "is damaged"),
-    ],
-    ids=["missing", "text", "truncated", "empty", "list"],
-)
-def test_a_damaged_policy_file_is_one_line(tmp_path, damage, problem):
-    path = saved(tmp_path / "p.pt", policy(guidance=False), NETWORK)
-    damage(path)
-    with pytest.raises(InputError, match=problem) as caught:
-        load_policy(path, NETWORK)
-    one_line(caught, path)
-
-
 def weights(path):
     return torch.load(path, weights_only=True)["weights"]
 

@@ -64,11 +64,8 @@ class Town:
 
     def command(self, **speeds):
         """The next control interval, with these speeds [m/s] in the last one; elsewhere nobody was seen."""
-        streets = (
-            seen([speeds.get(edge, np.nan) for edge in EDGES], crossing=(0.0, 0.0), crossed=(0.0, 0.0))
-            if speeds
-            else None
-        )
+        seen_speeds = [speeds.get(edge, np.nan) for edge in EDGES]
+        streets = seen(seen_speeds, crossing=(0.0, 0.0), crossed=(0.0, 0.0)) if speeds else None
         self.guide.command(self.shares[1], streets)
 
     def drive(self, count, by="a", free=True):
@@ -126,10 +123,8 @@ def test_who_waits_on_a_junction_is_seen(waited, expected):
     """It takes 20 s more by b; by a they wait on the junction before it, behind it, or on both, 1 s in any case."""
     for inside in ((waited, 0.0), (0.0, waited), (waited / 2, waited / 2)):
         town = Town(through_a=30.0, through_b=50.0, theta=0.5)
-        town.guide.command(
-            town.shares[1],
-            seen(np.full(len(EDGES), np.nan), crossing=(0.5 * inside[0], 0.5 * inside[1]), crossed=(0.5, 0.5)),
-        )
+        crossing = (0.5 * inside[0], 0.5 * inside[1])
+        town.guide.command(town.shares[1], seen(np.full(len(EDGES), np.nan), crossing=crossing, crossed=(0.5, 0.5)))
         town.routes["new"] = ("s",)
         town.guide.apply([Event(vehicle="new", source=None, region=0, destination=3, edge="t")])
         assert town.routes["new"][1] == expected

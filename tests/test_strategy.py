@@ -23,41 +23,27 @@ def scenario(tmp_path):
 @pytest.mark.parametrize(
     "name, controller, city",
     [
-        ("no-control", "no-control", {"gateways_fixed": False}),
-        ("pi-gating", "pi-gating", {"gateways_fixed": True}),
-        ("actuated", "no-control", {"gateways_fixed": False, "signals": "actuated"}),
-        (
-            "max-pressure+rerouting-100",
-            "no-control",
-            {"gateways_fixed": False, "signals": "max-pressure", "rerouting": 1.0},
-        ),
-        ("dpc-pc+rerouting-30+webster", "dpc-pc", {"gateways_fixed": True, "signals": "webster", "rerouting": 0.3}),
-        ("pi-gating+estimate", "pi-gating", {"gateways_fixed": True, "measurement": "estimate"}),
-        (
-            "dpc-pcrg+redistribute+compliance-0",
-            "dpc-pcrg",
-            {"gateways_fixed": True, "actuation": "redistribute", "compliance": 0.0},
-        ),
-        (
-            "pi-gating+guided+max-pressure",
-            "pi-gating",
-            {"gateways_fixed": True, "guided": True, "signals": "max-pressure"},
-        ),
-        ("guided", "no-control", {"gateways_fixed": False, "guided": True}),
-        ("dpc-pcrg+guidance-period-90", "dpc-pcrg", {"gateways_fixed": True, "guidance_period": 90.0}),
-        ("dpc-pc+metering", "dpc-pc", {"gateways_fixed": True, "metering": 1.2}),
-        ("metering-120", "no-control", {"gateways_fixed": False, "metering": 1.2}),
-        ("a.py:Gate", "a.py:Gate", {"gateways_fixed": True}),
-        (
-            "a+b/c d.py:Gate+actuated+rerouting-30",
-            "a+b/c d.py:Gate",
-            {"gateways_fixed": True, "signals": "actuated", "rerouting": 0.3},
-        ),
+        ("no-control", "no-control", {}),
+        ("pi-gating", "pi-gating", {}),
+        ("actuated", "no-control", {"signals": "actuated"}),
+        ("max-pressure+rerouting-100", "no-control", {"signals": "max-pressure", "rerouting": 1.0}),
+        ("dpc-pc+rerouting-30+webster", "dpc-pc", {"signals": "webster", "rerouting": 0.3}),
+        ("pi-gating+estimate", "pi-gating", {"measurement": "estimate"}),
+        ("dpc-pcrg+redistribute+compliance-0", "dpc-pcrg", {"actuation": "redistribute", "compliance": 0.0}),
+        ("pi-gating+guided+max-pressure", "pi-gating", {"guided": True, "signals": "max-pressure"}),
+        ("guided", "no-control", {"guided": True}),
+        ("dpc-pcrg+guidance-period-90", "dpc-pcrg", {"guidance_period": 90.0}),
+        ("dpc-pc+metering", "dpc-pc", {"metering": 1.2}),
+        ("metering-120", "no-control", {"metering": 1.2}),
+        ("a.py:Gate", "a.py:Gate", {}),
+        ("a+b/c d.py:Gate+actuated+rerouting-30", "a+b/c d.py:Gate", {"signals": "actuated", "rerouting": 0.3}),
     ],
 )
 def test_what_a_name_means(name, controller, city):
+    """Only without control may signals with gateways be actuated."""
     strategy = parse(name)
-    assert (strategy.name, strategy.controller.name, strategy.city) == (name, controller, city)
+    assert (strategy.name, strategy.controller.name) == (name, controller)
+    assert strategy.city == {"gateways_fixed": controller != ALONE, **city}
     assert strategy.metered == ("metering" in city) and hash(strategy) == hash(parse(name))
 
 
