@@ -103,10 +103,9 @@ def run(scenario: Path, controller: str, against: str | None, **options: Any) ->
     \b
     Examples:
       cosim run grid7_peak --controller dpc-pcrg --against no-control
-      cosim run grid7_peak --controller pi-gating+max-pressure --seed 3 --out runs/gating
       cosim run grid7_peak --controller pi-gating --set controllers.pi-gating.kp=2 --set sumo.min_green=8
     """
-    click.echo(cosim.api.run_controllers(scenario, [controller, *([against] if against else [])], **options))
+    click.echo(cosim.api.run_controllers(scenario, list(filter(None, (controller, against))), **options))
 
 
 @main.command()
@@ -123,13 +122,12 @@ def watch(scenario: Path, controller: str, against: str | None, gui: bool, **opt
     The page pauses the runs and sets their pace. Nothing is written.
 
     \b
-    Examples:
+    Example:
       cosim watch grid7_peak --controller pi-gating --against no-control
-      cosim watch grid7_peak --controller pi-gating --gui
     """
     if gui and against:
         raise InputError("--gui: shows one run; omit --against")
-    click.echo(cosim.api.watch(scenario, [controller, *([against] if against else [])], gui=gui, **options))
+    click.echo(cosim.api.watch(scenario, list(filter(None, (controller, against))), gui=gui, **options))
 
 
 @main.command()
@@ -171,9 +169,8 @@ def compare(folder: Path, **options: Any) -> None:
     Tables and figures go into RUN.
 
     \b
-    Examples:
+    Example:
       cosim compare runs/gating --controller pi-gating --seed 3
-      cosim compare runs/grid7_peak-evaluate
     """
     click.echo(cosim.api.compare(folder, **options))
 
@@ -188,8 +185,7 @@ def report(folders: tuple[Path, ...], **options: Any) -> None:
     RUN is a folder of `cosim run` or `cosim evaluate`. The page needs no network.
 
     \b
-    Examples:
-      cosim report runs/grid7_peak-evaluate
+    Example:
       cosim report runs/monday runs/tuesday --out both.html
     """
     click.echo(f"Written to {cosim.api.report(folders, **options)}: open it in a browser")
@@ -221,9 +217,8 @@ def tune(scenario: Path, controller: str, **how: Any) -> None:
     with the best options. The same command continues, also with more --candidates.
 
     \b
-    Examples:
+    Example:
       cosim tune grid7_peak --controller pi-gating --option kp=0.1:10 --option ki=0.001:0.1
-      cosim tune grid7_peak --controller dpc-pcrg+max-pressure --option mfd_scale=0.6:1
     """
     click.echo(cosim.api.tune(scenario, controller, **how))
 
@@ -236,8 +231,7 @@ def get(name: str | None) -> None:
     The city goes to cities/NAME, with its licence.
 
     \b
-    Examples:
-      cosim get
+    Example:
       cosim get cologne8
     """
     click.echo(cosim.api.get(name))
@@ -264,7 +258,6 @@ def import_(source: Path | None, bbox: str | None, **options: Any) -> None:
 
     \b
     Examples:
-      cosim import city.sumocfg --regions 5 --out networks/mycity
       cosim import city.net.xml.gz --regions 6 --demand peak --out networks/mycity
       cosim import --bbox 11.32,44.48,11.36,44.50 --regions 4 --demand peak --out networks/mycity
     """
@@ -297,8 +290,7 @@ def identify(scenario: Path, **options: Any) -> None:
     Policies trained on the network before do not fit the new one. SCENARIO may be the folder of an imported network.
 
     \b
-    Examples:
-      cosim identify networks/mycity
+    Example:
       cosim identify grid7_peak --with guided+max-pressure --network networks/grid7_max_pressure
     """
     click.echo(cosim.api.identify(scenario, **options))

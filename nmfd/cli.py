@@ -229,9 +229,8 @@ def benchmark(scenario: Path, settings: dict, out: Path | None, **options: Any) 
     the same --out, only runs that are not in it yet are done.
 
     \b
-    Examples:
-      nmfd benchmark economic_mpc --controllers no-control,pi-gating
-      nmfd benchmark economic_mpc --controllers no-control,dpc-pc --seeds 5 --set controllers.dpc-pc.seed=1
+    Example:
+      nmfd benchmark economic_mpc --controllers no-control,dpc-pc --seeds 5
     """
     loaded = nmfd.load_scenario(scenario, settings)
     out = out or nmfd.api.default_folder(loaded.name)
@@ -284,8 +283,7 @@ def train(scenario: Path, settings: dict, controller: str, **options: Any) -> No
     The policy file always holds the policy that is best in validation; Ctrl-C keeps it, and --resume continues.
 
     \b
-    Examples:
-      nmfd train economic_mpc --controller dpc-pcrg
+    Example:
       nmfd train economic_mpc --controller dpc-pc --steps 200 --out mine.pt
     """
     click.echo(f"Written to {nmfd.api.train(nmfd.load_scenario(scenario, settings), controller, **options)}")

@@ -112,13 +112,8 @@ def key_of(
         policy = policies.get(strategy.name)
         strategy.make(scenario, policy)
         own[strategy.name] = strategy.fingerprint(scenario, policy)
-    shared = {
-        "scenario": scenario.name,
-        "scenario_hash": scenario.hash,
-        "network": scenario.network.name,
-        "network_hash": scenario.network.hash,
-        "plant": plant,
-    }
+    network, shared = scenario.network, {"scenario": scenario.name, "scenario_hash": scenario.hash}
+    shared |= {"network": network.name, "network_hash": network.hash, "plant": plant}
     return lambda name: {**shared, "controller": own[name]}
 
 
