@@ -71,10 +71,8 @@ def instruments(city: City, layout: Layout, probe_share: float) -> Instruments:
     lane_length = np.array([city.length[edge] * city.lanes[edge] for edge in city.edges])
     region = np.array([city.region_of[edge] for edge in city.edges])
     equipped = np.isin(np.arange(len(region)), layout.edges)
-    whole, seen, squares = (
-        np.bincount(region, weights, city.regions)
-        for weights in (lane_length, lane_length * equipped, lane_length**2 * equipped)
-    )
+    weights = lane_length, lane_length * equipped, lane_length**2 * equipped
+    whole, seen, squares = (np.bincount(region, weight, city.regions) for weight in weights)
     share = seen / whole
     boundary, counted = np.zeros((2, city.regions, city.regions))
     for gateway, there in zip(city.gateways, layout.counted, strict=True):

@@ -25,17 +25,9 @@ class CityMap:
     def __init__(self, picture: CityPicture, title: str):
         self._picture = picture
         self._radius = next(radius for count, radius in GATE_RADII if len(picture.gates) <= count)
-        self.plot = figure(
-            height=MAP_HEIGHT,
-            sizing_mode="stretch_width",
-            match_aspect=True,
-            title=title,
-            tools="pan,wheel_zoom,reset",
-            active_scroll="wheel_zoom",
-            toolbar_location=None,
-            outline_line_color=None,
-            lod_threshold=None,
-        )
+        size = {"height": MAP_HEIGHT, "sizing_mode": "stretch_width", "match_aspect": True, "lod_threshold": None}
+        bare = {"tools": "pan,wheel_zoom,reset", "toolbar_location": None, "outline_line_color": None}
+        self.plot = figure(title=title, active_scroll="wheel_zoom", **size, **bare)
         self.plot.axis.visible = self.plot.grid.visible = False
         self.regions = self._add_regions()
         self.streets = self._add_streets()
@@ -72,14 +64,12 @@ class CityMap:
 
     def _add_regions(self) -> ColumnDataSource:
         rings = [(r, ring) for r, outline in enumerate(self._picture.outlines) for ring in outline]
-        source = ColumnDataSource(
-            {
-                **_lines([ring for _, ring in rings]),
-                "region": [r for r, _ in rings],
-                "width": np.ones(len(rings), np.float32),
-                "line": [colours.FAINT] * len(rings),
-                "fill": [colours.LAND] * len(rings),
-            }
+        source = _source(
+            **_lines([ring for _, ring in rings]),
+            region=[r for r, _ in rings],
+            width=np.ones(len(rings)),
+            line=[colours.FAINT] * len(rings),
+            fill=[colours.LAND] * len(rings),
         )
         self.plot.patches("xs", "ys", source=source, fill_color="fill", line_color="line", line_width="width")
         return source
@@ -88,13 +78,11 @@ class CityMap:
         picture = self._picture
         thin, per_lane = (0.8, 0.4) if len(picture.edges) > 2000 else (1.6, 0.9)  # pixels
         offset = LINE_OFFSET * float(np.ptp(np.concatenate(picture.shapes)[:, 0]))
-        source = ColumnDataSource(
-            {
-                **_lines([_to_the_right(shape, offset) for shape in picture.shapes]),
-                "edge": list(picture.edges),
-                "density": np.zeros(len(picture.edges), np.float32),
-                "width": _floats(thin + per_lane * picture.lanes),
-            }
+        source = _source(
+            **_lines([_to_the_right(shape, offset) for shape in picture.shapes]),
+            edge=list(picture.edges),
+            density=np.zeros(len(picture.edges)),
+            width=thin + per_lane * picture.lanes,
         )
         colour = linear_cmap("density", colours.SCALE, 0.0, JAM_DENSITY)
         self.plot.add_layout(colour_bar(colour.transform, "density [veh/km and lane]", [0.0, 50.0, 100.0]), "below")
@@ -106,19 +94,17 @@ class CityMap:
         gates = self._picture.gates
         places = np.array([gate.place for gate in gates]).reshape(-1, 2)
         signal = np.array([gate.signal for gate in gates], dtype=bool)
-        source = ColumnDataSource(
-            {
-                "x": _floats(places[:, 0]),
-                "y": _floats(places[:, 1]),
-                "way": [f"{gate.source} → {gate.target}" for gate in gates],
-                "end": np.full(len(gates), _wedge_end(1.0), np.float32),
-                "green": ["100%"] * len(gates),
-                "queue": np.zeros(len(gates), np.float32),
-                "halo": np.zeros(len(gates), np.float32),
-                "size": _floats(np.where(signal, 2.0 * self._radius + 2.0, self._radius)),
-                "radius": _floats(np.where(signal, self._radius, 0.0)),
-                "rim": [colours.INK if one else colours.FAINT for one in signal],
-            }
+        source = _source(
+            x=places[:, 0],
+            y=places[:, 1],
+            way=[f"{gate.source} → {gate.target}" for gate in gates],
+            end=np.full(len(gates), _wedge_end(1.0)),
+            green=["100%"] * len(gates),
+            queue=np.zeros(len(gates)),
+            halo=np.zeros(len(gates)),
+            size=np.where(signal, 2.0 * self._radius + 2.0, self._radius),
+            radius=np.where(signal, self._radius, 0.0),
+            rim=[colours.INK if one else colours.FAINT for one in signal],
         )
         self.plot.scatter("x", "y", size="halo", source=source, color=colours.QUEUE, alpha=0.3, line_color=None)
         discs = self.plot.scatter("x", "y", size="size", source=source, fill_color=colours.PAPER, line_color="rim")
@@ -135,10 +121,8 @@ class CityMap:
             begin = begin + 0.05 * np.array([along[1], -along[0]])
             angle = np.arctan2(along[1], along[0]) - np.pi / 2
             rows.append([*(begin + 0.3 * along), *(begin + 0.7 * along), angle])
-        columns = np.array(rows, np.float32).reshape(-1, 5).T
-        source = ColumnDataSource(dict(zip(("x", "y", "x1", "y1", "angle"), columns, strict=True)))
-        for name in ("width", "head", "guided"):
-            source.add(np.zeros(len(rows), np.float32), name)
+        columns = dict(zip(("x", "y", "x1", "y1", "angle"), np.array(rows).reshape(-1, 5).T, strict=True))
+        source = _source(**columns, **{name: np.zeros(len(rows)) for name in ("width", "head", "guided")})
         self.plot.segment("x", "y", "x1", "y1", source=source, line_width="width", color=colours.GUIDED, alpha=0.55)
         tip = {"marker": "triangle", "angle": "angle", "size": "head", "line_color": None, "alpha": 0.8}
         heads = self.plot.scatter("x1", "y1", source=source, color=colours.GUIDED, **tip)
@@ -146,7 +130,7 @@ class CityMap:
         return source
 
     def _add_numbers(self) -> None:
-        x, y = _floats(self._picture.places[:, 0]), _floats(self._picture.places[:, 1])
+        x, y = self._picture.places.astype(np.float32).T
         self.plot.scatter(x, y, size=24, fill_color=colours.PAPER, fill_alpha=0.9, line_color=colours.INK)
         labels = [str(r) for r in range(self._picture.regions)]
         middle = {"text_align": "center", "text_baseline": "middle", "text_font_size": "12px"}
@@ -162,10 +146,7 @@ class CityMap:
 def patch(source: ColumnDataSource, **columns: Any) -> None:
     """Replace whole columns, numbers as float32, without sending the others again."""
     if len(next(iter(columns.values()))):
-        floats = {
-            name: _floats(values) if isinstance(values, np.ndarray) else values for name, values in columns.items()
-        }
-        source.patch({name: [(slice(len(values)), values)] for name, values in floats.items()})
+        source.patch({name: [(slice(len(values)), values)] for name, values in _floats(columns).items()})
 
 
 def mean(values: np.ndarray) -> float:
@@ -186,12 +167,17 @@ def _wedge_end(share: np.ndarray | float) -> np.ndarray:
     return np.asarray(np.pi / 2 - 2.0 * np.pi * np.minimum(share, 0.9999))
 
 
-def _floats(values: np.ndarray) -> np.ndarray:
-    return np.asarray(values, dtype=np.float32)
+def _floats(columns: dict[str, Any]) -> dict[str, Any]:
+    """Return columns with arrays as float32."""
+    return {name: x.astype(np.float32) if isinstance(x, np.ndarray) else x for name, x in columns.items()}
+
+
+def _source(**columns: Any) -> ColumnDataSource:
+    return ColumnDataSource(_floats(columns))
 
 
 def _lines(shapes: Sequence[Points]) -> dict[str, Any]:
-    return {"xs": [_floats(shape[:, 0]) for shape in shapes], "ys": [_floats(shape[:, 1]) for shape in shapes]}
+    return {name: [shape[:, n].astype(np.float32) for shape in shapes] for n, name in enumerate(("xs", "ys"))}
 
 
 def _to_the_right(shape: np.ndarray, distance: float) -> np.ndarray:

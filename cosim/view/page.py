@@ -149,21 +149,10 @@ def with_slider(picture: CityPicture, runs: Mapping[str, Sequence[Frame]]) -> La
     wide = {"sizing_mode": "stretch_width", "styles": {"flex": "1 1 240px"}}
     slider = Slider(start=0.0, end=last * step, value=begin * step, step=step, title="time [min]", name="time", **wide)
     play = Toggle(label="Play", name="play", width=90, button_type="primary")
-    callback = CustomJS(
-        args={
-            "slider": slider,
-            "region": page.regions,
-            "film": film,
-            "choices": choices,
-            "titles": page.curves.titles,
-            "texts": texts,
-            "numbers": page.numbers,
-            "words": words,
-            "present": page.curves.present,
-            "spans": [*(load.now for load in page.loads), *page.curves.now],
-        },
-        code=SLIDER_JS,
-    )
+    args = {"slider": slider, "region": page.regions, "film": film, "choices": choices}
+    args |= {"titles": page.curves.titles, "texts": texts, "numbers": page.numbers, "words": words}
+    args |= {"present": page.curves.present, "spans": [*(load.now for load in page.loads), *page.curves.now]}
+    callback = CustomJS(args=args, code=SLIDER_JS)
     slider.js_on_change("value", callback)
     page.regions.js_on_change("value", callback)
     play.js_on_change("active", CustomJS(args={"slider": slider, "period": PLAY_PERIOD_MS}, code=PLAY_JS))

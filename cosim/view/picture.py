@@ -175,15 +175,9 @@ def after(
 
 def frames(picture: CityPicture, result: Any) -> list[Frame]:
     """Return the frames of a finished run: one at its start and one at the end of every control interval."""
+    parts = {name: getattr(result, name) for name in ("accumulation", "backlog", "completed", "removed")}
     states = [
-        State(
-            step=k,
-            time=k * picture.step,
-            accumulation=result.accumulation[k],
-            backlog=result.backlog[k],
-            completed=float(result.completed[k]),
-            removed=result.removed[k],
-        )
+        State(step=k, time=k * picture.step, **{name: values[k] for name, values in parts.items()})
         for k in range(len(result.accumulation))
     ]
     made = [first(picture, result.gateway_green.shape[1], states[0])]

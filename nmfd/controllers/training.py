@@ -112,12 +112,8 @@ def train(
     configuration |= {**vars(setup), "steps": steps}
     torch.manual_seed(seed)
     generator = Generator().manual_seed(seed)
-    architecture = Architecture(
-        guidance=strategy.controller.guides,
-        local=setup.local,
-        compact=planning.protected if setup.compact else (),
-        metering=setup.metering,
-    )
+    guidance, compact = strategy.controller.guides, planning.protected if setup.compact else ()
+    architecture = Architecture(guidance=guidance, local=setup.local, compact=compact, metering=setup.metering)
     policy = new_policy(planning.network, architecture)
     if setup.numbers and isinstance(policy, CompactPolicy):
         policy.numbers.data.copy_(torch.tensor(Numbers(*setup.numbers)))

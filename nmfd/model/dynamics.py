@@ -57,10 +57,7 @@ def parameters(
         return tensor([getattr(m, name) for m in network.mfds])
 
     return Parameters(
-        a=row("a"),
-        b=row("b"),
-        c=row("c"),
-        jam=row("jam"),
+        **{name: row(name) for name in ("a", "b", "c", "jam")},
         adjacency=tensor(network.adjacency),
         off_diagonal=1.0 - torch.eye(network.regions, dtype=dtype, device=device),
         exit_rates=tensor(network.exit_rates),

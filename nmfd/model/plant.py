@@ -45,14 +45,8 @@ class NmfdPlant:
         self._ended += ended
         self._k += 1
         state = self._state()
-        ledger.check(
-            state.step,
-            state.time,
-            entered=self._entered,
-            ended=self._ended,
-            inside=float(self._x.sum()),
-            least=float(self._x.min()),
-        )
+        inside, least = float(self._x.sum()), float(self._x.min())
+        ledger.check(state.step, state.time, entered=self._entered, ended=self._ended, inside=inside, least=least)
         return state
 
     def observe(self) -> Observation | None:

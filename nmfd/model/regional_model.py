@@ -122,13 +122,9 @@ class RegionalModel:
     @cached_property
     def hash(self) -> str:
         """Hash of all that the dynamics depend on; a policy is valid for one network only."""
-        content = [
-            self.adjacency.astype(int).tolist(),
-            [[m.a, m.b, m.c, m.jam] for m in self.mfds],
-            self.u_min,
-            self.u_max,
-            self.nominal_splits.round(12).tolist(),
-        ]
+        mfds = [[m.a, m.b, m.c, m.jam] for m in self.mfds]
+        content = [self.adjacency.astype(int).tolist(), mfds, self.u_min, self.u_max]
+        content += [self.nominal_splits.round(12).tolist()]
         options = {"exit_rates": self.exit_rates, "capacity": self.capacity, "storage": self.storage}
         content += [[name, option.tolist()] for name, option in options.items() if option is not None]
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]

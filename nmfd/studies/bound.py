@@ -52,10 +52,8 @@ def neutral_starts(network: RegionalModel, steps: int, *, guidance: bool) -> dic
         perimeter = np.where(network.adjacency, u, 0.0)
         return np.broadcast_to(perimeter, (steps, *perimeter.shape)), np.broadcast_to(splits, (steps, *splits.shape))
 
-    return {
-        "open": constant(network.u_max, nominal),
-        "middle": constant(0.5 * (network.u_min + network.u_max), even),
-    }
+    middle = 0.5 * (network.u_min + network.u_max)
+    return {"open": constant(network.u_max, nominal), "middle": constant(middle, even)}
 
 
 @one_thread()
