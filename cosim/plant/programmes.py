@@ -136,7 +136,7 @@ def optimised_plans(
             if output == "cycles.xml":
                 _keep_times(scratch / output, city.net_file)
         for output, file in (("cycles.xml", cycles), ("offsets.xml", offsets)):
-            text = (scratch / output).read_text(encoding="utf-8")
+            text = re.sub(r"(?s)<!--.*?-->\s*", "", (scratch / output).read_text(encoding="utf-8"))  # date and paths
             # Whole seconds: perimeter control follows programmes second by second.
             text = re.sub(r'offset="([^"]+)"', lambda m: f'offset="{round(float(m[1]))}"', text)
             write_text(file, text)
