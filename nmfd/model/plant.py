@@ -57,6 +57,8 @@ class NmfdPlant:
 
     def _disturb(self) -> float:
         """Add the process noise to each x_ij that is not empty; return the vehicles that it adds in all [veh]."""
+        if not self._scenario.process_std:
+            return 0.0
         before = self._accumulation()
         noise = self._scenario.process_std * self._random.standard_normal(before.shape)
         after = np.where(before > 0, np.maximum(before + noise, 0.0), before)
