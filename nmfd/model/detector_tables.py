@@ -61,6 +61,7 @@ def read_counts(path: Path, *, city: str | None = None, skip_bad: bool = False) 
     city: of several in the file; skip_bad: leave out rows with a missing or impossible number, and all but the first of
     one detector and interval, instead of raising InputError; rows marked as errors are always left out
     """
+    remedy = "" if skip_bad else "correct it, or leave such rows out with --skip-bad"
     parts, left, cities = [], {MARKED: 0, BAD: 0, DOUBLED: 0}, set[str]()
     for chunk in _chunks(path, COUNTS, ("error", "city", "region")):
         for key in ("day", "detid"):
@@ -72,9 +73,7 @@ def read_counts(path: Path, *, city: str | None = None, skip_bad: bool = False) 
             wrong = chunk["error"].str.strip().str.lower().isin(["1", "1.0", "true"])
             left[MARKED] += int(wrong.sum())
             chunk = chunk[~wrong]
-        good = _numbers(
-            chunk, COUNT_LIMITS, path, "" if skip_bad else "correct it, or leave such rows out with --skip-bad"
-        )
+        good = _numbers(chunk, COUNT_LIMITS, path, remedy)
         left[BAD] += len(chunk) - len(good)
         parts.append(good[[*COUNTS, *(["region"] if "region" in good else [])]])
     if (city is None and len(cities) > 1) or (city is not None and city not in cities):

@@ -66,7 +66,7 @@ def with_guesses(
 def _largest(samples: Sequence[Mapping[str, Points]], accumulations: Sequence[StatesOverTime]) -> PerRegion:
     if len(accumulations):
         return np.max([state.sum(axis=2).max(axis=0) for state in accumulations], axis=0)
-    return np.array([max((part[:, 0].max() for part in cloud.values() if len(part)), default=0.0) for cloud in samples])
+    return np.array([np.concatenate(list(cloud.values()))[:, 0].max(initial=0.0) for cloud in samples])
 
 
 def region_fits(
@@ -136,16 +136,12 @@ def hysteresis(cloud: Mapping[str, Points]) -> float:
 
     Mean over bins of accumulation with both, weighted by outflow; NaN without such bins.
     """
-    loading, unloading = (cloud.get(label, np.empty((0, 2))) for label in ("loading", "unloading"))
-    most = max((part[:, 0].max() for part in (loading, unloading) if len(part)), default=0.0)
-    means = np.full((2, HYSTERESIS_BINS), np.nan)
-    for row, part in zip(means, (loading, unloading), strict=True):
-        number = np.minimum((HYSTERESIS_BINS * part[:, 0] / max(most, 1e-9)).astype(int), HYSTERESIS_BINS - 1)
-        for n in range(HYSTERESIS_BINS):
-            if (number == n).sum() >= 3:
-                row[n] = part[number == n, 1].mean()
-    both = means[:, ~np.isnan(means).any(axis=0)]
-    return float((both[0] - both[1]).sum() / both.mean(axis=0).sum()) if both.size else float("nan")
+    parts = [cloud.get(label, np.empty((0, 2))) for label in ("loading", "unloading")]
+    most = np.concatenate(parts)[:, 0].max(initial=1e-9)
+    numbers = [np.minimum((HYSTERESIS_BINS * part[:, 0] / most).astype(int), HYSTERESIS_BINS - 1) for part in parts]
+    bins = [n for n in range(HYSTERESIS_BINS) if all((number == n).sum() >= 3 for number in numbers)]
+    both = np.array([[part[number == n, 1].mean() for n in bins] for part, number in zip(parts, numbers, strict=True)])
+    return float((both[0] - both[1]).sum() / both.mean(axis=0).sum()) if bins else float("nan")
 
 
 def fit_table(network: RegionalModel, fits: pd.DataFrame, known: Mapping[str, str] = MEANINGS) -> str:
@@ -206,6 +202,5 @@ def prediction_table(network: RegionalModel, errors: pd.DataFrame, step: float) 
 
 def write_fits(path: Path, fits: pd.DataFrame, held_out: pd.DataFrame | None = None) -> None:
     """Write fit.csv, a row per region; held_out: `predictions` in runs that the fit did not use."""
-    table = fits.assign(doubts=fits["doubts"].map("; ".join))
-    table = table if held_out is None else table.join(held_out.add_prefix("held_out_"))
-    files.write_table(path, table, float_format="%.6g")
+    errors = pd.DataFrame() if held_out is None else held_out.add_prefix("held_out_")
+    files.write_table(path, fits.assign(doubts=fits["doubts"].map("; ".join)).join(errors), float_format="%.6g")

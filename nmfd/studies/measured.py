@@ -99,8 +99,8 @@ def identify(
     rows, left = detector_tables.read_counts(counts, city=city, skip_bad=skip_bad)
     stations = detector_tables.read_detectors(paths[0], paths[1], rows, counts, city=city)
     base = _base_network(paths[3], stations)
-    names = sorted(set(stations["region"]), key=lambda name: name.rjust(9) if name.isdecimal() else name)
-    names = list(base.region_names) if base else names
+    by_number = sorted(set(stations["region"]), key=lambda name: name.rjust(9) if name.isdecimal() else name)
+    names = list(base.region_names) if base else by_number
     speed = rows["flow"].sum() * VEHICLE_LENGTH_M / 3600.0 / max(rows["occ"].sum(), 1e-9)
     if not detector_tables.SPEEDS_M_S[0] <= speed <= detector_tables.SPEEDS_M_S[1]:
         raise InputError(
@@ -121,8 +121,8 @@ def identify(
     trip_km, assumed = _trip_lengths(stations, table, trip_length)
     intervals = _intervals(rows, used)
     number = intervals["region"].map(names.index)
-    for column, per_lane in (("accumulation_veh", "density_veh_km"), ("production_veh_km_h", "flow_veh_h")):
-        intervals[column] = intervals[per_lane] * lane_km[number]
+    intervals["accumulation_veh"] = intervals["density_veh_km"] * lane_km[number]
+    intervals["production_veh_km_h"] = intervals["flow_veh_h"] * lane_km[number]
     intervals["outflow_veh_s"] = intervals["production_veh_km_h"] / trip_km[number] / 3600.0
     samples = [_cloud(intervals[intervals["region"] == region]) for region in names]
     for region in fit_quality.nearly_empty(samples):
@@ -136,7 +136,7 @@ def identify(
         places, pairs = _positions(stations, table), _adjacency(paths[3], stations, names)
         new |= {"region_names": tuple(names), "positions": places, "adjacency": pairs, "u_min": U_MIN, "u_max": U_MAX}
     new["mfds"] = tuple(mfd.fit(*fit_quality.own_points(cloud).T) for cloud in samples)
-    fresh = {"exit_rates": None, "capacity": None, "storage": None, "placeholder": False}
+    fresh: dict = {"exit_rates": None, "capacity": None, "storage": None, "placeholder": False}
     network = replace(base, **new, **fresh) if base else RegionalModel(**new)
     if (network.hops < 0).any():
         i, j = np.argwhere(network.hops < 0)[0]
@@ -196,9 +196,8 @@ def _base_network(path: Path | None, detectors: pd.DataFrame) -> RegionalModel |
     if path is None or path.suffix != ".toml":
         return None
     network = load_network(path.parent)
-    names = {str(number): name for number, name in enumerate(network.region_names)}
-    names |= {name: name for name in network.region_names}
-    detectors["region"] = detectors["region"].map(lambda name: names.get(name, name))
+    numbers = {str(n): name for n, name in enumerate(network.region_names) if str(n) not in network.region_names}
+    detectors["region"] = detectors["region"].replace(numbers)
     if odd := set(detectors["region"]) ^ set(network.region_names):
         known = ", ".join(network.region_names)
         raise InputError(f"{path}: region {min(odd)!r} is not in both; the regions must be the same, {known}")
