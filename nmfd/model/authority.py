@@ -18,11 +18,6 @@ ENOUGH = 0.25  # share of the filling vehicles that can be held: control may hel
 NOTHING = 0.05  # or less: control does not help
 WAITING_SHARE = 0.02  # of all trips waiting outside at a time, and
 SLOW = 2.5  # times the free-flow time: the city is congested
-IDENTIFY = "cosim identify {scenario}"
-EVALUATE = "cosim evaluate {scenario} --controllers no-control,route-guidance"
-PRESSURE = ",no-control+max-pressure"
-PARTITION = "cosim import SUMOCFG --regions N --out networks/OTHER"
-
 Counts = Real[np.ndarray, "R R"]
 FILE = "verdict.txt"
 NO_GATEWAY = "no gateway has a signal that perimeter control can use; other regions may have (cosim import --regions)"
@@ -68,16 +63,12 @@ class Verdict:
     def text(self) -> str:
         """Return the sentences and a table of the boundaries."""
         each = self.boundaries
+        headings = ["from", "to", "flow [veh]", "controlled [veh]", "share", "gateways", "with signals"]
+        columns = (each.flow, each.controlled, each.shares, each.gateways, each.controllable)
+        forms = ("{}", "{}", "{:.0f}", "{:.0f}", "{:.0%}", "{}", "{}")
         pairs = np.argwhere(each.gateways > 0)
-        columns = {
-            "flow [veh]": [f"{each.flow[i, h]:.0f}" for i, h in pairs],
-            "controlled [veh]": [f"{each.controlled[i, h]:.0f}" for i, h in pairs],
-            "share": [f"{each.shares[i, h]:.0%}" for i, h in pairs],
-            "gateways": each.gateways[*pairs.T],
-            "with signals": each.controllable[*pairs.T],
-        }
-        table = text_columns(["from", "to", *columns], zip(*pairs.T, *columns.values(), strict=True))
-        return "\n".join([*self.sentences, "", table]) + "\n"
+        lines = [map(str.format, forms, (i, h, *(part[i, h] for part in columns))) for i, h in pairs]
+        return "\n".join([*self.sentences, "", text_columns(headings, lines)]) + "\n"
 
 
 def verdict(
@@ -98,6 +89,9 @@ def verdict(
         unknown
     where: the runs, such as "in 6 loading runs"; scenario: its folder, for commands
     """
+    identify = f"cosim identify {scenario}"
+    guidance = f"cosim evaluate {scenario} --controllers no-control,route-guidance"
+    pressure = f"{guidance},no-control+max-pressure"
     names, flow, load = network.titles, boundaries.flow.sum(), most / network.seen_critical
     passed = f"; {boundaries.controlled.sum() / max(flow, 1):.0%} of the {flow:,.0f} crossings {where} passed one"
     guess = ", a guess" if network.placeholder else ""
@@ -117,23 +111,24 @@ def verdict(
     critical = np.flatnonzero(load >= 1.0)
     came, held = boundaries.flow.sum(axis=0), boundaries.controlled.sum(axis=0)
     holdable, protect = held / np.maximum(came + started, 1.0), np.empty(0, dtype=int)
-    remedies = [f"guidance and other signals: {EVALUATE}{PRESSURE}", f"another partition: {PARTITION}"]
+    partition = "another partition: cosim import SUMOCFG --regions N --out networks/OTHER"
+    remedies = [f"guidance and other signals: {pressure}", partition]
     if not boundaries.controllable.any():
         answer = f"No: {NO_GATEWAY}."
-        remedies[0] = f"guidance: {EVALUATE}"
+        remedies = [f"guidance: {guidance}", partition]
     elif not flow:
         answer = "No: no vehicle crosses a boundary."
     elif network.placeholder:
         answer = "Cannot say yet: the critical accumulations are guesses from lanes and speed limits."
-        remedies = [f"the model of the city: {IDENTIFY}"]
+        remedies = [f"the model of the city: {identify}"]
     elif not len(critical) and crowded:
         answer = f"Cannot say yet: {traffic}, but no region is seen to become critical."
-        remedies = [f"other demand shows more: {IDENTIFY} --levels 0.8,1,1.3", *remedies]
+        remedies = [f"other demand shows more: {identify} --levels 0.8,1,1.3", *remedies]
     elif not len(critical):
         near = int(np.argmax(np.nan_to_num(load)))
         nearest = f", {names[near]} comes nearest with {load[near]:.2f}" if load[near] > 0 else ""
         answer = f"No: no region is seen to become critical{nearest}; more demand may change that."
-        remedies.append(f"more demand: {EVALUATE}{PRESSURE} --demand 1,1.3,1.6")
+        remedies.append(f"more demand: {pressure} --demand 1,1.3,1.6")
     else:
         details += [
             f"{names[r]} becomes critical: {came[r]:,.0f} vehicles entered from other regions, "
@@ -151,9 +146,6 @@ def verdict(
         else:
             answer = f"It may: {names[best]} becomes critical, and gateways could hold {share}."
     if not answer.startswith(("It may", "Hardly")):
-        details += [f"Next, {remedy.format(scenario=scenario)}" for remedy in remedies]
-    return Verdict(
-        sentences=(f"Can perimeter control help? {answer}", *details),
-        boundaries=boundaries,
-        protect=tuple(map(int, protect)),
-    )
+        details += [f"Next, {remedy}" for remedy in remedies]
+    sentences = f"Can perimeter control help? {answer}", *details
+    return Verdict(sentences=sentences, boundaries=boundaries, protect=tuple(map(int, protect)))

@@ -170,10 +170,11 @@ def _misfit(
     p: dynamics.Parameters, data: Sequence[torch.Tensor], scale: torch.Tensor, scheme: Mapping[str, Any]
 ) -> torch.Tensor:
     """Return the mean Huber loss of x_i and x_ij over the horizon, in units of `scale` (R,) [veh]."""
-    total, horizon = torch.zeros(()), data[1].shape[1]
+    total, horizon, huber = torch.zeros(()), data[1].shape[1], torch.nn.SmoothL1Loss(beta=OUTLIER)
     for k, x in enumerate(_rollout(p, data, scheme), start=1):
         error = (x - data[0][:, k]) / scale.unsqueeze(-1)
-        total = total + _huber(error.sum(-1)) + BY_DESTINATION * _huber(error)
+        for off, weight in ((error.sum(-1), 1.0), (error, BY_DESTINATION)):
+            total = total + weight * huber(off, torch.zeros_like(off))
     return total / horizon
 
 
@@ -184,10 +185,6 @@ def _rollout(p: dynamics.Parameters, data: Sequence[torch.Tensor], scheme: Mappi
     for k in range(demand.shape[1]):
         x = dynamics.advance(p, x, demand[:, k], perimeter[:, k], splits[:, k], **scheme)
         yield x
-
-
-def _huber(error: torch.Tensor) -> torch.Tensor:
-    return torch.nn.functional.smooth_l1_loss(error, torch.zeros_like(error), beta=OUTLIER)
 
 
 def _network(

@@ -108,11 +108,9 @@ def fit(accumulation: Samples, outflow: Samples, *, max_rate: float = np.inf, bi
     x, g = x[good], g[good]
     number = np.minimum((bins * x / x.max()).astype(int), bins - 1)
     used = np.unique(number)
-    middle_x = np.array([np.median(x[number == n]) for n in used])
-    middle_g = np.array([np.median(g[number == n]) for n in used])
-    candidates = [
-        _fit_cubic(middle_x, middle_g, float(share * x.max()), max_rate) for share in np.linspace(0.2, 1.0, 17)
-    ]
+    middle_x, middle_g = (np.array([np.median(values[number == n]) for n in used]) for values in (x, g))
+    jams = (float(share * x.max()) for share in np.linspace(0.2, 1.0, 17))
+    candidates = (_fit_cubic(middle_x, middle_g, jam, max_rate) for jam in jams)
     return min(candidates, key=lambda curve: ((curve.outflow(middle_x) - middle_g) ** 2).sum())
 
 
@@ -124,20 +122,15 @@ def _fit_cubic(x: np.ndarray, g: np.ndarray, jam: float, max_rate: float) -> Mfd
     # Positive at the jam: A + B + C >= floor.
     y, scale = np.minimum(x / jam, 1.0), g.max()
     design = np.stack([y**3, y**2, y], axis=1)
-    floor, ceiling = 0.01, min(max_rate * jam / scale, 1e3)
+    limits = np.array([[0, -1, 0], [-2, -1, 0], [1, 1, 1], [0, 0, 1], [0, 0, -1]], dtype=float)
+    least = np.array([0.0, 0.0, 0.01, 0.01, -min(max_rate * jam / scale, 1e3)])
     result = minimize(
         lambda p: ((design @ p - g / scale) ** 2).sum(),
         x0=np.array([0.0, -1.0, 2.0]),
         jac=lambda p: 2.0 * design.T @ (design @ p - g / scale),
         method="SLSQP",
         options={"maxiter": 500, "ftol": 1e-14},
-        constraints={
-            "type": "ineq",
-            "fun": lambda p: np.array(
-                [-p[1], -2 * p[0] - p[1], p[0] + p[1] + p[2] - floor, p[2] - floor, ceiling - p[2]]
-            ),
-            "jac": lambda p: np.array([[0, -1, 0], [-2, -1, 0], [1, 1, 1], [0, 0, 1], [0, 0, -1]], dtype=float),
-        },
+        constraints={"type": "ineq", "fun": lambda p: limits @ p - least, "jac": lambda p: limits},
     )
-    third, second, first = (float(value) for value in result.x * scale)
-    return Mfd(a=third / jam**3, b=second / jam**2, c=first / jam, jam=jam)
+    a, b, c = map(float, result.x * scale)
+    return Mfd(a=a / jam**3, b=b / jam**2, c=c / jam, jam=jam)
