@@ -123,7 +123,7 @@ def model(scenario, runs):
 
 def test_any_free_numbers_are_a_valid_model(model):
     """q = c (1 - first y - second y^2) with y = x / jam, falling from c to a hundredth of it at the least."""
-    p = model.parameters_of(1.0 - torch.eye(7))
+    p = model.regional()
     c, first, second, jam = model.shape()
     assert (first >= 0).all() and (first + 2.0 * second >= 0).all() and (first + second <= 0.99).all()
     for y in (0.0, 0.3, 1.0):
@@ -136,12 +136,11 @@ def test_any_free_numbers_are_a_valid_model(model):
 
 def test_the_network_flows_as_the_free_numbers_do(scenario, runs, model):
     """Its exit rates are scaled, and its capacities are those at u_max: the flows stay what they were."""
-    off_diagonal = 1.0 - torch.eye(7)
-    network = identification._network(scenario.network, model, runs, off_diagonal)
+    network = identification._network(scenario.network, model, runs)
     random = np.random.default_rng(2)
     x = torch.from_numpy(random.uniform(0.0, 400.0, (7, 7)))
     perimeter, splits = map(torch.from_numpy, tiny.random_controls(random, network))
-    expected = dynamics.flows(model.parameters_of(off_diagonal), x.float(), perimeter.float(), splits.float())
+    expected = dynamics.flows(model.regional(), x.float(), perimeter.float(), splits.float())
     for mine, free in zip(dynamics.flows(dynamics.parameters(network), x, perimeter, splits), expected, strict=True):
         assert free.abs().max() > 0.0
         torch.testing.assert_close(mine, free.detach().double(), rtol=1e-4, atol=1e-6)

@@ -35,13 +35,8 @@ def region_map(
     ax.set_aspect("equal")
     ax.set_axis_off()
     for region, (x, y) in enumerate(places):
-        box = {
-            "boxstyle": "round,pad=0.25",
-            "facecolor": "white",
-            "edgecolor": COLOURS[region % len(COLOURS)],
-            "alpha": 0.85,
-        }
-        title = f"{region} {names[region]}"
+        colour, title = COLOURS[region % len(COLOURS)], f"{region} {names[region]}"
+        box = {"boxstyle": "round,pad=0.25", "facecolor": "white", "edgecolor": colour, "alpha": 0.85}
         ax.text(x, y, title, ha="center", va="center", fontsize="small", zorder=5, bbox=box)
     for controlled, face, label in ((True, "black", "gateway with a signal"), (False, "white", "without control")):
         edges = sorted({g["from_edge"] for g in tables.gateways if (g["control"] == CONTROLLED) == controlled})
@@ -71,7 +66,7 @@ def rings_round(shapes: Sequence[Points], regions: EdgeNumbers, blocks: float) -
     for region in range(int(regions.max()) + 1):
         rings = ax.contour(x, y, (label == region).astype(float), levels=[0.5]).allsegs[0]
         rings.sort(key=lambda ring: -abs(_area(ring)))
-        rings = [ring for ring in rings if _area(ring) * _area(rings[0]) > 0]  # the others run round holes
+        # Rings round holes run the other way: their area has the other sign.
         outlines.append([ring for ring in rings if _area(ring) / _area(rings[0]) > SMALLEST_RING_SHARE])
     return outlines
 
@@ -80,8 +75,7 @@ def _sampled(shapes: Sequence[Points]) -> tuple[np.ndarray, np.ndarray]:
     """Return points (n, 2) along the shapes of the edges, and the edge (n,) of each point."""
     points, of = [], []
     for n, shape in enumerate(shapes):
-        steps = np.hypot(*np.diff(shape, axis=0).T) if len(shape) > 1 else np.zeros(0)
-        along = np.concatenate([[0.0], np.cumsum(steps)])
+        along = np.append(0.0, np.cumsum(np.hypot(*np.diff(shape, axis=0).T)))
         marks = np.linspace(0.0, along[-1], max(2, int(along[-1] / POINT_SPACING_M) + 1))
         points.append(np.stack([np.interp(marks, along, shape[:, axis]) for axis in (0, 1)], axis=1))
         of.append(np.full(len(marks), n))
@@ -90,5 +84,5 @@ def _sampled(shapes: Sequence[Points]) -> tuple[np.ndarray, np.ndarray]:
 
 def _area(ring: Points) -> float:
     """Return the area [m^2] of a polygon (n, 2) [m]; negative if it runs clockwise."""
-    x, y = ring[:, 0], ring[:, 1]
+    x, y = ring.T
     return float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum()) / 2

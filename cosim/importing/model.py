@@ -14,7 +14,7 @@ from cosim.importing.streets import Streets
 from cosim.sumo.arrays import EdgeNumbers
 from nmfd.arrays import PairsOverTime
 from nmfd.model.identification import observed_split_ratios
-from nmfd.model.mfd import JAM_DENSITY, Mfd, guess
+from nmfd.model.mfd import JAM_DENSITY, guess
 from nmfd.model.regional_model import RegionalModel
 from nmfd.runs.config import quoted
 
@@ -68,8 +68,8 @@ def without_idle(case: SumoInput, traffic: Traffic) -> SumoInput:
 
 def clock(case: SumoInput, streets: Streets, traffic: Traffic) -> Clock:
     """Return control intervals of the most common signal cycle, until RECOVERY_S after the last departure."""
-    running = [logic for logic in streets.logics.values() if round(logic.cycle) > 0]
-    cycles = Counter(round(logic.cycle) for logic in running if logic.kind == "static")
+    cycles = Counter(round(logic.cycle) for logic in streets.logics.values() if logic.kind == "static")
+    del cycles[0]
     cycle = float(max(sorted(cycles), key=cycles.__getitem__)) if cycles else DEFAULT_CYCLE_S
     step = cycle * np.ceil(SHORTEST_STEP_S / cycle)
     if step > LONGEST_STEP_S:
@@ -88,22 +88,10 @@ def region_demand(traffic: Traffic, regions: EdgeNumbers, clock: Clock) -> Pairs
 
 
 def network_of(streets: Streets, regions: EdgeNumbers, name: str, baseline: Baseline) -> RegionalModel:
-    """Return the regional model: adjacency from streets, split ratios from the baseline, MFDs from lanes and speeds."""
-    network = RegionalModel(
-        name=name,
-        region_names=names(streets, regions),
-        positions=positions(streets, regions).round(1),
-        adjacency=digraph(streets, regions) > 0,
-        mfds=_placeholders(streets, regions, baseline),
-        u_min=0.1,
-        u_max=0.9,
-        placeholder=True,
-    )
-    return replace(network, observed_split_ratios=observed_split_ratios(network, baseline.crossings(regions)))
+    """Return the regional model: adjacency from streets, split ratios from the baseline, guessed MFDs.
 
-
-def _placeholders(streets: Streets, regions: np.ndarray, baseline: Baseline) -> tuple[Mfd, ...]:
-    """Return MFDs with a free-flow rate from speed limits and metres per visit, and a jam accumulation from lanes."""
+    Their free-flow rate is from speed limits and metres per visit, their jam accumulation from lanes.
+    """
     count = int(regions.max()) + 1
     lanes = np.bincount(regions, streets.lane_metres, count)
     speed = np.bincount(regions, streets.lane_metres * streets.speed, count) / np.maximum(lanes, 1.0)
@@ -111,7 +99,17 @@ def _placeholders(streets: Streets, regions: np.ndarray, baseline: Baseline) -> 
     measured = baseline.metres_per_visit(streets, regions)
     visit = np.where(np.isnan(measured), 0.7 * np.maximum(across, 100.0), np.maximum(measured, 50.0))
     rate, jam = SIGNAL_SPEED_SHARE * speed / visit, np.maximum(JAM_DENSITY * lanes / 1000.0, 10.0)
-    return tuple(map(guess, rate, jam))
+    network = RegionalModel(
+        name=name,
+        region_names=names(streets, regions),
+        positions=positions(streets, regions).round(1),
+        adjacency=digraph(streets, regions) > 0,
+        mfds=tuple(map(guess, rate, jam)),
+        u_min=0.1,
+        u_max=0.9,
+        placeholder=True,
+    )
+    return replace(network, observed_split_ratios=observed_split_ratios(network, baseline.crossings(regions)))
 
 
 def options(case: SumoInput, clock: Clock) -> dict[str, str]:

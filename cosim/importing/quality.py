@@ -80,10 +80,8 @@ def tables(
             "uncontrolled_share": round(free / flow, 3) if flow else np.nan,
         }
 
-    rows = [
-        row(str(n), name, regions == n, [g for g in gateways if n in (g["source"], g["target"])])
-        for n, name in enumerate(names)
-    ]
+    own = [[g for g in gateways if n in (g["source"], g["target"])] for n in range(len(names))]
+    rows = [row(str(n), name, regions == n, own[n]) for n, name in enumerate(names)]
     return Tables(quality=[*rows, row("all", "all regions", regions >= 0, gateways)], gateways=gateways)
 
 
@@ -94,10 +92,8 @@ def left_alone(streets: Streets, switched: Sequence[str] = ()) -> dict[str, str]
     """
     reasons = {signal: "no programme" for signal in streets.link_signals if signal and signal not in streets.logics}
     for signal, logic in streets.logics.items():
-        if logic.programme == "off":
-            reasons[signal] = "switched off"
-        elif logic.kind not in HELD:
-            reasons[signal] = f"{logic.kind} signal"
+        if logic.programme == "off" or logic.kind not in HELD:
+            reasons[signal] = "switched off" if logic.programme == "off" else f"{logic.kind} signal"
     return reasons | {signal: "programme follows a timetable" for signal in switched}
 
 
@@ -106,7 +102,6 @@ def import_verdict(
 ) -> Verdict:
     """Judge from the run without control whether perimeter control can help; scenario: its name."""
     crossings = ((row["source"], row["target"], row["flow_veh"], row["control"] == CONTROLLED) for row in gateways)
-    boundaries = Boundaries.of_gateways(network.regions, crossings)
     inside = np.array([np.bincount(regions, row, network.regions) for row in baseline.presence]) / INTERVAL_S
     started = np.zeros(network.regions)
     for (way, _), vehicles in baseline.ways.items():
@@ -114,7 +109,7 @@ def import_verdict(
             started[regions[way[0]]] += vehicles
     return authority.verdict(
         network,
-        boundaries,
+        Boundaries.of_gateways(network.regions, crossings),
         most=inside.max(axis=0),
         started=started,
         waiting=baseline.waiting,

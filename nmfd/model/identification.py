@@ -18,7 +18,7 @@ from nmfd.arrays import PairsOverTime, StatesOverTime, TurnsOverTime
 from nmfd.model import dynamics
 from nmfd.model.mfd import Mfd
 from nmfd.model.regional_model import RegionalModel
-from nmfd.tensors import PerPair, one_thread
+from nmfd.tensors import one_thread
 
 HORIZON = 10  # control intervals
 ITERATIONS = 600
@@ -74,8 +74,8 @@ class _Model(torch.nn.Module):
         first = 2.0 * drop * torch.sigmoid(self.bend)
         return self.free_rate.exp(), first, drop - first, self.jam.exp()
 
-    def parameters_of(self, off_diagonal: PerPair) -> dynamics.Parameters:
-        """Return the parameters; off_diagonal: (R, R), 1 but for zeros on the diagonal."""
+    def regional(self) -> dynamics.Parameters:
+        """Return the parameters of the regional model."""
         c, first, second, jam = self.shape()
         rates = EXIT_RATES ** torch.tanh(self.exit_rates)
         rates = torch.minimum(rates, 0.999 * self._fastest / c.unsqueeze(-1))
@@ -85,7 +85,7 @@ class _Model(torch.nn.Module):
             c=c,
             jam=jam,
             adjacency=self.adjacency,
-            off_diagonal=off_diagonal,
+            off_diagonal=1.0 - torch.eye(len(jam)),
             exit_rates=rates,
             capacity=self.capacity.exp() * self.adjacency / self._u_max,
             storage=self.storage.exp(),
@@ -136,31 +136,28 @@ def fit(
         horizon = min(HORIZON, max(len(run.demand) for run in runs))
         data, scheme = windows(runs, horizon), {"step": step, "substeps": substeps, "integrator": integrator}
         scale = torch.tensor(network.critical, dtype=torch.float32)
-        off_diagonal = 1.0 - torch.eye(network.regions)
         optimizer = torch.optim.Adam(model.parameters(), lr=LEARNING_RATE)
         for iteration in range(iterations):
             for group in optimizer.param_groups:
                 group["lr"] = LEARNING_RATE * (0.05 + 0.95 * 0.5 * (1.0 + math.cos(math.pi * iteration / iterations)))
             batch = torch.randint(len(data[0]), (min(BATCH, len(data[0])),), generator=generator)
-            loss = _misfit(model.parameters_of(off_diagonal), [part[batch] for part in data], scale, scheme)
+            loss = _misfit(model.regional(), [part[batch] for part in data], scale, scheme)
             optimizer.zero_grad()
             (loss + model.penalty()).backward()
             torch.nn.utils.clip_grad_norm_(model.parameters(), 10.0)
             optimizer.step()
             if progress:
                 progress(iteration + 1, iterations, f"misfit {loss.item():.3f}")
-        return _network(network, model, runs, off_diagonal)
+        return _network(network, model, runs)
 
 
 def windows(runs: Sequence[Observed], horizon: int) -> list[torch.Tensor]:
     """Return states (N, horizon + 1, R, R), demands, perimeters and splits (N, horizon, ...) of all windows."""
 
+    cut, long = np.lib.stride_tricks.sliding_window_view, [run for run in runs if len(run.demand) >= horizon]
+
     def stack(name: str, length: int) -> torch.Tensor:
-        parts = [
-            np.lib.stride_tricks.sliding_window_view(getattr(run, name), length, axis=0)
-            for run in runs
-            if len(run.demand) >= horizon
-        ]
+        parts = [cut(getattr(run, name), length, axis=0) for run in long]
         return torch.tensor(np.moveaxis(np.concatenate(parts), -1, 1), dtype=torch.float32)
 
     return [stack("accumulation", horizon + 1), *(stack(name, horizon) for name in ("demand", "perimeter", "splits"))]
@@ -187,24 +184,19 @@ def _rollout(p: dynamics.Parameters, data: Sequence[torch.Tensor], scheme: Mappi
         yield x
 
 
-def _network(
-    network: RegionalModel, model: _Model, runs: Sequence[Observed], off_diagonal: torch.Tensor
-) -> RegionalModel:
+def _network(network: RegionalModel, model: _Model, runs: Sequence[Observed]) -> RegionalModel:
     """Return the fitted network, with exit rates scaled to 1 on the average of a region's vehicles."""
     with torch.no_grad():
-        p = model.parameters_of(off_diagonal)
+        p = model.regional()
     assert p.exit_rates is not None and p.capacity is not None and p.storage is not None
     rates = p.exit_rates.double().numpy()
     weight = sum(run.accumulation.sum(axis=0) for run in runs)
     weight[weight.sum(axis=1) == 0] = 1.0  # empty in all runs
     mean = (weight * rates).sum(axis=1) / weight.sum(axis=1)
-    mfds = tuple(
-        Mfd(a=float(a) * m, b=float(b) * m, c=float(c) * m, jam=float(jam))
-        for a, b, c, jam, m in zip(p.a, p.b, p.c, p.jam, mean, strict=True)
-    )
+    curves = zip(*(part.tolist() for part in (p.a, p.b, p.c, p.jam)), mean, strict=True)
     return replace(
         network,
-        mfds=mfds,
+        mfds=tuple(Mfd(a=a * m, b=b * m, c=c * m, jam=jam) for a, b, c, jam, m in curves),
         exit_rates=rates / mean[:, None],
         capacity=p.capacity.double().numpy() * network.u_max * network.adjacency,
         storage=p.storage.double().numpy(),
