@@ -167,7 +167,8 @@ def test_a_control_horizon_of_one_holds_the_best_constant_controls(two_regions):
     theta = controller.admissible.open(1)[:, 2:]
 
     def cost(gates):
-        return controller.cost(start, demand, np.concatenate([np.reshape(gates, (1, 2)), theta], axis=1))
+        plan = np.concatenate([np.reshape(gates, (1, 2)), theta], axis=1)
+        return controller.vehicle_steps(start, demand, plan)[0]
 
     grid = [(u, v) for u in np.linspace(0.1, 0.9, 5) for v in np.linspace(0.1, 0.9, 5)]
     assert cost(chosen) <= min(map(cost, grid)) * (1.0 + 1e-5)

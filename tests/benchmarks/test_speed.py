@@ -66,7 +66,7 @@ def random_city(family, regions):
 
 
 def compare(scenario, measured, guidance):
-    """Total time spent over the horizon [veh s] by our MPC, by plain IPOPT, and whether that converged."""
+    """Vehicles over the horizon by our MPC, by plain IPOPT, and whether that converged."""
     controller, k = EconomicMpc(planning_model(scenario), guidance=guidance), measured.step
     assert controller.act(measured).status == Status.OK
     ipopt = Ipopt(planning_model(scenario), guidance=guidance, horizon=HORIZON, limits={"max_iter": 200})
@@ -74,7 +74,8 @@ def compare(scenario, measured, guidance):
     rows = [controller.admissible.decision(u, theta) for u, theta in zip(perimeter, splits, strict=True)]
     other = controller.admissible.project(np.stack(rows))
     start, demand = controller.forecast(measured)
-    return controller.cost(start, demand, controller._plan), controller.cost(start, demand, other), reason is None
+    ours, plain = (controller.vehicle_steps(start, demand, plan)[0] for plan in (controller._plan, other))
+    return ours, plain, reason is None
 
 
 @KINDS

@@ -85,9 +85,9 @@ class Policy(nn.Module):
             self.register_buffer("split_mask", mask.float(), persistent=False)
             self.register_buffer("split_bias", bias, persistent=False)
 
-    def forward(self, x: PerPair) -> tuple[PerPair, PerTurn | None]:
-        """Return perimeter and splits of the states x."""
-        perimeter, splits = self.listed(x)
+    def forward(self, x: PerPair, memory: Memory | None = None) -> tuple[PerPair, PerTurn | None]:
+        """Return perimeter and splits of the states x; memory: what `remember` returned for x, None in rollouts."""
+        perimeter, splits = self.listed(x, memory)
         if not self.architecture.listed:
             return perimeter, splits
         onward, empty = self.onward, perimeter.new_zeros(*x.shape[:-2], self.regions, self.regions)
@@ -99,10 +99,7 @@ class Policy(nn.Module):
     def listed(
         self, x: PerPair, memory: Memory | None = None
     ) -> tuple[Float[torch.Tensor, "*#B R D"], Float[torch.Tensor, "*#B R D R"] | None]:
-        """Return perimeter (..., R, D) and splits (..., R, D, R) towards the regions `onward` (R, D); D = R if dense.
-
-        memory: what `remember` returned for x; None in rollouts
-        """
+        """Return perimeter (..., R, D) and splits (..., R, D, R) towards the regions `onward`; D = R if dense."""
         shape = self.onward.shape
         hidden = self.backbone(self._around(x) if self.architecture.local else (x / self.scale).flatten(-2))
         open_share = torch.sigmoid(self.perimeter_decoder(hidden)).reshape(*x.shape[:-2], *shape)
@@ -147,7 +144,6 @@ class DpcController:
     def __init__(self, policy: Policy):
         self.policy = policy.eval()
         self.name = "dpc-pcrg" if policy.architecture.guidance else "dpc-pc"
-        self._onward = policy.onward.numpy() if policy.architecture.listed else None
         self.reset()
 
     def reset(self, seed: int = 0) -> None:
@@ -159,20 +155,8 @@ class DpcController:
             # A local policy needs the sums only, and no copy.
             x = torch.from_numpy(accumulation if policy.architecture.local else accumulation.astype(np.float32))
             self._memory = policy.remember(x, self._memory)
-            perimeter, splits = policy.listed(x, self._memory)
-            rates = policy.prices(x), policy.metering(x)
-            prices, metering = (None if values is None else values.numpy().astype(float) for values in rates)
-        perimeter = perimeter.numpy()
+            values = *policy(x, self._memory), policy.prices(x), policy.metering(x)
+        perimeter, splits, prices, metering = (None if v is None else v.numpy().astype(float) for v in values)
         if splits is not None:
-            splits = splits.numpy().astype(float)
-            splits = self._full(splits / np.maximum(splits.sum(axis=1, keepdims=True), 1e-9))  # float32 misses 1
-        return Controls(perimeter=self._full(perimeter), splits=splits, prices=prices, metering=metering)
-
-    def _full(self, listed: np.ndarray) -> np.ndarray:
-        """Return (R, R) or (R, R, R) from (R, D) or (R, D, R): all regions instead of the neighbours."""
-        if self._onward is None:
-            return listed.astype(float, copy=False)
-        full = np.zeros((len(listed), len(listed), *listed.shape[2:]))
-        here, way = np.nonzero(np.diff(self._onward, prepend=-1))
-        full[here, self._onward[here, way]] = listed[here, way]
-        return full
+            splits /= np.maximum(splits.sum(axis=1, keepdims=True), 1e-9)  # float32 misses 1
+        return Controls(perimeter=perimeter, splits=splits, prices=prices, metering=metering)

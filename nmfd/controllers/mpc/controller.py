@@ -147,7 +147,7 @@ class EconomicMpc:
         self._moves = min(horizon - 1 if blind else horizon, self.options.control_horizon or horizon)
         self._model = edge_model.build(network, self._used, guidance=guidance, **planning.scheme)
         rounded = replace(self._model, rounding=JAM_ROUNDING * min(mfd.jam for mfd in network.mfds))
-        self._exact = partial(edge_model.vehicle_steps, self._model)
+        self.vehicle_steps = partial(edge_model.vehicle_steps, self._model)  # exact
         self._rounded: Callable = partial(edge_model.vehicle_steps, rounded, gradient=True)
         self.admissible = Admissible(network, self._model, guidance=guidance)
         self._open = self.admissible.open(self._moves)
@@ -174,7 +174,7 @@ class EconomicMpc:
         last = np.concatenate([self._plan[1:], self._plan[-1:]]) if self._left else self._open
         try:
             if self._left:
-                cost = partial(self._exact, start, demand, deadline=deadline, beyond=beyond)
+                cost = partial(self.vehicle_steps, start, demand, deadline=deadline, beyond=beyond)
                 last = self._open if cost(self._open)[0] < cost(last)[0] else last
             minimum = self._solve(start, demand, last, deadline, beyond)
         except Late:
@@ -208,10 +208,6 @@ class EconomicMpc:
         """Return the first interval of the plan."""
         perimeter, splits = self.admissible.controls(self._plan[0])
         return Controls(perimeter=perimeter, splits=splits, status=status, note=note)
-
-    def cost(self, start: PerCell, demand: Demands, plan: Plan) -> float:
-        """Return the total time spent over the horizon (veh s) of a plan (moves, E + V) by the exact model."""
-        return self._step * self._exact(start, demand, plan)[0]
 
     def forecast(self, observation: Observation) -> tuple[PerCell, Demands]:
         """Return the cells (veh, (C,)) now and their demand (veh/s, (horizon, C)), numbered as in edge_model."""
