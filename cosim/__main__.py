@@ -1,12 +1,10 @@
 """The command `cosim`, also `python -m cosim`."""
 
-from nmfd.__main__ import start
+from functools import partial
 
+from nmfd.__main__ import main as run
 
-def main() -> None:
-    """Run the command `cosim`."""
-    start("cosim")
-
+main = partial(run, "cosim")
 
 if __name__ == "__main__":
     main()

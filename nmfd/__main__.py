@@ -1,15 +1,14 @@
-"""The command `nmfd`, also `python -m nmfd`; cosim.__main__ takes `start` from here."""
+"""The command `nmfd`, also `python -m nmfd`."""
 
 import os
 import signal
 from importlib import import_module
-from typing import NoReturn
 
 
-def start(program: str) -> None:
+def main(program: str = "nmfd") -> None:
     """Run a command line, whose imports end in a line after Ctrl-C, too."""
 
-    def end(*_: object) -> NoReturn:
+    def end(*_: object) -> None:
         os.write(2, f"{program}: interrupted\n".encode())
         os._exit(130)
 
@@ -18,14 +17,9 @@ def start(program: str) -> None:
     try:
         import_module(f"{program}.cli").main()
     except SystemExit as ended:
-        if ended.code == 130:  # after Ctrl-C in a text that it executed, Python would return -2
+        if ended.code == 130:  # Python itself may return -2
             os._exit(130)
         raise
-
-
-def main() -> None:
-    """Run the command `nmfd`."""
-    start("nmfd")
 
 
 if __name__ == "__main__":

@@ -48,10 +48,10 @@ class Commands(click.Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run a command; exit with 2 after a user error, 1 after failed runs, 130 after Ctrl-C or SIGTERM."""
-        stops = []  # an import may make another exception of it
+        stops = []
 
         def stop(*_: object) -> NoReturn:
-            stops.append("interrupted")
+            stops.append(True)  # an import may make another exception of this one
             raise KeyboardInterrupt
 
         if threading.current_thread() is threading.main_thread():
@@ -65,15 +65,13 @@ class Commands(click.Group):
         try:
             return super().invoke(ctx)
         except (KeyboardInterrupt, Exception) as error:
-            if isinstance(error, KeyboardInterrupt) or stops:
-                told = isinstance(error, KeyboardInterrupt) and str(error)
-                text, status = f"interrupted: {told}" if told else "interrupted", 130
-            elif isinstance(error, RunFailed):
-                text, status = f"error: {error}", 1
-            elif isinstance(error, (InputError, OSError)) and not isinstance(error, BrokenPipeError):
-                text, status = f"error: {error}", 2
-            else:  # click ends without a word if nobody reads on
-                raise
+            if stops or isinstance(error, KeyboardInterrupt):
+                told = str(error) * isinstance(error, KeyboardInterrupt)
+                text, status = ": ".join(filter(None, ["interrupted", told])), 130
+            elif isinstance(error, BrokenPipeError) or not isinstance(error, (RunFailed, InputError, OSError)):
+                raise  # click ends without a word if nobody reads on
+            else:
+                text, status = f"error: {error}", 1 if isinstance(error, RunFailed) else 2
         click.echo(f"{self.name}: {' '.join(text.split())}", err=True)
         ctx.exit(status)
 

@@ -49,6 +49,7 @@ if TYPE_CHECKING:
 MANIFEST, TABLE, LOCK = "manifest.json", "runs.csv", ".lock"
 DASK_PATIENCE_S = 10.0  # for the scheduler to answer
 POLL_S, EXIT_S = 0.2, 5.0  # between looks at the time limit; for a process to end after its outcome
+PRELOADED = "xarray", "dask.array"  # which a Result imports, if they are there
 STARTING = threading.Lock()  # held while a process starts
 PACKAGES = ("numpy", "torch", "casadi", "libsumo")  # whose versions are in the manifest
 
@@ -157,7 +158,13 @@ def _outcomes(
     elif workers == 0:
         yield from ((run, attempt(run.job)) for run in todo)
     else:
-        yield from _processes(todo, workers, time_limit)
+        try:
+            yield from _processes(todo, workers, time_limit)
+        finally:
+            server: Any = forkserver._forkserver
+            if server._forkserver_pid is not None:  # it may still import
+                os.kill(server._forkserver_pid, signal.SIGTERM)
+                server._stop()
 
 
 def _alone(job: Callable[[], Result], folder: str, time_limit: float | None) -> Result | str:
@@ -170,51 +177,43 @@ def _processes(
     todo: Sequence[Run], workers: int, time_limit: float | None, folder: str = ""
 ) -> Generator[tuple[Run, Result | str]]:
     """Yield every run with its outcome from a process of its own in `folder`, `workers` at a time."""
-    waiting: list[Run] = list(reversed(todo))
-    live: dict[connection.Connection, tuple[Run, BaseProcess, float]] = {}
+    waiting, live = list(reversed(todo)), dict[connection.Connection, tuple[Run, BaseProcess, float]]()
     try:
         while waiting or live:
             while waiting and len(live) < workers:
-                run = waiting.pop()
-                channel, process = _start(run.job, os.path.abspath(folder))
-                live[channel] = run, process, time.monotonic() + (time_limit or math.inf)
+                channel, process = _start(waiting[-1].job, os.path.abspath(folder))
+                live[channel] = waiting.pop(), process, time.monotonic() + (time_limit or math.inf)
                 with suppress(BrokenPipeError):  # it has died, which is an outcome
-                    channel.send(run.job)
+                    channel.send(live[channel][0].job)
             ready, now = connection.wait(live, POLL_S), time.monotonic()
             for channel in [one for one, (_, _, end) in live.items() if one in ready or now > end]:
-                run, process, _ = live[channel]
-                outcome = _outcome(channel, process)
-                del live[channel]
-                yield run, outcome
-    except BaseException:  # Ctrl-C, perhaps while the server imports, or an end of the iteration
+                outcome = _outcome(channel, live[channel][1])
+                yield live.pop(channel)[0], outcome
+    finally:  # after Ctrl-C there are some
         for _, process, _ in live.values():
             process.kill()
-            process.join()
-        if server := getattr(forkserver._forkserver, "_forkserver_pid", None):
-            os.kill(server, signal.SIGTERM)
-        raise
 
 
 def _start(job: Callable[[], Result], folder: str) -> tuple[connection.Connection, BaseProcess]:
-    """Start a process for `job`, and return it behind the channel for the job and its outcome.
+    """Start a process, and return it behind the channel for a job and its outcome.
 
-    Where the system can, it is forked from a server that has imported the module of the job.
+    Where the system can, it is forked from a server that has imported the module of `job`.
     """
-    method = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
+    method, environment = "forkserver" if hasattr(os, "fork") else "spawn", dict(os.environ)
     context: Any = multiprocessing.get_context(method)
     if method == "forkserver":
-        context.set_forkserver_preload([__name__, getattr(job, "func", job).__module__])
+        context.set_forkserver_preload([__name__, getattr(job, "func", job).__module__, *PRELOADED])
         resource_tracker.ensure_running()  # first, as it lets Ctrl-C through
-        blocked, kept = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}), dict(os.environ)
+        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         os.environ |= {"PYTHONSAFEPATH": "1", "PYTHONPATH": os.pathsep.join(sys.path)}  # the modules of this process
         try:
             forkserver.ensure_running()
         finally:
             os.environ.clear()
-            os.environ |= kept
+            os.environ |= environment
             signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
     ours, theirs = context.Pipe()
-    process = context.Process(target=_work, args=(theirs, folder, dict(os.environ)), daemon=True)
+    process = context.Process(target=_work, args=(theirs, folder, environment), daemon=True)
     with STARTING:  # without the user's script, which would do everything again
         main, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
         try:
@@ -226,23 +225,22 @@ def _start(job: Callable[[], Result], folder: str) -> tuple[connection.Connectio
 
 
 def _work(channel: connection.Connection, folder: str, environment: Mapping[str, str]) -> None:
-    """Send back the outcome of the job that comes through `channel`, unless the process at its other end is gone."""
+    """Send back the outcome of the job that comes through `channel`, as long as its other end is there."""
+
+    def end_with_parent() -> None:
+        multiprocessing.parent_process().join()  # type: ignore[union-attr]
+        os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
     os.environ.clear()
     os.environ.update(environment)
     os.chdir(folder)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
     with suppress(OSError):
         channel.send(attempt(lambda: channel.recv()()))
 
 
-def _end_with_parent() -> None:
-    if parent := multiprocessing.parent_process():
-        parent.join()
-        os._exit(1)
-
-
 def _outcome(channel: connection.Connection, process: BaseProcess) -> Result | str:
-    """Return what comes through `channel`, or why nothing does; end the process."""
+    """Return what comes through `channel`, or why nothing does; wait for the end of the process."""
     if not channel.poll():
         process.kill()
         return "not finished within the time limit"
@@ -251,11 +249,9 @@ def _outcome(channel: connection.Connection, process: BaseProcess) -> Result | s
     except (EOFError, OSError):
         process.join(EXIT_S)
         status = process.exitcode or 0
-        name = f", {signal.strsignal(-status)}" if status < 0 else ""
-        return f"its process died (status {status}{name})"
+        return f"its process died (status {status}{f', {signal.strsignal(-status)}' if status < 0 else ''})"
     finally:
         process.join(EXIT_S)
-        process.kill()
         channel.close()
 
 
