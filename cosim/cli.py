@@ -36,13 +36,11 @@ CONTROLLER = click.option(
 )
 AGAINST = click.option("--against", metavar="NAME[+...]", help="Second controller, on the same trips.")
 STEPS = click.option("--steps", type=COUNT, help="Control intervals. [default: the scenario's]")
-DEMAND = click.option("--demand", type=LEVEL, default=1.0, show_default=True, help="Factor on the demand.")
+DEMAND = click.option("--demand", type=LEVEL, default=1.0, help="Factor on the demand.")
 WORKERS = click.option(
     "--workers", type=COUNT, default=lambda: os.cpu_count() or 1, show_default="one per core", help="Runs at a time."
 )
-LEVELS = click.option(
-    "--demand", "levels", type=listed(LEVEL), default="1", show_default=True, help="Factors on the demand."
-)
+LEVELS = click.option("--demand", "levels", type=listed(LEVEL), default="1", help="Factors on the demand.")
 
 
 def span(text: str) -> tuple[float, float]:
@@ -54,6 +52,7 @@ def span(text: str) -> tuple[float, float]:
 @click.group(
     name="cosim",
     cls=Commands,
+    context_settings={"show_default": True},
     sections={
         "First steps": ("demo", "run", "watch"),
         "Studies": ("evaluate", "compare", "report", "tune"),
@@ -66,7 +65,7 @@ def main() -> None:
 
 
 @main.command()
-@click.option("--out", type=FOLDER, default="runs/demo", show_default=True, metavar="DIR", help="Run folder.")
+@click.option("--out", type=FOLDER, default="runs/demo", metavar="DIR", help="Run folder.")
 def demo(out: Path) -> None:
     """Run a small city with and without gates; write a page.
 
@@ -114,7 +113,13 @@ def run(scenario: Path, controller: str, against: str | None, **options: Any) ->
 @AGAINST
 @seed_option("Seed of trips, drivers and guidance.")
 @DEMAND
-@click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port of the page. [default: any that is free]")
+@click.option(
+    "--port",
+    type=click.IntRange(0, 65535),
+    default=0,
+    show_default=False,
+    help="Port of the page. [default: any that is free]",
+)
 @click.option("--gui", is_flag=True, help="Open sumo-gui instead of a page, with one run.")
 def watch(scenario: Path, controller: str, against: str | None, gui: bool, **options: Any) -> None:
     """Watch runs on a live page with map and curves.
@@ -133,8 +138,8 @@ def watch(scenario: Path, controller: str, against: str | None, gui: bool, **opt
 @main.command()
 @SCENARIO
 @CONTROLLERS
-@click.option("--seeds", type=COUNT, default=10, show_default=True, help="Runs per controller and demand level.")
-@click.option("--first-seed", type=SEED, default=2000, show_default=True, help="Development uses seeds below 2000.")
+@click.option("--seeds", type=COUNT, default=10, help="Runs per controller and demand level.")
+@click.option("--first-seed", type=SEED, default=2000, help="Development uses seeds below 2000.")
 @LEVELS
 @STEPS
 @POLICIES
@@ -203,10 +208,8 @@ def report(folders: tuple[Path, ...], **options: Any) -> None:
     callback=parsed("KEY=LOW:HIGH, such as kp=0.1:10", span),
     help="Option of the controller and its range; KEY[0], KEY[1] for numbers of a list. May be repeated.",
 )
-@click.option(
-    "--candidates", "trials", type=COUNT, default=40, show_default=True, help="Candidates, the scenario's own first."
-)
-@click.option("--seeds", type=COUNT, default=2, show_default=True, help="Runs per candidate and level, from seed 1000.")
+@click.option("--candidates", "trials", type=COUNT, default=40, help="Candidates, the scenario's own first.")
+@click.option("--seeds", type=COUNT, default=2, help="Runs per candidate and level, from seed 1000.")
 @LEVELS
 @WORKERS
 @out_option("runs/SCENARIO-tune")
@@ -243,12 +246,12 @@ def get(name: str | None) -> None:
 @click.option("--regions", required=True, metavar="N|CSV", help="Number of regions to find, or a table edge,region.")
 @click.option("--routes", type=FILE, multiple=True, metavar="FILE", help="Vehicles, trips or flows. May be repeated.")
 @click.option("--demand", type=click.Choice(["peak"]), help="Generate a morning peak for a city without demand.")
-@click.option("--level", type=LEVEL, default=1.0, show_default=True, help="Factor on the vehicles, or on the peak.")
+@click.option("--level", type=LEVEL, default=1.0, help="Factor on the vehicles, or on the peak.")
 @click.option("--mesoscopic", is_flag=True, help="Simulate with SUMO's queue model.")
 @click.option("--begin", metavar="TIME", help="Start in s or h:m:s. [default: the sumocfg's]")
 @click.option("--end", metavar="TIME", help="End of departures in s or h:m:s. [default: the sumocfg's]")
 @seed_option()
-@click.option("--seeds", type=COUNT, default=3, show_default=True, help="Runs without control, to average densities.")
+@click.option("--seeds", type=COUNT, default=3, help="Runs without control, to average densities.")
 @click.option("--out", type=FOLDER, required=True, metavar="DIR", help="New folder, such as networks/mycity.")
 def import_(source: Path | None, bbox: str | None, **options: Any) -> None:
     """Make a network and a scenario of any SUMO city.
@@ -269,8 +272,8 @@ def import_(source: Path | None, bbox: str | None, **options: Any) -> None:
 
 @main.command()
 @SCENARIO
-@click.option("--levels", type=listed(LEVEL), default="0.6,0.8,1", show_default=True, help="Factors on the demand.")
-@click.option("--seeds", type=COUNT, default=2, show_default=True, help="Loading runs per level, from seed 1000.")
+@click.option("--levels", type=listed(LEVEL), default="0.6,0.8,1", help="Factors on the demand.")
+@click.option("--seeds", type=COUNT, default=2, help="Loading runs per level, from seed 1000.")
 @click.option(
     "--with",
     "city",

@@ -12,13 +12,10 @@ PerPair = Float[np.ndarray, "R R"]  # [i, j] = in i bound for j, or [i, h] = fro
 PerTurn = Float[np.ndarray, "R R R"]  # [i, h, j] = in i, bound for j, by way of h
 PairsOverTime = Float[np.ndarray, "T R R"]
 TurnsOverTime = Float[np.ndarray, "T R R R"]
-RegionsOverTime = Float[np.ndarray, "T R"]
 StatesOverTime = Float[np.ndarray, "S R R"]
 Positions = Float[np.ndarray, "R 2"]
 Adjacency = Bool[np.ndarray, "R R"]
 TurnMask = Bool[np.ndarray, "R R R"]
 Hops = Int[np.ndarray, "R R"]
 Intervals = Float[np.ndarray, " T"]
-Flags = Int[np.ndarray, " T"]
-Cumulative = Float[np.ndarray, " S"]
 Points = Float[np.ndarray, "_ 2"]  # of a line on the map [m], or samples of accumulation and outflow

@@ -162,12 +162,12 @@ POLICIES = click.option(
     callback=parsed("NAME=FILE, such as dpc-pc=mine.pt", Path),
     help="Policy or plan file of a controller. May be repeated. [default: SCENARIO/NAME.pt or .npz]",
 )
-WORKERS = click.option("--workers", type=COUNT, default=1, show_default=True, help="Runs at a time.")
+WORKERS = click.option("--workers", type=COUNT, default=1, help="Runs at a time.")
 
 
 def seed_option(text: str = "Random seed.") -> Callable:
     """Return the option --seed."""
-    return click.option("--seed", type=SEED, default=0, show_default=True, help=text)
+    return click.option("--seed", type=SEED, default=0, help=text)
 
 
 def out_option(default: str, text: str = "Run folder; finished runs in it are kept.") -> Callable:
@@ -178,6 +178,7 @@ def out_option(default: str, text: str = "Run folder; finished runs in it are ke
 @click.group(
     name="nmfd",
     cls=Commands,
+    context_settings={"show_default": True},
     sections={
         "Commands in the order of use": ("show", "benchmark", "robustness"),
         "Controllers": ("train", "bound", "new-controller"),
@@ -215,8 +216,8 @@ def show(scenario: Path | None, settings: dict, out: Path | None) -> None:
 @main.command()
 @SCENARIO
 @CONTROLLERS
-@click.option("--seeds", type=COUNT, default=1, show_default=True, help="Runs with seeds 0 to N - 1.")
-@click.option("--plant", type=click.Choice(["nmfd", "acyclic"]), default="nmfd", show_default=True, help="Plant model.")
+@click.option("--seeds", type=COUNT, default=1, help="Runs with seeds 0 to N - 1.")
+@click.option("--plant", type=click.Choice(["nmfd", "acyclic"]), default="nmfd", help="Plant model.")
 @POLICIES
 @WORKERS
 @out_option("runs/SCENARIO-TIME")
@@ -244,10 +245,9 @@ def benchmark(scenario: Path, settings: dict, out: Path | None, **options: Any) 
     "--sigmas",
     type=listed(Number(0.0)),
     default="0,0.25,0.5,0.75,1,1.5,2,3,5",
-    show_default=True,
     help="Standard deviations of the demand noise (veh/s).",
 )
-@click.option("--scenarios", type=COUNT, default=20, show_default=True, help="Noise draws for every sigma.")
+@click.option("--scenarios", type=COUNT, default=20, help="Noise draws for every sigma.")
 @WORKERS
 @out_option("runs/SCENARIO-TIME")
 def robustness(scenario: Path, settings: dict, out: Path | None, **options: Any) -> None:

@@ -5,7 +5,6 @@ import subprocess
 import sys
 import time
 
-import numpy as np
 import pytest
 import tiny
 import torch
@@ -73,14 +72,6 @@ def test_benchmark_writes_a_run_folder(benchmark, tmp_path):
     assert "±" in lines[2] and lines[-1] == f"Written to {tmp_path / 'out'}"
     runs = {f"{name}-{seed}.nc" for name in ("no-control", "pi-gating") for seed in (0, 1)}
     assert runs | {"runs.csv", "manifest.json", "mfd.png"} <= {path.name for path in (tmp_path / "out").iterdir()}
-
-
-def test_two_workers_give_the_same_results_as_one(benchmark, tmp_path):
-    good(nmfd(*benchmark, "--plant", "acyclic"))
-    good(nmfd(*benchmark[:-1], tmp_path / "two", "--workers", 2, "--plant", "acyclic"))
-    one = arrays(tmp_path / "out")
-    assert len(one) == 4 and same(one, arrays(tmp_path / "two"))
-    assert all(np.all(data["accumulation"] >= 0) for data in one.values())
 
 
 def test_settings(scenario, tmp_path):

@@ -114,14 +114,6 @@ def test_outputs_of_sumo_agree_with_ours(small, tmp_path):
     assert (out / "pi-gating-0.emission.xml.gz").stat().st_size > 1000
 
 
-def test_policy_for_another_network(small, tmp_path):
-    network = load_network(ROOT / "networks" / "hexagon7")
-    torch.save(checkpoint(Policy(network, Architecture(width=8)), network, {}), tmp_path / "other.pt")
-    result = cosim("run", small, "--controller", "dpc-pc", "--policy", tmp_path / "other.pt", "--out", tmp_path / "out")
-    assert "other.pt: network_hash: the policy was trained for network 'hexagon7'" in error_line(result)
-    assert not (tmp_path / "out").exists()
-
-
 RUN = ("run", "{small}", "--controller", "no-control", "--out", "{tmp}/out")
 EVALUATE = ("evaluate", "{small}", "--out", "{tmp}/out", "--controllers")
 IMPORT = ("import", "--out", "{tmp}/out/city")
