@@ -245,9 +245,8 @@ def _chunks(path: Path, needed: Sequence[str], optional: Sequence[str] = ()) -> 
     try:
         header = list(pd.read_csv(path, nrows=0, skipinitialspace=True).columns)
         if missing := [name for name in needed if name not in header]:
-            raise InputError(
-                f"{path}: column {missing[0]} is missing{did_you_mean(missing[0], header)}; needed: {', '.join(needed)}"
-            )
+            known = f"{did_you_mean(missing[0], header)}; needed: {', '.join(needed)}"
+            raise InputError(f"{path}: column {missing[0]} is missing{known}")
         names = [name for name in header if name in (*needed, *optional)]
         yield from pd.read_csv(path, dtype=str, chunksize=CHUNK_ROWS, usecols=names, skipinitialspace=True)
     except (OSError, UnicodeDecodeError, pd.errors.ParserError, pd.errors.EmptyDataError) as error:

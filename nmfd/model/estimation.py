@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Real
 from scipy.optimize import nnls
+from torch import Tensor
 
 from nmfd.arrays import PerPair, PerRegion, PerTurn
 from nmfd.model import dynamics
@@ -29,6 +30,7 @@ from nmfd.types import Controls
 
 Vector = Float[np.ndarray, " N"]
 Square = Float[np.ndarray, "N N"]
+Inputs = tuple[PerPair, PerPair, PerTurn]  # demand [veh/s], perimeter and splits [-] of a control interval
 # Relative errors: memory [s] and standard deviation [-] (of the expansion: `Instruments.detector_error`).
 MEMORY, EXPANSION_MEMORY = 900.0, 3600.0
 OUTFLOW_ERROR, DEMAND_ERROR = 0.3, 0.3
@@ -132,11 +134,8 @@ class Estimator:
         """Return to an empty network."""
         self._k, self._seen = 0, list[np.ndarray]()
         variance = torch.cat([self._spread**2, torch.full((self._cells,), FLOOR, dtype=torch.float64)])
-        self.belief = Belief(
-            mean=np.zeros(self._states),
-            covariance=torch.diag(variance).numpy(),
-            probes=np.zeros((self._regions, self._regions)),
-        )
+        probes = np.zeros((self._regions, self._regions))
+        self.belief = Belief(mean=np.zeros(self._states), covariance=torch.diag(variance).numpy(), probes=probes)
 
     @property
     def accumulation(self) -> PerPair:
@@ -151,7 +150,7 @@ class Estimator:
         self._seen = [*self._seen[-2:], readings.accumulation]
         stuck = np.ptp(self._seen, axis=0) == 0 if len(self._seen) == 3 else np.zeros(len(demand), dtype=bool)
         loops = np.where(stuck & (readings.accumulation > 0), np.nan, readings.accumulation)
-        self.belief = self._advanced(self.belief, demand, controls.perimeter, splits, readings, loops)
+        self.belief = self._advanced(self.belief, (demand, controls.perimeter, splits), readings, loops)
         self._k += 1
         return self.accumulation
 
@@ -173,11 +172,9 @@ class Estimator:
         half = 0.5 * place.reshape(regions, regions, -1).sum(axis=1)
         return np.concatenate([place, half, crossing]), np.concatenate([place, departure])
 
-    def _advanced(
-        self, belief: Belief, demand: PerPair, perimeter: PerPair, splits: PerTurn, readings: Readings, loops: PerRegion
-    ) -> Belief:
+    def _advanced(self, belief: Belief, inputs: Inputs, readings: Readings, loops: PerRegion) -> Belief:
         """Return the belief one control interval later; loops: (R,) [veh], valid detector readings."""
-        z, covariance, leaving = self._predicted(belief, demand, perimeter, splits)
+        z, covariance, leaving = self._predicted(belief, inputs)
         mean, posterior = z[: self._states], covariance[: self._states, : self._states]
         reading, expected, noise = self._readings(z, leaving, readings, loops)
         there = np.flatnonzero(np.isfinite(reading))
@@ -199,19 +196,17 @@ class Estimator:
         probes = np.minimum(probes, mean[self._x].reshape(counted.shape))
         return Belief(mean=mean, covariance=posterior, probes=probes)
 
-    def _predicted(
-        self, belief: Belief, demand: PerPair, perimeter: PerPair, splits: PerTurn
-    ) -> tuple[np.ndarray, torch.Tensor, np.ndarray]:
+    def _predicted(self, belief: Belief, inputs: Inputs) -> tuple[np.ndarray, Tensor, np.ndarray]:
         """Return Z (size,), its covariance, and the vehicles that leave each cell (R^2,) [veh]."""
         mean, errors, first = torch.from_numpy(belief.mean), self._x.start, self._expansion.start
-        # Flows depend on all inputs but the expansion.
-        inputs = torch.cat([torch.arange(first), torch.arange(errors, self._states)])
-        points = mean[inputs].repeat(len(inputs) + 1, 1)
-        points[1:] += DIFFERENCE * torch.eye(len(inputs), dtype=torch.float64)
-        outputs, moves, of_probes = self._rollout(points, belief.probes, demand, perimeter, splits)
+        # Flows depend on the whole state but the expansion.
+        varied = torch.cat([torch.arange(first), torch.arange(errors, self._states)])
+        points = mean[varied].repeat(len(varied) + 1, 1)
+        points[1:] += DIFFERENCE * torch.eye(len(varied), dtype=torch.float64)
+        outputs, moves, of_probes = self._rollout(points, belief.probes, inputs)
         jacobian = torch.zeros(self._size, self._states, dtype=torch.float64)
         jacobian[:errors, :errors] = torch.diag(self._kept)
-        jacobian[errors:, inputs] = (outputs[1:] - outputs[0]).T / DIFFERENCE
+        jacobian[errors:, varied] = (outputs[1:] - outputs[0]).T / DIFFERENCE
         covariance = jacobian @ torch.from_numpy(belief.covariance) @ jacobian.T
         covariance.diagonal()[:errors] += (1.0 - self._kept**2) * self._spread**2
         leaving = torch.zeros(self._cells, dtype=torch.float64)
@@ -219,17 +214,15 @@ class Estimator:
         covariance[errors:, errors:] += self._flow_noise(belief, moves, of_probes, leaving)
         return torch.cat([self._kept * mean[:errors], outputs[0]]).numpy(), covariance, leaving.numpy()
 
-    def _rollout(
-        self, points: torch.Tensor, probes: PerPair, demand: PerPair, perimeter: PerPair, splits: PerTurn
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def _rollout(self, points: Tensor, probes: PerPair, inputs: Inputs) -> tuple[Tensor, Tensor, Tensor]:
         """Return Z without errors at `points` (B, 2 R + R^2), and the first one's events [veh], all and of probes."""
         regions, batch = self._regions, len(points)
         duration = self._step / self._substeps
-        controls = [torch.tensor(values, dtype=torch.float64) for values in (perimeter, splits)]
+        demand, *controls = (torch.tensor(values, dtype=torch.float64) for values in inputs)
         x = points[:, 2 * regions :].reshape(batch, regions, regions)
         outflow, wish = (1.0 + points[:, : 2 * regions].reshape(batch, 2, regions)).clamp(min=0.0).unbind(1)
         outflow = outflow.minimum(1.0 / (duration * self._fastest))  # at most all vehicles leave
-        entering = duration * torch.from_numpy(demand) * wish[:, :, None]
+        entering = duration * demand * wish[:, :, None]
         n = torch.from_numpy(probes).expand(batch, -1, -1)
         mean, crossings = torch.zeros_like(outflow), torch.zeros_like(x)
         moves = torch.zeros(2, regions, regions, regions, dtype=x.dtype)
@@ -258,9 +251,7 @@ class Estimator:
         every = events[0].clamp(min=0.0)
         return outputs, every, events[1].clamp(min=0.0).minimum(every)
 
-    def _flow_noise(
-        self, belief: Belief, moves: torch.Tensor, of_probes: torch.Tensor, leaving: torch.Tensor
-    ) -> torch.Tensor:
+    def _flow_noise(self, belief: Belief, moves: Tensor, of_probes: Tensor, leaving: Tensor) -> Tensor:
         """Return the covariance of Z, without relative errors, due to Poisson counts and errors of the flows [veh]."""
         x, turns = torch.from_numpy(belief.mean[self._x]), len(self._turns)
         cell = self._from[:turns]
@@ -306,7 +297,7 @@ class Estimator:
         )
         return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
 
-    def _rows(self, z: np.ndarray, matrix: torch.Tensor) -> torch.Tensor:
+    def _rows(self, z: np.ndarray, matrix: Tensor) -> Tensor:
         """Return the Jacobian of the readings by Z times a matrix (size, n): (m, n)."""
         expansion, mean = (torch.from_numpy(z[part])[:, None] for part in (self._expansion, self._mean))
         loops = (1.0 + expansion) * matrix[self._mean] + mean * matrix[self._expansion]
@@ -314,7 +305,7 @@ class Estimator:
         return torch.cat([loops, matrix[self._crossings.start :], share])
 
 
-def _pairs(left: torch.Tensor, right: torch.Tensor) -> tuple:
+def _pairs(left: Tensor, right: Tensor) -> tuple:
     """Return shape, (row, column, event) and product of the non-zeros of left diag(w) right' (m, n)."""
     product = left[:, None] * right[None]
     index = product.nonzero(as_tuple=True)

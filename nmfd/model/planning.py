@@ -81,9 +81,8 @@ def planning_model(scenario: Scenario, controller: str = "", table: str = "") ->
         network = other_model(scenario, folder)
     else:
         network = scenario.network
-    shared = {
-        part.name: copy.deepcopy(getattr(scenario, part.name)) for part in fields(Horizon) if part.name != "network"
-    }
+    own = (part.name for part in fields(Horizon) if part.name != "network")
+    shared = {name: copy.deepcopy(getattr(scenario, name)) for name in own}
     if controller:
         shared["controller_options"][controller] = copy.deepcopy(merged)
     return PlanningModel(**shared, network=copy.deepcopy(network), forecast=scenario.forecast.copy())
@@ -93,10 +92,9 @@ def other_model(scenario: Scenario, folder: Path, where: str = "") -> RegionalMo
     """Return the regional model in `folder`. Raise InputError, which names `where`, if it is of another city."""
     model = load_network(folder)
     if not np.array_equal(model.adjacency, scenario.network.adjacency):
-        raise InputError(
-            f"{where or folder / 'network.toml'}: network {model.name} has other regions or boundaries than "
-            f"{scenario.network.name}; identify one for the same city with 'cosim identify'"
-        )
+        what = f"network {model.name} has other regions or boundaries than {scenario.network.name}"
+        remedy = "identify one for the same city with 'cosim identify'"
+        raise InputError(f"{where or folder / 'network.toml'}: {what}; {remedy}")
     check_step(model, scenario.step / scenario.substeps, f"{model.folder}")
     return model
 

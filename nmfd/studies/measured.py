@@ -103,10 +103,9 @@ def identify(
     names = list(base.region_names) if base else by_number
     speed = rows["flow"].sum() * VEHICLE_LENGTH_M / 3600.0 / max(rows["occ"].sum(), 1e-9)
     if not detector_tables.SPEEDS_M_S[0] <= speed <= detector_tables.SPEEDS_M_S[1]:
-        raise InputError(
-            f"{counts}: flow and occ give a mean speed of {speed:.3g} m/s, with {VEHICLE_LENGTH_M:g} m for a vehicle "
-            "over a loop; expected flow in veh/h per lane, not per interval, and occ as a share, not percent"
-        )
+        what = f"a mean speed of {speed:.3g} m/s, with {VEHICLE_LENGTH_M:g} m for a vehicle over a loop"
+        expected = "flow in veh/h per lane, not per interval, and occ as a share, not percent"
+        raise InputError(f"{counts}: flow and occ give {what}; expected {expected}")
     read, days, count = len(rows), rows["day"].nunique(), rows["detid"].nunique()
     rows, faulty = detector_tables.screened(rows, stations["region"])
     stations = stations.drop(list(faulty.get(detector_tables.SUM, ())))  # its lanes are those of the others
@@ -140,10 +139,8 @@ def identify(
     network = replace(base, **new, **fresh) if base else RegionalModel(**new)
     if (network.hops < 0).any():
         i, j = np.argwhere(network.hops < 0)[0]
-        raise InputError(
-            f"{adjacency or counts}: region {names[j]} cannot be reached from {names[i]}; give all pairs of "
-            "neighbours, region,neighbour, with --adjacency"
-        )
+        remedy = "give all pairs of neighbours, region,neighbour, with --adjacency"
+        raise InputError(f"{adjacency or counts}: region {names[j]} cannot be reached from {names[i]}; {remedy}")
     network = fit_quality.with_guesses(network, samples, lane_km)
     fits = fit_quality.region_fits(network, samples, lane_km=lane_km)
     lengths = np.where(assumed, trip_km, np.nan)
@@ -153,11 +150,9 @@ def identify(
     ]
     network = replace(network, doubts=tuple(fits["doubts"]))
     share = "unknown" if np.isnan(coverage).all() else f"{np.nanmin(coverage):.0%} to {np.nanmax(coverage):.0%}"
-    facts = (
-        f"{read:,} rows of {count} detectors on {days} days; left out: "
-        f"{detector_tables.omitted(left)}; share of the lane-km with detectors: {share}; trip length within a region: "
-        f"{1000 * trip_km.min():,.0f} to {1000 * trip_km.max():,.0f} m"
-    )
+    facts = f"{read:,} rows of {count} detectors on {days} days; left out: {detector_tables.omitted(left)}; "
+    facts += f"share of the lane-km with detectors: {share}; trip length within a region: "
+    facts += f"{1000 * trip_km.min():,.0f} to {1000 * trip_km.max():,.0f} m"
     notes = wrapped("\n".join([*(f"WARNING, {line}" for line in broken), facts, UNKNOWN_PARTS]))
     report = "\n".join([fit_quality.fit_table(network, fits, MEANINGS), *notes])
     text = network_toml(network, {}, f"Regional model: written by nmfd identify from {counts.name}; see identify.txt.")
@@ -220,16 +215,13 @@ def _lane_km(
     covered = detectors["lane_km"].groupby(detectors["region"]).sum(min_count=1).reindex(about.index).to_numpy()
     total = about["lane_km"].to_numpy()
     if (unknown := np.isnan(covered) & np.isnan(total)).any():
-        raise InputError(
-            f"{where}: the lane-kilometres of region {about.index[unknown][0]} are unknown; give the length of "
-            "the detectors' links with --detectors, or lane_km of every region with --about"
-        )
+        remedy = "give the length of the detectors' links with --detectors, or lane_km of every region with --about"
+        raise InputError(f"{where}: the lane-kilometres of region {about.index[unknown][0]} are unknown; {remedy}")
     if (covered > 1.05 * total).any():
         n = int(np.nanargmax(covered / total))
-        raise InputError(
-            f"{where}: region {about.index[n]}: lane_km: {total[n]:g} is less than the {covered[n]:.4g} km of its "
-            "detectors; correct it, or length and lanes in the detectors' table"
-        )
+        what = f"lane_km: {total[n]:g} is less than the {covered[n]:.4g} km of its detectors"
+        remedy = "correct it, or length and lanes in the detectors' table"
+        raise InputError(f"{where}: region {about.index[n]}: {what}; {remedy}")
     return np.where(np.isnan(total), covered, total), in_use / total
 
 
@@ -244,10 +236,9 @@ def _trip_lengths(
         try:
             lengths[n] = 2.0 / 3.0 * np.sqrt(ConvexHull(points).volume) / 1000.0  # volume of a plane hull: its area
         except (QhullError, ValueError):
-            raise InputError(
-                f"region {about.index[n]}: the mean trip length is unknown and cannot be assumed without positions; "
-                "give --trip-length METRES, or a column trip_length with --about"
-            ) from None
+            what = "the mean trip length is unknown and cannot be assumed without positions"
+            remedy = "give --trip-length METRES, or a column trip_length with --about"
+            raise InputError(f"region {about.index[n]}: {what}; {remedy}") from None
     return lengths, assumed
 
 
@@ -263,10 +254,8 @@ def _adjacency(path: Path | None, detectors: pd.DataFrame, regions: Sequence[str
     try:
         corners = Delaunay(points).simplices
     except (QhullError, ValueError):
-        raise InputError(
-            "adjacency is unknown without detector positions (long, lat or x, y); give a table region,neighbour with "
-            "--adjacency"
-        ) from None
+        what = "adjacency is unknown without detector positions (long, lat or x, y)"
+        raise InputError(f"{what}; give a table region,neighbour with --adjacency") from None
     edges = np.unique(np.sort([pair for corner in corners for pair in combinations(corner, 2)], axis=1), axis=0)
     distance = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
     for i, h in own[edges[distance <= FAR * np.median(distance)]]:
