@@ -1,8 +1,8 @@
 """Loop detectors and probes in SUMO: what they see of a small run, and the closed loop on estimates."""
 
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ from nmfd.api import load_scenario
 from nmfd.controllers.rules import PiGating
 from nmfd.controllers.strategy import parse
 from nmfd.model.planning import planning_model
-from nmfd.types import Observation
+from nmfd.types import Controls, Observation
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
 INTERVALS = 3
@@ -36,12 +36,10 @@ def city(scenario):
     return city_of(scenario.network)
 
 
-def drive(scenario, **overrides):
-    plant = SumoPlant(scenario, settings=Settings(**overrides))
-    try:
-        return closed_loop.run(plant, PiGating(planning_model(scenario)), scenario, seed=3)
-    finally:
-        plant.close()
+def drive(scenario, controller=None, planning=None, settings=None, **overrides):
+    plant = SumoPlant(scenario, settings=settings or Settings(**overrides), planning=planning)
+    with closing(plant):
+        return closed_loop.run(plant, controller or PiGating(planning_model(scenario)), scenario, seed=3)
 
 
 @pytest.fixture(scope="module")
@@ -81,16 +79,14 @@ def test_all_links_and_all_probes_see_everything(scenario):
     """Loops on every link come close to the accumulations; probes are all vehicles."""
     plant = SumoPlant(scenario, settings=Settings(measurement="estimate", detector_share=1.0, probe_share=1.0))
     seen = []
-    try:
+    with closing(plant):
         state, controller = plant.reset(3), PiGating(planning_model(scenario))
         readings = plant._estimation.readings
         plant._estimation.readings = lambda: (seen.append(readings()), seen[-1])[1]
         for _ in range(scenario.steps):
             before, state = state, plant.step(controller.act(plant.observe()))
         estimate = plant.observe()
-        crossings = SimpleNamespace(**plant.record()).crossings[-1].sum(axis=2)
-    finally:
-        plant.close()
+        crossings = plant.record()["crossings"][-1].sum(axis=2)
     assert (seen[-1].probes == state.accumulation).all()
     assert np.abs(estimate.accumulation - state.accumulation).max() < 3.0
     assert (estimate.backlog == state.backlog).all()
@@ -123,15 +119,9 @@ def test_estimating_changes_nothing_but_what_is_seen(scenario, run):
             pass
 
         def act(self, measurement: Observation):
-            from nmfd.types import Controls
-
             return Controls(perimeter=run.perimeter[measurement.step], splits=None)
 
-    plant = SumoPlant(scenario, settings=Settings())
-    try:
-        exact = closed_loop.run(plant, Again(), scenario, seed=3)
-    finally:
-        plant.close()
+    exact = drive(scenario, Again())
     assert not exact.estimated and run.estimated
     assert (exact.accumulation == run.accumulation).all()
 
@@ -144,15 +134,9 @@ def test_states_are_estimated_with_the_model_of_those_who_drive():
     assert [model.folder.name for model in models] == ["grid7_guided", "grid7_max_pressure"]
     found = simulate(Simulation(scenario, strategies[0], seed=3))
     for model, same in zip(models, (True, False), strict=True):
-        plant = SumoPlant(
-            scenario,
-            settings=settings(scenario).changed(measurement="estimate"),
-            planning=replace(planning_model(scenario), network=model),
-        )
-        try:
-            again = closed_loop.run(plant, make_controller("route-guidance", scenario), scenario, seed=3)
-        finally:
-            plant.close()
+        planning = replace(planning_model(scenario), network=model)
+        changed = settings(scenario).changed(measurement="estimate")
+        again = drive(scenario, make_controller("route-guidance", scenario), planning, changed)
         assert (again.accumulation == found.accumulation).all()
         assert (again.observed == found.observed).all() == same
 

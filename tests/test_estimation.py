@@ -67,15 +67,8 @@ class Crowd:
         for _ in range(SCENARIO.substeps):
             x = self.accumulation
             before = x.sum(axis=1)
-            ends, transfers = (
-                part.numpy()
-                for part in dynamics.flows(
-                    self._parameters,
-                    torch.from_numpy(x + 1e-9),
-                    torch.from_numpy(controls.perimeter),
-                    torch.from_numpy(NETWORK.nominal_splits),
-                )
-            )
+            given = map(torch.from_numpy, (x + 1e-9, controls.perimeter, NETWORK.nominal_splits))
+            ends, transfers = (part.numpy() for part in dynamics.flows(self._parameters, *given))
             change = np.zeros_like(self.groups)
             for i, j in np.argwhere(x > 0):
                 ways = step * outflow[i] * each[i, :, j] * transfers[i, :, j] / x[i, j]
@@ -94,20 +87,13 @@ class Crowd:
         self._factors = keep * self._factors + np.sqrt(1.0 - keep**2) * random.normal(size=(2, REGIONS))
         known = self._known
         slow = np.exp(-SCENARIO.step / estimation.EXPANSION_MEMORY)
-        self._expansion = slow * self._expansion + np.sqrt(1.0 - slow**2) * known.detector_error * random.normal(
-            size=REGIONS
-        )
-        noise = random.normal(size=REGIONS) * np.sqrt(
-            mean * (1.0 - known.detector_share) / known.detector_share + (known.detector_noise * mean) ** 2
-        )
+        change = known.detector_error * random.normal(size=REGIONS)
+        self._expansion = slow * self._expansion + np.sqrt(1.0 - slow**2) * change
+        sampled = mean * (1.0 - known.detector_share) / known.detector_share
+        noise = random.normal(size=REGIONS) * np.sqrt(sampled + (known.detector_noise * mean) ** 2)
         share = np.where(NETWORK.adjacency, known.counted_share, 1.0)
-        uneven = (
-            np.sqrt(np.maximum(1.0 - share, 0.0))
-            * random.normal(size=share.shape)
-            * np.sqrt(
-                crossings / share + estimation.COUNT_ERROR**2 * crossings**2 / np.maximum(known.counted_gateways, 1)
-            )
-        )
+        spread = crossings / share + (estimation.COUNT_ERROR * crossings) ** 2 / np.maximum(known.counted_gateways, 1)
+        uneven = np.sqrt(np.maximum(1.0 - share, 0.0) * spread) * random.normal(size=share.shape)
         return Readings(
             accumulation=np.maximum((1.0 + self._expansion) * mean + noise, 0.0),
             crossings=np.where(NETWORK.adjacency, crossings + uneven, np.nan),

@@ -1,6 +1,6 @@
 """Identification on runs whose truth is known: made by the regional model itself, under the probing controller."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -48,11 +48,6 @@ def observe(scenario, seed, factor):
     )
 
 
-def first_of(run, intervals):
-    kept = {f.name: getattr(run, f.name)[:intervals] for f in fields(run)}
-    return Observed(**{**kept, "accumulation": run.accumulation[: intervals + 1]})
-
-
 @pytest.fixture(scope="module")
 def runs(scenario):
     return [observe(scenario, seed, factor) for seed, factor in enumerate((0.7, 1.0, 1.3, 1.0))]
@@ -67,13 +62,8 @@ def test_the_true_model_predicts_without_error(scenario, runs):
 
 
 def test_the_fit_predicts_a_run_that_it_has_not_seen(scenario, runs):
-    start = replace(
-        scenario.network,
-        exit_rates=None,
-        capacity=None,
-        storage=None,
-        mfds=(Mfd(a=0.0, b=-2e-7, c=0.004, jam=9000.0),) * 7,
-    )
+    line = (Mfd(a=0.0, b=-2e-7, c=0.004, jam=9000.0),) * 7
+    start = replace(scenario.network, exit_rates=None, capacity=None, storage=None, mfds=line)
     fitted = identification.fit(start, runs[:3], step=30.0, iterations=250)
     assert all(mfd.problem() is None for mfd in fitted.mfds)
     assert error(fitted, runs[3:], 10) < 0.35 * error(start, runs[3:], 10)
@@ -161,5 +151,5 @@ def test_what_a_fit_makes_small(scenario, runs, by_origin):
 
 
 def test_a_run_shorter_than_the_horizon_is_left_out(runs):
-    short = first_of(runs[0], 3)
+    short = replace(runs[0], accumulation=runs[0].accumulation[:4], demand=runs[0].demand[:3])
     assert len(identification.windows([short, runs[0]], 5)[0]) == len(identification.windows(runs[:1], 5)[0])
