@@ -1,12 +1,9 @@
 """A generated peak: its routes are assigned, and its level is one of a congested network, not of a few full streets."""
 
 import re
-import subprocess
-from pathlib import Path
 from xml.etree.ElementTree import fromstring
 
 import pytest
-import sumo
 import tiny_city
 
 from cosim.importing.assignment import assign
@@ -30,54 +27,27 @@ EDGES = "".join(
 def fork(tmp_path_factory):
     """(network, 600 vehicles in ten minutes that all go straight on)"""
     folder = tmp_path_factory.mktemp("fork")
-    (folder / "n.nod.xml").write_text(f"<nodes>{NODES}</nodes>")
-    (folder / "e.edg.xml").write_text(f"<edges>{EDGES}</edges>")
+    (folder / "n.xml").write_text(f"<nodes>{NODES}</nodes>")
+    (folder / "e.xml").write_text(f"<edges>{EDGES}</edges>")
     net = folder / "fork.net.xml"
-    subprocess.run(
-        [
-            Path(sumo.SUMO_HOME) / "bin" / "netconvert",
-            "-n",
-            folder / "n.nod.xml",
-            "-e",
-            folder / "e.edg.xml",
-            "-o",
-            net,
-            "--no-turnarounds",
-        ],
-        check=True,
-        capture_output=True,
-    )
-    vehicles = [
-        fromstring(
-            f'<vehicle id="v{n}" type="car" depart="{n}.00" departLane="best"><route edges="ab bm md de"/></vehicle>'
-        )
-        for n in range(600)
-    ]
-    return net, [fromstring('<vType id="car"/>'), *vehicles]
+    tiny_city.run("netconvert", "-n", folder / "n.xml", "-e", folder / "e.xml", "-o", net, "--no-turnarounds")
+    vehicle = '<vehicle id="v{0}" type="car" depart="{0}.00" departLane="best"><route edges="ab bm md de"/></vehicle>'
+    return net, [fromstring('<vType id="car"/>'), *(fromstring(vehicle.format(n)) for n in range(600))]
 
 
 def test_routes_spread_until_nobody_gains(fork):
     """The fork: the gap falls to what was asked for, in both of SUMO's models; the seed tells all."""
     net, vehicles = fork
     stages = []
-    found = assign(
-        net,
-        vehicles,
-        begin=0.0,
-        end=1800.0,
-        seed=3,
-        iterations=2,
-        mesoscopic=False,
-        progress=lambda stage, share=0.0: stages.append(stage),
-    )
+    options = {"begin": 0.0, "end": 1800.0, "seed": 3, "iterations": 2}
+    found = assign(net, vehicles, **options, mesoscopic=False, progress=lambda stage, _: stages.append(stage))
     ways = {tuple(route) for route in found.routes.values()}
     assert ways == {("ab", "bm", "md", "de"), ("ab", "bc", "cd", "de")} and len(found.routes) == 600
     queue, followed = found.gaps[:-1], found.gaps[-1]
     assert queue[0] > 0.5 and queue[-1] < 0.05 and found.best == len(queue)
     assert len(stages) == len(found.gaps) and stages[0] == "assignment, at most 2 iterations"
     assert "car-following" in stages[-1] and 0.0 <= followed < 0.5
-    again = assign(net, vehicles, begin=0.0, end=1800.0, seed=3, iterations=2)
-    assert again.gaps == queue
+    assert assign(net, vehicles, **options).gaps == queue
 
 
 def test_an_assignment_that_sumo_refuses(fork):

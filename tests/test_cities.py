@@ -57,16 +57,9 @@ def check(folder: Path, name: str, intervals: int) -> None:
     ],
 )
 def test_demos_of_sumo(tmp_path, name, expected):
-    result = cosim(
-        "import",
-        GAMES / f"{name}.sumocfg",
-        "--regions",
-        3,
-        "--out",
-        tmp_path / "networks" / name,
-    )
+    result = cosim("import", GAMES / f"{name}.sumocfg", "--regions", 3, "--out", tmp_path / "networks" / name)
     if expected is None:
-        assert result.exit_code == 0, result.output + str(result.exception)
+        good(result)
         check(tmp_path, name, 2)
     else:
         assert result.exit_code == 2 and expected in result.stderr and result.stderr.count("\n") == 1
@@ -80,17 +73,9 @@ def test_real_cities(tmp_path, name):
     if not (CITIES / source).is_file():
         pytest.skip(f"no real city: {CITIES / source} is not there")
     peak = ("--demand", "peak", "--level", "0.05") if name == "luxembourg" else ()
-    result = cosim(
-        "import",
-        CITIES / source,
-        "--regions",
-        count,
-        *peak,
-        "--out",
-        tmp_path / "networks" / name,
-    )
-    assert result.exit_code == 0, result.output + str(result.exception)
-    assert "regions instead of" not in result.stdout
+    out = tmp_path / "networks" / name
+    text = good(cosim("import", CITIES / source, "--regions", count, *peak, "--out", out))
+    assert "regions instead of" not in text
     check(tmp_path, name, 2)
 
 
@@ -102,8 +87,7 @@ def test_max_pressure_takes_no_longer_than_fixed_time(tmp_path, name, level):
     (config,) = (CITIES / name).glob("*.sumocfg") if (CITIES / name).is_dir() else (None,)
     if config is None:
         pytest.skip(f"no real city: {CITIES / name} is not there")
-    result = cosim("import", config, "--regions", 3, "--out", tmp_path / "networks" / name)
-    assert result.exit_code == 0, result.output + str(result.exception)
+    good(cosim("import", config, "--regions", 3, "--out", tmp_path / "networks" / name))
     spent = {}
     for signals in ("no-control", "max-pressure", "max-pressure-cyclic"):
         run = simulate(Simulation(load_scenario(tmp_path / "scenarios" / name), parse(signals), seed=1, demand=level))
@@ -129,9 +113,6 @@ def test_committed_cities_are_small_and_need_nothing_else(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", COMMITTED)
 def test_committed_cities_run_under_their_policies(tmp_path, name):
-    for strategy in ("route-guidance", *(policy.stem for policy in (ROOT / "scenarios" / name).glob("*.pt"))):
-        good(
-            cosim(
-                "run", ROOT / "scenarios" / name, "--controller", strategy, "--steps", 2, "--out", tmp_path / strategy
-            )
-        )
+    scenario = ROOT / "scenarios" / name
+    for strategy in ("route-guidance", *(policy.stem for policy in scenario.glob("*.pt"))):
+        good(cosim("run", scenario, "--controller", strategy, "--steps", 2, "--out", tmp_path / strategy))

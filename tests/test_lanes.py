@@ -16,6 +16,7 @@ EDGES = """<edges><edge id="ab" from="a" to="b" numLanes="2"/>
 <edge id="bl" from="b" to="l"/><edge id="br" from="b" to="r"/>
 <edge id="le" from="l" to="e"/><edge id="re" from="r" to="e"/><edge id="lr" from="l" to="r"/>
 <edge id="rl" from="r" to="l"/></edges>"""
+AFTER = {"ab": ("bl", "br"), "bl": ("le", "lr"), "br": ("re", "rl"), "lr": ("re",), "rl": ("le",), "le": (), "re": ()}
 # The right lane, 0, leads to the right only.
 CONNECTIONS = """<connections><connection from="ab" to="br" fromLane="0" toLane="0"/>
 <connection from="ab" to="bl" fromLane="1" toLane="0"/></connections>"""
@@ -29,20 +30,11 @@ LEADERS = {f"{way}0": target for way, target in TARGETS.items()}
 @pytest.fixture(scope="module")
 def network(tmp_path_factory):
     folder = tmp_path_factory.mktemp("lanes")
-    files = {"nod": NODES, "edg": EDGES, "con": CONNECTIONS}
-    for kind, text in files.items():
-        (folder / f"{kind}.xml").write_text(text)
-    tiny_city.run(
-        "netconvert",
-        "--node-files",
-        folder / "nod.xml",
-        "--edge-files",
-        folder / "edg.xml",
-        "--connection-files",
-        folder / "con.xml",
-        "--output-file",
-        folder / "net.xml",
-    )
+    options = ["-o", folder / "net.xml"]
+    for option, text in (("-n", NODES), ("-e", EDGES), ("-x", CONNECTIONS)):
+        (folder / f"{option}.xml").write_text(text)
+        options += [option, folder / f"{option}.xml"]
+    tiny_city.run("netconvert", *options)
     return folder
 
 
@@ -75,29 +67,12 @@ def drive(session, seconds):
 
 
 def guide_of(session, *, period, turn_late=False):
-    """Of the whole network as one region."""
-    after = {
-        "ab": ("bl", "br"),
-        "bl": ("le", "lr"),
-        "br": ("re", "rl"),
-        "lr": ("re",),
-        "rl": ("le",),
-        "le": (),
-        "re": (),
-    }
-    city = streets.city(
-        dict.fromkeys(after, 0), after, length=dict.fromkeys(after, 300.0), speed=dict.fromkeys(after, 13.9)
-    )
-    return Guide(
-        session,
-        city,
-        np.zeros((1, 1, 1)),
-        compliance=1.0,
-        most_detour=60.0,
-        period=period,
-        turn_late=turn_late,
-        random=np.random.default_rng(0),
-    )
+    """Return a guide with a command, of the whole network as one region."""
+    length, speed = dict.fromkeys(AFTER, 300.0), dict.fromkeys(AFTER, 13.9)
+    city, random = streets.city(dict.fromkeys(AFTER, 0), AFTER, length=length, speed=speed), np.random.default_rng(0)
+    guide = Guide(session, city, np.zeros((1, 1, 1)), compliance=1.0, period=period, turn_late=turn_late, random=random)
+    guide.command(np.zeros((1, 1, 1)), None)
+    return guide
 
 
 @pytest.mark.parametrize("session", [-0.5], indirect=True)
@@ -129,7 +104,6 @@ def test_near_the_end_of_a_lane_it_is_too_late_for_others(session, late):
 def test_from_before_the_stop_line_they_are_sent_elsewhere_only_if_they_are_led_on(session, turn_late, period, sent):
     guide = guide_of(session, period=period, turn_late=turn_late)
     assert session.set_route("left0", ["ab", "br", "rl", "le"])  # longer than by bl, where the lane does not lead
-    guide.command(np.zeros((1, 1, 1)), None)
     guide.apply([Event(vehicle="left0", source=None, edge="le", region=0, destination=0)])
     assert (session.route("left0") == ("ab", "bl", "le")) is sent
 
@@ -137,7 +111,6 @@ def test_from_before_the_stop_line_they_are_sent_elsewhere_only_if_they_are_led_
 @pytest.mark.parametrize("session", [-0.5], indirect=True)
 def test_guided_drivers_are_led_on(session):
     guide = guide_of(session, period=60.0)
-    guide.command(np.zeros((1, 1, 1)), None)
     guide.apply(
         [
             Event(vehicle=vehicle, source=None, edge=TARGETS[vehicle.rstrip("0123456789")], region=0, destination=0)

@@ -3,14 +3,14 @@
 import re
 from pathlib import Path
 
+import commands
 import copies
 import numpy as np
 import pytest
 import tiny
-from click.testing import CliRunner
+from commands import good
 from commands import nmfd as command
 
-import cosim.cli
 import nmfd
 from nmfd.controllers import template
 from nmfd.controllers.strategy import parse
@@ -80,11 +80,8 @@ def test_files_and_modules_beside_it(place):
 def test_sumo_takes_it(place):
     (place / "mine.py").write_text(GOOD)
     copies.peak(place)
-    done = CliRunner().invoke(
-        cosim.cli,
-        ["run", "scenarios/peak", "--controller", "mine.py:Mine+max-pressure", "--steps", "2", "--out", "out"],
-    )
-    assert done.exit_code == 0 and "mine.py:Mine+max-pressure" in done.output, done.output
+    name = "mine.py:Mine+max-pressure"
+    assert name in good(commands.cosim("run", "scenarios/peak", "--controller", name, "--steps", 2, "--out", "out"))
 
 
 @pytest.mark.parametrize(
@@ -106,10 +103,7 @@ def test_sumo_takes_it(place):
         (GOOD.replace("splits=None", "splits=np.zeros((2, 2, 2))"), "splits: expected a sum of 1 over h"),
         (GOOD.replace("splits=None", "splits=np.ones((2, 2, 2))"), "splits[0, 0, 0]: expected 0 to 0, got 1 instead"),
         (GOOD.replace("splits=None", "splits=None, prices=np.array([0.0, -1.0])"), "prices[1]: expected 0 to 100"),
-        (
-            GOOD.replace("splits=None", "splits=None, metering='all'"),
-            "act: interval 0: metering: expected numbers of shape (2,)",
-        ),
+        (GOOD.replace("splits=None", "splits=None, metering='all'"), "metering: expected numbers of shape (2,)"),
         (GOOD.replace("return Controls(", "return dict("), "act: interval 0: expected nmfd.Controls, got dict instead"),
     ],
 )

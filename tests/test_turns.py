@@ -3,6 +3,7 @@
 import time
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -43,11 +44,9 @@ def by_dynamics(network, model, start, demand, plan, *, step, substeps, integrat
     p, x, total, edges = dynamics.parameters(network), cells(start), 0.0, len(model.edges)
     for k in range(len(demand)):
         row = plan[min(k, len(plan) - 1)]
-        perimeter = torch.zeros(7, 7, dtype=torch.float64).index_put(
-            tuple(torch.from_numpy(model.edges.T)), row[:edges]
-        )
-        splits = torch.zeros(7, 7, 7, dtype=torch.float64).index_put(
-            tuple(torch.from_numpy(model.turns.T)), row[edges:]
+        perimeter, splits = (
+            torch.zeros((7,) * len(at.T), dtype=torch.float64).index_put(tuple(torch.from_numpy(at.T)), values)
+            for at, values in ((model.edges, row[:edges]), (model.turns, row[edges:]))
         )
         x = dynamics.advance(p, x, cells(demand[k]), perimeter, splits, step, integrator=integrator, substeps=substeps)
         total = total + x.sum()
@@ -150,21 +149,12 @@ def box_gap(x, gradient):
 
 def test_minimise_a_quadratic_in_a_box():
     curvature, centre = 10.0 ** np.linspace(-2, 2, 30), np.linspace(-1.0, 2.0, 30)
-    for metric in (1.0, curvature):
-        calls, function = [], quadratic(curvature, centre)
-        found = minimise(
-            lambda x, calls=calls, function=function: calls.append(x) or function(x),
-            in_box,
-            box_gap,
-            np.full(30, 0.5),
-            metric=metric,
-            tolerance=1e-10,
-            iterations=1000,
-            seconds=10.0,
-        )
-        assert found.reason is None
+    limits = {"tolerance": 1e-10, "iterations": 1000, "seconds": 10.0}
+    for metric, most in ((1.0, 1000), (curvature, 5)):  # the exact metric makes it one step
+        function = Mock(side_effect=quadratic(curvature, centre))
+        found = minimise(function, in_box, box_gap, np.full(30, 0.5), metric=metric, **limits)
+        assert found.reason is None and function.call_count <= most
         np.testing.assert_allclose(found.point, in_box(centre), atol=1e-3)
-    assert len(calls) <= 5  # the exact metric makes it one step
 
 
 def test_minimise_says_why_it_stopped():
@@ -177,14 +167,9 @@ def test_minimise_says_why_it_stopped():
     assert search(hard, seconds=0.0).reason == "time limit"
     assert search(lambda x: (np.nan, x)).reason == "not a number"
 
-    calls = []
-
-    def rising(x):  # from everywhere: the line search would go on for long
-        calls.append(x)
-        time.sleep(0.01)
-        return float((x != 0.0).any()), -np.ones(2)
-
+    # Rising from everywhere: the line search would go on for long.
+    rising = Mock(side_effect=lambda x: time.sleep(0.01) or (float((x != 0.0).any()), -np.ones(2)))
     search(rising, seconds=0.025)
-    assert len(calls) <= 3
+    assert rising.call_count <= 3
     wrong = search(lambda x: (1.0 + x.sum(), -np.ones(2)))
     assert wrong.reason == "no further descent" and (wrong.point == 0.0).all()
