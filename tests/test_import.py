@@ -55,7 +55,7 @@ def test_traffic_keeps_cars_and_leaves_the_rest_alone(config):
     assert 30 <= sum(name.startswith("chance.") for name in ids) <= 90
     assert 30 <= sum(name.startswith("down.") for name in ids) <= 90
     assert (np.diff(traffic.depart) >= 0).all() and traffic.depart.min() >= 600.0
-    assert [element.get("id") for element in traffic.background] == ["line2", "bus", "walker"]
+    assert [element.get("id") for element in traffic.background] == ["line2.0", "bus", "walker", "line2.1", "line2.2"]
     assert "edgeData" not in [element.tag for element in traffic.shared]
     detector = next(element for element in traffic.shared if element.tag == "inductionLoop")
     assert detector.get("file") == "NUL"  # a run writes nothing into the user's folders
@@ -222,7 +222,8 @@ def test_options_and_includes_of_the_user_count(config, tmp_path):
         '<mesosim v="true"/><max-depart-delay value="60"/><tripinfo-output value="trips.xml"/></configuration>'
     )
     case = read_sumo_input(tmp_path / "city.sumocfg")
-    assert case.scale == 2.5 and case.mesoscopic and case.left_out == ("max-depart-delay = 60",)
+    assert case.reading == {"scale": "2.5"} and case.mesoscopic and case.left_out == ()
+    assert case.options["max-depart-delay"] == "60" and case.options["meso-junction-control"] == "false"
     text = good(
         cosim(
             "import",
@@ -233,10 +234,9 @@ def test_options_and_includes_of_the_user_count(config, tmp_path):
             tmp_path / "networks" / "x",
         )
     )
-    assert "60 vehicles in" in text
-    assert "not taken over from city.sumocfg: max-depart-delay = 60, scale = 2.5" in text
+    assert "150 vehicles in" in text
     scenario = load_scenario(tmp_path / "scenarios" / "x")
-    assert scenario.demand_factor == 2.5 and scenario.demand.sum() * scenario.step == pytest.approx(150.0)
+    assert scenario.demand_factor == 1.0 and scenario.demand.sum() * scenario.step == pytest.approx(150.0)
     assert settings(scenario).mesoscopic
     good(
         cosim(

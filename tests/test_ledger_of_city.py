@@ -262,7 +262,7 @@ def run(folder: Path, city, case: Case, *, mesoscopic: bool, seed: int):
             "--ignore-junction-blocker",
             "20",
             *case.options,
-            *(MESOSCOPIC if mesoscopic else ()),
+            *(f"--{key}={value}" for key, value in MESOSCOPIC.items() if mesoscopic),
         ),
     )
     states = []

@@ -32,23 +32,23 @@ ADDITIONAL = """<additional>
   <edgeData id="all" file="edges.xml"/>
 </additional>"""
 CARS = """<routes>
-  <vehicle id="round" depart="610" type="mixed" route="loop"/>
-  <vehicle id="stops" depart="612" type="lorry"><route edges="A1B1 B1C1 C1D1"/>
-    <stop lane="B1C1_0" endPos="60" duration="20"/></vehicle>
   <trip id="early" depart="5" from="A0A1" to="D1D2"/>
-  <trip id="astray" depart="620" from="A0A1" to="nowhere"/>
-  <vehicle id="gap" depart="620"><route edges="A0A1 D1D2"/></vehicle>
-  <trip id="short" depart="0:10:30" from="B1C1" to="B1C1"/>
   <flow id="zones" begin="600" end="1200" number="30" from="A0A1" to="D1D2"/>
   <flow id="across" begin="600" end="1200" period="8" from="A1B1" to="C1D1" type="mixed"/>
   <flow id="back" begin="600" end="1200" vehsPerHour="360" from="D2C2" to="B2A2"/>
   <flow id="chance" begin="600" end="1200" probability="0.1" from="B3C3" to="C0B0"/>
   <flow id="down" begin="600" end="1200" period="exp(0.1)" from="C3C2" to="C1C0"/>
+  <vehicle id="round" depart="610" type="mixed" route="loop"/>
+  <vehicle id="stops" depart="612" type="lorry"><route edges="A1B1 B1C1 C1D1"/>
+    <stop lane="B1C1_0" endPos="60" duration="20"/></vehicle>
+  <trip id="astray" depart="620" from="A0A1" to="nowhere"/>
+  <vehicle id="gap" depart="620"><route edges="A0A1 D1D2"/></vehicle>
+  <trip id="short" depart="0:10:30" from="B1C1" to="B1C1"/>
 </routes>"""
 BUSES = """<routes>
+  <flow id="line2" type="citybus" begin="600" end="1200" period="200" from="A2B2" to="C2D2"/>
   <vehicle id="bus" type="citybus" line="1" depart="605"><route edges="A1B1 B1C1 C1D1 D1D2"/>
     <stop busStop="stop" duration="15"/></vehicle>
-  <flow id="line2" type="citybus" begin="600" end="1200" period="200" from="A2B2" to="C2D2"/>
   <person id="walker" depart="615"><walk edges="B1C1 C1D1"/></person>
 </routes>"""
 

@@ -101,7 +101,7 @@ def averaged_runs(
     """Run the city with seeds 0, 1, ... and average the presence; all else is that of seed 0.
 
     files: routes of the demand, background and additional -> names of files in the folder
-    times: SUMO's options begin, end [s], and others
+    times: SUMO's options begin, end [s], and all others that change the traffic
     factor: multiplies the demand [-]; seed 0 departs as recorded
 
     Raises:
@@ -132,7 +132,7 @@ def averaged_runs(
                 "vehroute-output": scratch / "ways.xml",
                 "statistic-output": scratch / "statistic.xml",
             }
-            run_sumo("sumo", SILENT | options, *(MESOSCOPIC if mesoscopic else ()), where=str(streets.path))
+            run_sumo("sumo", SILENT | (MESOSCOPIC if mesoscopic else {}) | options, where=str(streets.path))
             runs.append(_measured(scratch, streets, begin, end, {name for _, _, name in drawn}))
     return replace(runs[0], presence=np.mean([run.presence for run in runs], axis=0))
 

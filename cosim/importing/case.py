@@ -6,27 +6,30 @@ import re
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
+from urllib.parse import unquote
 
 import numpy as np
 import sumo
 
 from cosim.sumo.build import run_sumo
-from cosim.sumo.xml_files import BROKEN, file_list, opened, read_xml
+from cosim.sumo.xml_files import BROKEN, attribute, file_list, opened, read_xml
 from nmfd.errors import InputError
 from nmfd.runs.files import temporary_folder
 
 ENDLESS_S = 1e9  # a later end is none
-# Options that change what is written or shown, or how fast, but not the traffic.
-IDLE = re.compile(
-    r".*output.*|.*log.*|.*threads|(verbose|no-warnings|quit|start|delay|seed|random|precision|version|remote|xml|gui|"
-    r"window|tracker|print|human|save|summary|tripinfo|vehroute|fcd|netstate|statistic|queue|emission|"
-    r"device\.emissions|link|language|meso-).*"
+# Groups of options, in SUMO's own words, that change what is written or shown, or how it is read, but not the traffic.
+IDLE = set(
+    "configuration output report emissions traci_server random_number gui_only example_device ssm_device fcd_device "
+    "tripinfo_device vehroutes_device".split()
 )
+WRITING = re.compile(r".*(output|threads)|xml-validation.*|scale-suffix")  # others of this kind
+READ = ("load-state", "load-state.offset", "load-state.remove-vehicles", "scale", "random-depart-offset")
+FILES = re.compile(r"weight-files|astar\..*|pedestrian\.jupedsim\..*|phemlight-path|device\.fcd-replay\..*")
 # As SUMO's documentation recommends: sumo.dlr.de/docs/Networks/Import/OpenStreetMap.html. OpenStreetMap does not say
 # what signals show: they come out actuated.
 NETCONVERT = (
@@ -41,6 +44,7 @@ LICENCE = (
 LEFT_HAND = Path(__file__).with_name("left_hand.csv")
 SERVERS = "hpi,oapi,pcoffee"  # osmGet.py's names of public ones
 SERVER_TIME_LIMIT_S = 600.0
+OWN_DEFAULTS = {"collision.action": "teleport"}  # of SUMO, where a scenario has others
 Box = tuple[float, float, float, float]  # west, south, east, north [degrees]
 
 
@@ -56,8 +60,10 @@ class SumoInput:
 
     source: the given file; net; routes and additional in SUMO's order
     begin, end: [s]; end is None if it is open
-    scale: factor of the demand [-]; step_length [s]; mesoscopic: by SUMO's queue model
+    step_length [s]; mesoscopic: by SUMO's queue model
     time_to_teleport: waiting time before a teleport [s], -1 for never
+    options: all others that change the traffic; reading: those that matter only to the reading of vehicles
+    gaps: SUMO drives routes with gaps
     left_out: options that may change the traffic and are not taken over, as NAME = VALUE
     notice: required by the licence of the data
     """
@@ -68,10 +74,12 @@ class SumoInput:
     additional: tuple[Path, ...] = ()
     begin: float = 0.0
     end: float | None = None
-    scale: float = 1.0
     step_length: float = 1.0
     time_to_teleport: float = 300.0
     mesoscopic: bool = False
+    options: Mapping[str, str] = field(default_factory=lambda: dict(OWN_DEFAULTS))
+    reading: Mapping[str, str] = field(default_factory=dict)
+    gaps: bool = False
     left_out: tuple[str, ...] = ()
     notice: str = ""
 
@@ -115,10 +123,16 @@ def read_sumo_input(path: Path) -> SumoInput:
         raise InputError(
             f"{path}: expected a sumocfg, a net.xml or a file of OpenStreetMap, got a file of <{root.tag}> instead"
         )
-    options = {e.tag: value for e in read_xml(path).iter() if (value := e.get("value", e.get("v"))) is not None}
+    with temporary_folder() as folder:
+        saved = folder / "read.sumocfg"
+        run_sumo("sumo", {"configuration-file": path.absolute(), "save-configuration": saved}, where=str(path))
+        groups = read_xml(saved)
+    options = {e.tag: attribute(e, "value") for group in groups if group.tag not in IDLE for e in group}
+    options = {name: value for name, value in options.items() if not WRITING.fullmatch(name)}
     files: dict[str, tuple[Path, ...]] = {}
     for key in ("net-file", "route-files", "additional-files"):
-        files[key] = tuple(path.parent / name.strip() for name in options.pop(key, "").split(",") if name.strip())
+        names = [unquote(name).split("/") for name in options.pop(key, "").split(",") if unquote(name).strip()]
+        files[key] = tuple(Path("/".join(part.strip() for part in parts)) for parts in names)
         for file in files[key]:
             if not file.is_file():
                 raise InputError(f"{path}: {key}: no such file: {file}; correct the name or add the file")
@@ -129,18 +143,28 @@ def read_sumo_input(path: Path) -> SumoInput:
         return seconds(options.pop(name, default), f"{path}: {name}")
 
     end, teleport = number("end", "-1"), number("time-to-teleport", "300")
+    begin = "0"
+    if state := options.get("load-state"):
+        options["load-state"] = unquote(state)
+        begin = _root(Path(options["load-state"])).get("time", begin)
+    mesoscopic, gaps = (
+        options.pop(name, "").lower() in ("true", "1", "yes", "on", "x") for name in ("mesosim", "ignore-route-errors")
+    )
+    own = OWN_DEFAULTS | ({"meso-junction-control": "false"} if mesoscopic else {})
     return SumoInput(
         source=path,
         net=files["net-file"][0],
         routes=files["route-files"],
         additional=files["additional-files"],
-        begin=number("begin", "0"),
+        begin=number("begin", begin),
         end=end if 0 < end < ENDLESS_S else None,
-        scale=number("scale", "1"),
         step_length=number("step-length", "1"),
         time_to_teleport=teleport if teleport > 0 else -1.0,
-        mesoscopic=options.pop("mesosim", "false").lower() in ("true", "1", "yes", "on", "x"),
-        left_out=tuple(f"{name} = {value}" for name, value in sorted(options.items()) if not IDLE.fullmatch(name)),
+        mesoscopic=mesoscopic,
+        options=own | {k: v for k, v in options.items() if k not in READ and not FILES.fullmatch(k)},
+        reading={name: options[name] for name in READ if name in options},
+        gaps=gaps,
+        left_out=tuple(f"{name} = {value}" for name, value in sorted(options.items()) if FILES.fullmatch(name)),
     )
 
 

@@ -29,6 +29,7 @@ from nmfd.runs.tables import text_table
 from nmfd.studies import plots
 
 LARGE_CITY_EDGES = 5000  # for cars: beyond, the run without control is mesoscopic, so that it takes a minute
+LEFT_OUT = 0.01  # share of vehicles or distance above which a warning follows
 NET = "city.net.xml.gz"
 FILES = {"routes": "vehicles.rou.xml.gz", "background": "background.rou.xml.gz", "additional": "city.add.xml.gz"}
 TYPES = ("vType", "vTypeDistribution")
@@ -90,7 +91,7 @@ def import_city(
         traffic = read_traffic(case, streets, seed)
         mesoscopic = mesoscopic or case.mesoscopic
         meso = mesoscopic or streets.drivable.sum() > LARGE_CITY_EDGES
-        factor, assigned = case.scale * level, None
+        factor, assigned = level, None
         if peak:
             traffic, assigned = _peak(case, streets, traffic, level, seed, iterations, meso, progress)
             factor = 1.0
@@ -124,6 +125,9 @@ def import_city(
         tables = quality.tables(streets, labels, network.region_names, city, baseline, left)
         verdict = quality.import_verdict(network, tables.gateways, labels, baseline, scenario.name)
         network = replace(network, controllable=verdict.boundaries.shares)
+        if max(traffic.left_out) > LEFT_OUT:
+            warning = f"WARNING: {_left_out(traffic)}: this is not the traffic of {case.source.name}"
+            verdict = replace(verdict, sentences=(*verdict.sentences, warning))
         report = _report(case, streets, traffic, clock, tables, baseline, assigned)
         if isinstance(regions, int) and network.regions < regions:
             report.append(f"{network.regions} regions instead of {regions}: others could not be reached, or fell apart")
@@ -236,6 +240,10 @@ def _zip(path: Path, content: bytes) -> None:
     path.write_bytes(gzip.compress(content, mtime=0))
 
 
+def _left_out(traffic: Traffic) -> str:
+    return "{:.1%} of the vehicles and {:.1%} of the distance left out".format(*traffic.left_out)
+
+
 def _notes(traffic: Traffic) -> str:
     return "".join(f"; {note}: {count:,}" for note, count in sorted(traffic.notes.items()))
 
@@ -254,7 +262,7 @@ def _report(
         f"{case.source.name}: {len(streets.edges):,} edges, {streets.drivable.sum():,} for cars, "
         f"{'left' if streets.left_hand else 'right'}-hand traffic; {len(streets.logics):,} signals; "
         f"{len(traffic.vehicles):,} vehicles in {clock.steps} intervals of "
-        f"{clock.step:g} s{_notes(traffic)}",
+        f"{clock.step:g} s; {_left_out(traffic)}{_notes(traffic)}",
         text_table(tables.quality, CAPTION),
         f"without control: {baseline.teleports} teleports; at the end {baseline.running} vehicles on the road and "
         f"{baseline.waiting} waiting to enter; {baseline.dropped:,} without a route or a free lane",
@@ -265,8 +273,6 @@ def _report(
         if gap > GAP:
             lines.append(f"WARNING: a relative gap above {100 * GAP:g} %: rerouting gains what drivers know already")
     changed = list(case.left_out)
-    if case.scale != 1.0:
-        changed.append(f"scale = {case.scale:g}, vehicles are multiplied instead")
     if case.step_length != (step := float(model.options(case, clock)["step-length"])):
         changed.append(f"step-length = {case.step_length:g}, not {step:g}")
     if changed:

@@ -8,7 +8,7 @@ import numpy as np
 
 from cosim.importing.baseline import Baseline
 from cosim.importing.case import SumoInput
-from cosim.importing.demand import Traffic
+from cosim.importing.demand import Traffic, departure
 from cosim.importing.regions import digraph, names, positions
 from cosim.importing.streets import Streets
 from cosim.sumo.arrays import EdgeNumbers
@@ -62,7 +62,7 @@ class Clock:
 
 def without_idle(case: SumoInput, traffic: Traffic) -> SumoInput:
     """Begin the case later if its first vehicle departs more than IDLE_S after the beginning."""
-    first = traffic.depart[0] if len(traffic.depart) else case.begin
+    first = min([*traffic.depart[:1], *(departure(element) for element in traffic.background)], default=case.begin)
     return case if first - case.begin <= IDLE_S else replace(case, begin=float(first // IDLE_S * IDLE_S))
 
 
@@ -113,10 +113,11 @@ def network_of(streets: Streets, regions: EdgeNumbers, name: str, baseline: Base
 
 
 def options(case: SumoInput, clock: Clock) -> dict[str, str]:
-    """Return SUMO's time options; the city's own step length if it divides the control interval, else 1 s."""
+    """Return SUMO's options; the city's own step length if it divides the control interval, else 1 s."""
     own = case.step_length
     fits = 0.0 < own <= 1.0 and abs(clock.step / own - round(clock.step / own)) < 1e-9
     return {
+        **case.options,
         "begin": f"{clock.begin:.1f}",
         "end": f"{clock.end:.1f}",
         "step-length": f"{own if fits else 1.0:g}",
@@ -158,5 +159,7 @@ def scenario_text(
         "ways_return = true          # guided drivers may leave a region and come back, as main roads here do\n"
         + "".join(f"{key} = [{', '.join(map(quoted, values))}]\n" for key, values in lists.items())
         + ("mesoscopic = true           # SUMO's queue model: fast, without lanes\n" if mesoscopic else "")
+        + "\n[sumo.options]              # of SUMO, as the city has them\n"
+        + "".join(f"{quoted(key)} = {quoted(value)}\n" for key, value in sorted(case.options.items()))
         + TRAINING
     )

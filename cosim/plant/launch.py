@@ -24,7 +24,8 @@ REROUTING = (
     "--route-steps 1 --device.rerouting.pre-period 60 --device.rerouting.period 60 "
     "--device.rerouting.adaptation-interval 1 --device.rerouting.adaptation-steps 180"
 ).split()
-DEPARTURE_JITTER_S = 10.0  # departures of recorded trips are moved by up to this, either way, by the seed
+GIVEN = ("step-length", "time-to-teleport", "collision.action")  # arguments of Session
+DEPARTURE_JITTER_S = 10.0  # departures of recorded trips are moved by up to this, either way, by a seed other than 0
 
 
 def own_vehicles(scenario: Scenario, settings: Settings, city: City) -> RecordedTrips:
@@ -71,6 +72,7 @@ class Launch:
             seed=seed,
             step_length=settings.step_length,
             time_to_teleport=settings.time_to_teleport,
+            collision_action=settings.options.get("collision.action", "warn"),
             options=tuple(self._options()),
             gui=self._gui,
         )
@@ -91,8 +93,10 @@ class Launch:
         options += ["--ignore-route-errors", str(bool(settings.routes)).lower()]
         if settings.rerouting > 0:
             options += [*REROUTING, "--device.rerouting.probability", str(settings.rerouting)]
-        if settings.mesoscopic:
-            options += recorded.MESOSCOPIC
+        more = (recorded.MESOSCOPIC if settings.mesoscopic else {}) | settings.options
+        for key, value in more.items():
+            if f"--{key}" not in options and key not in GIVEN:
+                options += [f"--{key}", value]
         if additional := self._additional():
             options += ["--additional-files", file_list(additional)]
         return options
@@ -123,7 +127,8 @@ class Launch:
             return [f"v{n}" for n in range(len(trips.routes))]
         if self._originals is None:
             self._originals = own_vehicles(scenario, settings, self._city)
-        how = {"factor": scenario.demand_factor, "jitter": DEPARTURE_JITTER_S, "begin": settings.begin}
+        jitter = DEPARTURE_JITTER_S if seed else 0.0
+        how = {"factor": scenario.demand_factor, "jitter": jitter, "begin": settings.begin}
         drawn = recorded.draw(self._originals, seed=seed, **how)
         if metered:
             self.held = recorded.write_held_trips(

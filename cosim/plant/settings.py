@@ -7,7 +7,7 @@ from pydantic import model_validator
 
 from nmfd.errors import InputError
 from nmfd.runs import config
-from nmfd.runs.config import Problem, Seconds, Share, Texts, setting
+from nmfd.runs.config import Problem, Seconds, Share, Text, Texts, setting
 
 if TYPE_CHECKING:  # heavy, and the help of a command imports this module
     from nmfd.model.scenario import Scenario
@@ -32,6 +32,9 @@ class Settings(config.Settings):
     routes: Texts = setting("route files of recorded trips; without any, trips are drawn from the demand", ())
     background: Texts = setting("route files of traffic outside the demand: public transport, persons", ())
     additional: Texts = setting("additional files: vehicle types, stops, signal programmes", ())
+    options: dict[Text, Text] = setting(
+        "SUMO's own options that change what drives, such as max-depart-delay, as texts; the settings here go first", {}
+    )
     signals: Signals = setting("control of the signals", FIXED)
     leave_signals: Texts = setting("signals that perimeter control does not change", ())
     actuation: Mode = setting("green taken from a gateway is red for all, or goes to other movements", HOLD_BACK)

@@ -19,7 +19,7 @@ from nmfd.errors import InputError
 from nmfd.runs import files
 
 STREAM = 7102  # keeps these random numbers apart from others of the same seed
-MESOSCOPIC = ("--mesosim", "true", "--meso-junction-control", "true")  # options of SUMO
+MESOSCOPIC = {"mesosim": "true", "meso-junction-control": "true"}  # options of SUMO
 # Vehicle classes that keep to their lines, or do not use the road as cars do.
 BOUND = frozenset(
     "bus coach tram rail rail_urban rail_electric rail_fast subway cable_car ship aircraft bicycle pedestrian scooter "
@@ -27,7 +27,7 @@ BOUND = frozenset(
 )
 DrawnTrip = tuple[float, int, str]  # departure [s], number of the vehicle, id
 HELD = "held."  # prefix of the ids of routes that only one vehicle uses
-# Attribute of a vehicle -> argument of libsumo.vehicle.add, whose defaults are those of the attributes.
+# Attribute of a vehicle -> argument of Session.begin_trip, whose defaults are those of the attributes.
 ORDERED = {
     "type": "typeID",
     "departLane": "departLane",
@@ -36,6 +36,7 @@ ORDERED = {
     "arrivalLane": "arrivalLane",
     "arrivalPos": "arrivalPos",
     "arrivalSpeed": "arrivalSpeed",
+    "speedFactor": "speedFactor",
 }
 
 
@@ -166,7 +167,7 @@ def draw(originals: RecordedTrips, *, seed: int, factor: float, jitter: float, b
             while copy and name in taken:
                 stem += "."
                 name = f"{stem}.{copy}"
-            drawn.append((round(depart, 2), n, name))
+            drawn.append((round(depart, 2 if jitter else 3), n, name))
     return sorted(drawn, key=lambda vehicle: vehicle[:2])
 
 
@@ -228,7 +229,7 @@ def _meterable_route(element: ElementTree.Element, shared: Mapping[str, tuple[st
 
 
 def _departing(element: ElementTree.Element, name: str, depart: float) -> ElementTree.Element:
-    copy = ElementTree.Element(element.tag, {**element.attrib, "id": name, "depart": f"{depart:.2f}"})
+    copy = ElementTree.Element(element.tag, {**element.attrib, "id": name, "depart": f"{depart:.10g}"})
     copy.extend(element)
     copy.text = element.text
     return copy

@@ -100,9 +100,9 @@ class Session:
             if gui:
                 libsumo.start(["sumo-gui", *self.command[1:], *GUI_OPTIONS])
             else:
-                _start_quietly(self.command)
+                start_quietly(self.command)
         except ERRORS as error:
-            raise InputError(f"{net_file}: SUMO cannot run it with {routes}: {_one_line(error)}") from None
+            raise InputError(f"{net_file}: SUMO cannot run it with {routes}: {one_line(error)}") from None
         Session._open = True
         self.time = libsumo.simulation.getTime()
         self._lanes_of: dict[str, tuple[str, ...]] = {}  # edge -> its lanes
@@ -149,7 +149,7 @@ class Session:
         try:
             libsumo.simulationStep()
         except ERRORS as error:
-            raise RunFailed(f"SUMO stopped at {self.time:g} s: {_one_line(error)}") from None
+            raise RunFailed(f"SUMO stopped at {self.time:g} s: {one_line(error)}") from None
         self.sumo_time += time.perf_counter() - before
         self.time = libsumo.simulation.getTime()
 
@@ -220,8 +220,15 @@ class Session:
         return _accepted(libsumo.vehicle.setRoute, vehicle, edges)
 
     def begin_trip(self, order: Mapping[str, str]) -> None:
-        """Let a vehicle depart now. order: arguments of libsumo.vehicle.add, with a route that SUMO knows"""
-        libsumo.vehicle.add(**order, depart="now")
+        """Let a vehicle depart now.
+
+        order: arguments of libsumo.vehicle.add, with a route that SUMO knows, and speedFactor
+        """
+        arguments = dict(order)
+        factor = arguments.pop("speedFactor", None)
+        libsumo.vehicle.add(**arguments, depart="now")
+        if factor is not None:
+            libsumo.vehicle.setSpeedFactor(order["vehID"], float(factor))
 
     def programme(self, signal: str) -> Programme:
         """Return the programme that runs on `signal` now."""
@@ -289,7 +296,7 @@ def _keep_freed() -> None:
             ctypes.CDLL(None).mallopt(option, size)
 
 
-def _start_quietly(command: list[str]) -> None:
+def start_quietly(command: list[str]) -> None:
     """Start libsumo. Raises FatalTraCIError with what SUMO writes to stderr, which the library does not hand on."""
     with tempfile.TemporaryFile() as said:
         sys.stderr.flush()
@@ -310,8 +317,9 @@ def _start_quietly(command: list[str]) -> None:
             sys.stderr.write(words)
         return
     lines = [line.removeprefix("Error: ") for line in words.splitlines() if line.startswith("Error: ")]
-    raise libsumo.FatalTraCIError(lines[0] if lines else _one_line(failure))
+    raise libsumo.FatalTraCIError(lines[0] if lines else one_line(failure))
 
 
-def _one_line(error: Exception) -> str:
+def one_line(error: Exception) -> str:
+    """Return the words of an error in one line."""
     return " ".join(str(error).split()) or type(error).__name__

@@ -1,0 +1,196 @@
+"""Every form in which SUMO takes vehicles: an import drives the same ones, trip by trip."""
+
+import shutil
+import xml.etree.ElementTree as ElementTree
+
+import pytest
+import tiny_city
+
+from cosim.api import run
+from cosim.importing.case import read_sumo_input
+from cosim.importing.demand import read_traffic
+from cosim.importing.importer import import_city
+from cosim.importing.streets import read_streets
+
+ADDITIONAL = """<vType id="own" vClass="taxi" maxSpeed="9"/><vType id="thin" scale="0.5"/>
+<vType id="spread" speedFactor="normc(1,0.2,0.5,1.5)"/>
+<vTypeDistribution id="mixed"><vType id="a" probability="0.6"/><vType id="b" vClass="truck" probability="0.4"/>
+</vTypeDistribution><vTypeDistribution id="named" vTypes="own spread"/>
+<route id="r" edges="A1B1 B1C1 C1D1"/><route id="s" edges="A1B1 B1B2"/>
+<route id="halt" edges="A1B1 B1C1"><stop lane="A1B1_0" duration="7"/></route>
+<routeDistribution id="d"><route id="d1" edges="A1B1 B1C1" probability="1"/><route edges="A1B1 B1B2" probability="2"/>
+</routeDistribution><routeDistribution id="refs" routes="r s" probabilities="1 3"/>
+<busStop id="bus" lane="B1C1_0" startPos="20" endPos="40"/>
+<parkingArea id="park" lane="B1C1_0" startPos="60" endPos="80"/>
+<taz id="west" edges="A0A1 A1B1"/><taz id="east"><tazSource id="C1D1" weight="1"/><tazSink id="C1D1" weight="1"/></taz>
+<trip id="beside" depart="9" from="A1B1" to="C1D1"/>
+<calibrator id="c" edge="B2C2" pos="0">
+<flow begin="0" end="60" route="r" vehsPerHour="600"/></calibrator>"""
+TRIP, ENDS = '<trip id="{0}" depart="{1}" ', 'from="A1B1" to="C1D1"'
+FLOW, ROUTED = '<flow id="{0}" begin="{1}" ', '<vehicle id="{0}" depart="{1}" '
+FORMS = {
+    "trip": TRIP + ENDS + "/>",
+    "via": TRIP + ENDS + ' via="B2C2"/>',
+    "blanks": TRIP + 'from=" A1B1 " to="C1D1&#9;" via=" B2C2 "/>',
+    "stops_only": TRIP + '><stop lane="A1B1_0" duration="3"/><stop lane="C1D1_0" duration="3"/></trip>',
+    "stop_on_the_way": TRIP + ENDS + '><stop lane="B2C2_0" duration="3" startPos="5" endPos="30"/></trip>',
+    "stop_at_the_end": TRIP + 'from="A1B1"><stop busStop="bus" duration="5"/></trip>',
+    "parking": TRIP + ENDS + '><stop parkingArea="park" duration="9"/></trip>',
+    "junctions": TRIP + 'fromJunction="A1" toJunction="D1"/>',
+    "zones": TRIP + 'fromTaz="west" toTaz="east"/>',
+    "coordinates": TRIP + 'fromXY="100,195" toXY="500,195"/>',
+    "one_edge": TRIP + 'from="B1C1" to="B1C1"/>',
+    "clock": TRIP.replace("{1}", "0:00:{1}") + ENDS + "/>",
+    "own_type": TRIP + ENDS + ' type="own" color="1,0,0"><param key="a" value="b"/></trip>',
+    "types": TRIP + ENDS + ' type="mixed"/>',
+    "named_types": TRIP + ENDS + ' type="named"/>',
+    "own_speed": TRIP + ENDS + ' speedFactor="1.3"/>',
+    "places": TRIP + ENDS + ' departLane="free" departPos="random" departSpeed="random" arrivalPos="random"/>',
+    "last": TRIP + ENDS + ' departLane="best_prob" departPos="last" departSpeed="avg" arrivalLane="1"/>',
+    "numbers": TRIP + ENDS + ' departLane="1" departPos="30.5" departSpeed="0" arrivalPos="-20" arrivalSpeed="3"/>',
+    "rerouting": TRIP + ENDS + '><param key="has.rerouting.device" value="true"/></trip>',
+    "named_route": ROUTED + 'route="r"/>',
+    "route_with_stop": ROUTED + 'route="halt"/>',
+    "nested": ROUTED + '><route edges="A1B1&#10;  B1C1"/></vehicle>',
+    "repeat": ROUTED + '><route edges="A1B1 B1B2 B2A2 A2A1" repeat="2"/></vehicle>',
+    "nested_stop": ROUTED + '><route edges="A1B1 B1C1"/><stop lane="B1C1_1" until="90" parking="true"/></vehicle>',
+    "depart_edge": ROUTED + 'route="r" departEdge="1" arrivalEdge="2"/>',
+    "reroute": ROUTED + 'reroute="true"><route edges="A1B1 C1D1"/></vehicle>',
+    "shared": ROUTED + 'route="d"/>',
+    "references": ROUTED + 'route="refs"/>',
+    "alternatives": ROUTED
+    + '><routeDistribution last="0"><route cost="9" probability="0.4" edges="A1B1 B1C1"/>'
+    + '<route cost="9" probability="0.6" edges="A1B1 B1B2"/></routeDistribution></vehicle>',
+    "period": FLOW + 'end="60" period="7.3" ' + ENDS + "/>",
+    "hourly": FLOW + 'end="60" vehsPerHour="700" route="d" type="mixed"/>',
+    "per_hour": FLOW + 'end="60" perHour="333" ' + ENDS + ' departPos="random_free"/>',
+    "count": FLOW + 'end="60" number="7" route="r"/>',
+    "at_once": FLOW + 'end="{1}" number="4" ' + ENDS + ' departLane="best"/>',
+    "chance": FLOW + 'end="60" probability="0.3" route="refs"/>',
+    "poisson": FLOW + 'end="60" period="exp(0.2)" ' + ENDS + ' type="named"/>',
+    "until_then": FLOW + 'period="20" number="3" ' + ENDS + "/>",
+    "endless": FLOW + 'vehsPerHour="60" ' + ENDS + "/>",
+    "flow_via": FLOW + 'end="60" number="3" via="B2C2" ' + ENDS + '><stop lane="C1D1_0" duration="2"/></flow>',
+    "flow_zones": FLOW + 'end="60" number="3" fromTaz="west" toTaz="east"/>',
+    "scaled_type": FLOW + 'end="60" number="9" route="r" type="thin"/>',
+    "waits_for_a_person": ROUTED.replace("{1}", "triggered") + 'route="r"/><person id="p{0}" depart="{1}">'
+    '<ride from="A1B1" to="B1C1" lines="{0}"/></person>',
+    "walker": '<personFlow id="{0}" begin="{1}" end="60" number="3"><walk from="A1B1" to="B1C1"/></personFlow>',
+    "unsorted": TRIP.replace("{1}", "1") + ENDS + "/>",
+    "later": TRIP.replace("{1}", "700") + ENDS + "/>",
+}
+OPTIONS = {  # of SUMO
+    "scale": '<scale value="1.7"/>',
+    "offset": '<random-depart-offset value="20"/>',
+    "text": "<step-length>0.5</step-length>",
+    "meso": '<mesosim value="yes"/><meso-tauff value="1.9"/>',
+    "window": '<begin value="0:00:13"/>',
+    "lateral": '<lateral-resolution v="0.8"/><default.action-step-length v="1"/><time-to-teleport v="60"/>',
+    "equipped": '<device.rerouting.probability v="0.5"/><device.rerouting.period v="30"/><max-depart-delay v="15"/>',
+}
+
+
+# SUMO draws these with other random numbers of a run, or differs by itself: the same vehicles, driven otherwise.
+OF_CHANCE = ("per_hour", "places", "last", "walker", "waits_for_a_person")
+
+
+DRAWN = ("chance", "hourly", "shared", "references", "alternatives")  # their destinations
+
+
+def city(folder, forms, additional, options=""):
+    """A sumocfg with these forms, every one with its own time."""
+    tiny_city.network(folder)
+    lines = "\n".join(FORMS[name].format(name, 2 + n // 4) for n, name in enumerate(forms))
+    (folder / "c.rou.xml").write_text(f"<routes>{lines}</routes>")
+    (folder / "c.add.xml").write_text(f"<additional>{additional}</additional>")
+    (folder / "c.sumocfg").write_text(
+        '<configuration><net-file value="city.net.xml"/><route-files value="c.rou.xml"/><additional-files '
+        f'value="c.add.xml"/><end value="600"/><junction-taz value="true"/>{options}</configuration>'
+    )
+    return folder / "c.sumocfg"
+
+
+def trips(file) -> dict[str, dict[str, str]]:
+    """Id -> what SUMO says about every vehicle that departed, without those of the calibrator."""
+    driven = (trip.attrib for trip in ElementTree.parse(file).iter("tripinfo"))
+    return {trip["id"]: trip for trip in driven if not trip["id"].startswith("c.") and float(trip["depart"]) >= 0}
+
+
+def plain(config):
+    """The trips of SUMO alone."""
+    out = config.with_name("plain.xml")
+    tiny_city.run("sumo", "-c", config, "--tripinfo-output", out, "--tripinfo-output.write-unfinished", "--seed", 0)
+    return trips(out)
+
+
+def imported(config) -> str:
+    """The report of an import into networks/x and scenarios/x."""
+    folders = [config.with_name(name) / "x" for name in ("networks", "scenarios")]
+    for folder in folders:
+        shutil.rmtree(folder, ignore_errors=True)
+    return import_city(config, *folders, regions=2, seeds=1)
+
+
+@pytest.mark.parametrize("options", ["", *OPTIONS.values()], ids=["plain", *OPTIONS])
+def test_an_import_reads_what_sumo_reads(tmp_path, options):
+    """The same vehicles from edge to edge, with the same departures; none is left out."""
+    config = city(tmp_path, FORMS, ADDITIONAL, options)
+    case, driven = read_sumo_input(config), plain(config)
+    streets = read_streets(case.net, case.additional)
+    traffic = read_traffic(case, streets, seed=0)
+    read = {vehicle.get("id"): n for n, vehicle in enumerate(traffic.vehicles)}
+    assert traffic.left_out == (0.0, 0.0)
+    timed = set(driven) - {"waits_for_a_person"}
+    assert timed <= set(read) if "max-depart-delay" in case.options else timed == set(read)
+    for name in timed:
+        start, end = (driven[name][key].rpartition("_")[0] for key in ("departLane", "arrivalLane"))
+        assert streets.edges[traffic.origin[read[name]]] == start, name
+        if end and name.partition(".")[0] not in DRAWN:
+            assert streets.edges[traffic.destination[read[name]]] == end, name
+        due = float(driven[name]["depart"]) - float(driven[name]["departDelay"])
+        assert -0.02 <= traffic.depart[read[name]] - due < case.step_length + 0.02, name
+
+
+@pytest.mark.parametrize("options", ["", *map(OPTIONS.__getitem__, ("meso", "lateral", "equipped", "window"))])
+def test_seed_0_without_control_is_plain_sumo(tmp_path, options):
+    config = city(
+        tmp_path, [name for name in FORMS if name not in OF_CHANCE], ADDITIONAL.partition("<calibrator")[0], options
+    )
+    imported(config)
+    out = tmp_path / "t.xml"
+    run(tmp_path / "scenarios" / "x", "no-control", seed=0, sumo_output={"tripinfo": out}, progress=False)
+    keys = ("depart", "arrival", "routeLength", "departLane", "arrivalLane", "timeLoss")
+    mine, alone = ({name: [trip[key] for key in keys] for name, trip in t.items()} for t in (trips(out), plain(config)))
+    ended = {name: trip for name, trip in alone.items() if trip[1] != "-1.00"}  # the import simulates longer
+    assert {name: mine[name] for name in ended} == ended and len(ended) > 55 and set(mine) == set(alone)
+
+
+def test_vehicles_of_a_loaded_state_begin_where_they_are(tmp_path):
+    config = city(tmp_path, ["trip", "via", "period", "later"], ADDITIONAL.partition("<calibrator")[0])
+    state = tmp_path / "state.xml"
+    tiny_city.run("sumo", "-c", config, "--save-state.times", 50, "--save-state.files", state, "--end", 51)
+    config.write_text(config.read_text().replace("<end", '<load-state value="state.xml"/><end'))
+    case = read_sumo_input(config)
+    traffic = read_traffic(case, read_streets(case.net, case.additional), seed=0)
+    placed = [vehicle for vehicle in traffic.vehicles if float(vehicle.get("depart")) == 50.0]
+    assert case.begin == 50.0 and {"trip", "via", "period.0"} <= {vehicle.get("id") for vehicle in placed}
+    assert all(vehicle.get("departLane") in "01" and vehicle.get("departPos") for vehicle in placed)
+    assert len(traffic.vehicles) == len(plain(config)) == 11
+    imported(config)
+    result = run(tmp_path / "scenarios" / "x", "no-control", seed=0, progress=False)
+    assert result.departures.sum() == 11
+
+
+def test_what_is_left_out_is_said_first_and_last(tmp_path):
+    """SUMO refuses a route with a gap, or drives it if it is told to ignore errors."""
+    config = city(tmp_path, ["count", "reroute"], ADDITIONAL.partition("<calibrator")[0])
+    route = '<vehicle id="gap" depart="9"><route edges="A1B1 C1D1"/></vehicle></routes>'
+    (tmp_path / "c.rou.xml").write_text((tmp_path / "c.rou.xml").read_text().replace("</routes>", route))
+    first, *_, last = imported(config).splitlines()
+    assert "10.0% of the vehicles and 6.9% of the distance left out" in first
+    assert (
+        last == "WARNING: 10.0% of the vehicles and 6.9% of the distance left out: this is not the traffic of c.sumocfg"
+    )
+    assert last in (tmp_path / "networks" / "x" / "verdict.txt").read_text()
+    config.write_text(config.read_text().replace("<end", '<ignore-route-errors value="true"/><end'))
+    assert " 0.0% of the vehicles and 0.0% of the distance left out" in imported(config)
