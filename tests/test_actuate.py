@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from signal_rules import MIN_GREEN, PHASES, SINGLE, check, runs
 
-from cosim.plant.gates import DEFAULT_YELLOW_S, GatewaySignal, Ration, _apportion, yellow_time
-from cosim.plant.settings import MODES, REDISTRIBUTE
+from cosim.plant.gates import DEFAULT_YELLOW_S, GatewaySignal, Ration, yellow_time
 from cosim.sumo.session import Phase, Programme
 
 
@@ -15,9 +14,9 @@ def programme(phases, position=0.0):
     )
 
 
-def play(phases, movements, mode, commands, *, position=0.0, interval=90):
+def play(phases, movements, commands, *, position=0.0, interval=90):
     """The state of every second, under a new command (R, R) every `interval` seconds."""
-    signal = GatewaySignal(programme(phases, position), movements, start=0.0, redistribute=mode == REDISTRIBUTE)
+    signal = GatewaySignal(programme(phases, position), movements, start=0.0)
     states, shown = [], ""
     for second in range(len(commands) * interval):
         if second % interval == 0:
@@ -28,18 +27,16 @@ def play(phases, movements, mode, commands, *, position=0.0, interval=90):
     return states
 
 
-@pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("phases", [PHASES, SINGLE])
-def test_u_max_is_the_original_programme(mode, phases):
+def test_u_max_is_the_original_programme(phases):
     movements = {link: (0, 1) for link in range(1, len(phases[0][0]))}
-    states = play(phases, movements, mode, [np.ones((2, 2))] * 4, position=17.0)
+    states = play(phases, movements, [np.ones((2, 2))] * 4, position=17.0)
     original = [s for s, d in phases for _ in range(int(d))]
     assert states == [original[(second + 17) % 90] for second in range(360)]
 
 
-@pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("phases", [PHASES, SINGLE])
-def test_random_commands_are_safe(mode, phases):
+def test_random_commands_are_safe(phases):
     random = np.random.default_rng(3)
     for _ in range(40):
         links = random.permutation(len(phases[0][0]))[: random.integers(1, len(phases[0][0]) + 1)]
@@ -48,7 +45,6 @@ def test_random_commands_are_safe(mode, phases):
         states = play(
             phases,
             movements,
-            mode,
             list(commands),
             position=float(random.integers(90)),
             interval=int(random.choice([30, 45, 90, 170])),
@@ -59,7 +55,7 @@ def test_random_commands_are_safe(mode, phases):
 def test_green_falls_from_the_original_to_the_minimum():
     green = []
     for share in np.linspace(0.0, 1.0, 11):
-        states = play(PHASES, {0: (0, 1)}, "hold-back", [np.full((2, 2), share)] * 3)
+        states = play(PHASES, {0: (0, 1)}, [np.full((2, 2), share)] * 3)
         green.append(sum(s[0] in "Gg" for s in states[90:180]))
     assert green[0] == MIN_GREEN and green[-1] == 30
     assert green[2] == 10 and green[4] == 15 and green[6] == 20  # 5 s and so much of the other 25 s
@@ -68,14 +64,14 @@ def test_green_falls_from_the_original_to_the_minimum():
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.7])
 def test_a_green_that_is_cut_has_the_yellow_of_the_programme_and_no_more(share):
-    states = play(SINGLE, {0: (0, 1)}, "hold-back", [np.full((2, 2), share)] * 4)
+    states = play(SINGLE, {0: (0, 1)}, [np.full((2, 2), share)] * 4)
     assert [length for shown, length in runs(states, 0)[2:-1] if shown == "y"] == [3, 3, 3]
 
 
 @pytest.mark.parametrize("position", [0.0, 17.0])
 def test_a_link_that_is_never_red_is_held_once_per_cycle(position):
     """Its window is the cycle; the one that had begun before the simulation is left whole."""
-    states = play(PHASES, {3: (0, 1)}, "hold-back", [np.full((2, 2), 0.4)] * 4, position=position)
+    states = play(PHASES, {3: (0, 1)}, [np.full((2, 2), 0.4)] * 4, position=position)
     first = round(90 - position) if position else 90
     assert "".join(state[3] for state in states[first : first + 180]) == 2 * (39 * "g" + 3 * "y" + 48 * "r")
     assert {state[3] for state in states[: round(90 - position)]} == {"g"}
@@ -87,16 +83,9 @@ def test_a_time_just_before_the_end_of_the_cycle_is_in_its_last_phase():
     assert signal.update(90.0 - 1e-7) == "ry" and signal.update(90.0) == "Gr"
 
 
-def test_redistribute_leaves_the_time_between_greens_alone():
-    """Phases that are red for all are as long as before; the crossing street gets it all."""
-    phases = [("Gr", 30), ("yr", 3), ("rr", 2), ("rG", 30), ("ry", 3), ("rr", 2)]
-    held = play(phases, {0: (0, 1)}, "redistribute", [np.zeros((2, 2))] * 3, interval=70)[70:140]
-    assert [held.count(state) for state in ("Gr", "yr", "rr", "rG", "ry")] == [5, 3, 4, 55, 3]
-
-
 def test_every_window_of_a_link_keeps_its_minimum_green():
     phases = [("G", 20), ("y", 3), ("G", 10), ("y", 3), ("r", 54)]
-    held = "".join(play(phases, {0: (0, 1)}, "hold-back", [np.zeros((2, 2))] * 2)[90:])
+    held = "".join(play(phases, {0: (0, 1)}, [np.zeros((2, 2))] * 2)[90:])
     assert held == 5 * "G" + 3 * "y" + 15 * "r" + 5 * "G" + 3 * "y" + 59 * "r"
 
 
@@ -107,23 +96,6 @@ def test_u_max_is_the_original_programme_to_the_fraction_of_a_second():
     while signal.next_change < 270.0:
         signal.update(signal.next_change)
     assert signal.green_time()[0] == pytest.approx(3 * 42.4)
-
-
-@pytest.mark.parametrize(
-    "total, weights, shares",
-    [
-        (10, [1, 1, 1], [4, 3, 3]),
-        (7, [2, 1], [5, 2]),
-        (5, [1, 3], [1, 4]),
-        (0, [1, 2], [0, 0]),
-        (7.5, [1, 1], [4.5, 3]),
-        (11, [5, 3, 3], [5, 3, 3]),
-        (2, [1, 1, 1, 1], [1, 1, 0, 0]),
-        (9, [4], [9]),
-    ],
-)
-def test_seconds_are_shared_out_whole_and_all(total, weights, shares):
-    assert _apportion(total, weights) == shares
 
 
 @pytest.mark.parametrize(

@@ -124,7 +124,7 @@ IMPORT = ("import", "--out", "{tmp}/out/city")
     [
         ((*RUN, "--set", "sumo.complience=1"), "sumo.complience: unknown key; did you mean compliance?"),
         ((*RUN, "--set", "sumo.compliance=2.0"), "sumo.compliance: should be less than or equal to 1, got 2.0"),
-        ((*RUN, "--set", "sumo.actuation=hold"), "sumo.actuation: should be 'hold-back' or 'redistribute', got 'hold'"),
+        ((*RUN, "--set", "sumo.measurement=all"), "sumo.measurement: should be 'exact' or 'estimate', got 'all'"),
         ((*RUN, "--set", "sumo.step_length=0.7"), "sumo.step_length: expected a divisor of the control interval"),
         ((*RUN, "--set", "steps=0"), "steps: should be greater than or equal to 1, got 0"),
         ((*RUN, "--set", "network=../../networks/none"), "network.toml: no such file"),

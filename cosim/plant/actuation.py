@@ -7,7 +7,7 @@ import numpy as np
 from cosim.plant.gates import GatewaySignal, ResponsiveSignal
 from cosim.plant.incidents import Incidents
 from cosim.plant.max_pressure import FACTS, MaxPressure
-from cosim.plant.settings import CYCLIC, REDISTRIBUTE, Settings
+from cosim.plant.settings import CYCLIC, Settings
 from cosim.sumo.arrays import PerGateway
 from cosim.sumo.net import City, Gateway, gateway_movements
 from cosim.sumo.session import Phase, Session
@@ -47,12 +47,7 @@ class Actuation:
             phases = {signal.id: signal.phases for signal in steered if signal.id in movements}
         left = {*phases, *settings.leave_signals}
         own = [session.programme(signal) for signal in sorted(movements) if signal not in left]
-        redistribute = settings.actuation == REDISTRIBUTE
-        self._fixed = [
-            GatewaySignal(plan, movements[plan.signal], start=session.time, redistribute=redistribute)
-            for plan in own
-            if plan.static
-        ]
+        self._fixed = [GatewaySignal(plan, movements[plan.signal], start=session.time) for plan in own if plan.static]
         self._responsive = [
             ResponsiveSignal(session, plan, movements[plan.signal], show=incidents.show, release=incidents.release)
             for plan in own

@@ -8,14 +8,12 @@ keeps m + s (L - m) seconds
   nominal green in a cycle, or the whole cycle.
 
 Then come the original yellow and red. Green is only taken away: no new conflicts, and s = 1 is the original programme.
-The green that is taken stays red (hold-back), or phases without a gateway movement get it (redistribute).
+The green that is taken stays red.
 """
 
 from bisect import bisect_right
 from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import accumulate
-
-import numpy as np
 
 from cosim.sumo.session import Phase, Programme, Session
 from cosim.sumo.signals import GREEN, is_stage
@@ -32,25 +30,14 @@ class GatewaySignal:
     signal, phases: of the original programme; next_change: time of the next `update` [s]
     """
 
-    def __init__(
-        self,
-        programme: Programme,
-        movements: Mapping[int, tuple[int, int]],
-        *,
-        start: float,
-        redistribute: bool = False,
-    ):
+    def __init__(self, programme: Programme, movements: Mapping[int, tuple[int, int]], *, start: float):
         """movements: link index -> (i, h); start: simulation time at which the programme was read [s]"""
         self.signal, self.phases = programme.signal, programme.phases
-        self._states = [phase.state for phase in programme.phases]
-        self._original = [phase.duration for phase in programme.phases]
         self._movements = {link: _Movement(pair) for link, pair in movements.items()}
-        self._redistribute, self._cycle = redistribute, programme.cycle
-        self._least = least_times(programme.phases)
         self._windows = {link: _windows(programme, link) for link in movements}
         self._yellow = {link: yellow_time(programme.phases, link) for link in movements}
-        self._cycle_start = start - programme.position
-        self._ends = list(accumulate(self._original))
+        self._cycle, self._cycle_start = programme.cycle, start - programme.position
+        self._ends = list(accumulate(phase.duration for phase in programme.phases))
         self._shown, self._since, self.next_change = "", start, start
 
     def command(self, share: PerPair) -> None:
@@ -65,9 +52,8 @@ class GatewaySignal:
                 movement.green_time += now - self._since
         while now >= self._cycle_start + self._cycle:
             self._cycle_start += self._cycle
-            self._ends = list(accumulate(self._durations()))
         phase = min(bisect_right(self._ends, now - self._cycle_start + 1e-6), len(self._ends) - 1)
-        shown, self.next_change = list(self._states[phase]), self._cycle_start + self._ends[phase]
+        shown, self.next_change = list(self.phases[phase].state), self._cycle_start + self._ends[phase]
         for link, movement in self._movements.items():
             shown[link], change = self._filter(link, movement, shown[link], phase, now)
             self.next_change = min(self.next_change, change)
@@ -77,28 +63,6 @@ class GatewaySignal:
     def green_time(self) -> dict[int, float]:
         """Return the green of every gateway link up to the last update [s]."""
         return {link: movement.green_time for link, movement in self._movements.items()}
-
-    def _durations(self) -> list[float]:
-        """Return the phase durations of the cycle that begins; their sum is the original one."""
-        if not self._redistribute:
-            return self._original
-        shares: dict[int, float] = {}
-        for link, movement in self._movements.items():
-            for phase, state in enumerate(self._states):
-                if state[link] in GREEN and "y" not in state:
-                    shares[phase] = max(shares.get(phase, 0.0), movement.share)
-        takers = [phase for phase, state in enumerate(self._states) if phase not in shares and is_stage(state)]
-        if not takers:
-            return self._original
-        durations = list(self._original)
-        for phase, share in shares.items():
-            least = self._least[phase]
-            durations[phase] = least + float(round(share * (durations[phase] - least)))
-        freed = sum(self._original) - sum(durations)
-        weights = [self._original[phase] for phase in takers]
-        for phase, extra in zip(takers, _apportion(freed, weights), strict=True):
-            durations[phase] += extra
-        return durations
 
     def _filter(self, link: int, movement: "_Movement", base: str, phase: int, now: float) -> tuple[str, float]:
         """Return the light of a link instead of `base`, and the time of its next change [s]."""
@@ -171,17 +135,6 @@ def run_length(phases: Sequence[Phase], first: int, link: int, lights: Collectio
     while phases[n % len(phases)].state[link] in lights:
         length, n = length + phases[n % len(phases)].duration, n + 1
     return length
-
-
-def _apportion(total: float, weights: list[float]) -> list[float]:
-    """Share `total` whole seconds by weight, in whole seconds (largest remainders)."""
-    exact = np.array(weights) / sum(weights) * total
-    shares = np.floor(exact)
-    left = total - shares.sum()
-    for n in np.argsort(shares - exact, kind="stable")[: int(left)]:
-        shares[n] += 1.0
-    shares[0] += total - shares.sum()
-    return shares.tolist()
 
 
 class Ration:

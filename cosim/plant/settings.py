@@ -13,11 +13,8 @@ if TYPE_CHECKING:  # heavy, and the help of a command imports this module
     from nmfd.model.scenario import Scenario
 
 Signals = Literal["fixed", "webster", "actuated", "max-pressure", "max-pressure-cyclic"]
-Mode = Literal["hold-back", "redistribute"]
-SIGNALS, MODES = get_args(Signals), get_args(Mode)
-FIXED, WEBSTER, ACTUATED, MAX_PRESSURE, CYCLIC = SIGNALS
+FIXED, WEBSTER, ACTUATED, MAX_PRESSURE, CYCLIC = get_args(Signals)
 PRESSURES = (MAX_PRESSURE, CYCLIC)
-HOLD_BACK, REDISTRIBUTE = MODES
 EXACT, ESTIMATE = "exact", "estimate"
 FILES = ("routes", "background", "additional")
 
@@ -37,7 +34,6 @@ class Settings(config.Settings):
     )
     signals: Signals = setting("control of the signals", FIXED)
     leave_signals: Texts = setting("signals that perimeter control does not change", ())
-    actuation: Mode = setting("green taken from a gateway is red for all, or goes to other movements", HOLD_BACK)
     gateways_fixed: bool = setting("signals with gateways stay fixed-time if the others are actuated", True)
     guided: bool = setting("drivers are guided by travel times if the controller does not guide them", False)
     compliance: Share = setting("probability that a driver follows the guidance in a region", 1.0)

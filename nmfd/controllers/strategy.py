@@ -87,8 +87,6 @@ CITY_WORDS: Mapping[str, tuple[str, Any, str]] = {
     "actuated": ("signals", "actuated", "signals that extend green while vehicles arrive"),
     "max-pressure": ("signals", "max-pressure", "max-pressure control of all signals"),
     "max-pressure-cyclic": ("signals", "max-pressure-cyclic", "max-pressure with the stages in their order"),
-    "hold-back": ("actuation", "hold-back", "green taken from a gateway is red for all"),
-    "redistribute": ("actuation", "redistribute", "green taken from a gateway goes to the other movements"),
     "estimate": ("measurement", "estimate", "the controller sees estimates from detectors and probe vehicles"),
     "metering": ("metering", 1.2, "trips wait outside while their region is full, or as the controller commands"),
     "guided": ("guided", True, "drivers are guided by travel times"),
