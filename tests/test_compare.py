@@ -9,7 +9,7 @@ import tiny
 import torch
 import trajectories
 
-from cosim.evaluation.identify import _protected, as_it_was, samples_of, static_model
+from cosim.evaluation.identify import _protected, as_it_was, static_model
 from cosim.evaluation.model_validation import error_table, errors, held_up, outflow_samples, predict
 from nmfd.api import load_scenario
 from nmfd.controllers.strategy import parse
@@ -94,7 +94,7 @@ def test_the_model_of_those_who_drive():
 
 def test_outflow_samples_lie_on_the_mfd(scenario, result):
     for region in (0, 3):
-        cloud = outflow_samples([result], scenario.network.u_max, region, scenario.network.adjacency)
+        cloud = outflow_samples(scenario.network, [result])[region]
         points = np.concatenate(list(cloud.values()))
         expected = scenario.network.mfds[region].outflow(points[:, 0])
         # The samples are taken at the middle of an interval, the flows at its beginning.
@@ -182,8 +182,9 @@ def test_an_empty_region_keeps_its_model_in_identification(scenario, result):
     alone.accumulation[:, 0], alone.crossings[:, 0], alone.arrivals[:, 0] = 0.0, 0.0, 0.0
     static = static_model(scenario, [alone], guided=False)
     assert static.mfds[0] == network.mfds[0] and static.mfds[3] != network.mfds[3]
-    assert 0 in nearly_empty(samples_of(network, [alone])) and 3 not in nearly_empty(samples_of(network, [alone]))
-    table = fit_table(static, region_fits(static, samples_of(network, [alone])))
+    samples = outflow_samples(network, [alone])
+    assert 0 in nearly_empty(samples) and 3 not in nearly_empty(samples)
+    table = fit_table(static, region_fits(static, samples))
     assert "few samples" in table
     fitted = replace(static, exit_rates=np.full((7, 7), 2.0), storage=np.full(7, 10.0))
     kept = as_it_was(static, fitted, [0])

@@ -18,7 +18,6 @@ import pandas as pd
 
 from cosim.evaluation.model_validation import observed, outflow_samples
 from cosim.evaluation.runs import runs_of
-from cosim.sumo.arrays import Points
 from cosim.sumo.build import network_folder
 from cosim.sumo.net import City, city_of
 from nmfd.arrays import PerRegion
@@ -104,7 +103,7 @@ def identify(
         model = identification.fit(static, seen, iterations=iterations, progress=fitting, **loaded.scheme)
         return as_it_was(static, model, fit_quality.nearly_empty(samples))
 
-    samples = samples_of(static, runs)
+    samples = outflow_samples(static, runs)
     model = fitted(runs, samples)
     states, lane_km = [run.accumulation for run in runs], city_lane_km(city_of(static))
     model = fit_quality.with_guesses(model, samples, lane_km, states, fastest=loaded.substeps / loaded.step)
@@ -112,29 +111,26 @@ def identify(
     text, errors = fit_quality.fit_table(model, fits), None
     if len(seeds) > 1:  # the last seed is held out once
         kept = [run for run in runs if run.seed != seeds[-1]]
-        without = replace(fitted(kept, samples_of(static, kept)), critical_above=model.critical_above)
+        without = replace(fitted(kept, outflow_samples(static, kept)), critical_above=model.critical_above)
         unseen = [observed(run) for run in runs if run.seed == seeds[-1]]
         errors = fit_quality.predictions(without, unseen, loaded.scheme)
         text += "\n" + fit_quality.prediction_table(without, errors, loaded.step)
     files.write_text(out / "fit.txt", text + "\n")
     fit_quality.write_fits(out / "fit.csv", fits, errors)
-    rows = [
-        (i, branch, *point) for i, cloud in enumerate(samples) for branch, points in cloud.items() for point in points
-    ]
+    clouds = ((i, branch, points) for i, cloud in enumerate(samples) for branch, points in cloud.items())
+    rows = [(i, branch, *point) for i, branch, points in clouds for point in points]
     table = pd.DataFrame(rows, columns=["region", "branch", "accumulation_veh", "outflow_veh_s"])
     files.write_table(out / "samples.csv", table, float_format="%.6g")
     plots.draw_mfds(out / "mfd.png", model, samples)
     model = replace(model, placeholder=False, doubts=tuple(fits["doubts"]))
     verdict = run_verdict(loaded, model, first)
     model = replace(model, controllable=verdict.boundaries.shares)
-    target.mkdir(parents=True, exist_ok=True)
-    comment = (
-        f"Written by cosim identify from {len(runs)} runs of {loaded.name} under "
-        f"{', '.join(dict.fromkeys(run.controller for run in runs))};\n"
-        f"# loading runs: demand times {', '.join(map('{:g}'.format, levels))}, seeds {min(seeds)} to {max(seeds)}."
-    )
+    under, times = ", ".join(dict.fromkeys(run.controller for run in runs)), ", ".join(map("{:g}".format, levels))
+    comment = f"Written by cosim identify from {len(runs)} runs of {loaded.name} under {under};\n"
+    comment += f"# loading runs: demand times {times}, seeds {min(seeds)} to {max(seeds)}."
     sumo = config.read(own / "network.toml").get("sumo", {})
     sumo |= {key: files.relative(own / sumo[key], target) for key in PATHS if isinstance(sumo.get(key), str)}
+    target.mkdir(parents=True, exist_ok=True)
     files.write_text(target / "network.toml", network_toml(model, sumo, comment))
     files.write_text(target / authority.FILE, verdict.text())
     proposed = _protected(loaded, verdict.protect, write=protect)
@@ -177,7 +173,7 @@ def _check_target(target: Path, own: Path) -> None:
 def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool) -> RegionalModel:
     """Return the network with fitted MFDs, and own split ratios unless guided. Raises InputError for empty runs."""
     network = replace(scenario.network, exit_rates=None, capacity=None, storage=None, critical_above={})
-    samples = samples_of(network, results)
+    samples = outflow_samples(network, results)
     empty = fit_quality.nearly_empty(samples)
     if len(empty) == network.regions:
         raise InputError("--levels: every region was nearly empty in all loading runs; give higher levels")
@@ -191,11 +187,6 @@ def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool)
         return network
     crossings = sum(result["crossings"].sum(axis=0) for result in results)
     return replace(network, observed_split_ratios=observed_split_ratios(network, crossings))
-
-
-def samples_of(network: RegionalModel, results: Sequence[Result]) -> list[dict[str, Points]]:
-    """Return the outflow samples of every region."""
-    return [outflow_samples(results, network.u_max, region, network.adjacency) for region in range(network.regions)]
 
 
 def as_it_was(network: RegionalModel, model: RegionalModel, regions: Sequence[int]) -> RegionalModel:

@@ -16,6 +16,7 @@ from nmfd.arrays import Adjacency
 from nmfd.controllers.strategy import parse
 from nmfd.model.dynamics import advance, parameters
 from nmfd.model.identification import Observed
+from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs import files
 from nmfd.runs.tables import text_columns, text_table
@@ -168,27 +169,27 @@ def prediction_table(rows: pd.DataFrame) -> str:
     return text_table(lines, OF_ALL_RUNS)
 
 
-def outflow_samples(results: Sequence[Result], u_max: float, region: int, adjacency: Adjacency) -> dict[str, Points]:
-    """Return the MFD samples of a region: label -> (n, 2) of accumulation [veh] and outflow [veh/s].
+def outflow_samples(network: RegionalModel, results: Sequence[Result]) -> list[dict[str, Points]]:
+    """Return the MFD samples of each region: label -> (n, 2) of accumulation [veh] and outflow [veh/s].
 
     Labels are "loading", "unloading", and SPILLBACK for intervals in which a neighbour's congestion limits the outflow
     (`held_up`). The outflow of an interval is that which the model's g gives: trips ended in the region, and transfers
     divided by u. In the model x_ii leaves at q x_ii and x_ij at u q x_ij, so q = outflow / (x_ii + u x_i,other).
     """
-    samples: dict[str, list[Points]] = {"loading": [], "unloading": [], SPILLBACK: []}
+    samples: list[dict] = [{"loading": [], "unloading": [], SPILLBACK: []} for _ in range(network.regions)]
     for result in results:
         x = 0.5 * (result.accumulation[1:] + result.accumulation[:-1])
-        total, own = x.sum(2), x[:, range(x.shape[1]), range(x.shape[1])]
+        total, own = x.sum(2), np.diagonal(x, axis1=1, axis2=2)
         outflow = regional_outflow(result, result.step)
-        share = np.minimum(result.perimeter[:, region].max(axis=1), u_max)
-        weight = own[:, region] + share * (total - own)[:, region]
-        points = np.stack([total[:, region], outflow[:, region] * total[:, region] / np.maximum(weight, 1e-9)], axis=1)
-        rising = np.diff(result.accumulation[:, region].sum(1)) >= 0
-        seen, blocked = total[:, region] >= FEWEST_VEHICLES, held_up(total, outflow, adjacency)[:, region]
-        samples["loading"].append(points[seen & ~blocked & rising])
-        samples["unloading"].append(points[seen & ~blocked & ~rising])
-        samples[SPILLBACK].append(points[seen & blocked])
-    return {label: np.concatenate(clouds) for label, clouds in samples.items()}
+        weight = own + np.minimum(result.perimeter.max(axis=2), network.u_max) * (total - own)
+        points = np.stack([total, outflow * total / np.maximum(weight, 1e-9)], axis=2)
+        rising = np.diff(result.accumulation.sum(2), axis=0) >= 0
+        seen, blocked = total >= FEWEST_VEHICLES, held_up(total, outflow, network.adjacency)
+        masks = {"loading": seen & ~blocked & rising, "unloading": seen & ~blocked & ~rising, SPILLBACK: seen & blocked}
+        for n, clouds in enumerate(samples):
+            for label, mask in masks.items():
+                clouds[label].append(points[mask[:, n], n])
+    return [{label: np.concatenate(parts) for label, parts in clouds.items()} for clouds in samples]
 
 
 def held_up(accumulation: RegionCounts, outflow: RegionCounts, adjacency: Adjacency) -> Bool[np.ndarray, "T R"]:

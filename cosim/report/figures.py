@@ -141,11 +141,8 @@ def draw_levels(out: Path, rows: pd.DataFrame) -> None:
 
 
 def _draw_mfds(path: Path, network: RegionalModel, results: Sequence[Result]) -> None:
-    def cloud(run: Result, region: int) -> np.ndarray:
-        parts = model_validation.outflow_samples([run], network.u_max, region, network.adjacency)
-        return np.concatenate(list(parts.values()))
-
-    samples = [{run.controller: cloud(run, region) for run in results} for region in range(network.regions)]
+    clouds = [(run.controller, model_validation.outflow_samples(network, [run])) for run in results]
+    samples = [{name: np.concatenate([*of[n].values()]) for name, of in clouds} for n in range(network.regions)]
     plots.draw_mfds(path, network, samples)
 
 

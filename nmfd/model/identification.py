@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float, Real
+from torch import Tensor
 
 from nmfd.arrays import PairsOverTime, StatesOverTime, TurnsOverTime
 from nmfd.model import dynamics
@@ -68,7 +69,7 @@ class _Model(torch.nn.Module):
         self.capacity = free(self._first_capacity)
         self.storage = free(np.log(np.maximum(2.0 * largest, 1.0)))
 
-    def shape(self) -> tuple[torch.Tensor, ...]:
+    def shape(self) -> tuple[Tensor, ...]:
         """Return c, first, second, jam of q = c (1 - first y - second y^2), y = x / jam, q(jam) >= LEAST_RATE c."""
         drop = (1.0 - LEAST_RATE) * torch.sigmoid(self.drop)
         first = 2.0 * drop * torch.sigmoid(self.bend)
@@ -91,7 +92,7 @@ class _Model(torch.nn.Module):
             storage=self.storage.exp(),
         )
 
-    def penalty(self) -> torch.Tensor:
+    def penalty(self) -> Tensor:
         """Return the ridge penalty of departures from the initial values."""
         moved = (self.capacity - self._first_capacity) * self.adjacency
         return RIDGE * ((self.exit_rates**2).mean() + (moved**2).mean())
@@ -151,21 +152,19 @@ def fit(
         return _network(network, model, runs)
 
 
-def windows(runs: Sequence[Observed], horizon: int) -> list[torch.Tensor]:
+def windows(runs: Sequence[Observed], horizon: int) -> list[Tensor]:
     """Return states (N, horizon + 1, R, R), demands, perimeters and splits (N, horizon, ...) of all windows."""
 
     cut, long = np.lib.stride_tricks.sliding_window_view, [run for run in runs if len(run.demand) >= horizon]
 
-    def stack(name: str, length: int) -> torch.Tensor:
+    def stack(name: str, length: int) -> Tensor:
         parts = [cut(getattr(run, name), length, axis=0) for run in long]
         return torch.tensor(np.moveaxis(np.concatenate(parts), -1, 1), dtype=torch.float32)
 
     return [stack("accumulation", horizon + 1), *(stack(name, horizon) for name in ("demand", "perimeter", "splits"))]
 
 
-def _misfit(
-    p: dynamics.Parameters, data: Sequence[torch.Tensor], scale: torch.Tensor, scheme: Mapping[str, Any]
-) -> torch.Tensor:
+def _misfit(p: dynamics.Parameters, data: Sequence[Tensor], scale: Tensor, scheme: Mapping[str, Any]) -> Tensor:
     """Return the mean Huber loss of x_i and x_ij over the horizon, in units of `scale` (R,) [veh]."""
     total, horizon, huber = torch.zeros(()), data[1].shape[1], torch.nn.SmoothL1Loss(beta=OUTLIER)
     for k, x in enumerate(_rollout(p, data, scheme), start=1):
@@ -175,7 +174,7 @@ def _misfit(
     return total / horizon
 
 
-def _rollout(p: dynamics.Parameters, data: Sequence[torch.Tensor], scheme: Mapping[str, Any]) -> Iterator[torch.Tensor]:
+def _rollout(p: dynamics.Parameters, data: Sequence[Tensor], scheme: Mapping[str, Any]) -> Iterator[Tensor]:
     """Yield the states (N, R, R) [veh] after each interval, from the first states of `windows`."""
     observed, demand, perimeter, splits = data
     x = observed[:, 0]

@@ -14,6 +14,8 @@ from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import files
 from nmfd.runs.tables import text_columns, text_table, wrapped
 
+Samples = Sequence[Mapping[str, Points]]  # by region, label -> (n, 2) of accumulation [veh] and outflow [veh/s]
+States = Sequence[StatesOverTime]  # accumulations of each run
 SPILLBACK = "held up by a neighbour"  # label of samples that the region's own MFD does not explain
 SAMPLES = 10  # of a region: with fewer it keeps its MFD
 HYSTERESIS_BINS = 12  # of accumulation
@@ -40,17 +42,12 @@ HELD_OUT = (
 
 
 def with_guesses(
-    model: RegionalModel,
-    samples: Sequence[Mapping[str, Points]],
-    lane_km: PerRegion,
-    accumulations: Sequence[StatesOverTime] = (),
-    *,
-    fastest: float = np.inf,
+    model: RegionalModel, samples: Samples, lane_km: PerRegion, accumulations: States = (), *, fastest: float = np.inf
 ) -> RegionalModel:
     """Return `model` with `critical_above` where its curve hardly falls up to the largest accumulation.
 
-    The curve is a guess from lanes (R,) [km] there, unless the region is nearly empty. samples, accumulations: as of
-    `region_fits`; fastest: largest rate of any vehicle [1/s]
+    The curve is a guess from lanes (R,) [km] there, unless the region is nearly empty. fastest: largest rate of any
+    vehicle [1/s]
     """
     empty, most, above, mfds = nearly_empty(samples), _largest(samples, accumulations), {}, list(model.mfds)
     for n, curve in enumerate(model.mfds):
@@ -63,7 +60,7 @@ def with_guesses(
     return replace(model, mfds=tuple(mfds), storage=storage, critical_above=above)
 
 
-def _largest(samples: Sequence[Mapping[str, Points]], accumulations: Sequence[StatesOverTime]) -> PerRegion:
+def _largest(samples: Samples, accumulations: States) -> PerRegion:
     if len(accumulations):
         return np.max([state.sum(axis=2).max(axis=0) for state in accumulations], axis=0)
     return np.array([np.concatenate(list(cloud.values()))[:, 0].max(initial=0.0) for cloud in samples])
@@ -71,8 +68,8 @@ def _largest(samples: Sequence[Mapping[str, Points]], accumulations: Sequence[St
 
 def region_fits(
     network: RegionalModel,
-    samples: Sequence[Mapping[str, Points]],
-    accumulations: Sequence[StatesOverTime] = (),
+    samples: Samples,
+    accumulations: States = (),
     seeds: int = 2,
     lane_km: PerRegion | None = None,
 ) -> pd.DataFrame:
@@ -83,8 +80,7 @@ def region_fits(
     accumulation in any run over the critical one [-]; doubts, each of which begins with a key of MEANINGS. NaN where
     unknown.
 
-    samples: by region, label -> (n, 2) of accumulation [veh] and outflow [veh/s]; accumulations: (T+1, R, R) [veh] of
-    each run; seeds: of the loading runs; lane_km: (R,)
+    accumulations: (T+1, R, R) [veh]; seeds: of the loading runs; lane_km: (R,)
     """
     most, critical, rows = _largest(samples, accumulations), network.seen_critical, []
     density = critical / (np.full(network.regions, np.nan) if lane_km is None else lane_km)
@@ -126,7 +122,7 @@ def own_points(cloud: Mapping[str, Points]) -> Points:
     return np.concatenate([points for label, points in cloud.items() if label != SPILLBACK])
 
 
-def nearly_empty(samples: Sequence[Mapping[str, Points]]) -> list[int]:
+def nearly_empty(samples: Samples) -> list[int]:
     """Return the regions with too few samples for a fit."""
     return [region for region, cloud in enumerate(samples) if len(own_points(cloud)) < SAMPLES]
 
