@@ -11,7 +11,7 @@ from nmfd.types import Result, Status
 
 # Counts of decisions that are not OK: column -> its heading in every table, and its meaning.
 COUNTED = {
-    "solver_failures": ("failures", "of the solver or policy"),
+    "solver_failures": ("failures", "of the solver, or decisions short of its tolerance"),
     "fallbacks": ("fallbacks", "controls of something behind the controller"),
     "late_decisions": ("late", "decisions after their deadline, at most the control interval"),
     "sensor_faults": ("sensor", "decisions on a wrong or missing measurement"),

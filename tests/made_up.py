@@ -84,6 +84,7 @@ def result(scenario, strategy, *, seed, demand, city) -> Result:
         "outside_training": "",
         "teleports": 3 * (strategy.name == "pi-gating"),
         "final_backlog_veh": 20,
+        "signal_violations": 0,
     }
     return trajectories.recorded(trajectory, record, facts)
 
