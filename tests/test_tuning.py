@@ -157,21 +157,11 @@ def test_the_command(city, tmp_path, runs):
 def test_options_that_train_a_policy_train_one_for_every_candidate(city, tmp_path, monkeypatch):
     seen = []
 
-    class Pool:
-        def __init__(self, *_, **__): ...
-
-        def __enter__(self):
-            return self
-
-        def __exit__(self, *_): ...
-
-        map = staticmethod(map)
-
     def made(scenario, strategy, *, seed, demand):
         seen.append(scenario.controller_options["dpc-pcrg"]["mfd_scale"])
         return trajectories.in_city(scenario, strategy, seed, demand, tts=1e6 * seen[-1], trips=9, completed=9)
 
-    monkeypatch.setattr(tuning, "ProcessPoolExecutor", Pool)
+    monkeypatch.setattr(tuning, "processes", lambda jobs, _: [(job, job.job()) for job in jobs])
     made_up.instead_of_sumo(monkeypatch, made)
     chosen = tuning.Tuning(
         scenario=city,

@@ -11,13 +11,11 @@ more because it is heavier. Ranges over more than a decade are searched in the l
 """
 
 import math
-import multiprocessing
 import re
 import warnings
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -35,11 +33,11 @@ from cosim.evaluation.runs import city_key, runs_of
 from cosim.evaluation.statistics import TTS
 from nmfd.controllers import training
 from nmfd.controllers.strategy import Strategy, check_tables
-from nmfd.errors import InputError
+from nmfd.errors import InputError, RunFailed
 from nmfd.model.scenario import Scenario
 from nmfd.runs import files
 from nmfd.runs.progress import Progress
-from nmfd.runs.run_many import TABLE, Run, locked, raise_failures, run_many
+from nmfd.runs.run_many import TABLE, Run, locked, processes, raise_failures, run_many
 
 OPTION = re.compile(r"[a-z_]\w*(\[[0-9]\])?")  # KEY, or KEY[N] for one number of a list
 INITIAL_DEVIATION = 0.25  # standard deviation of the first generation, as a share of every range
@@ -215,8 +213,11 @@ def _runs(order: Tuning, trials: Sequence[FrozenTrial], city: Mapping[str, objec
     untrained = {number: scenario for number, scenario in scenarios.items() if not order.policy(number).is_file()}
     if trains and untrained:
         order.policy(0).parent.mkdir(exist_ok=True)
-        with ProcessPoolExecutor(max(workers, 1), mp_context=multiprocessing.get_context("spawn")) as pool:
-            list(pool.map(_train, [order] * len(untrained), untrained, untrained.values()))
+        jobs = [Run(str(number), {}, partial(_train, order, number, one)) for number, one in untrained.items()]
+        if failures := [
+            f"policy of candidate {job.name}: {why}" for job, why in processes(jobs, max(workers, 1)) if why
+        ]:
+            raise RunFailed("; ".join(failures))
     runs = []
     for number, scenario in scenarios.items():
         for level in order.levels:
@@ -228,12 +229,13 @@ def _runs(order: Tuning, trials: Sequence[FrozenTrial], city: Mapping[str, objec
     return runs
 
 
-def _train(order: Tuning, number: int, scenario: Scenario) -> None:
-    """Train the policy of a candidate; it gets its name when the training is complete."""
+def _train(order: Tuning, number: int, scenario: Scenario) -> str:
+    """Train the policy of a candidate; it gets its name when the training is complete. Return "", no failure."""
     file = order.policy(number)
     unfinished = file.with_suffix(".partial.pt")
     training.train(scenario, order.strategy, seed=order.search_seed, out=unfinished)
     unfinished.replace(file)
+    return ""
 
 
 def _totals(order: Tuning, rows: pd.DataFrame, number: int) -> dict[str, float]:

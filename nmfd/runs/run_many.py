@@ -61,13 +61,13 @@ class Run:
     name: stem of its file (`run_name`)
     key: everything the result depends on, as JSON types: hashes, settings, versions. Its item "controller" holds what
         only runs of this controller depend on; all else is the same for all runs of a folder
-    job: a picklable function without arguments that returns the Result
+    job: a picklable function without arguments that returns the Result, or why there is none
     folder: below that of all runs
     """
 
     name: str
     key: Mapping[str, Any]
-    job: Callable[[], Result]
+    job: Callable[[], Result | str]
     folder: str = ""
 
     @property
@@ -158,25 +158,32 @@ def _outcomes(
     elif workers == 0:
         yield from ((run, attempt(run.job)) for run in todo)
     else:
-        try:
-            yield from _processes(todo, workers, time_limit)
-        finally:
-            server: Any = forkserver._forkserver
-            if server._forkserver_pid is not None:  # it may still import
-                os.kill(server._forkserver_pid, signal.SIGTERM)
-                server._stop()
+        yield from processes(todo, workers, time_limit)
 
 
-def _alone(job: Callable[[], Result], folder: str, time_limit: float | None) -> Result | str:
+def _alone(job: Callable[[], Result | str], folder: str, time_limit: float | None) -> Result | str:
     """Do `job` in a new process in `folder`, from a worker of Dask."""
     multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]  # may have a child
     return list(_processes([Run("", {}, job)], 1, time_limit, folder))[0][1]
 
 
+def processes(
+    todo: Sequence[Run], workers: int, time_limit: float | None = None
+) -> Generator[tuple[Run, Result | str]]:
+    """Yield every run with its outcome from a process of its own, `workers` at a time; no process is left."""
+    try:
+        yield from _processes(todo, workers, time_limit)
+    finally:
+        server: Any = forkserver._forkserver
+        if server._forkserver_pid is not None:  # it may still import
+            os.kill(server._forkserver_pid, signal.SIGTERM)
+            server._stop()
+
+
 def _processes(
     todo: Sequence[Run], workers: int, time_limit: float | None, folder: str = ""
 ) -> Generator[tuple[Run, Result | str]]:
-    """Yield every run with its outcome from a process of its own in `folder`, `workers` at a time."""
+    """Yield runs and outcomes as `processes`, from processes in `folder`."""
     waiting, live = list(reversed(todo)), dict[connection.Connection, tuple[Run, BaseProcess, float]]()
     try:
         while waiting or live:
@@ -192,9 +199,10 @@ def _processes(
     finally:  # after Ctrl-C there are some
         for _, process, _ in live.values():
             process.kill()
+            process.join()
 
 
-def _start(job: Callable[[], Result], folder: str) -> tuple[connection.Connection, BaseProcess]:
+def _start(job: Callable[[], Result | str], folder: str) -> tuple[connection.Connection, BaseProcess]:
     """Start a process, and return it behind the channel for a job and its outcome.
 
     Where the system can, it is forked from a server that has imported the module of `job`.
