@@ -70,8 +70,6 @@ def run(
     """
     strategy = parse(controller, city)
     scenario = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
-    if steps is not None and steps < 1:
-        raise InputError(f"steps: expected 1 or more control intervals, got {steps} instead")
     if not 0.0 < demand <= 10.0:
         raise InputError(f"demand: expected a number above 0 up to 10, got {demand:g} instead")
     outputs = {kind: Path(file) for kind, file in (sumo_output or {}).items()}

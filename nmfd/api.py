@@ -4,6 +4,7 @@ import re
 import sys
 import textwrap
 from collections.abc import Mapping, Sequence
+from functools import partial
 from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,13 +16,14 @@ from nmfd.controllers.strategy import CONTROLLERS, Strategy, check_tables, city_
 from nmfd.errors import InputError, did_you_mean
 from nmfd.model.scenario import Scenario, read_scenario, with_demand
 from nmfd.runs import shipped
-from nmfd.runs.files import default_folder, file_name
+from nmfd.runs.files import default_folder, file_name, run_name
 from nmfd.runs.progress import Progress, watched
+from nmfd.runs.run_many import Run, locked, run_many
 from nmfd.runs.run_many import raise_failures as raise_failures
 from nmfd.studies import benchmark as benchmark_study
 from nmfd.studies import bound as bound_study
 from nmfd.studies import robustness as robustness_study
-from nmfd.studies.benchmark import PLANTS, draw_scenario
+from nmfd.studies.benchmark import PLANTS, REFERENCE, draw_scenario, key_of, processes
 from nmfd.studies.benchmark import summary_table as summary_table
 from nmfd.studies.measured import identify as identify
 from nmfd.studies.robustness import SIGMAS_VEH_S
@@ -93,11 +95,7 @@ def run(
 
     The same seed gives the same result but for wall times (Result.without_times). Raises InputError.
     """
-    strategy, scenario = parse(controller).regional(), _loaded(scenario)
-    if steps is not None:
-        if steps < 1:
-            raise InputError(f"steps: expected 1 or more control intervals, got {steps} instead")
-        scenario = with_demand(scenario, steps=steps)
+    strategy, scenario = parse(controller).regional(), with_demand(_loaded(scenario), steps=steps)
     _check_plant(plant)
     acting, name = strategy.make(scenario, None if policy is None else Path(policy)), type(plant).__name__
     if isinstance(plant, str):
@@ -159,22 +157,33 @@ def robustness(
     workers: int = 1,
     progress: Progress = None,
 ) -> "pd.DataFrame":
-    """Run controllers against perturbed demand in a folder, draw the improvement, and return one row per run.
+    """Run controllers, and no control, against perturbed demand in a folder, draw the improvement; return the runs.
 
     sigmas: standard deviations of the demand noise (veh/s)
     scenarios: noise draws for every sigma
     out, workers, progress: see `benchmark`
     """
     scenario = _loaded(scenario)
-    return robustness_study.robustness(
-        scenario,
-        parse_many(controllers, scenario, regional=True),
-        sigmas,
-        scenarios,
-        out=default_folder(scenario.name) if out is None else Path(out),
-        workers=workers,
-        progress=progress,
-    )
+    others = [one for one in parse_many(controllers, scenario, regional=True) if one.name != REFERENCE]
+    strategies = [parse(REFERENCE), *others]
+    key = key_of(scenario, strategies, robustness_study.PLANT, {})
+    runs = [
+        Run(
+            run_name(strategy.name, number),
+            {**key(strategy.name), "sigma_veh_per_s": sigma},
+            partial(robustness_study.run_one, strategy, number, scenario=scenario, sigma=sigma),
+            folder=f"sigma-{sigma:g}",
+        )
+        for sigma in sigmas
+        for number in range(scenarios)
+        for strategy in strategies
+    ]
+    out = default_folder(scenario.name) if out is None else Path(out)
+    with locked(out):
+        rows = run_many(runs, out, **processes(strategies, workers), progress=progress)
+        if (rows["failure"] == "").any():
+            robustness_study.draw(out, rows)
+    return rows
 
 
 def train(

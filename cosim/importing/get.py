@@ -39,21 +39,14 @@ def _github(repository: str, commit: str, **rest: str) -> Published:
     return Published(source=f"https://github.com/{repository}/archive/{commit}.zip", folder=folder, **rest)
 
 
+def _resco(name: str, about: str, regions: int) -> Published:
+    source, start = "sumo-rl==1.4.5", f"{name}.sumocfg --regions {regions}"
+    return Published(about=about, licence=RESCO, source=source, folder=f"sumo_rl/nets/RESCO/{name}", start=start)
+
+
 CITIES: Mapping[str, Published] = {
-    "cologne8": Published(
-        about="Cologne, a corridor of 8 signals, 7:00 to 8:00, demand of TAPASCologne",
-        licence=RESCO,
-        source="sumo-rl==1.4.5",
-        folder="sumo_rl/nets/RESCO/cologne8",
-        start="cologne8.sumocfg --regions 3",
-    ),
-    "ingolstadt21": Published(
-        about="Ingolstadt, a corridor of 21 signals, 16:00 to 17:00, from InTAS",
-        licence=RESCO,
-        source="sumo-rl==1.4.5",
-        folder="sumo_rl/nets/RESCO/ingolstadt21",
-        start="ingolstadt21.sumocfg --regions 4",
-    ),
+    "cologne8": _resco("cologne8", "Cologne, a corridor of 8 signals, 7:00 to 8:00, demand of TAPASCologne", 3),
+    "ingolstadt21": _resco("ingolstadt21", "Ingolstadt, a corridor of 21 signals, 16:00 to 17:00, from InTAS", 4),
     "lust": _github(
         "lcodeca/LuSTScenario",
         "10e1e42d01a9446c488915b9be936edb9d82b197",

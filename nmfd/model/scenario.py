@@ -124,6 +124,8 @@ class Scenario(Horizon):
 
 def with_demand(scenario: Scenario, *, steps: int | None = None, factor: float = 1.0) -> Scenario:
     """Return at most the first `steps` control intervals of `scenario`, with `factor` times its demand."""
+    if steps is not None and steps < 1:
+        raise InputError(f"steps: expected 1 or more control intervals, got {steps} instead")
     steps = scenario.steps if steps is None else min(steps, scenario.steps)
     return replace(
         scenario, steps=steps, demand=factor * scenario.demand[:steps], demand_factor=factor * scenario.demand_factor

@@ -94,8 +94,7 @@ def legend_below(drawing: Figure, axes: Sequence[Axes], columns: int = 4) -> Non
 def total_accumulation(ax: Axes, trajectories: Sequence[Result], seed: int | None = None) -> Axes:
     """Draw vehicles in the network and waiting to enter over time; seed: shown instead of the mean over seeds."""
     _curves(ax, trajectories, lambda t: t.accumulation.sum(axis=(1, 2)) + t.backlog.sum(axis=(1, 2)), seed)
-    ax.set_ylabel("vehicles in the network [veh]")
-    ax.set_ylim(bottom=0.0)
+    ax.set(ylabel="vehicles in the network [veh]", ylim=(0.0, None))
     return ax
 
 
@@ -110,9 +109,8 @@ def region_accumulation(
     style = dict(color="0.35", linewidth=1.0, linestyle=":", zorder=1)
     ax.hlines(critical, 0.0, 1.0, transform=ax.get_yaxis_transform(), label=CRITICAL, **style)
     _curves(ax, trajectories, lambda t: t.accumulation[:, region].sum(axis=1), seed)
-    ax.set_ylabel("accumulation [veh]")
     highest = max((t.accumulation[:, region].sum(axis=1).max() for t in trajectories), default=0.0)
-    ax.set_ylim(0.0, 1.06 * np.nanmax([highest, 1.25 * critical]))
+    ax.set(ylabel="accumulation [veh]", ylim=(0.0, 1.06 * np.nanmax([highest, 1.25 * critical])))
     ax.set_title(network.titles[region], fontsize="medium")
     return ax
 
@@ -137,12 +135,10 @@ def mfd(ax: Axes, mfd: Mfd, samples: Mapping[str, np.ndarray] | None = None, *, 
     grid = np.linspace(0.0, right, 1001)
     ax.plot(grid, mfd.outflow(grid), color="black", linewidth=1.8, label="MFD")
     if seen and not clouds:
-        text, top = f"{mfd.critical:,.0f} veh, {mfd.capacity:.3g} veh/s", (mfd.critical, mfd.capacity)
-        ax.annotate(text, top, xytext=(0, 6), textcoords="offset points", ha="center", fontsize="small")
-    ax.set_xlim(0.0, right)
-    ax.set_ylim(0.0, 1.12 * max([mfd.capacity, *(cloud[:, 1].max() for cloud in clouds.values())]))
-    ax.set_xlabel("accumulation [veh]")
-    ax.set_ylabel("outflow [veh/s]")
+        text, peak = f"{mfd.critical:,.0f} veh, {mfd.capacity:.3g} veh/s", (mfd.critical, mfd.capacity)
+        ax.annotate(text, peak, xytext=(0, 6), textcoords="offset points", ha="center", fontsize="small")
+    top = 1.12 * max([mfd.capacity, *(cloud[:, 1].max() for cloud in clouds.values())])
+    ax.set(xlim=(0.0, right), ylim=(0.0, top), xlabel="accumulation [veh]", ylabel="outflow [veh/s]")
     ax.xaxis.set_major_locator(MaxNLocator(5))
     _thousands(ax.xaxis)
     ax.spines[["top", "right"]].set_visible(False)
@@ -156,8 +152,7 @@ def draw_mfds(path: Path, network: RegionalModel, samples: Sequence[Mapping[str,
     for region, ax in zip(shown, axes, strict=True):
         seen = region not in network.critical_above
         mfd(ax, network.mfds[region], samples[region] if samples else None, seen=seen)
-        title = network.titles[region] if len(shown) == network.regions else "every region"
-        ax.set_title(title, fontsize="medium")
+        ax.set_title(network.titles[region] if len(shown) == network.regions else "every region", fontsize="medium")
     legend_below(drawing, axes)
     return save(drawing, path)
 
@@ -172,10 +167,8 @@ def region_map(ax: Axes, network: RegionalModel) -> Axes:
         ax.add_patch(Circle((x, y), 0.31 * spacing, facecolor="#dbe9f6", edgecolor="#30506f", linewidth=1.2, zorder=2))
         name = network.region_names[region]
         ax.text(x, y, str(region), ha="center", va="bottom" if name != str(region) else "center", fontweight="bold")
-        if name != str(region):
-            ax.text(x, y, name, ha="center", va="top", fontsize="x-small")
-    ax.autoscale_view()
-    ax.set_aspect("equal")
+        ax.text(x, y, name if name != str(region) else "", ha="center", va="top", fontsize="x-small")
+    ax.axis("scaled")
     ax.set_axis_off()
     return ax
 
@@ -204,8 +197,7 @@ def demand(ax: Axes, scenario: Scenario) -> Axes:
         rates = np.concatenate([arriving[used, :end], arriving[used, end - 1 : end]], axis=1)
         labels = [f"to {scenario.network.titles[j]}" for j in used]
         ax.stackplot(time, rates, step="post", labels=labels, colors=_tones(len(used)), linewidth=0)
-    ax.set_ylabel("demand [veh/s]")
-    ax.set_ylim(bottom=0.0)
+    ax.set(ylabel="demand [veh/s]", ylim=(0.0, None))
     ax.spines[["top", "right"]].set_visible(False)
     return ax
 
@@ -237,10 +229,9 @@ def _curves(
 
 def time_axis(ax: Axes, seconds: np.ndarray) -> np.ndarray:
     """Set up the time axis of `ax`, in minutes up to four hours; return `seconds` in its unit."""
-    unit, name = (60.0, "min") if seconds[-1] <= 4 * 3600 else (3600.0, "h")
-    ax.set_xlabel(f"time [{name}]")
-    ax.set_xlim(0.0, seconds[-1] / unit)
-    steps = (1, 2, 5, 10, 15, 30, 60) if name == "min" else (1, 2, 3, 6, 12, 24)
+    short = 60.0, "min", (1, 2, 5, 10, 15, 30, 60)
+    unit, name, steps = short if seconds[-1] <= 4 * 3600 else (3600.0, "h", (1, 2, 3, 6, 12, 24))
+    ax.set(xlabel=f"time [{name}]", xlim=(0.0, seconds[-1] / unit))
     ax.xaxis.set_major_locator(MultipleLocator(next((s for s in steps if seconds[-1] / unit / s <= 6), steps[-1])))
     return seconds / unit
 

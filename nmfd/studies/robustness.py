@@ -5,21 +5,17 @@ perturbed demand; its improvement is over no control in the same perturbed scena
 """
 
 import math
-from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from nmfd.controllers.strategy import Strategy, parse
+from nmfd.controllers.strategy import Strategy
 from nmfd.metrics import percent_change, summary
 from nmfd.model.scenario import Scenario, perturbed
-from nmfd.runs.progress import Progress
-from nmfd.runs.run_many import Run, locked, run_many, run_name
 from nmfd.runs.tables import text_columns
 from nmfd.studies import plots
-from nmfd.studies.benchmark import REFERENCE, closed_loop_of, interval, key_of, processes
+from nmfd.studies.benchmark import REFERENCE, closed_loop_of, interval
 from nmfd.types import Result
 
 if TYPE_CHECKING:
@@ -47,48 +43,10 @@ def run_one(strategy: Strategy, seed: int, *, scenario: Scenario, sigma: float) 
     return Result(xarray.Dataset(attrs=facts | {column: row[column] for column in KEPT}))
 
 
-def robustness(
-    scenario: Scenario,
-    strategies: Sequence[Strategy],
-    sigmas: Sequence[float],
-    scenarios: int,
-    *,
-    out: Path,
-    workers: int = 1,
-    progress: Progress = None,
-) -> "pd.DataFrame":
-    """Do the runs that are not in the folder `out`, draw robustness.png, and return one row per run (`run_many`).
-
-    No control is run too, as the reference.
-
-    Raises:
-        InputError: a controller cannot be made
-    """
-    strategies = [parse(REFERENCE), *(strategy for strategy in strategies if strategy.name != REFERENCE)]
-    key = key_of(scenario, strategies, PLANT, {})
-    runs = [
-        Run(
-            run_name(strategy.name, number),
-            {**key(strategy.name), "sigma_veh_per_s": sigma},
-            partial(run_one, strategy, number, scenario=scenario, sigma=sigma),
-            folder=f"sigma-{sigma:g}",
-        )
-        for sigma in sigmas
-        for number in range(scenarios)
-        for strategy in strategies
-    ]
-    with locked(out):
-        rows = run_many(runs, out, **processes(strategies, workers), progress=progress)
-        if (rows["failure"] == "").any():
-            draw(out, rows)
-    return rows
-
-
 def improvements(rows: "pd.DataFrame", controller: str) -> dict[float, tuple[float, float]]:
     """Return sigma -> mean and 95 % half interval of the improvement of `controller` over no control [%]."""
-    totals = rows[rows["failure"] == ""].pivot_table(
-        "total_time_spent_veh_s", ["sigma_veh_per_s", "seed"], "controller", sort=True
-    )
+    done = rows[rows["failure"] == ""]
+    totals = done.pivot_table("total_time_spent_veh_s", ["sigma_veh_per_s", "seed"], "controller")
     gains: dict[float, list[float]] = {}
     for (sigma, _), own, reference in totals.reindex(columns=[controller, REFERENCE]).dropna().itertuples():
         gains.setdefault(sigma, []).append(-percent_change(own, reference))
@@ -100,8 +58,7 @@ def draw(folder: Path, rows: "pd.DataFrame") -> None:
     drawing = plots.figure(8.0, 4.8)
     ax = drawing.subplots()
     ax.axhline(0.0, color=plots.COLOURS[REFERENCE], linewidth=1.0)
-    names = _compared(rows)
-    colours = plots.colours(names)
+    colours = plots.colours(names := _compared(rows))
     for number, name in enumerate(names):
         gains = improvements(rows, name)
         mean, half = np.array(list(gains.values())).reshape(-1, 2).T
