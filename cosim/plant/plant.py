@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
@@ -32,8 +31,8 @@ from nmfd.types import Controls, Observation, State
 GUIDANCE = 0x67756964  # keeps the random numbers of the guided drivers apart from others of the same seed
 
 
-class Observer(Protocol):
-    """Observer of a run, which only reads; it may hold up the run, and its exceptions end the run."""
+class Observer:
+    """Observer of a run, which only reads; it may hold up the run, and its exceptions end the run. This one is idle."""
 
     def began(self, city: City, state: State) -> None:
         """Take the initial state."""
@@ -69,7 +68,7 @@ class SumoPlant:
         Raises InputError for a city that does not fit the scenario's network or the settings.
         """
         self._scenario, self._planning = scenario, planning or planning_model(scenario)
-        self._observer = observer
+        self._observer = observer or Observer()
         self._settings = settings = settings or settings_of(scenario)
         check_lanes(scenario, settings)
         self.city: City = city_of(scenario.network)
@@ -121,8 +120,7 @@ class SumoPlant:
         self._junctions = None if settings.mesoscopic else Junctions(session, city)
         self._state = meter.state(0, 0.0)
         self._recorder = Recorder(meter, self._guide, self._actuation)
-        if self._observer:
-            self._observer.began(city, self._state)
+        self._observer.began(city, self._state)
         return self._state
 
     def step(self, controls: Controls) -> State:
@@ -150,8 +148,7 @@ class SumoPlant:
                 self._estimation.sample()
             if n % sampling == 0:
                 self._sampler.sample()
-                if self._observer:
-                    self._observer.sampled(session.time, *self._sampler.last)
+                self._observer.sampled(session.time, *self._sampler.last)
             self._guide.apply(events)
         self._k += 1
         state = self._meter.state(self._k, self._k * scenario.step)
@@ -160,8 +157,7 @@ class SumoPlant:
             self._estimation.update(controls)
         self._state = replace(state, problem=self._incidents.problem())
         row = self._recorder.add(streets)
-        if self._observer:
-            self._observer.recorded(controls, self._state, row)
+        self._observer.recorded(controls, self._state, row)
         return self._state
 
     def observe(self) -> Observation | None:

@@ -19,6 +19,7 @@ from bokeh.server.server import Server
 from tornado.ioloop import PeriodicCallback
 
 from cosim.evaluation.simulate import Simulation, simulate
+from cosim.plant.plant import Observer
 from cosim.plant.settings import settings
 from cosim.sumo.arrays import PerEdge
 from cosim.sumo.net import City
@@ -125,7 +126,7 @@ def run(n: int, job: Simulation, messages: Any, going: Any, delay: Any) -> None:
         messages.put((n, error))
 
 
-class Reporter:
+class Reporter(Observer):
     """The observer of one run: it sends frames and holds the run to the pace; the run stays the same otherwise."""
 
     def __init__(self, n: int, scenario: Scenario, messages: Any, going: Any, delay: Any):

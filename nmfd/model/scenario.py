@@ -23,10 +23,6 @@ from nmfd.runs.config import Name, Numbers, Problem, Regions, Rows, Settings, Te
 LONGEST_STEP_S = 86_400.0
 MOST_STEPS = 10**6
 MOST_FLOW_VEH_S = 1e6
-COPIED = (  # from file to scenario
-    *("name", "step", "steps", "measurement_std", "process_std", "integrator", "substeps", "protected"),
-    *("demand_factor", "forecast_error", "faults", "sumo"),
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -215,20 +211,15 @@ def read_scenario(folder: Path | str, settings: Mapping[str, Any] | None = None)
     table = config.checked(ScenarioTable, tables, path)
     network = load_network(folder / table.network)
     check_step(network, table.step / table.substeps, str(path))
-    scenario = Scenario(
-        **{key: getattr(table, key) for key in COPIED},
-        network=network,
-        demand=table.demand_factor * _demand(table, network, folder),
-        controller_options=table.controllers,
-        initial=np.array(table.initial) if table.initial else None,
-        folder=folder,
-    )
+    values = {key: value for key, value in vars(table).items() if key in Scenario.__dataclass_fields__}
+    values |= {"network": network, "demand": table.demand_factor * _demand(table, network, folder), "folder": folder}
+    values |= {"controller_options": table.controllers, "initial": np.array(table.initial) if table.initial else None}
+    scenario = Scenario(**values)
     if max(table.protected, default=0) >= network.regions:
         allowed = f"a list of distinct whole numbers from 0 to {network.regions - 1}"
         raise config.error(path, "protected", config.got(allowed, list(table.protected)))
-    if table.initial and (
-        {len(row) for row in table.initial} | {len(table.initial)} != {network.regions} or scenario.start.min() < 0
-    ):
+    lengths = {len(row) for row in table.initial} | {len(table.initial)}
+    if table.initial and (lengths != {network.regions} or scenario.start.min() < 0):
         allowed = f"{network.regions} lists of {network.regions} numbers from 0 up"
         raise config.error(path, "initial", config.got(allowed, [list(row) for row in table.initial]))
     _ = scenario.ordered_faults
