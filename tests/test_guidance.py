@@ -1,6 +1,5 @@
 """The searches of route guidance against all ways there are, in a small random city."""
 
-from dataclasses import replace
 from itertools import product
 from unittest.mock import Mock
 
@@ -241,7 +240,7 @@ def test_with_prices_no_way_is_a_long_detour_by_the_times_without(city, ways_ret
                 way.append(before[here, way[-1]])
             if way[-1] == here and best[here, target] < np.inf:
                 routes["driver"] = tuple(names[n] for n in way[::-1])
-                guide.apply([replace(DRIVER, destination=3, edge=names[target])])
+                guide.apply([DRIVER._replace(destination=3, edge=names[target])])
                 detours.append(time[[int(name) for name in routes["driver"][1:]]].sum() - best[here, target])
         longest[most] = max(detours)
         assert longest[most] <= most + 1e-6

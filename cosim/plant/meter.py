@@ -6,7 +6,7 @@ final route, else a removal.
 
 import math
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -34,23 +34,16 @@ class _Vehicle:
     origin: int
     destination: int
     edge: str  # last one of its route
-    announced: int  # region of its last Event, perhaps ahead
-    free: bool = True  # guidance may reroute it
-    private: bool = True  # `Session.is_private`
+    free: bool  # guidance may reroute it
+    private: bool  # `Session.is_private`
     due: float = 0.0  # [s]
     waited: float = 0.0  # departure delay [s]
-    region: int | None = None  # the present one, None before the departure
-
-    @property
-    def here(self) -> int:
-        """Return the region of a vehicle that has departed."""
-        if self.region is None:
-            raise RuntimeError(f"a vehicle bound for {self.edge} is on the road, but was never seen to depart")
-        return self.region
+    departed: bool = False
+    region: int = 0  # the present one, since the departure
+    announced: int = 0  # region of its last Event, perhaps ahead
 
 
-@dataclass(frozen=True, kw_only=True)
-class Event:
+class Event(NamedTuple):
     """A departure (source None), or the entry of a vehicle into another region.
 
     edge: last one of its route; free: the driver may take another route (no public transport, no stops)
@@ -164,19 +157,18 @@ class Meter:
             self._teleporting.add(vehicle)
         self._teleporting.difference_update(session.ended_teleport())
         for vehicle in session.departed():
-            if vehicle in self._vehicles and self._vehicles[vehicle].region is not None:  # its id is used again
+            if vehicle in self._vehicles and self._vehicles[vehicle].departed:  # its id is used again
                 self._leave(vehicle)
                 if vehicle in arrived:
                     arrived.remove(vehicle)
             known = self._depart(vehicle)
-            events.append(_event(vehicle, known, None, known.origin))
+            events.append(Event(vehicle, None, known.origin, known.destination, known.edge, known.free))
         self._steps += 1
         for edge, region in self._entries.items() if self._steps % self._poll_steps == 0 else ():
             present = session.vehicles_on(edge)
             if present != self._seen[edge]:
                 for vehicle in set(present).difference(self._seen[edge]):
-                    if (event := self._enter(vehicle, edge, region)) is not None:
-                        events.append(event)
+                    events += self._enter(vehicle, edge, region)
                 self._seen[edge] = present
         for vehicle in arrived:
             self._leave(vehicle)
@@ -197,13 +189,13 @@ class Meter:
             self._settle(self._trips.ends())
         for vehicle in on_road:
             known = self._under_way(vehicle)
-            region = self._city.region_of.get(self._session.road(vehicle), known.here)
             self._follow(vehicle, known)
-            self._cross(known, region)
-            counted[region, known.destination] += 1
+            self._cross(known, self._city.region_of.get(self._session.road(vehicle), known.region))
+            counted[known.region, known.destination] += 1
         away = self._teleporting.difference(on_road)
-        if len(on_road) + len(away) < self._running.sum():
-            away |= self._off_road(on_road)
+        if len(on_road) + len(away) < self._running.sum():  # the mesoscopic model holds vehicles off a jammed road
+            under_way = {vehicle for vehicle, known in self._vehicles.items() if known.departed}
+            away |= under_way.difference(on_road).intersection(self._session.known())  # the others have left
         for vehicle in away:
             known = self._vehicles[vehicle]
             counted[known.region, known.destination] += 1
@@ -239,11 +231,11 @@ class Meter:
         """Return (R, R) [veh] due to depart from i for j, but not inserted yet; book those that SUMO dropped."""
         pending = self._session.pending()
         waiting = self.held() + self._waiting(pending)
-        ahead = {vehicle for vehicle, known in self._vehicles.items() if known.region is None}.difference(pending)
+        ahead = {vehicle for vehicle, known in self._vehicles.items() if not known.departed}.difference(pending)
         for vehicle in sorted(ahead.difference(self._session.known())) if ahead else ():
             self._leave(vehicle)
         for vehicle, known in self._vehicles.items():
-            if known.region is None and known.due < self._session.time:  # or not, if it waits for a person
+            if not known.departed and known.due < self._session.time:  # or not, if it waits for a person
                 self._time(vehicle, known)
         return waiting
 
@@ -262,7 +254,7 @@ class Meter:
         """Yield the trips that were due and have not ended."""
         now, losses = self._session.time, {} if self._trips is None else self._trips.under_way
         for vehicle, known in self._vehicles.items():
-            if known.region is not None:
+            if known.departed:
                 yield _trip(known, UNDER_WAY, now, losses.get(vehicle, math.nan))
             elif known.due < now:
                 yield _trip(known, WAITING, now)
@@ -282,7 +274,7 @@ class Meter:
         counted = np.zeros(self._running.shape)
         for vehicle in self._probes & self._vehicles.keys():
             known = self._vehicles[vehicle]
-            if known.region is not None:
+            if known.departed:
                 counted[known.region, known.destination] += 1
         return counted
 
@@ -296,12 +288,6 @@ class Meter:
             known = self._load(vehicle)
             waiting[known.origin, known.destination] += 1
         return waiting
-
-    def _off_road(self, on_road: Collection[str]) -> set[str]:
-        """Return vehicles that the mesoscopic model holds off a jammed road; the others off the road have left."""
-        under_way = {vehicle for vehicle, known in self._vehicles.items() if known.region is not None}
-        lost = under_way.difference(on_road, self._teleporting)
-        return lost.intersection(self._session.known())
 
     def _settle(self, ends: Iterable[End]) -> None:
         """Book ends of trips."""
@@ -326,31 +312,23 @@ class Meter:
     def _book(self, gone: _Vehicle, end: End) -> None:
         """Book the end of a vehicle."""
         self._end(_trip(gone, REMOVED if end.reason else COMPLETED, end.time, end.time_loss))
-        i, j = gone.here, gone.destination
-        if not end.reason and (to := self._city.region_of.get(end.edge, j)) != j:
-            self.redirected[i, j, to] += 1
-            j = to
+        i, j = gone.region, gone.destination
         h = self._city.region_of.get(end.edge, i if end.reason else j)
-        if h != i:
-            (self.crossings if (i, h) in self._joined else self.jumps)[i, h, j] += 1
         if end.reason:
             self.removals[h, j] += 1
         else:
             self.arrivals[h] += 1
+            self.redirected[i, j, h] += h != j
+            j = h
+        (self.crossings if (i, h) in self._joined else self.jumps)[i, h, j] += h != i
 
     def _load(self, vehicle: str) -> _Vehicle:
         if vehicle not in self._vehicles:
-            route, region_of = self._session.route(vehicle), self._city.region_of
-            origin = region_of.get(route[0], 0)
-            self._vehicles[vehicle] = _Vehicle(
-                origin=origin,
-                destination=region_of.get(route[-1], 0),
-                edge=route[-1],
-                announced=origin,
-                free=self._session.is_free(vehicle),
-                private=self._session.is_private(vehicle),
-            )
-            self._time(vehicle, self._vehicles[vehicle])
+            session, route = self._session, self._session.route(vehicle)
+            origin, destination = (self._city.region_of.get(edge, 0) for edge in (route[0], route[-1]))
+            known = _Vehicle(origin, destination, route[-1], session.is_free(vehicle), session.is_private(vehicle))
+            self._vehicles[vehicle] = known
+            self._time(vehicle, known)
         return self._vehicles[vehicle]
 
     def _time(self, vehicle: str, known: _Vehicle) -> None:
@@ -367,7 +345,7 @@ class Meter:
             self._time(vehicle, known)
             self._follow(vehicle, known)
             known.origin = self._city.region_of.get(self._session.road(vehicle), known.origin)
-        known.region = known.announced = known.origin
+        known.departed, known.region, known.announced = True, known.origin, known.origin
         self._running[known.origin, known.destination] += 1
         self.departures[known.origin, known.destination] += 1
         self.probe_departures[known.origin, known.destination] += vehicle in self._probes
@@ -376,7 +354,7 @@ class Meter:
     def _under_way(self, vehicle: str) -> _Vehicle:
         """Return a vehicle on the road, even if another program put it there without a departure."""
         known = self._vehicles.get(vehicle)
-        return self._depart(vehicle) if known is None or known.region is None else known
+        return known if known and known.departed else self._depart(vehicle)
 
     def _follow(self, vehicle: str, known: _Vehicle) -> None:
         """Book a change of the destination."""
@@ -384,7 +362,7 @@ class Meter:
         if edge == known.edge:
             return
         before, known.edge, known.destination = known.destination, edge, self._city.region_of.get(edge, 0)
-        if known.region is not None and known.destination != before:
+        if known.departed and known.destination != before:
             self.redirected[known.region, before, known.destination] += 1
             self._running[known.region, before] -= 1
             self._running[known.region, known.destination] += 1
@@ -393,7 +371,7 @@ class Meter:
         """Take a vehicle out; its end is booked when tripinfo has it."""
         self._teleporting.discard(vehicle)
         known, ended = self._vehicles.pop(vehicle), self._session.time - self._session.step_length
-        if known.region is None:  # given up before it departed
+        if not known.departed:  # given up before it departed
             self.given_up[known.origin, known.destination] += 1
             self._end(_trip(known, GIVEN_UP, ended))
             return
@@ -403,16 +381,16 @@ class Meter:
         else:
             self._gone.setdefault(vehicle, []).append(known)
 
-    def _enter(self, vehicle: str, edge: str, region: int) -> Event | None:
+    def _enter(self, vehicle: str, edge: str, region: int) -> list[Event]:
         known = self._under_way(vehicle)
         if vehicle in self._teleporting or known.region == known.announced == region:
-            return None
-        source = known.announced if known.region == region else known.here
+            return []
+        source = known.announced if known.region == region else known.region
         self._follow(vehicle, known)
         self._cross(known, region)
         known.announced = region
         self.entry_flow[source, edge] += 1
-        return _event(vehicle, known, source, region)
+        return [Event(vehicle, source, region, known.destination, known.edge, known.free)]
 
     def _cross(self, known: _Vehicle, region: int) -> None:
         if region != known.region:
@@ -425,11 +403,5 @@ class Meter:
 
 def _trip(known: _Vehicle, outcome: str, end: float, time_loss: float = 0.0) -> Trip:
     time = max(end - known.due, 0.0)
-    waited = time if known.region is None else known.waited
+    waited = known.waited if known.departed else time
     return Trip(known.origin, known.private, outcome, waited, time, time_loss)
-
-
-def _event(vehicle: str, known: _Vehicle, source: int | None, region: int) -> Event:
-    return Event(
-        vehicle=vehicle, source=source, region=region, destination=known.destination, edge=known.edge, free=known.free
-    )
