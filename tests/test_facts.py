@@ -100,7 +100,7 @@ def test_measures_of_a_city_are_those_of_tripinfo(tmp_path, steps):
     expected |= {"mean_departure_delay_s": delay[~other].mean(), "mean_time_loss_s": trips["timeLoss"][begun].mean()}
     expected |= {"other_trips": sum(other), "other_time_spent_veh_s": time[other].sum()}
     expected |= {"other_departure_delay_veh_s": delay[other].sum()}
-    assert {name: row[name] for name in expected} == pytest.approx(expected, rel=1e-6)
+    assert {name: row[name] for name in expected} == pytest.approx(expected, rel=1e-5)  # of hundredths of seconds
     assert result.time_spent.shape == (steps,) and min(expected.values()) > 0
     assert result.other_time_spent.sum() == pytest.approx(time[other].sum())
 
