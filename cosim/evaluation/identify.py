@@ -19,8 +19,7 @@ import pandas as pd
 from cosim.evaluation.model_validation import observed, outflow_samples
 from cosim.evaluation.runs import runs_of
 from cosim.sumo.build import network_folder
-from cosim.sumo.net import City, city_of
-from nmfd.arrays import PerRegion
+from cosim.sumo.net import city_of
 from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
 from nmfd.model import authority, identification, mfd
@@ -105,7 +104,9 @@ def identify(
 
     samples = outflow_samples(static, runs)
     model = fitted(runs, samples)
-    states, lane_km = [run.accumulation for run in runs], city_lane_km(city_of(static))
+    states, city = [run.accumulation for run in runs], city_of(static)
+    metres = [city.length[edge] * city.lanes[edge] for edge in city.edges]
+    lane_km = np.bincount([city.region_of[edge] for edge in city.edges], metres, city.regions) / 1000.0
     model = fit_quality.with_guesses(model, samples, lane_km, states, fastest=loaded.substeps / loaded.step)
     fits = fit_quality.region_fits(model, samples, states, seeds=len(seeds), lane_km=lane_km)
     text, errors = fit_quality.fit_table(model, fits), None
@@ -193,18 +194,9 @@ def as_it_was(network: RegionalModel, model: RegionalModel, regions: Sequence[in
     """Return `model` with some regions as in `network`: a fit to hardly any vehicles says nothing of more."""
     alone = np.isin(np.arange(model.regions), regions)
     mfds = tuple((network if alone[n] else model).mfds[n] for n in range(model.regions))
-    return replace(
-        model,
-        mfds=mfds,
-        exit_rates=np.where(alone[:, None], 1.0, model.exit_rates),
-        storage=np.where(alone, np.maximum(model.storage, [mfd.jam for mfd in mfds]), model.storage),
-    )
-
-
-def city_lane_km(city: City) -> PerRegion:
-    """Return the lane-kilometres (R,) of the regions."""
-    metres = [city.length[edge] * city.lanes[edge] for edge in city.edges]
-    return np.bincount([city.region_of[edge] for edge in city.edges], metres, city.regions) / 1000.0
+    rates = np.where(alone[:, None], 1.0, model.exit_rates)
+    storage = np.where(alone, np.maximum(model.storage, [mfd.jam for mfd in mfds]), model.storage)
+    return replace(model, mfds=mfds, exit_rates=rates, storage=storage)
 
 
 def run_verdict(scenario: Scenario, network: RegionalModel, results: Sequence[Result]) -> authority.Verdict:

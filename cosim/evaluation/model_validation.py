@@ -107,8 +107,7 @@ def error_table(rows: pd.DataFrame) -> str:
 def write_comparison(folder: Path, scenario: Scenario, result: Result) -> pd.DataFrame:
     """Write compare-<run>.csv and a figure beside a run; return the rows of `errors`."""
     network, predicted = scenario.network, predict(scenario, result)
-    rows = errors(scenario, result, predicted)
-    name = files.run_name(result.controller, result.seed)
+    rows, name = errors(scenario, result, predicted), files.run_name(result.controller, result.seed)
     files.write_table(folder / f"compare-{name}.csv", rows)
     drawing, axes = plots.panels(network.regions + 1)
     for region, ax in enumerate(axes[:-1]):
@@ -134,6 +133,7 @@ def prediction_errors(found: Finished, model: Path | None = None) -> pd.DataFram
         for controller, rows in level.rows.groupby("controller", sort=False):
             network = parse(controller).planning(scenario, model).network
             runs = [observed(level.read(controller, seed)) for seed in rows["seed"]]
+            most = np.max([run.accumulation.sum(axis=2).max(axis=0) for run in runs], axis=0)
             columns = {
                 "demand": level.demand,
                 "controller": controller,
@@ -141,8 +141,7 @@ def prediction_errors(found: Finished, model: Path | None = None) -> pd.DataFram
                 "model": os.path.normpath(network.folder) if network.folder else "",
                 "region": range(network.regions),
                 "critical_veh": network.seen_critical,
-                "most_share": np.max([run.accumulation.sum(axis=2).max(axis=0) for run in runs], axis=0)
-                / network.seen_critical,
+                "most_share": most / network.seen_critical,
             }
             tables.append(pd.DataFrame(columns).join(predictions(network, runs, scenario.scheme)))
     return pd.concat(tables, ignore_index=True)

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -19,8 +19,7 @@ from nmfd.model.regional_model import RegionalModel
 CONTROLLED = "controlled"  # gateway with a signal that perimeter control uses
 
 
-@dataclass(frozen=True, kw_only=True)
-class Tables:
+class Tables(NamedTuple):
     """Rows of quality.csv (one per region, and one for all) and of gateways.csv (one per movement over a boundary)."""
 
     quality: Sequence[Mapping]

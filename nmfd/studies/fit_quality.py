@@ -71,7 +71,7 @@ def region_fits(
     samples: Samples,
     accumulations: States = (),
     seeds: int = 2,
-    lane_km: PerRegion | None = None,
+    lane_km: PerRegion | float = np.nan,
 ) -> pd.DataFrame:
     """Return the fit of each region, a row each.
 
@@ -83,7 +83,7 @@ def region_fits(
     accumulations: (T+1, R, R) [veh]; seeds: of the loading runs; lane_km: (R,)
     """
     most, critical, rows = _largest(samples, accumulations), network.seen_critical, []
-    density = critical / (np.full(network.regions, np.nan) if lane_km is None else lane_km)
+    density, dense = critical / lane_km, CRITICAL_DENSITIES
     for region, (curve, cloud) in enumerate(zip(network.mfds, samples, strict=True)):
         points, above = own_points(cloud), network.critical_above.get(region, np.nan)
         residuals, r2 = points[:, 1] - curve.outflow(points[:, 0]), np.nan
@@ -93,8 +93,7 @@ def region_fits(
             f"{FEW} ({len(points)})": len(points) < SAMPLES,
             f"{POOR} {r2:.2f}": len(points) >= SAMPLES and not r2 >= EXPLAINED,  # NaN too
             f"{ENDLESS} (critical above {above:.0f} veh, not seen)": region in network.critical_above,
-            f"{ODD} {density[region]:.3g} veh per lane-km": abs(density[region] - np.mean(CRITICAL_DENSITIES))
-            > np.ptp(CRITICAL_DENSITIES) / 2.0,
+            f"{ODD} {density[region]:.3g} veh per lane-km": density[region] < dense[0] or density[region] > dense[1],
             ALONE: seeds < 2,
         }
         rows.append(
