@@ -147,22 +147,6 @@ def test_cars_for_streets_that_are_closed_to_them(net, city, tmp_path):
     assert due == departed == 2 and backlog == 0
 
 
-def test_routes_of_a_nested_distribution(city):
-    """As marouter writes them: every vehicle of such a flow gets a route, by their shares."""
-    config = city(
-        '<flow id="f" begin="0" end="600" number="200" fromTaz="1" toTaz="2"><routeDistribution>'
-        '<route probability="150" edges="A1B1 B1C1"/><route probability="50" edges="D1C1 C1B1"/></routeDistribution>'
-        "</flow>",
-        '<taz id="1" edges="A1B1 D1C1"/><taz id="2" edges="B1C1 C1B1"/>',
-    )
-    vehicles = traffic_of(config).vehicles
-    edges = [vehicle.find("route").get("edges") for vehicle in vehicles]
-    assert len(edges) == 200 and 120 < edges.count("A1B1 B1C1") < 180 and "D1C1 C1B1" in edges
-    assert not any({"fromTaz", "toTaz"} & set(vehicle.keys()) for vehicle in vehicles)
-    due, departed, *_, backlog = driven(imported(config)[1], 2, 0.4)
-    assert due == departed + backlog > 40
-
-
 def test_what_else_changes_routes_and_vehicles(city, tmp_path, monkeypatch):
     """Rerouters with other routes, closed streets and calibrators: SUMO runs them, the ledger is exact; vehicles that
     SUMO gives up are told; nothing is written where the user is."""

@@ -23,8 +23,8 @@ ADDITIONAL = """<vType id="own" vClass="taxi" maxSpeed="9"/><vType id="thin" sca
 <busStop id="bus" lane="B1C1_0" startPos="20" endPos="40"/>
 <parkingArea id="park" lane="B1C1_0" startPos="60" endPos="80"/>
 <taz id="west" edges="A0A1 A1B1"/><taz id="east"><tazSource id="C1D1" weight="1"/><tazSink id="C1D1" weight="1"/></taz>
-<trip id="beside" depart="9" from="A1B1" to="C1D1"/>
-<calibrator id="c" edge="B2C2" pos="0">
+<trip id="beside" depart="9" from="A1B1" to="C1D1"/>"""
+CALIBRATOR = """<calibrator id="c" edge="B2C2" pos="0">
 <flow begin="0" end="60" route="r" vehsPerHour="600"/></calibrator>"""
 TRIP, ENDS = '<trip id="{0}" depart="{1}" ', 'from="A1B1" to="C1D1"'
 FLOW, ROUTED = '<flow id="{0}" begin="{1}" ', '<vehicle id="{0}" depart="{1}" '
@@ -86,18 +86,16 @@ OPTIONS = {  # of SUMO
     "meso": '<mesosim value="yes"/><meso-tauff value="1.9"/>',
     "window": '<begin value="0:00:13"/>',
     "lateral": '<lateral-resolution v="0.8"/><default.action-step-length v="1"/><time-to-teleport v="60"/>',
-    "equipped": '<device.rerouting.probability v="0.5"/><device.rerouting.period v="30"/><max-depart-delay v="15"/>',
+    "equipped": '<device.rerouting.probability v="1"/><device.rerouting.period v="30"/><max-depart-delay v="15"/>',
 }
 
 
 # SUMO draws these with other random numbers of a run, or differs by itself: the same vehicles, driven otherwise.
 OF_CHANCE = ("per_hour", "places", "last", "walker", "waits_for_a_person")
-
-
 DRAWN = ("chance", "hourly", "shared", "references", "alternatives")  # their destinations
 
 
-def city(folder, forms, additional, options=""):
+def city(folder, forms, options="", additional=ADDITIONAL):
     """A sumocfg with these forms, every one with its own time."""
     tiny_city.network(folder)
     lines = "\n".join(FORMS[name].format(name, 2 + n // 4) for n, name in enumerate(forms))
@@ -134,7 +132,7 @@ def imported(config) -> str:
 @pytest.mark.parametrize("options", ["", *OPTIONS.values()], ids=["plain", *OPTIONS])
 def test_an_import_reads_what_sumo_reads(tmp_path, options):
     """The same vehicles from edge to edge, with the same departures; none is left out."""
-    config = city(tmp_path, FORMS, ADDITIONAL, options)
+    config = city(tmp_path, FORMS, options, ADDITIONAL + CALIBRATOR)
     case, driven = read_sumo_input(config), plain(config)
     streets = read_streets(case.net, case.additional)
     traffic = read_traffic(case, streets, seed=0)
@@ -153,9 +151,7 @@ def test_an_import_reads_what_sumo_reads(tmp_path, options):
 
 @pytest.mark.parametrize("options", ["", *map(OPTIONS.__getitem__, ("meso", "lateral", "equipped", "window"))])
 def test_seed_0_without_control_is_plain_sumo(tmp_path, options):
-    config = city(
-        tmp_path, [name for name in FORMS if name not in OF_CHANCE], ADDITIONAL.partition("<calibrator")[0], options
-    )
+    config = city(tmp_path, [name for name in FORMS if name not in OF_CHANCE], options)
     imported(config)
     out = tmp_path / "t.xml"
     run(tmp_path / "scenarios" / "x", "no-control", seed=0, sumo_output={"tripinfo": out}, progress=False)
@@ -166,7 +162,7 @@ def test_seed_0_without_control_is_plain_sumo(tmp_path, options):
 
 
 def test_vehicles_of_a_loaded_state_begin_where_they_are(tmp_path):
-    config = city(tmp_path, ["trip", "via", "period", "later"], ADDITIONAL.partition("<calibrator")[0])
+    config = city(tmp_path, ["trip", "via", "period", "later"])
     state = tmp_path / "state.xml"
     tiny_city.run("sumo", "-c", config, "--save-state.times", 50, "--save-state.files", state, "--end", 51)
     config.write_text(config.read_text().replace("<end", '<load-state value="state.xml"/><end'))
@@ -183,14 +179,12 @@ def test_vehicles_of_a_loaded_state_begin_where_they_are(tmp_path):
 
 def test_what_is_left_out_is_said_first_and_last(tmp_path):
     """SUMO refuses a route with a gap, or drives it if it is told to ignore errors."""
-    config = city(tmp_path, ["count", "reroute"], ADDITIONAL.partition("<calibrator")[0])
+    config = city(tmp_path, ["count", "reroute"])
     route = '<vehicle id="gap" depart="9"><route edges="A1B1 C1D1"/></vehicle></routes>'
     (tmp_path / "c.rou.xml").write_text((tmp_path / "c.rou.xml").read_text().replace("</routes>", route))
     first, *_, last = imported(config).splitlines()
-    assert "10.0% of the vehicles and 6.9% of the distance left out" in first
-    assert (
-        last == "WARNING: 10.0% of the vehicles and 6.9% of the distance left out: this is not the traffic of c.sumocfg"
-    )
+    share = "10.0% of the vehicles and 6.9% of the distance left out"
+    assert share in first and last == f"WARNING: {share}: this is not the traffic of c.sumocfg"
     assert last in (tmp_path / "networks" / "x" / "verdict.txt").read_text()
     config.write_text(config.read_text().replace("<end", '<ignore-route-errors value="true"/><end'))
     assert " 0.0% of the vehicles and 0.0% of the distance left out" in imported(config)
