@@ -77,7 +77,8 @@ def test_rationed_green(phases):
         now = float(second)
         if second % cycle == 0:
             share = 1.0 if second >= 30 * cycle else float(random.uniform())
-            junction.command(np.full((2, 2), share))
+            for ration in junction.rations.values():
+                ration.share = share
             budgets.append(np.inf if share == 1.0 else MIN_GREEN + share * (cycle - MIN_GREEN))
         if now >= junction.next_change - 1e-6:
             junction.advance(now)
@@ -89,17 +90,18 @@ def test_rationed_green(phases):
     assert (green <= np.ceil(np.array(budgets))[:, None]).all()
     limited = np.isfinite(budgets)
     assert (green[limited] >= np.array(budgets)[limited, None] - 1.0).any()  # rations are used up somewhere
-    assert junction.green_time(40.0 * cycle) == {link: green[:, n].sum() for n, link in enumerate(links)}
+    spent = [junction.rations[link].green_time(40.0 * cycle) for link in links]
+    assert spent == green.sum(axis=0).tolist()
 
 
 def test_the_minimum_green():
     """Of a stage, and of a gateway whose ration is the least."""
     held = Junction(signal(CROSS), 0.0, {0: (0, 1)})
-    held.command(np.zeros((2, 2)))
+    held.rations[0].share = 0.0
     assert held.may_switch(MIN_GREEN) and not held.may_switch(MIN_GREEN - 1.0)
     while held.next_change < 66.0:
         held.advance(held.next_change)
-    assert held.green_time(66.0) == {0: MIN_GREEN}
+    assert held.rations[0].green_time(66.0) == MIN_GREEN
 
 
 def link(index, start, end, lane=0):
@@ -170,10 +172,8 @@ def test_saturation_flows_by_hand():
     """A lane each; of a lane that two movements share, a share; of a permissive green, less; nothing of a lane that
     this stage serves in part and another one wholly: its queue stands behind whoever is first."""
     _, roads = weights()
-    gain, begins = roads.stages([CROSSING, END])
-    assert begins == [0, 2]
-    dense = gain.toarray()
-    movement = roads.movements
+    assert roads.begins == [0, 2]
+    dense, movement = roads.gain.toarray(), roads.movements
     assert dense[0, movement["a", "b"]] == 1.0 and dense[1, movement["c", "d"]] == 1.0
     assert dense[2, movement["b", "e"]] == pytest.approx(1.75)
     assert dense[2, movement["b", "f"]] == pytest.approx(0.25 * PERMISSIVE)
@@ -185,7 +185,7 @@ def test_a_lane_that_no_stage_serves_wholly_counts_as_its_first_vehicle_is_likel
     """Three quarters of the right lane of b go to e: a share of 0.75 with a chance of 0.75; 0.25 of 0.25 go to f."""
     divided = signal([("GGr", 30), ("yyr", 3), ("rrG", 30), ("rry", 3)], END.links, "t")
     roads = Roads(TOWN, [CROSSING, divided], FLOWS)
-    dense, movement = roads.stages([CROSSING, divided])[0].toarray(), roads.movements
+    dense, movement = roads.gain.toarray(), roads.movements
     assert dense[2, movement["b", "e"]] == pytest.approx(1.0 + 0.75 * 0.75)
     assert dense[3, movement["b", "f"]] == pytest.approx(0.25 * 0.25)
 

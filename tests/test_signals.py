@@ -114,15 +114,14 @@ def test_pressure_is_upstream_minus_downstream(city, scenario):
     """A queue gives its stage the pressure; the same queue behind the junction takes it away; shares add up."""
     simple, _ = read_signals(city)
     roads = Roads(city, simple, turning_flows(city, scenario.demand, scenario.step))
-    gain, begins = roads.stages(simple)
     n = next(n for n, s in enumerate(simple) if s.id == "o11")
     chosen = simple[n]
     straight = next(k for k in chosen.links if chosen.phases[0].state[k.index] == "G")
 
     def pressures(counts):
         present = np.array([counts.get(lane.rpartition("_")[0], 0.0) for lane in roads.lanes])
-        begin = begins[n]
-        return (gain @ np.maximum(roads.weights @ present, 0.0))[begin : begin + len(chosen.stages)]
+        begin = roads.begins[n]
+        return (roads.gain @ np.maximum(roads.weights @ present, 0.0))[begin : begin + len(chosen.stages)]
 
     queue = pressures({straight.from_edge: 5.0})
     assert int(np.argmax(queue)) == 0 and queue[0] > 5.0

@@ -17,6 +17,7 @@ In both no green outlasts MAX_GREEN_S while others wait. A change costs yellow a
 counts for the share of green in these and the LOOKAHEAD_S that follow.
 """
 
+from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import lru_cache
 from itertools import permutations
@@ -45,7 +46,8 @@ MAX_RED_S = 120.0  # about the longest usual cycle (Signal Timing Manual, 2nd ed
 SHORT_ROAD_M = 15.0  # two vehicles
 REACH_M = 100.0  # before a signal within which vehicles count, wherever roads join and part there
 WHOLE = 1 - 1e-9  # share of the vehicles of a lane: all of them
-PERMISSIVE = 0.3  # saturation flow of a movement that must give way (g), as a share of a protected one
+PERMISSIVE = 0.3  # saturation flow of a movement that must give way, as a share of a protected one
+SATURATION = {"G": 1.0, "g": PERMISSIVE}  # light -> saturation flow [lanes]
 
 
 class MaxPressure:
@@ -64,12 +66,9 @@ class MaxPressure:
         """flows: (edge, next edge) -> flow, any unit; show(signal, state): sets the state of a signal"""
         self._session, self._show, self._cyclic = session, show, cyclic
         roads = Roads(city, signals, flows)
-        self._lanes, self._weights, self._movements = roads.lanes, roads.weights, roads.movements
-        self._gain, self._begins = roads.stages(signals)
-        self._apart = roads.apart(signals)
-        self._shared, self._start = roads.shared(signals), session.time
+        self._roads, self._start = roads, session.time
         pairs = gateway_movements(city)
-        self._programmed = float(np.mean([_intergreen(signal) for signal in signals])) if signals else 0.0
+        self._programmed = float(np.mean([_intergreen(signal.phases) for signal in signals]))
         self._junctions = [Junction(signal, session.time, pairs.get(signal.id)) for signal in signals]
         self._approaches = [Approaches(signal, roads.watched, session.time) for signal in signals]
         self._rationed = [junction for junction in self._junctions if junction.rations]
@@ -80,18 +79,21 @@ class MaxPressure:
     def command(self, share: PerPair) -> None:
         """Set the shares (R, R) [-], (u - u_min) / (u_max - u_min), of the cycles that begin from now on."""
         for junction in self._rationed:
-            junction.command(share)
+            for ration in junction.rations.values():
+                ration.share = float(share[ration.pair])
 
     def green_time(self) -> dict[str, dict[int, float]]:
         """Return signal -> gateway link -> green so far [s]."""
         now = self._session.time
-        return {junction.signal: junction.green_time(now) for junction in self._rationed}
+        return {
+            junction.signal: {link: ration.green_time(now) for link, ration in junction.rations.items()}
+            for junction in self._rationed
+        }
 
     def facts(self, now: float) -> dict[str, float]:
         """Return FACTS until `now` [s]."""
-        lost = [junction.lost for junction in self._junctions]
-        share = float(np.mean(lost)) / max(now - self._start, 1.0) if lost else 0.0
-        return dict(zip(FACTS, (*self._shared, share, self._programmed), strict=True))
+        share = float(np.mean([junction.lost for junction in self._junctions])) / max(now - self._start, 1.0)
+        return dict(zip(FACTS, (*self._roads.shared, share, self._programmed), strict=True))
 
     def play(self, now: float) -> None:
         """Set all states from `now` [s] on."""
@@ -101,10 +103,9 @@ class MaxPressure:
         if now < self._next - 1e-6:
             return
         self._next = now + DECISION_PERIOD_S
-        count = self._session.lane_vehicles
-        present = np.array([count(lane) for lane in self._lanes], dtype=float)
+        present = np.array([self._session.lane_vehicles(lane) for lane in self._roads.lanes], dtype=float)
         pressure = self._pressure(present)
-        for junction, approaches, begin in zip(self._junctions, self._approaches, self._begins, strict=True):
+        for junction, approaches, begin in zip(self._junctions, self._approaches, self._roads.begins, strict=True):
             approaches.observe(junction.state, now)
             if junction.may_switch(now):
                 waiting = approaches.waiting(present, junction.exhausted_links())
@@ -132,11 +133,12 @@ class MaxPressure:
         return own
 
     def _pressure(self, present: np.ndarray) -> np.ndarray:
-        weight = np.maximum(self._weights @ present, 0.0)
+        roads = self._roads
+        weight = np.maximum(roads.weights @ present, 0.0)
         for junction in self._rationed:
             for link in junction.exhausted_links():
-                weight[self._movements[junction.movement[link]]] = 0.0
-        return self._gain @ weight + self._apart @ present
+                weight[roads.movements[junction.movement[link]]] = 0.0
+        return roads.gain @ weight + roads.apart @ present
 
 
 class Junction:
@@ -151,34 +153,24 @@ class Junction:
     def __init__(self, signal: Signal, now: float, gateways: Mapping[int, tuple[int, int]] | None = None):
         """gateways: link index -> (i, h), of links whose green is rationed"""
         self.signal, self._phases, self._numbers = signal.id, signal.phases, stages_of(signal)
-        self.stages, self.stage = len(self._numbers), 0
-        self._base = signal.phases[self._numbers[0]].state
-        phases = signal.phases
+        self.stages, self.stage, phases = len(self._numbers), 0, signal.phases
         crossed = {k: max(run_length(phases, n, k, GREEN) for n in range(len(phases))) for k in ends_bare(phases)}
         self._least = [  # of every stage [s]
             max([MIN_GREEN_S, *(green for k, green in crossed.items() if phases[n].state[k] in GREEN)])
             for n in self._numbers
         ]
         self._green_since, self.stage_since = now, now
-        cycle = sum(phase.duration for phase in signal.phases)
+        cycle = sum(phase.duration for phase in phases)
         self.rations = {
-            link: Ration(pair, cycle=cycle, yellow=yellow_time(signal.phases, link), start=now)
+            link: Ration(pair, cycle=cycle, yellow=yellow_time(phases, link), start=now)
             for link, pair in (gateways or {}).items()
         }
         self.movement = {link.index: (link.from_edge, link.to_edge) for link in signal.links}
         self._coming: list[tuple[float, str]] = []
         self._between: dict[tuple[int, int], list[Phase]] = {}  # stage, next stage -> phases between them
-        self.lost, self.state = 0.0, self._base
+        self.lost, self._base = 0.0, phases[self._numbers[0]].state
+        self.state = self._base
         self.next_change = now if self.rations else NEVER  # until then, commands hold from the first second on
-
-    def command(self, share: PerPair) -> None:
-        """Set the shares (R, R) [-] of the cycles that begin from now on."""
-        for ration in self.rations.values():
-            ration.share = float(share[ration.pair])
-
-    def green_time(self, now: float) -> dict[int, float]:
-        """Return the green of every gateway link before `now` [s]."""
-        return {link: ration.green_time(now) for link, ration in self.rations.items()}
 
     def exhausted_links(self) -> list[int]:
         """Return the gateway links without more green in this cycle."""
@@ -299,10 +291,9 @@ def transition(phases: tuple[Phase, ...], source: int, target: int) -> list[Phas
     ]
 
 
-def _intergreen(signal: Signal) -> float:
-    """Return the share of the cycle between two stages in the original programme."""
-    between = sum(phase.duration for phase in signal.phases if not is_stage(phase.state))
-    return between / max(sum(phase.duration for phase in signal.phases), 1.0)
+def _intergreen(phases: Sequence[Phase]) -> float:
+    """Return the share of the cycle between two stages."""
+    return sum(p.duration for p in phases if not is_stage(p.state)) / sum(p.duration for p in phases)
 
 
 class Approaches:
@@ -341,13 +332,16 @@ def _green(state: str) -> np.ndarray:
 
 
 class Roads:
-    """Vehicles by lane -> weights of movements -> pressures of stages, as two sparse matrices.
+    """Vehicles by lane -> weights of movements -> pressures of stages, as sparse matrices.
 
     lanes: (L,) names, those for cars and all others before the signals, such as bus lanes, which have no weight
     movements: (edge, next edge) at `signals` -> number; weights: (M, L) [-]
+    gain, apart: saturation flows [lanes] in stages, (S, M) of movements, (S, L) of lanes on streets closed to cars
+    begins: first stage of every signal
+    shared: numbers of lanes for cars before signals, of those that a stage serves in part, and that none serves whole
     """
 
-    def __init__(self, city: City, signals: Iterable[Signal], flows: Mapping[tuple[str, str], float]):
+    def __init__(self, city: City, signals: Sequence[Signal], flows: Mapping[tuple[str, str], float]):
         """flows: (edge, next edge) -> flow, any unit, for the turning shares"""
         self._city, self._flows = city, flows
         self._before: dict[str, list[str]] = {edge: [] for edge in city.edges}
@@ -366,46 +360,48 @@ class Roads:
                 self._links.setdefault(link.from_edge, []).append(link)
         movements = sorted({(link.from_edge, link.to_edge) for links in self._links.values() for link in links})
         self.movements = {movement: n for n, movement in enumerate(movements)}
-        rows: list[dict[int, float]] = []
-        for edge, target in self.movements:
+        rows = []
+        for edge, target in movements:
             row = self._queue(edge, target, arriving=True)
-            end = self._chain(target)[-1]
+            end = self._end(target)
             for onward, share in self._turns(end).items():
                 for lane, part in self._queue(end, onward).items():
                     row[lane] = row.get(lane, 0.0) - share * part
             rows.append(row)
         self.weights = _sparse(rows, len(self.lanes))
+        self._add_stages(signals)
 
-    def stages(self, signals: Iterable[Signal]) -> tuple[csr_array, list[int]]:
-        """Return (S, M) saturation flows [lanes] of movements in stages, and each signal's first stage."""
-        rows, begins = list[dict[int, float]](), list[int]()
+    def _add_stages(self, signals: Iterable[Signal]) -> None:
+        """Set `gain`, `apart`, `begins` and `shared`."""
+        rows, apart = list[dict[int, float]](), list[dict[int, float]]()
+        lanes, split, whole = set[str](), set[str](), set[str]()
+        self.begins: list[int] = []
         for signal in signals:
-            begins.append(len(rows))
+            self.begins.append(len(rows))
+            lanes |= {lane_id(link) for link in signal.links} & self._cars
             states = [signal.phases[number].state for number in stages_of(signal)]
             served = [self._served(signal, state) for state in states]
-            whole = {lane for parts in served for lane, part in parts.items() if part >= WHOLE}
+            split |= {lane for parts in served for lane, part in parts.items() if part < WHOLE}
+            here = {lane for parts in served for lane, part in parts.items() if part >= WHOLE}
+            whole |= here
+            links = {(link.from_edge, link.lane, link.to_edge): link for link in signal.links}.values()
             for state, parts in zip(states, served, strict=True):
-                row: dict[int, float] = {}
-                for link in {(k.from_edge, k.lane, k.to_edge): k for k in signal.links}.values():
-                    lane, light = lane_id(link), state[link.index]
-                    counts = lane in self._cars and (lane not in whole or parts.get(lane, 0.0) >= WHOLE)
-                    if light in GREEN and counts:
-                        share = self._lane_shares(lane)[link.to_edge]
-                        gain = share * min(parts[lane], 1.0) * (1.0 if light == "G" else PERMISSIVE)
-                        movement = self.movements[link.from_edge, link.to_edge]
-                        row[movement] = row.get(movement, 0.0) + gain
+                row = defaultdict[int, float](float)
+                for link in links:
+                    lane, flow = lane_id(link), SATURATION.get(state[link.index])
+                    if flow and lane in self._cars and (lane not in here or parts.get(lane, 0.0) >= WHOLE):
+                        gain = self._lane_shares(lane)[link.to_edge] * min(parts[lane], 1.0) * flow
+                        row[self.movements[link.from_edge, link.to_edge]] += gain
                 rows.append(row)
-        return _sparse(rows, len(self.movements)), begins
-
-    def shared(self, signals: Iterable[Signal]) -> tuple[int, int, int]:
-        """Return the numbers of lanes before signals, served in part by a stage, and served whole by none."""
-        lanes, split, whole = set[str](), set[str](), set[str]()
-        for signal in signals:
-            lanes |= {lane_id(link) for link in signal.links} & self._cars
-            for number in stages_of(signal):
-                for lane, part in self._served(signal, signal.phases[number].state).items():
-                    (whole if part >= WHOLE else split).add(lane)
-        return len(lanes), len(split), len(split - whole)
+                apart.append(
+                    {
+                        self.lane_number[lane_id(link)]: SATURATION[state[link.index]]
+                        for link in signal.others
+                        if state[link.index] in GREEN and lane_id(link) not in self._cars
+                    }
+                )
+        self.gain, self.apart = _sparse(rows, len(self.movements)), _sparse(apart, len(self.lanes))
+        self.shared = len(lanes), len(split), len(split - whole)
 
     def _served(self, signal: Signal, state: str) -> dict[str, float]:
         """Return lane -> share of its vehicles that have green in `state`."""
@@ -431,21 +427,6 @@ class Roads:
             for before, part in self._arriving(last, length).items():
                 queue |= {self.lane_number[lane]: share * part for lane in self._city.lane_ids[before]}
         return queue
-
-    def apart(self, signals: Iterable[Signal]) -> csr_array:
-        """Return (S, L) saturation flows [lanes] of lanes in stages, on streets closed to cars."""
-        rows = []
-        for signal in signals:
-            for number in stages_of(signal):
-                state = signal.phases[number].state
-                rows.append(
-                    {
-                        self.lane_number[lane_id(link)]: 1.0 if state[link.index] == "G" else PERMISSIVE
-                        for link in signal.others
-                        if state[link.index] in GREEN and lane_id(link) not in self._cars
-                    }
-                )
-        return _sparse(rows, len(self.lanes))
 
     def watched(self, link: Link) -> set[int]:
         """Return the lanes (numbers) whose vehicles may wait for a link: its own, and those behind a short road."""
@@ -483,19 +464,17 @@ class Roads:
     def _upstream(self, edge: str) -> str | None:
         """Return the edge before if the road only gets turn lanes here."""
         before = self._before[edge]
-        if len(before) == 1 and len(self._city.successors[before[0]]) == 1 and before[0] not in self._links:
-            return before[0]
-        return None
+        alone = len(before) == 1 and len(self._city.successors[before[0]]) == 1 and before[0] not in self._links
+        return before[0] if alone else None
 
-    def _chain(self, edge: str) -> list[str]:
-        """Return the edges of a road from `edge` to the next signal or fork."""
+    def _end(self, edge: str) -> str:
+        """Return the last edge of a road from `edge` to the next signal or fork."""
         chain = [edge]
-        while chain[-1] not in self._links:
-            after = self._city.successors[chain[-1]]
-            if len(after) != 1 or self._upstream(after[0]) != chain[-1] or after[0] in chain:
+        while (after := self._city.successors[chain[-1]]) and self._upstream(after[0]) == chain[-1]:
+            if after[0] in chain:
                 break
             chain.append(after[0])
-        return chain
+        return chain[-1]
 
 
 def _sparse(rows: list[dict[int, float]], columns: int) -> csr_array:
