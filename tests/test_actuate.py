@@ -14,16 +14,22 @@ def programme(phases, position=0.0):
     )
 
 
+def gateway_signal(phases, movements, position=0.0):
+    """A fixed-time signal, and the states that it will show."""
+    shown = []
+    signal = GatewaySignal(programme(phases, position), movements, start=0.0, show=lambda _, state: shown.append(state))
+    return signal, shown
+
+
 def play(phases, movements, commands, *, position=0.0, interval=90):
     """The state of every second, under a new command (R, R) every `interval` seconds."""
-    signal = GatewaySignal(programme(phases, position), movements, start=0.0)
-    states, shown = [], ""
+    signal, shown = gateway_signal(phases, movements, position)
+    states = []
     for second in range(len(commands) * interval):
         if second % interval == 0:
             signal.command(commands[second // interval])
-        if second >= signal.next_change:
-            shown = signal.update(float(second))
-        states.append(shown)
+        signal.play(float(second))
+        states.append(shown[-1])
     return states
 
 
@@ -79,8 +85,10 @@ def test_a_link_that_is_never_red_is_held_once_per_cycle(position):
 
 def test_a_time_just_before_the_end_of_the_cycle_is_in_its_last_phase():
     """Sums of simulation steps are off by some rounding."""
-    signal = GatewaySignal(programme(SINGLE), {0: (0, 1)}, start=0.0)
-    assert signal.update(90.0 - 1e-7) == "ry" and signal.update(90.0) == "Gr"
+    signal, shown = gateway_signal(SINGLE, {0: (0, 1)})
+    signal.play(90.0 - 1e-7)
+    signal.play(90.0)
+    assert shown == ["ry", "Gr"]
 
 
 def test_every_window_of_a_link_keeps_its_minimum_green():
@@ -91,11 +99,11 @@ def test_every_window_of_a_link_keeps_its_minimum_green():
 
 def test_u_max_is_the_original_programme_to_the_fraction_of_a_second():
     phases = [("Gr", 42.4), ("yr", 3), ("rG", 41.6), ("ry", 3)]
-    signal = GatewaySignal(programme(phases), {0: (0, 1)}, start=0.0)
+    signal, _ = gateway_signal(phases, {0: (0, 1)})
     signal.command(np.ones((2, 2)))
     while signal.next_change < 270.0:
-        signal.update(signal.next_change)
-    assert signal.green_time()[0] == pytest.approx(3 * 42.4)
+        signal.play(signal.next_change)
+    assert signal.green_time()["s"][0] == pytest.approx(3 * 42.4)
 
 
 @pytest.mark.parametrize(

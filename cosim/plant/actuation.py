@@ -40,21 +40,22 @@ class Actuation:
         self._session, self._city, self._network, self._incidents = session, city, network, incidents
         movements = gateway_movements(city)
         phases: dict[str, Sequence[Phase]] = {}  # original ones of the signals that are commanded
-        self._pressure = None
+        self._pressure, show = None, incidents.show
+        self._controls: list[MaxPressure | GatewaySignal | ResponsiveSignal] = []
         if flows is not None:
             cyclic = settings.signals == CYCLIC
-            self._pressure = MaxPressure(session, city, steered, flows, show=incidents.show, cyclic=cyclic)
+            self._pressure = MaxPressure(session, city, steered, flows, show=show, cyclic=cyclic)
+            self._controls.append(self._pressure)
             phases = {signal.id: signal.phases for signal in steered if signal.id in movements}
         left = {*phases, *settings.leave_signals}
         own = [session.programme(signal) for signal in sorted(movements) if signal not in left]
-        self._fixed = [GatewaySignal(plan, movements[plan.signal], start=session.time) for plan in own if plan.static]
-        self._responsive = [
-            ResponsiveSignal(session, plan, movements[plan.signal], show=incidents.show, release=incidents.release)
-            for plan in own
-            if plan.actuated
-        ]
-        self._gates: list[GatewaySignal | ResponsiveSignal] = [*self._fixed, *self._responsive]
-        phases |= {signal.signal: signal.phases for signal in self._gates}
+        for plan in own:
+            links = movements[plan.signal]
+            if plan.static:
+                self._controls.append(GatewaySignal(plan, links, start=session.time, show=show))
+            elif plan.actuated:
+                self._controls.append(ResponsiveSignal(session, plan, links, show=show, release=incidents.release))
+        phases |= {plan.signal: plan.phases for plan in own if plan.static or plan.actuated}
         self._commanded: Collection[str] = phases.keys()
         self.original_green = _programmed_green(city, phases, step)
         self.states: dict[str, list[tuple[float, str]]] = {signal: [] for signal in session.signals()}
@@ -63,21 +64,14 @@ class Actuation:
         """Set u (R, R) [-] of the control interval that begins."""
         network = self._network
         share = np.clip((perimeter - network.u_min) / (network.u_max - network.u_min), 0.0, 1.0)
-        if self._pressure is not None:
-            self._pressure.command(share)
-        for signal in self._gates:
-            signal.command(share)
+        for control in self._controls:
+            control.command(share)
 
     def play(self) -> None:
         """Set all states from now on."""
         now = self._session.time
-        if self._pressure is not None:
-            self._pressure.play(now)
-        for signal in self._fixed:
-            if now >= signal.next_change - 1e-6:
-                self._incidents.show(signal.signal, signal.update(now))
-        for responsive in self._responsive:
-            responsive.play(now)
+        for control in self._controls:
+            control.play(now)
         self._incidents.play(now)
 
     def observe(self) -> None:
@@ -90,8 +84,7 @@ class Actuation:
 
     def green_time(self) -> PerGateway:
         """Return (G,) [s] of green so far per gateway, mean of its links; NaN where no command arrives."""
-        green = {} if self._pressure is None else self._pressure.green_time()
-        green |= {signal.signal: signal.green_time() for signal in self._gates}
+        green = {signal: times for control in self._controls for signal, times in control.green_time().items()}
         return np.array(
             [
                 sum(green[g.signal][link] for link in g.links) / len(g.links) if g.signal in green else np.nan

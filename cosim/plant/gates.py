@@ -22,20 +22,17 @@ from nmfd.arrays import PerPair
 MIN_GREEN_S = 5.0  # of a gateway link, and of every stage under max-pressure
 DEFAULT_YELLOW_S = 3.0  # where the original programme has none after a green
 NEVER = float("inf")
+Movements = Mapping[int, tuple[int, int]]  # index of a gateway link -> (i, h)
+Show = Callable[[str, str], None]  # (signal, state): sets the state
 
 
 class GatewaySignal:
-    """A fixed-time signal with gateway links.
+    """A fixed-time signal with gateway links. next_change: time of the next change of its state [s]"""
 
-    signal, phases: of the original programme; next_change: time of the next `update` [s]
-    """
-
-    def __init__(self, programme: Programme, movements: Mapping[int, tuple[int, int]], *, start: float):
-        """movements: link index -> (i, h); start: simulation time at which the programme was read [s]"""
-        self.signal, self.phases = programme.signal, programme.phases
-        self._movements = {link: _Movement(pair) for link, pair in movements.items()}
-        self._windows = {link: _windows(programme, link) for link in movements}
-        self._yellow = {link: yellow_time(programme.phases, link) for link in movements}
+    def __init__(self, programme: Programme, movements: Movements, *, start: float, show: Show):
+        """start: simulation time at which the programme was read [s]"""
+        self._signal, self._phases, self._show = programme.signal, programme.phases, show
+        self._movements = {link: _Movement(pair, programme, link) for link, pair in movements.items()}
         self._cycle, self._cycle_start = programme.cycle, start - programme.position
         self._ends = list(accumulate(phase.duration for phase in programme.phases))
         self._shown, self._since, self.next_change = "", start, start
@@ -45,35 +42,37 @@ class GatewaySignal:
         for movement in self._movements.values():
             movement.share = float(share[movement.pair])
 
-    def update(self, now: float) -> str:
-        """Return the state from `now` [s] on; call at every `next_change`."""
+    def play(self, now: float) -> None:
+        """Set the state from `now` [s] on."""
+        if now < self.next_change - 1e-6:
+            return
         for link, movement in self._movements.items():
             if self._shown and self._shown[link] in GREEN:
                 movement.green_time += now - self._since
         while now >= self._cycle_start + self._cycle:
             self._cycle_start += self._cycle
         phase = min(bisect_right(self._ends, now - self._cycle_start + 1e-6), len(self._ends) - 1)
-        shown, self.next_change = list(self.phases[phase].state), self._cycle_start + self._ends[phase]
+        shown, self.next_change = list(self._phases[phase].state), self._cycle_start + self._ends[phase]
         for link, movement in self._movements.items():
-            shown[link], change = self._filter(link, movement, shown[link], phase, now)
+            shown[link], change = self._filter(movement, shown[link], phase, now)
             self.next_change = min(self.next_change, change)
         self._shown, self._since = "".join(shown), now
-        return self._shown
+        self._show(self._signal, self._shown)
 
-    def green_time(self) -> dict[int, float]:
-        """Return the green of every gateway link up to the last update [s]."""
-        return {link: movement.green_time for link, movement in self._movements.items()}
+    def green_time(self) -> dict[str, dict[int, float]]:
+        """Return signal -> gateway link -> green up to the last change [s]."""
+        return {self._signal: {link: movement.green_time for link, movement in self._movements.items()}}
 
-    def _filter(self, link: int, movement: "_Movement", base: str, phase: int, now: float) -> tuple[str, float]:
+    def _filter(self, movement: "_Movement", base: str, phase: int, now: float) -> tuple[str, float]:
         """Return the light of a link instead of `base`, and the time of its next change [s]."""
-        full = self._windows[link].get(phase, 0.0)
+        full = movement.windows.get(phase, 0.0)
         always = full >= self._cycle  # a link without red: its window is the cycle
         if base in GREEN:
             if not movement.open or (always and now - movement.opened_at >= self._cycle - 1e-6):
                 movement.open, movement.cut_at = True, NEVER
                 if self._shown:  # the window during which control starts is left whole
                     least = min(MIN_GREEN_S, full)
-                    most = full - self._yellow[link] if always else full  # its yellow ends with the cycle
+                    most = full - movement.yellow if always else full  # its yellow ends with the cycle
                     kept = full if movement.share >= 1.0 else min(least + round(movement.share * (full - least)), most)
                     movement.opened_at, movement.cut_at = now, now + kept
             if now < movement.cut_at:
@@ -85,26 +84,23 @@ class GatewaySignal:
                 return base, NEVER
             if now < movement.cut_at:
                 return base, NEVER
-        red_at = movement.cut_at + self._yellow[link]
+        red_at = movement.cut_at + movement.yellow
         return ("y", red_at) if now < red_at else ("r", NEVER)
 
 
 class _Movement:
-    """State of a gateway link between two updates."""
+    """State of a gateway link between two changes.
 
-    def __init__(self, pair: tuple[int, int]):
+    windows: phase -> length [s] of the green window that begins there, which may pass the cycle's end
+    """
+
+    def __init__(self, pair: tuple[int, int], programme: Programme, link: int):
         self.pair, self.green_time, self.share = pair, 0.0, 1.0
+        phases, self.yellow = programme.phases, yellow_time(programme.phases, link)
+        green = [phase.state[link] in GREEN for phase in phases]
+        starts = [n for n in range(len(phases)) if green[n] and not green[n - 1]]
+        self.windows = {0: programme.cycle} if all(green) else {n: run_length(phases, n, link, GREEN) for n in starts}
         self.open, self.opened_at, self.cut_at = False, -NEVER, NEVER
-
-
-def _windows(programme: Programme, link: int) -> dict[int, float]:
-    """Return phase -> length [s] of the green window of a link that begins there; it may pass the cycle's end."""
-    phases = programme.phases
-    green = [phase.state[link] in GREEN for phase in phases]
-    if all(green):
-        return {0: programme.cycle}
-    starts = [n for n in range(len(phases)) if green[n] and not green[n - 1]]
-    return {n: run_length(phases, n, link, GREEN) for n in starts}
 
 
 def yellow_time(phases: Sequence[Phase], link: int) -> float:
@@ -215,23 +211,18 @@ class ResponsiveSignal:
         self,
         session: Session,
         programme: Programme,
-        movements: Mapping[int, tuple[int, int]],
+        movements: Movements,
         *,
-        show: Callable[[str, str], None],
+        show: Show,
         release: Callable[[str, str], None],
     ):
-        """movements: link index -> (i, h); show(signal, state), release(signal, programme): see Incidents"""
-        self.signal, self.phases, self._programme = programme.signal, programme.phases, programme.id
+        """release(signal, programme): see Incidents"""
+        self._signal, self._phases, self._programme = programme.signal, programme.phases, programme.id
         self._session, self._show, self._release = session, show, release
         phases, start = programme.phases, session.time
+        full = {link: sum(p.duration for p in phases if p.state[link] in GREEN) for link in movements}
         self._rations = {
-            link: Ration(
-                pair,
-                cycle=programme.cycle,
-                full=sum(p.duration for p in phases if p.state[link] in GREEN),
-                yellow=yellow_time(phases, link),
-                start=start,
-            )
+            link: Ration(pair, cycle=programme.cycle, yellow=yellow_time(phases, link), start=start, full=full[link])
             for link, pair in movements.items()
         }
         self._least = least_times(phases)
@@ -247,7 +238,7 @@ class ResponsiveSignal:
 
     def play(self, now: float) -> None:
         """Set the state from `now` [s] on, or leave the signal to SUMO."""
-        session, signal = self._session, self.signal
+        session, signal = self._session, self._signal
         base = session.state_underneath(signal, self._programme) if self._held else session.signal_state(signal)
         if base == self._base and now < self._next - 1e-6:
             return
@@ -267,21 +258,22 @@ class ResponsiveSignal:
         elif self._held or self._limited:
             self._hold("".join(shown), now)
 
-    def green_time(self) -> dict[int, float]:
-        """Return the green of every gateway link so far [s]."""
-        return {link: ration.green_time(self._session.time) for link, ration in self._rations.items()}
+    def green_time(self) -> dict[str, dict[int, float]]:
+        """Return signal -> gateway link -> green so far [s]."""
+        now = self._session.time
+        return {self._signal: {link: ration.green_time(now) for link, ration in self._rations.items()}}
 
     def _hold(self, state: str, now: float) -> None:
         """Show `state` from the first limit on; give the signal back to SUMO in the midst of a stage after the last."""
         # A stage that has just begun could end too early, one step behind SUMO.
-        least = [time for phase, time in zip(self.phases, self._least, strict=True) if phase.state == state]
+        least = [time for phase, time in zip(self._phases, self._least, strict=True) if phase.state == state]
         limited = self._limited or any(ration.limited for ration in self._rations.values())
         ends = not limited and state == self._base and is_stage(state)
         again = self._since + max(MIN_GREEN_S, *least, 0.0) if ends else NEVER
         self._held = now < again - 1e-6
         if self._held:
-            self._show(self.signal, state)
+            self._show(self._signal, state)
         else:
             again = NEVER
-            self._release(self.signal, self._programme)
+            self._release(self._signal, self._programme)
         self._next = min(self._next, again)

@@ -25,7 +25,7 @@ from itertools import permutations
 import numpy as np
 from scipy.sparse import csr_array
 
-from cosim.plant.gates import MIN_GREEN_S, NEVER, Ration, ends_bare, run_length, yellow_time
+from cosim.plant.gates import MIN_GREEN_S, NEVER, Movements, Ration, Show, ends_bare, run_length, yellow_time
 from cosim.sumo.net import City, gateway_movements
 from cosim.sumo.session import Phase, Session
 from cosim.sumo.signals import GREEN, Link, Signal, is_stage, lane_id
@@ -60,10 +60,10 @@ class MaxPressure:
         signals: Sequence[Signal],
         flows: Mapping[tuple[str, str], float],
         *,
-        show: Callable[[str, str], None],
+        show: Show,
         cyclic: bool = False,
     ):
-        """flows: (edge, next edge) -> flow, any unit; show(signal, state): sets the state of a signal"""
+        """flows: (edge, next edge) -> flow, any unit"""
         self._session, self._show, self._cyclic = session, show, cyclic
         roads = Roads(city, signals, flows)
         self._roads, self._start = roads, session.time
@@ -150,8 +150,8 @@ class Junction:
     lost: [s] between stages so far; next_change: time of the next `advance` [s]
     """
 
-    def __init__(self, signal: Signal, now: float, gateways: Mapping[int, tuple[int, int]] | None = None):
-        """gateways: link index -> (i, h), of links whose green is rationed"""
+    def __init__(self, signal: Signal, now: float, gateways: Movements | None = None):
+        """gateways: links whose green is rationed"""
         self.signal, self._phases, self._numbers = signal.id, signal.phases, stages_of(signal)
         self.stages, self.stage, phases = len(self._numbers), 0, signal.phases
         crossed = {k: max(run_length(phases, n, k, GREEN) for n in range(len(phases))) for k in ends_bare(phases)}

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from xml.etree.ElementTree import Element, ElementTree
+from xml.etree.ElementTree import Element, ElementTree, SubElement
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -66,9 +66,8 @@ def city_signals(city: City, scenario: Scenario, settings: Settings) -> CitySign
             f"{city.net_file}: sumo.signals: {settings.signals} needs {'' if pressure else 'fixed-time '}signals "
             f"with several green phases, but none of the {len(others)} signals here is one; choose fixed"
         )
-    kept = set()
-    if settings.gateways_fixed and settings.signals == ACTUATED:
-        kept = {gateway.signal for gateway in city.gateways}
+    fixed = settings.gateways_fixed and settings.signals == ACTUATED
+    kept = {gateway.signal for gateway in city.gateways if fixed}
     return CitySignals(simple=simple, steered=[signal for signal in simple if signal.id not in kept], others=others)
 
 
@@ -77,19 +76,16 @@ def write_actuated(path: Path, signals: Iterable[Signal]) -> None:
 
     A stage lasts up to 1.5 times its fixed time: in congestion, the shares of the green are those of the programme.
     """
-    rows = ["<additional>\n"]
+    root = Element("additional")
     for signal in signals:
-        rows.append(
-            f'  <tlLogic id={quoteattr(signal.id)} type="actuated" programID="plan" offset="{signal.offset:g}">\n'
-        )
+        about = {"id": signal.id, "type": "actuated", "programID": "plan", "offset": f"{signal.offset:g}"}
+        logic = SubElement(root, "tlLogic", about)
         for n, (phase, low) in enumerate(zip(signal.phases, least_times(signal.phases), strict=True)):
-            fixed, limits = phase.duration, ""
-            high = max(min(1.5 * fixed, ACTUATED_MAX_GREEN_S), MIN_GREEN_S, low)
+            row = SubElement(logic, "phase", duration=f"{phase.duration:g}", state=phase.state)
+            high = max(min(1.5 * phase.duration, ACTUATED_MAX_GREEN_S), MIN_GREEN_S, low)
             if n in signal.stages and low != high:
-                limits = f' minDur="{low:g}" maxDur="{high:g}"'
-            rows.append(f'    <phase duration="{fixed:g}"{limits} state="{phase.state}"/>\n')
-        rows.append("  </tlLogic>\n")
-    path.write_text("".join([*rows, "</additional>\n"]), encoding="utf-8")
+                row.attrib |= {"minDur": f"{low:g}", "maxDur": f"{high:g}"}
+    ElementTree(root).write(path)
 
 
 def optimised_plans(
@@ -111,25 +107,16 @@ def optimised_plans(
     cycles, offsets = (folder / f"webster-{key[:16]}-{kind}.add.xml" for kind in ("cycles", "offsets"))
     if cycles.is_file() and offsets.is_file():
         return [cycles, offsets]
-    unified = ("-u", "-y", "3", "-p", "webster", f"--skip={','.join(others)}")
+    network, unified = str(city.net_file.resolve()), ("-u", "-y", "3", "-p", "webster", f"--skip={','.join(others)}")
     with temporary_folder() as scratch:
         (scratch / "routes.xml").write_bytes(routes)
         for tool, output, options in (
             ("tlsCycleAdaptation.py", "cycles.xml", unified),
             ("tlsCoordinator.py", "offsets.xml", ("-a", "cycles.xml")),
         ):
-            program = Path(sumo.SUMO_HOME) / "tools" / tool
-            command = [
-                sys.executable,
-                str(program),
-                "-n",
-                str(city.net_file.resolve()),
-                "-r",
-                "routes.xml",
-                "-o",
-                output,
-            ]
-            result = subprocess.run([*command, *options], cwd=scratch, capture_output=True, text=True, check=False)
+            program = str(Path(sumo.SUMO_HOME) / "tools" / tool)
+            command = [sys.executable, program, "-n", network, "-r", "routes.xml", "-o", output, *options]
+            result = subprocess.run(command, cwd=scratch, capture_output=True, text=True, check=False)
             if result.returncode:
                 words = (result.stderr.strip() or "no message").splitlines()[-1]
                 raise InputError(f"{city.net_file}: {tool} cannot plan its signals ({words}); choose other signals")

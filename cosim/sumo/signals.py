@@ -1,6 +1,7 @@
 """Signals as the network file and additional files describe them."""
 
 import xml.etree.ElementTree as ElementTree
+from collections import defaultdict
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -63,28 +64,18 @@ def read_signals(
     several programmes the last one counts, as in SUMO: first those of the network file, then of `additional` files.
     """
     root = read_xml(city.net_file)
-    links: dict[str, list[Link]] = {}
-    closed: dict[str, list[Link]] = {}
+    links, closed = defaultdict[str, list[Link]](list), defaultdict[str, list[Link]](list)
     for connection in root.iter("connection"):
         source, target = attribute(connection, "from"), attribute(connection, "to")
         signal = connection.get("tl")
         if signal is not None and not source.startswith(":"):  # those are pedestrian crossings
-            is_open = source in city.lanes and target in city.lanes
-            (links if is_open else closed).setdefault(signal, []).append(
-                Link(
-                    index=int(attribute(connection, "linkIndex")),
-                    from_edge=source,
-                    lane=int(attribute(connection, "fromLane")),
-                    to_edge=target,
-                )
-            )
+            index, lane = int(attribute(connection, "linkIndex")), int(attribute(connection, "fromLane"))
+            link = Link(index=index, from_edge=source, lane=lane, to_edge=target)
+            (links if source in city.lanes and target in city.lanes else closed)[signal].append(link)
     logics = {
         attribute(logic, "id"): logic for file in (root, *map(read_xml, additional)) for logic in file.iter("tlLogic")
     }
-    signals = {
-        name: _simple(logic, tuple(links.get(name, ())), tuple(closed.get(name, ())), kinds)
-        for name, logic in sorted(logics.items())
-    }
+    signals = {name: _simple(logic, links[name], closed[name], kinds) for name, logic in sorted(logics.items())}
     return [signal for signal in signals.values() if signal], [name for name, s in signals.items() if s is None]
 
 
@@ -95,14 +86,12 @@ def phases_of(logic: ElementTree.Element) -> tuple[Phase, ...]:
 
 
 def _simple(
-    logic: ElementTree.Element, links: tuple[Link, ...], others: tuple[Link, ...], kinds: Collection[str]
+    logic: ElementTree.Element, links: Iterable[Link], others: Iterable[Link], kinds: Collection[str]
 ) -> Signal | None:
-    rows = list(logic.iter("phase"))
-    if logic.get("type", FIXED) not in kinds or any(row.get("next") for row in rows) or not links:
+    ordered = logic.get("type", FIXED) in kinds and not any(row.get("next") for row in logic.iter("phase"))
+    if not ordered or not links:
         return None
-    phases = phases_of(logic)
-    signal = Signal(
-        id=attribute(logic, "id"), offset=float(logic.get("offset", 0.0)), phases=phases, links=links, others=others
-    )
+    name, offset, phases = attribute(logic, "id"), float(logic.get("offset", 0.0)), phases_of(logic)
+    signal = Signal(id=name, offset=offset, phases=phases, links=tuple(links), others=tuple(others))
     plain = set("".join(phase.state for phase in phases)) <= set("Ggyr")
     return signal if plain and len(signal.stages) > 1 else None
