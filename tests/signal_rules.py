@@ -1,6 +1,7 @@
 """What the signals of a junction must keep to under any command, and two programmes to try it on."""
 
 import itertools
+from collections import defaultdict
 from xml.etree import ElementTree
 
 from cosim.evaluation.signal_proof import VIOLATIONS, Rules
@@ -35,6 +36,19 @@ def runs(states, link):
     """[(character class, seconds)] of one link: G for any green."""
     text = "".join("G" if s[link] in "Gg" else s[link] for s in states)
     return [(key, len(list(group))) for key, group in itertools.groupby(text)]
+
+
+def watched(plant):
+    """The states of every signal, one per simulation step from now on."""
+    session, shown, step = plant.session, defaultdict(list), plant.session.step
+
+    def watch():
+        step()
+        for name in session.signals():
+            shown[name].append(session.signal_state(name))
+
+    session.step = watch
+    return shown
 
 
 def rules(phases, crossings=()):

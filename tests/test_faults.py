@@ -171,7 +171,7 @@ def test_a_signal_that_does_not_obey_is_safe(city, signals, gateway):
     """Second by second its own programme, with yellow before and after."""
     plant = SumoPlant(city)
     gateways = {gateway.signal for gateway in plant.city.gateways}
-    name = next(one.id for one in plant.simple_signals if (one.id in gateways) == gateway)
+    name = next(one.id for one in plant.steered if (one.id in gateways) == gateway)
     plant.reset(0)
     own = [phase.state for phase in plant.session.programme(name).phases for _ in range(round(phase.duration))]
     plant.close()

@@ -45,11 +45,8 @@ class Streets:
 @pytest.mark.parametrize(
     "standing, room, expected",
     [
-        (
-            {"first": 130.0, "second": 150.0, "third": 200.0},
-            (50.0, 50.0),
-            {"first": "a_0", "third": "b_0"},
-        ),  # one per lane
+        # One per lane.
+        ({"first": 130.0, "second": 150.0, "third": 200.0}, (50.0, 50.0), {"first": "a_0", "third": "b_0"}),
         ({"first": 130.0, "second": 20.0}, (50.0, 0.0), {"first": "a_0"}),  # who has just come is not asked
         ({"first": 130.0, "second": 130.0}, (50.0, 9.0), {}),  # one street behind is full: a real lock
         ({"first": JUNCTION_PATIENCE_S - 1.0}, (50.0, 50.0), {}),

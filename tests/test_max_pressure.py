@@ -159,12 +159,7 @@ def test_a_short_piece_before_the_signal_is_not_all_of_the_queue(length, weight)
 def test_who_waits_behind_a_piece_too_short_to_be_seen_on_is_seen():
     """A vehicle stands on x, before the 5 m of a, where a detector would find nobody: it gets its green."""
     town = SimpleNamespace(**{**vars(TOWN), "length": {**TOWN.length, "a": 5.0}})
-    session = SimpleNamespace(time=0.0, lane_vehicles=lambda lane: {"x": 1.0, "c": 9.0}.get(lane[0], 0.0))
-    shown = []
-    control = MaxPressure(session, town, [CROSSING], FLOWS, show=lambda name, state: shown.append(state))
-    for _ in range(120):
-        control.play(session.time)
-        session.time += 1.0
+    shown = [state for _, state in shown_by(CROSSING, {"x": 1.0, "c": 9.0}, 120, town=town)]
     assert shown.count("rG") == 2 and shown.count("Gr") >= 2
 
 
@@ -213,16 +208,12 @@ def junctions():
 
 def shown_by(crossing, vehicles, seconds, *, town=TOWN, **options):
     """(time, state) of all that max-pressure shows at one signal, with so many vehicles on every lane of an edge."""
-    session = SimpleNamespace(time=0.0, lane_vehicles=lambda lane: vehicles.get(lane.partition("_")[0], 0.0))
-    shown = []
-    control = MaxPressure(
-        session,
-        town,
-        [crossing],
-        FLOWS,
-        show=lambda name, state: shown.append((session.time, state)),
-        **options,
-    )
+    session, shown = SimpleNamespace(time=0.0, lane_vehicles=lambda lane: vehicles.get(lane[0], 0.0)), []
+
+    def show(name, state):
+        shown.append((session.time, state))
+
+    control = MaxPressure(session, town, [crossing], FLOWS, show=show, **options)
     for _ in range(seconds):
         control.play(session.time)
         session.time += 1.0
@@ -248,20 +239,8 @@ def test_stages_keep_their_order_if_cyclic(cyclic, order):
     three = signal(phases, (link(0, "a", "b"), link(1, "c", "d"), link(2, "x", "e")), "s")
     after = {**AFTER, "x": ("e",)}
     town = SimpleNamespace(**{**vars(TOWN), "successors": after})
-    session = SimpleNamespace(time=0.0, lane_vehicles=lambda lane: {"a": 1.0, "c": 0.5, "x": 9.0}.get(lane[0], 0.0))
-    shown = []
-    control = MaxPressure(
-        session,
-        town,
-        [three],
-        {},
-        cyclic=cyclic,
-        show=lambda name, state: shown.append(state),
-    )
-    for _ in range(110):
-        control.play(session.time)
-        session.time += 1.0
-    assert [state.index("G") for state in shown if "G" in state][1:4] == order
+    shown = shown_by(three, {"a": 1.0, "c": 0.5, "x": 9.0}, 110, town=town, cyclic=cyclic)
+    assert [state.index("G") for _, state in shown if "G" in state][1:4] == order
 
 
 def test_who_waits_too_long_comes_first(monkeypatch):

@@ -10,7 +10,7 @@ import pytest
 import tiny
 import tiny_city
 from commands import cosim
-from signal_rules import MIN_GREEN
+from signal_rules import MIN_GREEN, watched
 
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
@@ -34,15 +34,7 @@ def imported(folder, name, *options, signals):
     tiny_city.network(folder, *signals)
     (folder / "cars.rou.xml").write_text(CARS)
     (folder / "city.sumocfg").write_text(CONFIG)
-    done = cosim(
-        "import",
-        folder / "city.sumocfg",
-        "--regions",
-        2,
-        "--out",
-        folder / "networks" / name,
-        *options,
-    )
+    done = cosim("import", folder / "city.sumocfg", "--regions", 2, "--out", folder / "networks" / name, *options)
     assert done.exit_code == 0, done.output + str(done.exception)
     return folder / "scenarios" / name
 
@@ -69,14 +61,7 @@ def drive(folder, gates, faults=(), **overrides):
     plant = SumoPlant(scenario, settings=settings(scenario).changed(**overrides))
     try:
         plant.reset(1)
-        session, shown, step = plant.session, {}, plant.session.step
-
-        def watch():
-            step()
-            for name in session.signals():
-                shown.setdefault(name, []).append(session.signal_state(name))
-
-        session.step = watch
+        shown = watched(plant)
         for gate in gates:
             plant.step(Controls(perimeter=np.where(scenario.network.adjacency, gate, 0.0), splits=None))
         return SimpleNamespace(
@@ -84,7 +69,7 @@ def drive(folder, gates, faults=(), **overrides):
             record=SimpleNamespace(**plant.record()),
             leaks=plant.leaks(),
             gateways=plant.city.gateways,
-            programmes={name: session.programme_id(name) for name in shown},
+            programmes={name: plant.session.programme_id(name) for name in shown},
         )
     finally:
         plant.close()

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import libsumo
 import numpy as np
 import pytest
-from signal_rules import MIN_GREEN
+from signal_rules import MIN_GREEN, watched
 
 from cosim.plant.max_pressure import Roads
 from cosim.plant.plant import SumoPlant
@@ -69,19 +69,10 @@ def driven(scenario):
 def drive(plant, scenario, intervals, seed=1, u=0.9):
     """States of every signal, second by second, under u at all gateways; the network's own programmes; the record."""
     plant.reset(seed)
-    session, shown = plant.session, {}
-    step = session.step
-
-    def watch():
-        step()
-        for name in session.signals():
-            shown.setdefault(name, []).append(session.signal_state(name))
-
-    session.step = watch
-    network = scenario.network
+    shown, network = watched(plant), scenario.network
     for _ in range(intervals):
         plant.step(Controls(perimeter=np.where(network.adjacency, u, 0.0), splits=None))
-    return shown, {s.id: s for s in plant.simple_signals}, SimpleNamespace(**plant.record())
+    return shown, {s.id: s for s in plant.steered}, SimpleNamespace(**plant.record())
 
 
 def test_signals_of_the_city(city):

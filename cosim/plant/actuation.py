@@ -1,6 +1,6 @@
 """The signals of one run: commands to states, by perimeter control and max-pressure."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -56,7 +56,6 @@ class Actuation:
             elif plan.actuated:
                 self._controls.append(ResponsiveSignal(session, plan, links, show=show, release=incidents.release))
         phases |= {plan.signal: plan.phases for plan in own if plan.static or plan.actuated}
-        self._commanded: Collection[str] = phases.keys()
         self.original_green = _programmed_green(city, phases, step)
         self.states: dict[str, list[tuple[float, str]]] = {signal: [] for signal in session.signals()}
 
@@ -105,15 +104,14 @@ class Actuation:
 
     def leaks(self) -> list[Gateway]:
         """Return the gateways that no command reaches."""
-        return [gateway for gateway in self._city.gateways if gateway.signal not in self._commanded]
+        return [self._city.gateways[n] for n in np.flatnonzero(np.isnan(self.original_green))]
 
 
 def _programmed_green(city: City, phases: Mapping[str, Sequence[Phase]], step: float) -> PerGateway:
     """Return (G,) [s] of green per control interval `step` [s]; NaN without phases."""
     green = np.full(len(city.gateways), np.nan)
     for n, gateway in enumerate(city.gateways):
-        plan = None if gateway.signal is None else phases.get(gateway.signal)
-        if plan is not None:
+        if plan := phases.get(gateway.signal or ""):
             lasting = [phase.duration * (phase.state[link] in GREEN) for phase in plan for link in gateway.links]
             green[n] = sum(lasting) / len(gateway.links) * step / sum(phase.duration for phase in plan)
     return green

@@ -6,13 +6,14 @@ from functools import cached_property
 from pathlib import Path
 
 from cosim.plant.detectors import Layout, write_loops
-from cosim.plant.programmes import CitySignals, optimised_plans, write_actuated
+from cosim.plant.programmes import optimised_plans, write_actuated
 from cosim.plant.settings import ACTUATED, ESTIMATE, WEBSTER, Settings, own_files
 from cosim.sumo import outputs
 from cosim.sumo import recorded_trips as recorded
 from cosim.sumo.net import City
 from cosim.sumo.recorded_trips import RecordedTrips
 from cosim.sumo.session import Session
+from cosim.sumo.signals import Signal
 from cosim.sumo.trips import PLANNING_SEEDS, HeldTrips, held, make_trips, turning_flows, write_trips
 from cosim.sumo.xml_files import file_list
 from nmfd.errors import InputError
@@ -46,7 +47,7 @@ class Launch:
         scenario: Scenario,
         settings: Settings,
         city: City,
-        signals: CitySignals,
+        signals: tuple[list[Signal], list[str]],
         layout: Layout,
         *,
         outputs: Mapping[str, Path],
@@ -104,12 +105,13 @@ class Launch:
     def _additional(self) -> list[Path]:
         """Return the additional files in SUMO's order of reading: the last programme of a signal runs."""
         scenario, settings, folder = self._scenario, self._settings, self._folder
+        steered, others = self._signals
         additional = own_files(scenario, settings.additional)
         if settings.signals == WEBSTER:
-            additional += optimised_plans(scenario, self._city, self._signals.others, self._planning_trips())
+            additional += optimised_plans(scenario, self._city, others, self._planning_trips())
         if settings.signals == ACTUATED:
             additional.append(folder / "actuated.add.xml")
-            write_actuated(additional[-1], self._signals.steered)
+            write_actuated(additional[-1], steered)
         if settings.measurement == ESTIMATE:
             additional.append(folder / "loops.add.xml")
             write_loops(self._city, self._layout, scenario.step, additional[-1])

@@ -167,7 +167,6 @@ class Junction:
         }
         self.movement = {link.index: (link.from_edge, link.to_edge) for link in signal.links}
         self._coming: list[tuple[float, str]] = []
-        self._between: dict[tuple[int, int], list[Phase]] = {}  # stage, next stage -> phases between them
         self.lost, self._base = 0.0, phases[self._numbers[0]].state
         self.state = self._base
         self.next_change = now if self.rations else NEVER  # until then, commands hold from the first second on
@@ -197,10 +196,7 @@ class Junction:
         return sum(phase.duration for phase in self._way(stage))
 
     def _way(self, stage: int) -> list[Phase]:
-        change = self.stage, stage
-        if change not in self._between:
-            self._between[change] = transition(self._phases, *(self._numbers[n] for n in change))
-        return self._between[change]
+        return transition(self._phases, self._numbers[self.stage], self._numbers[stage])
 
     def advance(self, now: float) -> str:
         """Return the state from `now` [s] on; call at every `next_change`."""
@@ -254,6 +250,7 @@ def clearance(phases: tuple[Phase, ...]) -> np.ndarray:
     return np.where(apart, np.where(direct < NEVER, direct, np.where(usual < NEVER, usual, 0.0)), 0.0)
 
 
+@lru_cache(maxsize=4096)
 def transition(phases: tuple[Phase, ...], source: int, target: int) -> list[Phase]:
     """Return the phases between two stages.
 

@@ -47,8 +47,7 @@ class Observer:
 class SumoPlant:
     """A SUMO simulation of the scenario's city (nmfd.types.Plant).
 
-    city: its edges, regions and gateways; simple_signals: signals that may run another programme; other_signals: names
-    of those that keep theirs
+    city: its edges, regions and gateways; steered, other_signals: see programmes.city_signals
     """
 
     def __init__(
@@ -75,10 +74,9 @@ class SumoPlant:
         check_adjacency(self.city, scenario.network)
         self._layout = lay_out(self.city, settings.detector_share)
         self._instruments = instruments(self.city, self._layout, settings.probe_share)
-        self._signals = city_signals(self.city, scenario, settings)
-        self.simple_signals, self.other_signals = self._signals.simple, self._signals.others
+        self.steered, self.other_signals = signals = city_signals(self.city, scenario, settings)
         self._launch = Launch(
-            scenario, settings, self.city, self._signals, self._layout, outputs=dict(outputs or {}), gui=gui
+            scenario, settings, self.city, signals, self._layout, outputs=dict(outputs or {}), gui=gui
         )
         self._session: Session | None = None
 
@@ -115,7 +113,7 @@ class SumoPlant:
         )
         flows = self._launch.turning_flows() if settings.signals in PRESSURES else None
         self._actuation = Actuation(
-            session, city, scenario.network, scenario.step, settings, self._signals.steered, self._incidents, flows
+            session, city, scenario.network, scenario.step, settings, self.steered, self._incidents, flows
         )
         self._junctions = None if settings.mesoscopic else Junctions(session, city)
         self._state = meter.state(0, 0.0)

@@ -5,7 +5,6 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from xml.etree.ElementTree import Element, ElementTree, SubElement
@@ -30,19 +29,6 @@ from nmfd.runs.files import temporary_folder, write_text
 ACTUATED_MAX_GREEN_S = 50.0  # netconvert's default
 
 
-@dataclass(frozen=True, kw_only=True)
-class CitySignals:
-    """The signals of a city by what may be done with them.
-
-    simple: may run another programme; steered: of these, all but gateways that stay fixed-time; others: names of those
-        that keep their own programme
-    """
-
-    simple: list[Signal]
-    steered: list[Signal]
-    others: list[str]
-
-
 def check_strategy(strategy: Strategy, scenario: Scenario, city: City) -> None:
     """Raise InputError, in a line that begins with the strategy, if it cannot run in this city."""
     try:
@@ -54,8 +40,11 @@ def check_strategy(strategy: Strategy, scenario: Scenario, city: City) -> None:
         raise InputError(f"controller {strategy.name} cannot run here: {error}") from None
 
 
-def city_signals(city: City, scenario: Scenario, settings: Settings) -> CitySignals:
-    """Return the signals of the city. Raises InputError if the programme of `settings` fits none."""
+def city_signals(city: City, scenario: Scenario, settings: Settings) -> tuple[list[Signal], list[str]]:
+    """Return the signals to run another programme, and the names of those that cannot.
+
+    Signals with gateways that stay fixed-time are in neither. Raises InputError if `settings.signals` fits none.
+    """
     pressure = settings.signals in PRESSURES
     kinds = HELD if pressure else (FIXED_TIME,)
     simple, others = read_signals(city, own_files(scenario, settings.additional), kinds)
@@ -68,7 +57,7 @@ def city_signals(city: City, scenario: Scenario, settings: Settings) -> CitySign
         )
     fixed = settings.gateways_fixed and settings.signals == ACTUATED
     kept = {gateway.signal for gateway in city.gateways if fixed}
-    return CitySignals(simple=simple, steered=[signal for signal in simple if signal.id not in kept], others=others)
+    return [signal for signal in simple if signal.id not in kept], others
 
 
 def write_actuated(path: Path, signals: Iterable[Signal]) -> None:
