@@ -14,8 +14,8 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from cosim.importing.case import seconds
 from cosim.sumo.arrays import EdgeMask, EdgeNumbers, PerEdge, Points
-from cosim.sumo.net import for_cars, size
-from cosim.sumo.xml_files import BROKEN, attribute, opened, read_xml
+from cosim.sumo.net import NORMAL, for_cars, size
+from cosim.sumo.xml_files import attribute, network_root, read_xml
 from nmfd.errors import InputError
 
 
@@ -114,36 +114,14 @@ class _Edge(NamedTuple):
 
 def read_streets(net: Path, additional: Iterable[Path] = ()) -> Streets:
     """Read a net.xml(.gz), and signal programmes of additional files, which replace those there. Raises InputError."""
-    rows: dict[str, _Edge] = {}
-    links: list[Mapping[str, str]] = []  # attributes of connections
-    roundabouts: list[list[str]] = []
-    logics: dict[str, Logic] = {}
-    try:
-        with opened(net) as stream:
-            events = ElementTree.iterparse(stream, events=("start", "end"))
-            (_, root), depth = next(events), 1
-            if root.tag != "net":
-                raise InputError(f"{net}: expected a SUMO network, got a file of <{root.tag}> instead")
-            left_hand = root.get("lefthand") == "true"
-            for event, element in events:
-                depth += 1 if event == "start" else -1
-                if event == "start" or depth != 1:
-                    continue
-                if element.tag == "edge" and element.get("function", "normal") in ("normal", "connector"):
-                    rows[attribute(element, "id")] = _edge(element)
-                elif element.tag == "connection" and not attribute(element, "from").startswith(":"):
-                    links.append(dict(element.attrib))
-                elif element.tag == "roundabout":
-                    roundabouts.append(element.get("edges", "").split())
-                elif element.tag == "tlLogic":
-                    logics[attribute(element, "id")] = _logic(element, net)
-                element.clear()
-                root.clear()
-    except BROKEN as error:
-        raise InputError(f"{net}: is not a SUMO network ({error}); build it with netconvert") from None
+    with network_root(net) as root:
+        normal = (edge for edge in root.iterfind("edge") if edge.get("function", "normal") in NORMAL)
+        rows = {attribute(edge, "id"): _edge(edge) for edge in normal}
+        links = [link.attrib for link in root.iterfind("connection") if not attribute(link, "from").startswith(":")]
+        roundabouts = [ring.get("edges", "").split() for ring in root.iterfind("roundabout")]
+        logics = {attribute(element, "id"): _logic(element, net) for element in root.iterfind("tlLogic")}
     for path in additional:
-        for element in read_xml(path).iter("tlLogic"):
-            logics[attribute(element, "id")] = _logic(element, path)
+        logics |= {attribute(element, "id"): _logic(element, path) for element in read_xml(path).iter("tlLogic")}
     if not any(row.cars for row in rows.values()):
         raise InputError(f"{net}: has no edge that cars may use; give a road network")
     edges = tuple(sorted(rows))
@@ -172,7 +150,7 @@ def read_streets(net: Path, additional: Iterable[Path] = ()) -> Streets:
         link_signals=tuple(signal_of[pair] for pair in cars),
         roundabouts=tuple(tuple(number[e] for e in ring if e in number) for ring in roundabouts),
         logics=dict(sorted(logics.items())),
-        left_hand=left_hand,
+        left_hand=root.get("lefthand") == "true",
     )
 
 

@@ -12,12 +12,13 @@ from jaxtyping import Float
 
 from cosim.sumo.arrays import PerEdge, Points
 from cosim.sumo.build import ensure_built
-from cosim.sumo.xml_files import BROKEN, attribute, opened
+from cosim.sumo.xml_files import attribute, network_root
 from nmfd.errors import InputError
 from nmfd.model.regional_model import RegionalModel
 from nmfd.runs.files import check_file
 
 JAM_SPACING = 7.5  # m of lane per standing vehicle
+NORMAL = "normal", "connector"  # functions of edges outside junctions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,18 +152,16 @@ def check_adjacency(city: City, network: RegionalModel) -> None:
 def edge_shapes(city: City) -> list[Points]:
     """Return (n, 2) [m] for every edge: its line on the map, midway between its outermost lanes."""
     shapes: dict[str, Points] = {}
-    with opened(city.net_file) as stream:
-        for _, element in ElementTree.iterparse(stream):
-            if element.tag == "edge":
-                lanes = [
-                    np.array([point.split(",")[:2] for point in attribute(lane, "shape").split()], dtype=float)
-                    for lane in element.iter("lane")
-                    if for_cars(lane)
-                ]
-                if lanes:
-                    same = len(lanes[0]) == len(lanes[-1])
-                    shapes[attribute(element, "id")] = (lanes[0] + lanes[-1]) / 2 if same else lanes[0]
-                element.clear()
+    with network_root(city.net_file) as root:
+        for edge in root.iterfind("edge"):
+            lanes = [
+                np.array([point.split(",")[:2] for point in attribute(lane, "shape").split()], dtype=float)
+                for lane in edge.iter("lane")
+                if for_cars(lane)
+            ]
+            if lanes:
+                same = len(lanes[0]) == len(lanes[-1])
+                shapes[attribute(edge, "id")] = (lanes[0] + lanes[-1]) / 2 if same else lanes[0]
     return [shapes[edge] for edge in city.edges]
 
 
@@ -176,33 +175,21 @@ def _read_net(
     lanes_of: dict[str, list[tuple[float, float, str]]] = {}
     internal: dict[str, tuple[float, float]] = {}
     connections: list[_Connection] = []
-    try:
-        with opened(path) as stream:
-            for _, element in ElementTree.iterparse(stream):
-                if element.tag == "edge":
-                    edge, open_lanes = attribute(element, "id"), [one for one in element.iter("lane") if for_cars(one)]
-                    lanes = [(size(one, "length"), size(one, "speed"), attribute(one, "id")) for one in open_lanes]
-                    if element.get("function", "normal") in ("normal", "connector"):
-                        lanes_of[edge] = lanes
-                        cars |= {(edge, int(attribute(lane, "index"))) for lane in open_lanes}
-                    else:
-                        internal[edge] = max(((long / speed, long) for long, speed, _ in lanes), default=(0.0, 0.0))
-                elif element.tag == "connection":
-                    source, target = attribute(element, "from"), attribute(element, "to")
-                    link = int(element.get("linkIndex", -1))
-                    lanes_joined = (int(attribute(element, key)) for key in ("fromLane", "toLane"))
-                    connections.append(
-                        _Connection(source, target, element.get("via"), element.get("tl"), link, *lanes_joined)
-                    )
-                if element.tag in ("edge", "connection", "junction", "tlLogic"):
-                    element.clear()
-        for connection in connections:
-            if connection.via and connection.via.rpartition("_")[0] not in internal:
-                raise LookupError(f"connection from {connection.source} by way of {connection.via}: no such edge")
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; give the path of an existing SUMO network") from None
-    except BROKEN as error:
-        raise InputError(f"{path}: is not a SUMO network ({error}); build it with netconvert") from None
+    with network_root(path) as root:
+        for element in root.iterfind("edge"):
+            edge, open_lanes = attribute(element, "id"), [one for one in element.iter("lane") if for_cars(one)]
+            lanes = [(size(one, "length"), size(one, "speed"), attribute(one, "id")) for one in open_lanes]
+            if element.get("function", "normal") in NORMAL:
+                lanes_of[edge] = lanes
+                cars |= {(edge, int(attribute(lane, "index"))) for lane in open_lanes}
+            else:
+                internal[edge] = max(((long / speed, long) for long, speed, _ in lanes), default=(0.0, 0.0))
+        for element in root.iterfind("connection"):
+            source, target, via = attribute(element, "from"), attribute(element, "to"), element.get("via")
+            numbers = element.get("linkIndex", "-1"), attribute(element, "fromLane"), attribute(element, "toLane")
+            if via and via.rpartition("_")[0] not in internal:
+                raise LookupError(f"connection from {source} by way of {via}: no such edge")
+            connections.append(_Connection(source, target, via, element.get("tl"), *map(int, numbers)))
     if not lanes_of:
         raise InputError(f"{path}: has no edges; build it with netconvert")
     return lanes_of, cars, internal, connections

@@ -4,7 +4,8 @@ import gzip
 import io
 import xml.etree.ElementTree as ElementTree
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from nmfd.errors import InputError
@@ -57,6 +58,21 @@ def read_xml(path: Path, depth: int = 0) -> ElementTree.Element:
         parts += read_xml(path.parent / part.get("href", ""), depth + 1) if part.tag == "include" else [part]
     root[:] = parts
     return root
+
+
+@contextmanager
+def network_root(net: Path) -> Iterator[ElementTree.Element]:
+    """Yield the root of a SUMO network. Raises InputError if it is none, or if the block misses a part of it."""
+    try:
+        with opened(net) as stream:
+            root = ElementTree.parse(stream).getroot()
+        if root.tag != "net":
+            raise ValueError(f"expected <net>, got a file of <{root.tag}> instead")
+        yield root
+    except FileNotFoundError:
+        raise InputError(f"{net}: no such file; give the path of an existing SUMO network") from None
+    except BROKEN as error:
+        raise InputError(f"{net}: is not a SUMO network ({error}); build it with netconvert") from None
 
 
 def file_list(files: Sequence[Path]) -> str:
