@@ -84,19 +84,23 @@ def test_in_the_regional_model_who_may_not_enter_waits_and_enters_later(kind):
     assert state.backlog.sum() == pytest.approx(0.0, abs=1e-9)
 
 
+def ran(scenario, seed=5, **changes):
+    """States and trips of a city with nothing held back at its gateways."""
+    network = scenario.network
+    rate = changes.pop("rate", None)
+    opened = Controls(perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=None, metering=rate)
+    plant = SumoPlant(scenario, settings=settings(scenario).changed(**changes))
+    plant.reset(seed)
+    states, trips = [plant.step(opened) for _ in range(scenario.steps)], plant.trips()
+    plant.close()
+    return states, trips
+
+
 def test_in_a_city_the_books_hold_and_waiting_counts():
     """grid7 with hardly anybody let in: the same trips, due at the same times, wait."""
     scenario = replace(load_scenario("grid7_peak"), steps=3)
-    network = scenario.network
-    opened = Controls(perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=None, metering=np.full(7, 0.02))
-    runs = []
-    for chosen in (settings(scenario), settings(scenario).changed(metering=1.2)):
-        plant = SumoPlant(scenario, settings=chosen)
-        plant.reset(5)
-        states = [plant.step(opened) for _ in range(3)]
-        runs.append((states, plant.trips()))
-        plant.close()
-    (free, trips), (held, metered) = runs
+    rate = np.full(7, 0.02)
+    (free, trips), (held, metered) = (ran(scenario, rate=rate, metering=level) for level in (0.0, 1.2))
     assert len(metered) == len(trips)
     inside = [(state.accumulation.sum() + state.backlog.sum() + state.completed) for state in held]
     assert inside == [state.accumulation.sum() + state.backlog.sum() + state.completed for state in free]
@@ -111,18 +115,6 @@ def test_in_a_city_the_books_hold_and_waiting_counts():
 def own(tmp_path):
     """A city whose vehicles come from a route file."""
     return tiny_city.imported(tmp_path)
-
-
-def ran(scenario, seed=5, **changes):
-    """States and trips of a city with nothing held back at its gateways."""
-    network = scenario.network
-    rate = changes.pop("rate", None)
-    opened = Controls(perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=None, metering=rate)
-    plant = SumoPlant(scenario, settings=settings(scenario).changed(**changes))
-    plant.reset(seed)
-    states, trips = [plant.step(opened) for _ in range(scenario.steps)], plant.trips()
-    plant.close()
-    return states, trips
 
 
 def test_a_citys_own_vehicles_wait_as_well(own):

@@ -19,7 +19,6 @@ from cosim.sumo.net import load_city
 from cosim.sumo.signals import read_signals
 from cosim.sumo.trips import make_trips, turning_flows
 from nmfd.api import load_scenario
-from nmfd.errors import InputError
 from nmfd.types import Controls
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
@@ -201,9 +200,3 @@ def test_the_same_drivers_reroute(scenario, plant_of):
         assert abs(len(equipped[share, signals]) / len(seen) - share) < 0.15
         plant.close()
     assert equipped[0.3, "fixed"] == equipped[0.3, "max-pressure"] < equipped[0.6, "fixed"]
-
-
-def test_a_city_without_fixed_signals(scenario, monkeypatch):
-    monkeypatch.setattr("cosim.plant.programmes.read_signals", lambda *_: ([], ["c11"]))
-    with pytest.raises(InputError, match="sumo.signals: webster needs fixed-time signals"):
-        SumoPlant(scenario, settings=Settings(signals="webster"))
