@@ -23,7 +23,6 @@ from cosim.sumo.arrays import PerEdge
 from cosim.sumo.net import City, Gateway, check_adjacency, city_of
 from cosim.sumo.outputs import TripReader
 from cosim.sumo.session import Session
-from nmfd.arrays import PerTurn
 from nmfd.model.planning import PlanningModel, planning_model
 from nmfd.model.scenario import Scenario
 from nmfd.types import Controls, Observation, State
@@ -130,7 +129,10 @@ class SumoPlant:
         )
         self._incidents.begin(self._k)
         self._actuation.command(controls.perimeter)
-        self._guide.command(self._splits(controls), self._streets, controls.prices)
+        splits = controls.splits
+        if controls.prices is not None or (splits is None and self._settings.guided):  # by travel times alone
+            splits = scenario.network.nominal_splits
+        self._guide.command(splits, self._streets, controls.prices)
         if self._metering:
             self._metering.command(controls.metering, self._state.accumulation.sum(axis=1))
         if self._junctions:
@@ -160,14 +162,10 @@ class SumoPlant:
 
     def observe(self) -> Observation | None:
         """Return the estimate; None if the exact state is measured."""
-        if self._estimation is None:
+        if (known := self._estimation) is None:
             return None
-        return Observation(
-            step=self._k,
-            time=self._k * self._scenario.step,
-            accumulation=self._estimation.accumulation,
-            backlog=self._estimation.backlog(),
-        )
+        time = self._state.time
+        return Observation(step=self._k, time=time, accumulation=known.accumulation, backlog=known.backlog())
 
     def close(self) -> None:
         """End the simulation and remove its files."""
@@ -193,14 +191,13 @@ class SumoPlant:
 
         Raises LedgerError if SUMO's tripinfo differs from the books.
         """
-        if self._session is not None:
-            followed = self._session.flush is not None
-            self._end_session()
-            if followed:
-                self._meter.close_books()
-            else:
-                self._trips.finish()
-            self._recorder.close()
+        followed = self.session.flush is not None
+        self._end_session()
+        if followed:
+            self._meter.close_books()
+        else:
+            self._trips.finish()
+        self._recorder.close()
         return {"co2_kg": self._trips.co2, "fuel_kg": self._trips.fuel}
 
     def trips(self) -> list[Trip]:
@@ -221,11 +218,6 @@ class SumoPlant:
         if self._session is None:
             raise RuntimeError("no simulation is running; call reset(seed) first")
         return self._session
-
-    def _splits(self, controls: Controls) -> PerTurn | None:
-        """Return the split ratios of the guidance: the drivers' own ones mean guidance by travel times alone."""
-        guided = controls.splits is None and self._settings.guided
-        return self._scenario.network.nominal_splits if guided or controls.prices is not None else controls.splits
 
     def _end_session(self) -> None:
         if self._session is not None:

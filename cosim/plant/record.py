@@ -96,10 +96,8 @@ class Recorder:
 
     def close(self) -> None:
         """Add to the last interval what was booked when the books were closed."""
-        totals = self._booked()
-        for name in totals if self._rows else ():
-            self._rows[-1][name] = self._rows[-1][name] + totals[name] - self._before[name]
-        self._before |= totals
+        for name, total in self._booked().items():
+            self._rows[-1][name] = self._rows[-1][name] + total - self._before[name]
 
     def _booked(self) -> dict[str, np.ndarray]:
         other, private = self._meter.time_spent()

@@ -45,10 +45,11 @@ class StreetSampler:
         self._inside = {edge: n for n, edge in enumerate(city.inside)}
         self._upstream = sorted({g.from_edge for g in city.gateways})  # gateways may share the edge before them
         self._upstream_of = np.array([self._upstream.index(g.from_edge) for g in city.gateways], dtype=int)
-        self._end, self.last = session.time, (np.zeros(len(city.edges)), np.zeros(len(city.edges)))
+        self.last = np.zeros(len(city.edges)), np.zeros(len(city.edges))
         self._begin()
 
     def _begin(self) -> None:
+        self._start = self._session.time
         # Sums over the samples: n, n v, and n times the speed that routing goes by.
         self._vehicles, self._metres, self._routed = np.zeros((3, len(self._city.edges)))
         self._crossing, self._crossed = np.zeros((2, len(self._inside)))
@@ -74,29 +75,24 @@ class StreetSampler:
 
     def finish(self, closed: EdgeMask) -> StreetMeans:
         """Return the means since the last call. closed: (E,) bool, streets without traffic"""
-        samples, vehicles, metres = len(self._queues), self._vehicles, self._metres
-        queues = np.array(self._queues).reshape(samples, len(self._upstream))
+        samples = len(self._queues)
+        queues = np.array(self._queues).reshape(samples, len(self._upstream))[:, self._upstream_of]
         with np.errstate(invalid="ignore"):
-            speed = self._routed / vehicles
+            speed = self._routed / self._vehicles
         speed[closed] = 0.0  # so that guidance does not take an empty street for a free one
-        production, accumulation = (
-            np.bincount(self._region, amount, self._city.regions) / samples for amount in (metres, vehicles)
-        )
-        mean, largest = (queue[self._upstream_of] for queue in (queues.mean(axis=0), queues.max(axis=0)))
-        crossing, crossed = self._crossing / samples, self._crossed / samples
-        self._begin()
-        begun, self._end = self._end, self._session.time
-        return StreetMeans(
-            duration=self._end - begun,
-            vehicles=vehicles / samples,
+        means = StreetMeans(
+            duration=self._session.time - self._start,
+            vehicles=self._vehicles / samples,
             speed=speed,
-            accumulation=accumulation,
-            production=production,
-            queue=mean,
-            queue_max=largest,
-            crossing=crossing,
-            crossed=crossed,
+            accumulation=np.bincount(self._region, self._vehicles, self._city.regions) / samples,
+            production=np.bincount(self._region, self._metres, self._city.regions) / samples,
+            queue=queues.mean(axis=0),
+            queue_max=queues.max(axis=0),
+            crossing=self._crossing / samples,
+            crossed=self._crossed / samples,
         )
+        self._begin()
+        return means
 
     def _travelled(self) -> tuple[list[int], list[str]]:
         """Return edges (numbers) and internal edges that hold all vehicles: a large city has more edges than these."""

@@ -4,8 +4,8 @@ import math
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Container, Iterable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 from xml.etree.ElementTree import Element
 from xml.sax.saxutils import quoteattr
 
@@ -25,8 +25,7 @@ KG_PER_MG = 1e-6
 END_TAG_BYTES = 200  # these last bytes of a file hold the end tag of its root
 
 
-@dataclass(frozen=True, kw_only=True)
-class End:
+class End(NamedTuple):
     """The end of a vehicle's trip.
 
     time: [s], of the simulation; edge: last one, "" if unknown
@@ -78,28 +77,26 @@ class TripReader:
             if last:
                 self._parser.close()
             elements = [event[-1] for event in self._parser.read_events()]
-            return self._ends([e for e in elements if isinstance(e, Element) and e.tag == "tripinfo"], left)
+            trips = [self._trip(e, left) for e in elements if isinstance(e, Element) and e.tag == "tripinfo"]
         except BROKEN as error:
             raise unfinished(self._path, error) from None
+        return [end for end in trips if end is not None]
 
-    def _ends(self, elements: Iterable[Element], left: Callable[[str], bool]) -> list[End]:
-        ends = []
-        for element in elements:
-            vehicle, reason = element.get("id", ""), element.get("vaporized", "")
-            depart, loss = float(attribute(element, "depart")), max(float(element.get("timeLoss", 0.0)), 0.0)
-            ended = float(attribute(element, "arrival")) >= 0 or (depart >= 0 and left(vehicle))
-            for emissions in element.iter("emissions"):
-                self.co2 += KG_PER_MG * float(attribute(emissions, "CO2_abs"))
-                self.fuel += KG_PER_MG * float(attribute(emissions, "fuel_abs"))
-            if ended:
-                self.completed, self.removed = self.completed + (not reason), self.removed + bool(reason)
-                edge = element.get("arrivalLane", "").rpartition("_")[0]
-                time = depart + float(attribute(element, "duration"))
-                ends.append(End(vehicle=vehicle, time=time, edge=edge, reason=reason, time_loss=loss))
-            elif depart >= 0:
-                self.under_way[vehicle] = loss
-            element.clear()
-        return ends
+    def _trip(self, element: Element, left: Callable[[str], bool]) -> End | None:
+        vehicle, reason = element.get("id", ""), element.get("vaporized", "")
+        depart, loss = float(attribute(element, "depart")), max(float(element.get("timeLoss", 0.0)), 0.0)
+        ended = float(attribute(element, "arrival")) >= 0 or (depart >= 0 and left(vehicle))
+        edge, time = element.get("arrivalLane", "").rpartition("_")[0], depart + float(attribute(element, "duration"))
+        for emissions in element.iter("emissions"):
+            self.co2 += KG_PER_MG * float(attribute(emissions, "CO2_abs"))
+            self.fuel += KG_PER_MG * float(attribute(emissions, "fuel_abs"))
+        element.clear()
+        if ended:
+            self.completed, self.removed = self.completed + (not reason), self.removed + bool(reason)
+            return End(vehicle, time, edge, reason, loss)
+        if depart >= 0:
+            self.under_way[vehicle] = loss
+        return None
 
 
 def check(kinds: Iterable[str]) -> None:
@@ -119,10 +116,10 @@ def paths(kinds: tuple[str, ...], folder: Path, controller: str, seed: int) -> t
 
 def options(trip_file: Path, outputs: Mapping[str, Path]) -> list[str]:
     """Return the options with which SUMO writes `trip_file`, for `TripReader`, and `outputs`, kind -> file."""
-    more = [(f"--{kind}-output", str(outputs[kind])) for kind in ("summary", "emission") if kind in outputs]
-    unfinished = "--tripinfo-output.write-unfinished true --tripinfo-output.write-undeparted true"
-    command = ["--tripinfo-output", str(trip_file), *unfinished.split(), "--device.emissions.probability", "1"]
-    return [*command, *(part for pair in more for part in pair)]
+    files = {"tripinfo": trip_file, **{kind: outputs[kind] for kind in ("summary", "emission") if kind in outputs}}
+    others = "--tripinfo-output.write-unfinished true --tripinfo-output.write-undeparted true"
+    written = [word for kind, file in files.items() for word in (f"--{kind}-output", str(file))]
+    return [*written, *others.split(), "--device.emissions.probability", "1"]
 
 
 def write_edge_data(path: Path, target: Path, period: float) -> None:
@@ -140,8 +137,6 @@ def check_whole(outputs: Mapping[str, Path]) -> None:
         end = b""
         try:
             with opened(path) as stream:
-                if path.suffix != ".gz":
-                    stream.seek(max(path.stat().st_size - END_TAG_BYTES, 0))
                 while part := stream.read(1 << 20):
                     end = (end + part)[-END_TAG_BYTES:]
         except BROKEN as error:
