@@ -28,7 +28,7 @@ from cosim.plant.meter import Event
 from cosim.plant.routes import Moves, Searches, TravelTimes, Trees, Ways
 from cosim.plant.sampling import StreetMeans
 from cosim.plant.stuck import QUEUE_END_M, Lanes
-from cosim.sumo.arrays import PerEdge, PerGateway
+from cosim.sumo.arrays import PerEdge
 from cosim.sumo.net import City
 from cosim.sumo.session import REFUSALS, Session
 from nmfd.arrays import PerRegion, PerTurn
@@ -119,30 +119,22 @@ class Guide:
         self._times = times = TravelTimes(city, lanes=lanes)
         self._move = {move: n for n, move in enumerate(zip(times.first.tolist(), times.second.tolist(), strict=True))}
         here = [np.array(self._region) == region for region in range(city.regions)]
-        self._within, within_back, self._without_back = (
+        self._within, self._homeward, self._without_back = (
             [Moves(times.first, times.second, allowed=allowed ^ outside, reverse=reverse) for allowed in here]
             for outside, reverse in ((False, False), (False, True), (True, True))
         )
-        self._homeward, self._anywhere = within_back, None  # by region, or one for all
-        if ways_return:
-            self._anywhere, back = (
-                Moves(times.first, times.second, allowed=np.full(len(city.edges), True), reverse=reverse)
-                for reverse in (False, True)
-            )
-            self._homeward = [back]
-        ends = [(self._index[g.from_edge], self._index[g.to_edge], g) for g in city.gateways]
-        rows = [
-            [(a, b, self._move[a, b], g.target) for a, b, g in ends if g.source == region]
-            for region in range(city.regions)
-        ]
-        self._gateways = [np.array(row, dtype=int).reshape(-1, 4).T for row in rows]
+        if ways_return:  # everywhere, of ways home, and of ways on that come back
+            ends, everywhere = (times.first, times.second), np.full(len(city.edges), True)
+            self._homeward = [Moves(*ends, allowed=everywhere, reverse=reverse) for reverse in (True, False)]
+        gateways = [(self._index[g.from_edge], self._index[g.to_edge], g.target, g.source) for g in city.gateways]
+        rows = np.array([(a, b, self._move[a, b], *pair) for a, b, *pair in gateways], dtype=int).reshape(-1, 5).T
+        self._gateways = [rows[:4, rows[4] == region] for region in range(city.regions)]
         spread = SPREAD if lanes else MESO_SPREAD
         self._taste = np.exp(spread * random.standard_normal((DRIVER_CLASSES, len(city.edges))))
-        self._prices: PerRegion | None = None
-        self._unpriced = tuple(range(city.regions))
+        self._prices, self._unpriced = np.zeros(city.regions), tuple(range(city.regions))
         # Results of the run; then those of one control interval, which `command` clears.
-        self._leading, self._ahead, self._back = cache(self._to_gateways), cache(self._to_nearest), cache(self._behind)
-        self._home, self._ways, self._everywhere = cache(self._home_from), cache(self._ways_from), cache(self._all_ways)
+        self._leading, self._ahead = cache(self._to_gateways), cache(self._to_nearest)
+        self._trees, self._ways = cache(self._trees_from), cache(self._ways_from)
         self._searches = Searches()
         self._guides, self._splits = False, own
         self._assigned, self._wished = np.zeros((2, *(city.regions,) * 3))
@@ -162,9 +154,9 @@ class Guide:
         self._interval += 1
         if seen is not None:
             self._times.learn(seen)
-        self._prices, self._searches = prices, Searches()
-        for kept in (self._home, self._ways, self._everywhere):
-            kept.cache_clear()
+        self._prices, self._searches = np.zeros(self._city.regions) if prices is None else prices, Searches()
+        self._trees.cache_clear()
+        self._ways.cache_clear()
         self._assigned *= MEMORY
         self._wished *= MEMORY
 
@@ -209,7 +201,9 @@ class Guide:
     def _guide_home(self, visit: _Visit, here: int, target: int) -> None:
         """Give the fastest way inside the region of destination; if ways may return, the fastest of all."""
         event, region = visit.event, 0 if self._ways_return else visit.event.region
-        told, true = (self._home(region, visit.taste, free) for free in (self._free(event.destination), self._unpriced))
+        told, true = (
+            self._trees(region, visit.taste, free) for free in (self._free(event.destination), self._unpriced)
+        )
         present = self._present(event.vehicle, here, told.time)
         cost = told.costs(target, self._worth(present) + 1.0)[told.number[here]]
         if here == target or not np.isfinite(cost) or self._keeps(present, cost):
@@ -259,10 +253,8 @@ class Guide:
         most = present.takes + 1.0 if present.bound else np.inf
         cost, reached = ways.cost(here, target, self._most_detour + most)
         # Plain numbers from here on: a handful of next regions is too few for arrays to pay.
-        least, open_ways = (
-            best.reduceat(values, ways.begins).tolist()
-            for best, values in ((np.minimum, cost), (np.logical_or, reached))
-        )
+        least = np.minimum.reduceat(cost, ways.begins).tolist()
+        open_ways = np.logical_or.reduceat(reached, ways.begins).tolist()
         returning = None  # next region of the fastest way of all, if that one comes back
         fastest = min(least, default=np.inf)
         of_all, gateway = ways.returning(here, target, min(fastest, most))
@@ -363,24 +355,24 @@ class Guide:
 
     def _free(self, destination: int) -> tuple[int, ...]:
         """Return the regions without a price for drivers to `destination`."""
-        prices = self._prices
-        return tuple(r for r in self._unpriced if prices is None or r == destination or not prices[r])
+        return tuple(r for r in self._unpriced if r == destination or not self._prices[r])
 
     def _seen(self, taste: int, free: tuple[int, ...]) -> PerEdge:
         """Return the times (E,) [s] that a class of drivers sees, with the prices of all regions but `free`."""
-        prices = np.zeros(self._city.regions) if self._prices is None else self._prices.copy()
+        prices = self._prices.copy()
         prices[list(free)] = 0.0
         return self._times.edges * (1.0 + prices)[self._region] * self._taste[taste]
 
-    def _home_from(self, region: int, taste: int, free: tuple[int, ...]) -> Trees:
-        return Trees(self._homeward[region], self._seen(taste, free), self._times.turns, self._searches)
+    def _trees_from(self, n: int, taste: int, free: tuple[int, ...]) -> Trees:
+        return Trees(self._homeward[n], self._seen(taste, free), self._times.turns, self._searches)
 
     def _ways_from(self, region: int, taste: int, free: tuple[int, ...]) -> Ways:
         first, second, move, following = self._gateways[region]
         leading, reached = self._leading(region)
         turns, everywhere = self._times.turns, None
-        if self._anywhere is not None:
-            everywhere = self._everywhere(taste, free), turns[move], self._back(region, taste)
+        if self._ways_return:
+            back = self._ahead(self._homeward[0], region, taste)[first]
+            everywhere = self._trees(-1, taste, free), turns[move], back
         return Ways(
             first,
             second,
@@ -390,16 +382,12 @@ class Guide:
             crossing=turns[move] if self._lanes else np.zeros(len(move)),
             leading=leading,
             reached=reached,
-            ahead=self._ahead(region, taste),
+            ahead=self._ahead(self._without_back[region], region, taste),
             time=self._seen(taste, free),
             turns=turns,
             searches=self._searches,
             everywhere=everywhere,
         )
-
-    def _all_ways(self, taste: int, free: tuple[int, ...]) -> Trees:
-        assert self._anywhere is not None
-        return Trees(self._anywhere, self._seen(taste, free), self._times.turns, self._searches)
 
     def _to_gateways(self, region: int) -> tuple[np.ndarray, np.ndarray]:
         """Return from where in the region its gateways can be reached, and what from behind them."""
@@ -407,13 +395,7 @@ class Guide:
         first, second, _, _ = self._gateways[region]
         return inside.leading_to(inside.number[first]), outside.leading_to(outside.number[second])
 
-    def _to_nearest(self, region: int, taste: int) -> np.ndarray:
-        """Return the time [s] in free flow from behind the nearest gateway of the region."""
-        times, outside = self._times, self._without_back[region]
-        nodes = outside.number[self._gateways[region][1]]
-        return outside.ahead(nodes, times.free * self._taste[taste], times.free_turns)
-
-    def _behind(self, region: int, taste: int) -> PerGateway:
-        """Return the time [s] in free flow from behind the nearest gateway back to each one."""
-        times, (first, second, _, _) = self._times, self._gateways[region]
-        return self._homeward[0].ahead(second, times.free * self._taste[taste], times.free_turns)[first]
+    def _to_nearest(self, back: Moves, region: int, taste: int) -> np.ndarray:
+        """Return the time [s] in free flow, by moves `back`, from behind the nearest gateway of the region."""
+        times, nodes = self._times, back.number[self._gateways[region][1]]
+        return back.ahead(nodes, times.free * self._taste[taste], times.free_turns)

@@ -6,8 +6,6 @@ model, which has no junctions to wait on, the newest control interval counts hal
 """
 
 import math
-from collections import OrderedDict
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -24,7 +22,7 @@ EMPTY_WEIGHT = 0.5  # of earlier observations after a control interval without v
 PRIOR_VEH_S = 3.0  # at the speed limit, which count besides
 STANDING_M_S = 0.1  # lowest speed of a travel time
 FAR_S = 1e9  # longer than any way
-MOST_NODES = 20_000_000  # of the trees that are kept, of 4 to 12 bytes each
+MOST_NODES = 20_000_000  # of the searches that are kept, of 12 bytes each
 FEWEST_TREES = 8  # that are kept, however large the city: one decision needs as many
 
 
@@ -129,53 +127,51 @@ class Moves:
 
 
 class Searches:
-    """Cache of search trees by owner and beginning, at most `most` nodes in all; the least recently used go first."""
+    """Cache of searches by owner and beginning, at most `most` nodes in all; the least recently used go first."""
 
     def __init__(self, most: int = MOST_NODES):
         self._most, self._nodes = most, 0
-        self._trees: OrderedDict[tuple[object, int], tuple[tuple, int]] = OrderedDict()
+        self._trees: dict[tuple[object, int], tuple[float, np.ndarray, np.ndarray]] = {}
 
-    def get(self, owner: object, begin: int) -> tuple[Any, ...] | None:
-        """Return the tree of `owner` for `begin`, None if it is not there."""
-        if (entry := self._trees.get((owner, begin))) is None:
-            return None
-        self._trees.move_to_end((owner, begin))
-        return entry[0]
-
-    def put(self, owner: object, begin: int, tree: tuple, nodes: int) -> tuple[Any, ...]:
-        """Keep a tree in place of that before, and return it."""
-        _, before = self._trees.pop((owner, begin), (None, 0))
-        self._trees[owner, begin] = tree, nodes
-        self._nodes += nodes - before
-        while self._nodes > self._most and len(self._trees) > FEWEST_TREES:
-            _, (_, gone) = self._trees.popitem(last=False)
-            self._nodes -= gone
+    def tree(
+        self, owner: object, begin: int, costs: csr_array, most: float
+    ) -> tuple[float, Float[np.ndarray, " nodes"], Int[np.ndarray, " nodes"]]:
+        """Return limit [s], costs [s] and predecessors of the search of `owner` from node `begin`, up to `most` [s]."""
+        tree = self._trees.pop((owner, begin), None)
+        self._nodes += costs.shape[0] if tree is None else 0
+        if tree is None or tree[0] < most:
+            tree = most, *dijkstra(costs, indices=begin, return_predecessors=True, limit=most)
+        while self._nodes > self._most and len(self._trees) >= FEWEST_TREES:
+            self._nodes -= len(self._trees.pop(next(iter(self._trees)))[1])
+        self._trees[owner, begin] = tree
         return tree
 
 
 class Trees:
     """Fastest ways by `moves` from single edges, searched on demand and no further than needed."""
 
-    def __init__(self, moves: Moves, time: PerEdge, turns: PerMove, searches: Searches):
-        """time: (E,) [s]; turns: (M,) [s]"""
+    def __init__(
+        self,
+        moves: Moves,
+        time: PerEdge,
+        turns: PerMove,
+        searches: Searches,
+        ahead: Float[np.ndarray, " nodes"] | None = None,
+    ):
+        """time: (E,) [s]; turns: (M,) [s]; ahead: (nodes,) [s], see `Moves.costing`"""
         self.time, self.number = time, moves.number
-        self._moves, self._costs = moves, moves.costing(time, turns)
+        self._moves, self._costs = moves, moves.costing(time, turns, ahead)
         # Not this object itself: `searches` would hold it, and both would stay until the garbage is collected.
         self._searches, self._owner = searches, object()
 
     def costs(self, begin: int, most: float) -> Float[np.ndarray, " nodes"]:
         """Return (nodes,) [s] from edge `begin`; more than `most` may be infinite."""
-        tree = self._searches.get(self._owner, begin)
-        if tree is None or tree[0] < most:
-            cost, before = dijkstra(self._costs, indices=self.number[begin], return_predecessors=True, limit=most)
-            tree = self._searches.put(self._owner, begin, (most, cost, before), len(cost))
-        return tree[1]
+        return self._searches.tree(self._owner, int(self.number[begin]), self._costs, most)[1]
 
     def back(self, begin: int, end: int) -> list[int]:
         """Return the edges from `end` back to `begin`, after `costs` of `begin`."""
-        tree = self._searches.get(self._owner, begin)
-        assert tree is not None
-        return self._moves.path(tree[2], int(self.number[end]), int(self.number[begin]))
+        first, last = int(self.number[end]), int(self.number[begin])
+        return self._moves.path(self._searches.tree(self._owner, last, self._costs, 0.0)[2], first, last)
 
 
 class Ways:
@@ -210,73 +206,57 @@ class Ways:
         everywhere: ways by all moves, (G,) [s] over each gateway on these, and (G,) [s], not above the time from behind
             the nearest gateway back to first[g]; None if no way may come back
         """
-        self.time, self._inside, self._outside, self._ahead = time, inside, outside, ahead
-        self._leading, self._reached = leading, reached
-        self._gates, self._first, self._second = first, inside.number[first], outside.number[second]
-        self._entering, self._everywhere = crossing + time[second], None
-        if everywhere is not None:
-            trees, over, back = everywhere
-            self._everywhere = trees, trees.number[first], over + time[second], back
+        self.time, self._ahead, self._leading, self._reached = time, ahead, leading, reached
+        self._there, self._onward = Trees(inside, time, turns, searches), Trees(outside, time, turns, searches, ahead)
+        self._first, self._second, self._entering = first, second, crossing + time[second]
+        self._exits, self._entries, self._everywhere = inside.number[first], outside.number[second], everywhere
         self.neighbours, self.begins = np.unique(next_region, return_index=True)
         self.ends = np.append(self.begins[1:], len(next_region))
-        self._costs = inside.costing(time, turns), outside.costing(time, turns, ahead)
-        self._searches, self._from_here, self._to_there = searches, object(), object()
 
     def cost(self, here: int, target: int, most: float) -> tuple[PerGateway, GatewayMask]:
         """Return (G,) [s] from the end of `here` to that of `target`, infinite above `most`; (G,), a way exists."""
-        last = int(self._outside.number[target])
-        open_ways = self._leading[self._inside.number[here]] & self._reached[last]
-        within = max(most - self._ahead[last], 0.0)
-        tree = self._searches.get(self._from_here, here)
-        if tree is None or tree[0] < within:
-            node = self._inside.number[here]
-            cost, before = dijkstra(self._costs[0], indices=node, return_predecessors=True, limit=within)
-            there = cost[self._first] + self._entering
-            entry = within, there, float(there.min(initial=np.inf)), before
-            tree = self._searches.put(self._from_here, here, entry, len(before))
-        _, there, nearest, _ = tree
-        if nearest == np.inf:
+        last = int(self._onward.number[target])
+        open_ways = self._leading[self._there.number[here]] & self._reached[last]
+        there = self._to_entries(here, max(most - self._ahead[last], 0.0))
+        if (nearest := float(there.min(initial=np.inf))) == np.inf:
             return there, open_ways
-        left = max(most - min(nearest, most) - self._ahead[last], 0.0)
-        onward = self._searches.get(self._to_there, target)
-        if onward is None or onward[0] < left:
-            cost, after = dijkstra(self._costs[1], indices=last, return_predecessors=True, limit=left)
-            back = left, cost[self._second] + self._ahead[last], after
-            onward = self._searches.put(self._to_there, target, back, len(after))
-        return there + onward[1], open_ways
+        return there + self._from_entries(target, max(most - min(nearest, most) - self._ahead[last], 0.0)), open_ways
 
     def returning(self, here: int, target: int, most: float) -> tuple[float, int]:
         """Return [s] of the fastest way of all, and its last gateway, after `cost`.
 
         Infinite if it takes `most` or longer, or does not come back into the region.
         """
-        there, onward = self._searches.get(self._from_here, here), self._searches.get(self._to_there, target)
-        if self._everywhere is None or there is None or onward is None:
+        if self._everywhere is None:
             return np.inf, 0
-        trees, gates, entering, back = self._everywhere
-        end = entering + onward[1]
+        trees, over, back = self._everywhere
+        end = over + self.time[self._second] + self._from_entries(target, 0.0)
         # By then it has left, and come back, which alone takes too long for most gateways.
-        end[there[2] + back + end >= most] = np.inf
+        end[self._to_entries(here, 0.0).min(initial=np.inf) + back + end >= most] = np.inf
         if (nearest := float(end.min(initial=np.inf))) == np.inf:
             return np.inf, 0
-        cost = trees.costs(here, most - nearest)[gates] + end
+        cost = trees.costs(here, most - nearest)[trees.number[self._first]] + end
         gateway = int(cost.argmin())
         return float(cost[gateway]), gateway
 
     def route(self, here: int, gateway: int, target: int) -> list[int]:
         """Return the edges from `here` to `target` through `gateway`, after `cost`."""
-        there = self._searches.get(self._from_here, here)
-        assert there is not None
-        to_gateway = self._inside.path(there[-1], int(self._first[gateway]), int(self._inside.number[here]))
-        return to_gateway[::-1] + self._onward(gateway, target)
+        return self._through(self._there, here, gateway, target)
 
     def returning_route(self, here: int, gateway: int, target: int) -> list[int]:
         """Return the edges of the way of `returning`."""
         assert self._everywhere is not None
-        return self._everywhere[0].back(here, int(self._gates[gateway]))[::-1] + self._onward(gateway, target)
+        return self._through(self._everywhere[0], here, gateway, target)
 
-    def _onward(self, gateway: int, target: int) -> list[int]:
-        """Return the edges from behind `gateway` to `target`."""
-        onward = self._searches.get(self._to_there, target)
-        assert onward is not None
-        return self._outside.path(onward[2], int(self._second[gateway]), int(self._outside.number[target]))
+    def _through(self, trees: Trees, here: int, gateway: int, target: int) -> list[int]:
+        """Return the edges from `here` to `target` through `gateway`, as far as that by `trees`."""
+        first, second = int(self._first[gateway]), int(self._second[gateway])
+        return trees.back(here, first)[::-1] + self._onward.back(target, second)
+
+    def _to_entries(self, here: int, most: float) -> PerGateway:
+        """Return (G,) [s] from the end of `here` to that of second[g]."""
+        return self._there.costs(here, most)[self._exits] + self._entering
+
+    def _from_entries(self, target: int, most: float) -> PerGateway:
+        """Return (G,) [s] from the end of second[g] to that of `target`."""
+        return self._onward.costs(target, most)[self._entries] + self._ahead[self._onward.number[target]]
