@@ -103,7 +103,7 @@ def test_the_closed_loop_runs_on_estimates(scenario, run):
     assert run.observed.min() >= 0.0 and (run.observed[0] == 0.0).all()
     assert (run.accumulation == np.round(run.accumulation)).all()
     assert (run.observed[1:] != np.round(run.observed[1:])).any()
-    share, cells = estimation_errors(run, scenario.network.critical)
+    share, cells = estimation_errors(run, scenario.network.critical).values()
     assert 0.0 < share < 0.15 and 0.0 < cells < 10.0
     vehicles = run.accumulation[-1].sum()
     assert abs(run.observed[-1].sum() - vehicles) < 0.2 * vehicles

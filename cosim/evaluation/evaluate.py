@@ -15,14 +15,12 @@ from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 import pandas as pd
-from pydantic import Field, TypeAdapter, ValidationError
-from typing_extensions import TypedDict
+from pydantic import Field
 
 from cosim.evaluation import explain, results, statistics
 from cosim.evaluation.runs import city_key, runs_of
 from nmfd.api import load_scenario
 from nmfd.controllers.strategy import Strategy
-from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
 from nmfd.runs import config, files
 from nmfd.runs.progress import Progress
@@ -33,7 +31,7 @@ from nmfd.types import HOST_TIMES
 Planned: TypeAlias = Sequence[tuple[Scenario, Sequence[float]]]  # with demand levels
 
 
-class Suite(TypedDict):
+class Suite(config.Settings):
     """Content of a suite: seeds, and scenario -> demand levels."""
 
     seeds: Annotated[list[int], Field(min_length=1)]
@@ -45,15 +43,11 @@ def read_suite(file: Path, settings: Mapping[str, Any] | None = None) -> tuple[P
 
     Scenarios are shipped names, or folders seen from that of the file. Raises InputError.
     """
-    try:
-        suite = TypeAdapter(Suite).validate_python(config.read(file))
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise InputError(f"{file}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
-    beside = {name: file.parent / name for name in suite["scenarios"]}
+    suite = config.checked(Suite, config.read(file), file)
+    beside = {name: file.parent / name for name in suite.scenarios}
     folders = {name: path if (path / "scenario.toml").is_file() else Path(name) for name, path in beside.items()}
-    scenarios = [(load_scenario(folders[name], settings), levels) for name, levels in suite["scenarios"].items()]
-    return scenarios, suite["seeds"]
+    scenarios = [(load_scenario(folders[name], settings), levels) for name, levels in suite.scenarios.items()]
+    return scenarios, suite.seeds
 
 
 def evaluate(
@@ -70,8 +64,7 @@ def evaluate(
     """Do the runs that are not in `out`, write the tables, and return one row per run (nmfd.runs.run_many)."""
     runs = plan(scenarios, strategies, seeds, policies)
     rows = run_many(runs, out, workers=workers, scheduler=scheduler, progress=progress)
-    done = results.finished_rows(rows)
-    if len(done):
+    if len(done := results.finished_rows(rows)):
         files.write_text(out / "evaluate.md", report(out, done))
     return rows
 
@@ -118,9 +111,9 @@ def check(runs: Sequence[Run], out: Path, number: int, *, workers: int = 1) -> l
 
     out: folder with runs.csv and manifest.json, with or without the results
     """
-    before = results.finished_rows(pd.read_csv(out / TABLE)).to_dict("records")
-    rows = {(row["folder"], row["controller"], row["seed"]): row for row in before}
-    keys = {folder: kept["key"] for folder, kept in read_manifest(out)["folders"].items()}
+    kept = results.finished_rows(pd.read_csv(out / TABLE)).to_dict("records")
+    rows = {(row["folder"], row["controller"], row["seed"]): row for row in kept}
+    keys = {name: folder["key"] for name, folder in read_manifest(out)["folders"].items()}
     chosen = random.Random(0).sample(list(runs), min(number, len(runs)))
     lines = [
         f"{run.file}: {name} was {keys.get(run.folder, {}).get(name)}, is {value}"
@@ -132,13 +125,11 @@ def check(runs: Sequence[Run], out: Path, number: int, *, workers: int = 1) -> l
         again = run_many(chosen, folder, workers=workers)
         again.to_csv(Path(folder, TABLE), index=False)  # as the kept table went through a file
         again = pd.read_csv(Path(folder, TABLE))
+    own = {*HOST_TIMES, "evaluation_time_s", "wall_time_s"}.union(name for name in again if "_ms" in name)
     for row in again.to_dict("records"):
         old = rows.get((row.get("folder", ""), row["controller"], row["seed"]), {})
-        lines += [
-            f"{row['controller']}, seed {row['seed']}: {name} was {old.get(name)}, is {row[name]}"
-            for name in row
-            if not (name in HOST_TIMES or "_ms" in name or name in ("evaluation_time_s", "wall_time_s"))
-            and old.get(name) != row[name]
-            and not (pd.isna(row[name]) and pd.isna(old.get(name, np.nan)))
-        ]
+        for name, value in row.items():
+            before = old.get(name, np.nan)
+            if name not in own and before != value and not (pd.isna(value) and pd.isna(before)):
+                lines.append(f"{row['controller']}, seed {row['seed']}: {name} was {before}, is {value}")
     return lines

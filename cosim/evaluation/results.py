@@ -90,12 +90,11 @@ def finished_rows(rows: pd.DataFrame) -> pd.DataFrame:
     """Return the rows of finished runs, controllers together, with a column folder."""
     rows = rows[rows["failure"].isna() | (rows["failure"] == "")].drop(columns="failure")
     rows["folder"] = rows["folder"].fillna("") if "folder" in rows else ""
-    order = list(dict.fromkeys(rows["controller"]))
     return rows.sort_values(
         [name for name in ("scenario", "demand", "controller", "seed") if name in rows],
         ignore_index=True,
         kind="stable",
-        key=lambda column: column.map(order.index) if column.name == "controller" else column,
+        key=lambda column: pd.factorize(column)[0] if column.name == "controller" else column,
     )
 
 

@@ -114,12 +114,7 @@ def simulate(
         files = {kind: stack.enter_context(atomic(path)) for kind, path in job.outputs.items()}
         chosen = settings(scenario).changed(**strategy.city)
         plant = SumoPlant(
-            scenario,
-            settings=chosen,
-            outputs=files,
-            planning=strategy.planning(scenario),
-            observer=observer,
-            gui=gui,
+            scenario, settings=chosen, outputs=files, planning=strategy.planning(scenario), observer=observer, gui=gui
         )
         stack.callback(plant.close)
         result = closed_loop.run(plant, controller, scenario, seed=job.seed, progress=progress)
@@ -130,7 +125,6 @@ def simulate(
         programmes, end = own_files(scenario, chosen.additional), chosen.begin + scenario.steps * scenario.step
         sheet = proof_sheet(plant.signal_states(), [plant.city.net_file, *programmes], end=end, step=chosen.step_length)
         result = settled(result.add({}, {**RECORD, **SHEET}, **plant.record(), **sheet))
-        rmse_share, cell_rmse = estimation_errors(result, scenario.network.critical)
         facts = {
             "scenario": job.scenario.name,
             "scenario_folder": str(scenario.folder or ""),
@@ -144,8 +138,7 @@ def simulate(
             "notes": metrics.notes(result),
             "outside_training": strategy.outside_training(scenario, job.demand, job.policy),
             "leaking_share": leaking_share(result, plant.city, leaks),
-            "estimate_rmse_share": rmse_share,
-            "estimate_cell_rmse_veh": cell_rmse,
+            **estimation_errors(result, scenario.network.critical),
             "overhead_share": 1.0 - plant_facts["sumo_time_s"] / result.wall_time,
             "setup_time_s": time.perf_counter() - begin - result.wall_time,
             "jumps": int(result.jumps.sum()),
@@ -202,16 +195,16 @@ def queue_facts(result: Result, city: City) -> dict[str, float]:
     }
 
 
-def estimation_errors(result: Result, critical: PerRegion) -> tuple[float, float]:
+def estimation_errors(result: Result, critical: PerRegion) -> dict[str, float]:
     """Return the root mean square errors of estimated states, NaN if they were exact.
 
     Of the accumulation of a region as a share of critical (R,) [veh], and of its parts with vehicles [veh].
     """
     if not result.estimated:
-        return math.nan, math.nan
+        return {"estimate_rmse_share": math.nan, "estimate_cell_rmse_veh": math.nan}
     off, used = result.observed - result.accumulation, (result.accumulation > 0).any(axis=0)
     shares = [_rms(off[:, i].sum(axis=1)) / limit for i, limit in enumerate(critical)]
-    return _rms(shares), _rms(off[:, used])
+    return {"estimate_rmse_share": _rms(shares), "estimate_cell_rmse_veh": _rms(off[:, used])}
 
 
 def _rms(values: ArrayLike) -> float:

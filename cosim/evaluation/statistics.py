@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -36,8 +36,7 @@ COLUMNS = {  # heading without unit -> meaning
 CAPTION = "; ".join(f"{heading}: {text}" for heading, text in COLUMNS.items())
 
 
-@dataclass(frozen=True, kw_only=True)
-class Paired:
+class Paired(NamedTuple):
     """Change from b to a on the seeds that both have: mean and half of the 95 % interval, NaN for one seed."""
 
     seeds: int
@@ -55,7 +54,7 @@ def paired(a: Mapping[int, float], b: Mapping[int, float]) -> Paired:
     seeds = sorted(set(a) & set(b))
     percent = [percent_change(a[seed], b[seed]) for seed in seeds]
     mean = float(np.mean(percent)) if seeds else math.nan
-    return Paired(seeds=len(seeds), percent=mean, percent_half=interval(percent))
+    return Paired(len(seeds), mean, interval(percent))
 
 
 def by_seed(rows: pd.DataFrame, level: float, controller: str, column: str = TTS) -> dict[int, float]:
@@ -91,7 +90,6 @@ def statistics(rows: pd.DataFrame) -> pd.DataFrame:
                     "controller": name,
                     "against": against,
                     "seeds": len(part),
-                    f"mean_{TTS}": part[TTS].mean(),
                     f"half_interval_{TTS}": interval(list(part[TTS])),
                     "change_percent": pair.percent,
                     "change_half_interval_percent": pair.percent_half,
@@ -112,34 +110,29 @@ def pairs(rows: pd.DataFrame) -> pd.DataFrame:
     for level, names in groups(rows).items():
         for name, other in ((name, other) for name in names for other in names if other != name):
             pair = paired(by_seed(rows, level, name), by_seed(rows, level, other))
-            out.append((level, name, other, pair.seeds, pair.percent, pair.percent_half, pair.excludes_zero))
+            out.append((level, name, other, *pair, pair.excludes_zero))
     columns = ["demand", "controller", "against", "seeds", "change_percent", "half_interval_percent", "excludes_zero"]
     return pd.DataFrame(out, columns=columns)
 
 
 def shown(table: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return `statistics` of one demand level as two tables of text: outcomes, and costs and decisions."""
-    first, second = [], []
+    lines = []
     against = table["against"].iloc[0]
     change = "change" if against == REFERENCE or len(table) == 1 else f"against {against}"
     for row in table.to_dict("records"):
         half = row[f"half_interval_{TTS}"]
-        first.append(
+        lines.append(
             {
                 "controller": row["controller"],
                 "seeds": row["seeds"],
-                "TTS [veh s]": f"{row[f'mean_{TTS}']:.3e}" + ("" if math.isnan(half) else f" ± {half:.1e}"),
+                "TTS [veh s]": f"{row[TTS]:.3e}" + ("" if math.isnan(half) else f" ± {half:.1e}"),
                 change: _change(row),
                 "completed": f"{row['completed_veh']:,.0f} of {row['trips']:,.0f}",
                 "removed [veh]": f"{row['removed_veh']:,.0f}",
                 "backlog [veh]": f"{row['final_backlog_veh']:,.0f}",
                 "backlog [veh s]": f"{row['total_backlog_veh_s']:.2e}",
                 "teleports": f"{row['teleports']:.0f}",
-            }
-        )
-        second.append(
-            {
-                "controller": row["controller"],
                 "trip [s]": " / ".join(_seconds(row[f"{kind}_trip_time_s"]) for kind in ("mean", "median", "p95")),
                 "finished [s]": _seconds(row["mean_finished_trip_time_s"]),
                 "departure delay [s]": _seconds(row["mean_departure_delay_s"]),
@@ -153,7 +146,9 @@ def shown(table: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
                 "outside SUMO": f"{100 * row['overhead_share']:.1f} %",
             }
         )
-    return pd.DataFrame(first), pd.DataFrame(second)
+    whole = pd.DataFrame(lines).set_index("controller")
+    parts = whole.loc[:, :"teleports"], whole.loc[:, "trip [s]":]
+    return parts[0].reset_index(), parts[1].reset_index()
 
 
 def _seconds(value: float) -> str:
