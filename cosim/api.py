@@ -112,7 +112,7 @@ def run_controllers(
     with locked(out):
         raise_failures(run_many(runs, out, workers=2))
         finished = results.read(out)
-        there = [level.read(*name) for level in finished.levels for name in level.runs]
+        there = [run for level in finished.levels for run in level.results()]
         draw_accumulations(out, loaded, there)
         write_table(out / "signals.csv", sheets(there), float_format="%g")
     wrong = [

@@ -52,9 +52,7 @@ def content(evaluation):
     """The page, with pictures of demand 1 only, which take most of the time."""
     draw = figures.draw_level
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            figures, "draw_level", lambda *a, **k: draw(*a, **k) if k["rows"]["demand"].iloc[0] == 1 else None
-        )
+        patch.setattr(figures, "draw_level", lambda *a, **k: draw(*a, **k) if k["level"].demand == 1 else None)
         result = cosim("report", evaluation)
     assert result.exit_code == 0, result.output + str(result.exception)
     return (evaluation / "report.html").read_text()

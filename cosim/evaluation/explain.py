@@ -41,7 +41,7 @@ def text(level: Level, finished: Finished) -> str:
 def city(level: Level, finished: Finished) -> str:
     """Return two sentences about the city under the reference."""
     names, against = finished.scenario.network.region_names, statistics.compared_with(level.rows)
-    peak, beyond = load(finished.scenario.network, _runs(level, against))
+    peak, beyond = load(finished.scenario.network, level.results(against))
     state = "no region exceeds its critical accumulation"
     if len(known := np.flatnonzero(~np.isnan(peak))):
         most = known[np.argmax(peak[known])]
@@ -78,7 +78,7 @@ def paragraph(level: Level, finished: Finished, name: str) -> str:
 
 def _reasons(level: Level, scenario: Scenario, name: str, against: str, *, gains: bool) -> list[str]:
     """Return what the controller did, and what limits it if it does not gain."""
-    reference, runs, strategy, network = _runs(level, against), _runs(level, name), parse(name), scenario.network
+    reference, runs, strategy, network = level.results(against), level.results(name), parse(name), scenario.network
     beyond = load(network, reference)[1]
     trips, acts = max(sum(run.departures.sum() for run in runs), 1), strategy.controller.name != ALONE
     limit = network.u_max - OPEN_SHARE * (network.u_max - network.u_min)
@@ -136,10 +136,6 @@ def _removed(level: Level, name: str) -> list[str]:
     """Return the removed trips as a reason if they are many: their time counts until then."""
     removed, trips = level.rows.loc[level.rows["controller"] == name, ["removed_veh", "trips"]].sum()
     return [f"{removed / trips:.1%} of its trips end by removal"] if removed > SMALL_SHARE * trips else []
-
-
-def _runs(level: Level, name: str) -> list[Result]:
-    return [level.read(*run) for run in level.runs if run[0] == name]
 
 
 def _leaking(level: Level) -> float:

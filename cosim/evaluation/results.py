@@ -29,10 +29,10 @@ class Level:
     key: Mapping
     controllers: Mapping
 
-    @property
-    def runs(self) -> list[tuple[str, int]]:
-        """Controller and seed of every run."""
-        return list(zip(self.rows["controller"], map(int, self.rows["seed"]), strict=True))
+    def results(self, *controllers: str) -> list[Result]:
+        """Return the runs of these controllers, of all if there are none."""
+        rows = self.rows[self.rows["controller"].isin(controllers)] if controllers else self.rows
+        return [self.read(row.controller, row.seed) for row in rows.itertuples()]
 
     def read(self, controller: str, seed: int) -> Result:
         """Return a run. Raise InputError if it is missing."""
@@ -80,7 +80,7 @@ def read(path: Path, scenario: str | None = None) -> Finished:
     for demand, part in rows.groupby("demand", sort=True):
         folder, part = part["folder"].iloc[0], part.reset_index(drop=True)
         levels.append(Level(demand=float(demand), folder=path / folder, rows=part, **manifest["folders"][folder]))
-    run = levels[0].read(*levels[0].runs[0])
+    run = levels[0].read(*rows.iloc[0][["controller", "seed"]])
     here = (Path(run.scenario_folder) / "scenario.toml").is_file()
     loaded = load_scenario(run.scenario_folder if here else run.scenario)  # a shipped one, on another machine
     return Finished(path=path, levels=tuple(levels), scenario=loaded, sessions=tuple(manifest["sessions"]))

@@ -1,8 +1,8 @@
 """The card on top of the report: the best strategy in four figures."""
 
 import math
-from dataclasses import dataclass, replace
 from statistics import mean
+from typing import NamedTuple
 
 import pandas as pd
 
@@ -19,48 +19,39 @@ QUANTITIES = {  # label -> column, its unit on the card, format of a value, sign
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class Figure:
+class Figure(NamedTuple):
     """One figure of the card: of the strategy, before of the reference; better: None if the interval holds zero."""
 
     label: str
     value: str
+    meaning: str
     before: str = ""
     change: str = ""
     better: bool | None = None
-    meaning: str
 
 
 def card(rows: pd.DataFrame) -> tuple[str, list[Figure], str]:
-    """Return a heading, four figures and the name of the best strategy of one demand level.
+    """Return a heading, the figures that were recorded, and the name of the best strategy of one demand level.
 
     It is compared with the reference on the seeds that both have.
     """
     against, level = statistics.compared_with(rows), rows["demand"].iloc[0]
     name = next((name for name in ranked(rows) if name != against), against)
-    figures = [_figure(rows, level, name, against, label) for label in QUANTITIES]
     heading = name if name == against else f"{name} compared with {against.replace('-', ' ')}"
-    return heading, [figure for figure in figures if figure is not None], name
-
-
-def _figure(rows: pd.DataFrame, level: float, name: str, against: str, label: str) -> Figure | None:
-    """Return one figure, None if it was not recorded."""
-    column, unit, form, good, meaning = QUANTITIES[label]
-    now, before = (statistics.by_seed(rows, level, one, column) for one in (name, against))
-    common = [seed for seed in now if seed in before]
-    value = mean([now[seed] for seed in common or now]) / unit
-    if math.isnan(value):
-        return None
-    pair = statistics.paired(now, before)
-    figure = Figure(label=label, value=form.format(value), meaning=meaning)
-    if name == against or math.isnan(pair.percent):
-        return figure
-    single = math.isnan(pair.percent_half)
-    spread = " on one seed" if single else f" ± {pair.percent_half:.0f} (95 %, {pair.seeds} seeds)"
     than = "without control" if against == REFERENCE else f"under {against}"
-    return replace(
-        figure,
-        before=f"{form.format(mean([before[seed] for seed in common]) / unit)} {than}",
-        change=f"{pair.percent:+.0f} %{spread}",
-        better=pair.percent * good > 0 if pair.excludes_zero else None,
-    )
+    figures = []
+    for label, (column, unit, form, good, meaning) in QUANTITIES.items():
+        now, before = (statistics.by_seed(rows, level, one, column) for one in (name, against))
+        common, pair = [seed for seed in now if seed in before], statistics.paired(now, before)
+        value = mean(now[seed] for seed in common or now) / unit
+        figure = Figure(label, form.format(value), meaning)
+        if name != against and not math.isnan(pair.percent):
+            single = math.isnan(pair.percent_half)
+            spread = " on one seed" if single else f" ± {pair.percent_half:.0f} (95 %, {pair.seeds} seeds)"
+            figure = figure._replace(
+                before=f"{form.format(mean(before[seed] for seed in common) / unit)} {than}",
+                change=f"{pair.percent:+.0f} %{spread}",
+                better=pair.percent * good > 0 if pair.excludes_zero else None,
+            )
+        figures += [] if math.isnan(value) else [figure]
+    return heading, figures, name

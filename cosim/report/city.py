@@ -39,11 +39,9 @@ class City:
         self.scenario = city if isinstance(city, Scenario) else None
         self.network = city.network if isinstance(city, Scenario) else city
         self.name = city.name
-        additional: tuple[Path, ...] = ()
-        left: tuple[str, ...] = ()
-        if self.scenario is not None:
-            setup = settings(self.scenario)
-            additional, left = tuple(own_files(self.scenario, setup.additional)), tuple(setup.leave_signals)
+        setup = None if self.scenario is None else settings(self.scenario)
+        additional = own_files(self.scenario, setup.additional) if self.scenario and setup else ()
+        left = setup.leave_signals if setup else ()
         self._streets = read_streets(ensure_built(self.network).net_file, additional)
         built = net.city_of(self.network)
         self._regions = np.array([built.region_of.get(edge, -1) for edge in self._streets.edges])

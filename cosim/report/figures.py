@@ -1,7 +1,7 @@
 """Figures of an evaluation in SUMO: functions that draw into `ax`, and the files of one demand level."""
 
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,16 +12,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cosim.evaluation import model_validation, statistics
-from cosim.evaluation.results import Finished
+from cosim.evaluation.results import Finished, Level
 from cosim.sumo.arrays import Series
 from cosim.sumo.net import City
 from nmfd.model.regional_model import RegionalModel
-from nmfd.model.scenario import Scenario
 from nmfd.studies import plots
 from nmfd.studies.benchmark import draw_accumulations, interval
 from nmfd.types import Result
 
-Read = Callable[[str, int], Result]  # controller, seed -> run
 Points = dict[str, dict[float, tuple[float, float]]]  # controller -> level -> mean and half of the interval
 
 SATURATION_FLOW = 0.5  # veh/s and lane
@@ -91,28 +89,27 @@ def ranked(rows: pd.DataFrame) -> list[str]:
 def draw_all(finished: Finished) -> None:
     """Draw the pictures of every demand level into its folder, and those of several levels beside them."""
     for level in finished.levels:
-        draw_level(level.folder, finished.scenario, finished.map(), level.rows, level.read)
+        draw_level(level.folder, finished, level)
     if len(finished.levels) > 1:
         draw_levels(finished.path, finished.rows)
 
 
-def draw_level(out: Path, scenario: Scenario, city: City, rows: pd.DataFrame, read: Read) -> None:
-    """Draw all pictures of one demand level into the folder `out`; rows: one per run; read: returns a run."""
-    network = scenario.network
+def draw_level(out: Path, finished: Finished, level: Level) -> None:
+    """Draw all pictures of one demand level into the folder `out`."""
+    rows, network = level.rows, finished.scenario.network
     seed = int(rows["seed"].value_counts().sort_index().idxmax())  # the first one that most controllers have
-    runs = [read(row.controller, row.seed) for row in rows.itertuples()]
+    runs = level.results()
     title = f"seed {seed}{', shaded: all seeds' if rows['seed'].nunique() > 1 else ''}"
-    draw_accumulations(out, scenario, runs, seed=seed, title=title)
+    draw_accumulations(out, finished.scenario, runs, seed=seed, title=title)
     best_first = {run.controller: run for run in runs if run.seed == seed}
     best_first = {name: best_first[name] for name in ranked(rows) if name in best_first}
     against = statistics.compared_with(rows)
     other = next((name for name in best_first if name != against), None)
     _draw_mfds(out / "mfd.png", network, [best_first[name] for name in (against, other) if name in best_first])
-    results = list(best_first.values())
-    closing = (run for run in results if (run.perimeter[:, network.adjacency] < network.u_max - 1e-9).any())
+    closing = (run for run in best_first.values() if (run.perimeter[:, network.adjacency] < network.u_max - 1e-9).any())
     if gating := next(closing, None):
-        _draw_perimeter(out / "perimeter.png", city, network, gating)
-    if guiding := next((run for run in results if run.guided.sum() > 0), None):
+        _draw_perimeter(out / "perimeter.png", finished.map(), network, gating)
+    if guiding := next((run for run in best_first.values() if run.guided.sum() > 0), None):
         _draw_splits(out / "splits.png", network, guiding)
 
 
@@ -148,24 +145,22 @@ def _draw_mfds(path: Path, network: RegionalModel, results: Sequence[Result]) ->
 
 def _draw_perimeter(path: Path, city: City, network: RegionalModel, run: Result) -> None:
     """Draw the boundaries that were closed most over time."""
+    gateways: dict[tuple[int, int], list[int]] = defaultdict(list)
+    for n, gateway in enumerate(city.gateways):
+        if not np.isnan(run.gateway_original_green[0, n]):
+            gateways[gateway.source, gateway.target].append(n)
     pairs = {}
-    for pair in map(tuple, np.argwhere(network.adjacency)):
-        members = [
-            n
-            for n, gateway in enumerate(city.gateways)
-            if (gateway.source, gateway.target) == pair and not np.isnan(run.gateway_original_green[0, n])
-        ]
+    for pair, members in sorted(gateways.items()):
         links = [len(city.gateways[n].links) for n in members]
-        original, shown = run.gateway_original_green[:, members] * links, run.gateway_green[:, members] * links
-        if members and original.sum() > 0:
-            flow = run.gateway_flow[:, members].sum(axis=1) / (SATURATION_FLOW * original.sum(axis=1))
-            pairs[pair] = run.perimeter[:, *pair], shown.sum(axis=1) / original.sum(axis=1), flow
-    closed = [pair for pair in pairs if pairs[pair][0].min() < network.u_max - 1e-9]
-    if not closed:
+        original, green = ((a[:, members] * links).sum(axis=1) for a in (run.gateway_original_green, run.gateway_green))
+        if original.sum() > 0 and run.perimeter[:, *pair].min() < network.u_max - 1e-9:
+            flow = run.gateway_flow[:, members].sum(axis=1) / (SATURATION_FLOW * original)
+            pairs[pair] = run.perimeter[:, *pair], green / original, flow
+    if not pairs:
         return
-    shown_pairs = sorted(sorted(closed, key=lambda pair: pairs[pair][0].mean())[:SHOWN_PANELS])
-    drawing, axes = plots.panels(len(shown_pairs))
-    for ax, pair in zip(axes, shown_pairs, strict=True):
+    shown = sorted(sorted(pairs, key=lambda pair: pairs[pair][0].mean())[:SHOWN_PANELS])
+    drawing, axes = plots.panels(len(shown))
+    for ax, pair in zip(axes, shown, strict=True):
         perimeter(ax, run.step, *pairs[pair]).set_title(f"{pair[0]} > {pair[1]}", fontsize="medium")
     _save(drawing, axes, path, f"{run.controller}, seed {run.seed}")
 

@@ -102,7 +102,7 @@ def _run(run: Finished) -> dict:
 def _level(run: Finished, level: Level) -> dict:
     """Return what the page shows of a demand level."""
     rows = level.rows
-    draw = partial(figures.draw_level, scenario=run.scenario, city=run.map(), rows=rows, read=level.read)
+    draw = partial(figures.draw_level, finished=run, level=level)
     return {
         "title": f"Demand times {level.demand:g}",
         "tables": [_html(table) for table in statistics.shown(statistics.statistics(rows))],
