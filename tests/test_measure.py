@@ -29,50 +29,13 @@ class Streets:
 
     def __init__(self):
         self.time, self.places, self.routes, self.waiting, self.bound = 0.0, {}, {}, [], set()
-        self.held, self.jumped, self.due = set(), 0, {}
-        self.clear()
-
-    def clear(self):
-        self.new, self.gone, self.loads, self.jumps, self.lands = [], [], [], [], []
-
-    # What the meter asks for.
-    def loaded(self):
-        return tuple(self.loads)
-
-    def departed(self):
-        return tuple(self.new)
-
-    def arrived(self):
-        return tuple(self.gone)
-
-    def started_teleport(self):
-        return tuple(self.jumps)
-
-    def ended_teleport(self):
-        return tuple(self.lands)
-
-    def teleports(self):
-        return self.jumped
-
-    def known(self):
-        return (*self.places, *self.held)
-
-    def running(self):
-        return tuple(self.places)
-
-    def pending(self):
-        return tuple(self.waiting)
-
-    def road(self, vehicle):
-        return self.places[vehicle]
+        self.held, self.due = set(), {}
+        self.teleports, self.running, self.road = lambda: 0, lambda: tuple(self.places), self.places.__getitem__
+        self.known, self.pending = lambda: (*self.places, *self.held), lambda: tuple(self.waiting)
+        self.is_free = self.is_private = lambda vehicle: vehicle not in self.bound
 
     def route(self, vehicle):
         return self.routes[vehicle]
-
-    def is_free(self, vehicle):
-        return vehicle not in self.bound
-
-    is_private = is_free
 
     def departure(self, vehicle):
         return self.time, self.time - self.due.get(vehicle, self.time)
@@ -88,18 +51,13 @@ def play():
     meter = Meter(session, CITY, probes=frozenset({"p"}))
 
     def step(*, new=(), move=None, gone=(), loads=(), jumps=(), lands=(), waiting=None, observed=meter):
-        session.clear()
         session.time += 1.0
-        for vehicle in loads:
-            session.loads.append(vehicle)
-        for vehicle in new:
-            session.new.append(vehicle)
-            session.places[vehicle] = session.routes[vehicle][0]
-        session.places.update(move or {})
+        session.places.update({vehicle: session.routes[vehicle][0] for vehicle in new} | (move or {}))
         for vehicle in (*gone, *jumps):
             session.places.pop(vehicle, None)
-        session.gone, session.jumps, session.lands = list(gone), list(jumps), list(lands)
-        session.waiting = session.waiting if waiting is None else list(waiting)
+        session.loaded, session.departed, session.arrived = lambda: loads, lambda: new, lambda: gone
+        session.started_teleport, session.ended_teleport = lambda: jumps, lambda: lands
+        session.waiting = session.waiting if waiting is None else waiting
         return observed.observe()
 
     return SimpleNamespace(session=session, meter=meter, step=step)
