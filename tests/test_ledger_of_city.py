@@ -77,10 +77,8 @@ def shorten(step, random):
 
 def change_target(step, random):
     for vehicle in some(random) if step % 5 == 0 else ():
-        try:
+        with suppress(libsumo.TraCIException):  # on a junction, without a way
             libsumo.vehicle.changeTarget(vehicle, str(random.choice(["C3D3", "B1A1", "C2C1", "D1C1"])))
-        except libsumo.TraCIException:
-            pass  # on a junction, without a way
 
 
 def add(step, random):
@@ -101,11 +99,9 @@ def reuse(step, random):
 def move(step, random):
     """By hand, far off; a waiting vehicle may come onto the road like that."""
     for vehicle in some(random, 0.1) if step % 20 == 10 else ():
-        try:
+        with suppress(libsumo.TraCIException):
             libsumo.vehicle.setRoute(vehicle, ["C1D1", "D1D2"]) if step % 40 == 10 else None
             libsumo.vehicle.moveTo(vehicle, "C1D1_0", 10.0)
-        except libsumo.TraCIException:
-            pass
 
 
 def forget(step, random):
@@ -161,9 +157,7 @@ CASES = {
     ),
     "teleports": Case(script=block, session={"time_to_teleport": 8.0}),
     "disconnected-teleports": Case(
-        vehicles="".join(
-            f'<vehicle id="gap{n}" depart="{4 * n}"><route edges="A1B1 C2D2"/></vehicle>' for n in range(20)
-        ),
+        vehicles='<flow id="gap" begin="0" end="80" period="4"><route edges="A1B1 C2D2"/></flow>',
         session={"time_to_teleport": 8.0},
         options=("--ignore-route-errors", "--time-to-teleport.disconnected", "1"),
         expects=("jumps",),
@@ -198,24 +192,13 @@ CASES = {
 # What SUMO's mesoscopic model does not have: collisions, standing drivers, places on edges, parking rerouters.
 MICRO_ONLY = {"collisions", "teleports", "moved-by-program"}
 QUICK = {  # in the default suite
-    ("calibrators", False),
-    ("collisions", False),
-    ("removed-as-anything", False),
-    ("another-target", True),
-    ("calibrators", True),
-    ("ids-used-again", False),
-    ("long-waits", True),
-    ("moved-by-program", False),
+    False: ("calibrators", "collisions", "removed-as-anything", "ids-used-again", "moved-by-program"),
+    True: ("another-target", "calibrators", "long-waits"),
 }
 MANY = [
-    pytest.param(
-        name,
-        meso,
-        id=f"{name}-{'meso' if meso else 'micro'}",
-        marks=() if (name, meso) in QUICK else (pytest.mark.slow,),
-    )
+    pytest.param(name, meso, id=f"{name}-{way}", marks=() if name in QUICK[meso] else (pytest.mark.slow,))
     for name in CASES
-    for meso in (False, True)
+    for meso, way in ((False, "micro"), (True, "meso"))
     if not (meso and name in MICRO_ONLY)
 ]
 
@@ -234,15 +217,9 @@ def city(tmp_path_factory):
 def trips(city, case: Case, seed: int) -> str:
     random = np.random.default_rng(seed)
     pairs = random.choice(city.edges, (case.trips, 2))
-    return (
-        f'<routes><vType id="DEFAULT_VEHTYPE" {case.type}/>'
-        + case.vehicles
-        + "".join(
-            f'<trip id="t{n}" depart="{150 * n / case.trips:.1f}" from="{a}" to="{b}"/>'
-            for n, (a, b) in enumerate(pairs)
-        )
-        + "</routes>"
-    )
+    trip = '<trip id="t{}" depart="{:.1f}" from="{}" to="{}"/>'
+    several = "".join(trip.format(n, 150 * n / case.trips, *pair) for n, pair in enumerate(pairs))
+    return f'<routes><vType id="DEFAULT_VEHTYPE" {case.type}/>{case.vehicles}{several}</routes>'
 
 
 def run(folder: Path, city, case: Case, *, mesoscopic: bool, seed: int):
@@ -256,12 +233,8 @@ def run(folder: Path, city, case: Case, *, mesoscopic: bool, seed: int):
         seed=seed,
         **case.session,
         options=(
-            *options(out, {}),
-            "--additional-files",
-            str(folder / "more.add.xml"),
-            "--ignore-junction-blocker",
-            "20",
-            *case.options,
+            *(*options(out, {}), "--additional-files", str(folder / "more.add.xml")),
+            *("--ignore-junction-blocker", "20", *case.options),
             *(f"--{key}={value}" for key, value in MESOSCOPIC.items() if mesoscopic),
         ),
     )
@@ -308,15 +281,9 @@ def check(city, meter, states, infos, count):
     ended = infos[:count]  # what is written after that is of those under way
     good = [not trip.get("vaporized") for trip in ended]
     assert (meter.arrivals.sum(), meter.removals.sum()) == (sum(good), count - sum(good))
-    arrived = np.bincount(
-        [
-            city.region_of[trip.get("arrivalLane").rpartition("_")[0]]
-            for trip, there in zip(ended, good, strict=True)
-            if there and trip.get("arrivalLane")
-        ],
-        minlength=3,
-    )
-    assert (meter.arrivals >= arrived).all()
+    lanes = [trip.get("arrivalLane") for trip, there in zip(ended, good, strict=True) if there]
+    arrived = [city.region_of[lane.rpartition("_")[0]] for lane in lanes if lane]
+    assert (meter.arrivals >= np.bincount(arrived, minlength=3)).all()
     departed = sum(float(trip.get("depart")) >= 0 for trip in infos)
     assert meter.departures.sum() == departed
     for state, arrivals, removed, then in states:
@@ -351,10 +318,8 @@ def test_a_vehicle_that_sumo_tells_nothing_of_is_an_error(city, tmp_path):
         '<flow id="f" type="s" begin="0" end="50" period="5" from="A1B1" to="B1C1"/>',
         trips=5,
     )
-    with pytest.raises(
-        LedgerError,
-        match=(r"such as f\.\d\): is the disk full\? Or does their type have has\.tripinfo\.device = false"),
-    ):
+    says = r"such as f\.\d\): is the disk full\? Or does their type have has\.tripinfo\.device = false"
+    with pytest.raises(LedgerError, match=says):
         run(tmp_path, city, silent, mesoscopic=False, seed=1)
 
 
@@ -393,11 +358,9 @@ def test_a_run_says_who_was_removed_and_counts_them_until_then(tmp_path):
     trips = tmp_path / "trips.xml"
     run = cosim.run(scenario, f"{tmp_path / 'mine.py'}:Meddler", steps=8, seed=1, sumo_output={"tripinfo": trips})
     ended = [trip.get("vaporized") for trip in ElementTree.parse(trips).getroot() if float(trip.get("arrival")) >= 0]
-    trajectory, facts, record = run, run.data.attrs, run
     spent = time_spent(ElementTree.parse(trips).getroot())
-    assert metrics.total_time_spent(run) == record.time_spent.sum() == pytest.approx(spent, rel=1e-9)
+    assert metrics.total_time_spent(run) == run.time_spent.sum() == pytest.approx(spent, rel=1e-9)
     assert {"", "traci", "calibrator"} <= set(ended) and ended.count("traci") >= 24
-    assert trajectory.completed[-1] == ended.count("") == record["arrivals"].sum() > 0
-    removed, inside = facts["removed_veh"], trajectory.accumulation[-1].sum()
-    assert removed == len(ended) - ended.count("") == record["removals"].sum() == trajectory.removed[-1].sum()
-    assert facts["departed_veh"] == trajectory.completed[-1] + removed + inside
+    assert run.completed[-1] == ended.count("") == run.arrivals.sum() > 0
+    assert run.removed_veh == len(ended) - ended.count("") == run.removals.sum() == run.removed[-1].sum()
+    assert run.departed_veh == run.completed[-1] + run.removed_veh + run.accumulation[-1].sum()
