@@ -101,8 +101,7 @@ def _iterate(folder: Path, n: int, options: Sequence[str], *, where: str) -> Non
     done = subprocess.run(
         [sys.executable, program, *start, "--first-step", str(n), "--last-step", str(n + 1), *ALWAYS, *options],
         cwd=folder,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
+        capture_output=True,
         stdin=subprocess.DEVNULL,
         env=os.environ | {"SUMO_HOME": sumo.SUMO_HOME, "PYTHONHASHSEED": "0"},
     )
@@ -126,18 +125,14 @@ def _relative_gap(folder: Path, net: Path, n: int, *, begin: float, seed: int) -
         "net-file": file_list([net]),
         "route-files": folder / "sample.rou.xml",
         "weight-files": weights,
-        "weights.expand": "true",
         "gawron.beta": "1",
-        "keep-all-routes": "true",
         "routing-algorithm": "astar",
         "begin": f"{begin:g}",
         "output-file": folder / "fastest.rou.xml",
         "alternatives-output": folder / "ways.xml",
-        "no-warnings": "true",
-        "no-step-log": "true",
-        "ignore-errors": "true",
     }
-    run_sumo("duarouter", options, where=str(net))
+    flags = "--weights.expand", "--keep-all-routes", "--no-warnings", "--no-step-log", "--ignore-errors"
+    run_sumo("duarouter", options, *flags, where=str(net))
     spent = least = 0.0
     for vehicle in read_xml(folder / "ways.xml").iter("vehicle"):
         costs = [float(attribute(route, "cost")) for route in vehicle.iter("route")]

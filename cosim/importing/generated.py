@@ -73,12 +73,9 @@ class _Ends:
         good = streets.core & (streets.length >= SHORT_EDGE_M)
         self._edges = np.flatnonzero(good if good.sum() >= 4 else streets.core)
         weight = streets.lane_metres[self._edges]
-        signalled = [n for n, signal in enumerate(streets.link_signals) if signal is not None]
-        middle = (
-            streets.centre[streets.links[signalled, 0]].mean(axis=0)
-            if signalled
-            else np.average(streets.centre[self._edges], axis=0, weights=weight)
-        )
+        middle = np.average(streets.centre[self._edges], axis=0, weights=weight)
+        if signalled := [n for n, signal in enumerate(streets.link_signals) if signal is not None]:
+            middle = streets.centre[streets.links[signalled, 0]].mean(axis=0)
         away = streets.centre[self._edges] - middle
         self._distance, self._angle = np.hypot(*away.T), np.arctan2(*away.T[::-1])
         radius = np.sqrt(np.average(self._distance**2, weights=weight))

@@ -73,17 +73,10 @@ def _not_reachable(streets: Streets, regions: np.ndarray) -> int | None:
     """Return the smallest region outside the largest set of regions that can be reached from each other."""
     inside = streets.main_part
     used, numbers = np.unique(regions[inside], return_inverse=True)
-    if len(used) == 1:
-        return None
-    compact = np.zeros(len(regions), dtype=int)
-    compact[inside] = numbers
-    links = streets.links[inside[streets.links].all(axis=1)]
-    _, part = connected_components(
-        graph(np.unique(compact[links], axis=0), len(used)), directed=True, connection="strong"
-    )
+    links = np.searchsorted(used, regions[streets.links[inside[streets.links].all(axis=1)]])
+    _, part = connected_components(graph(links, len(used)), directed=True, connection="strong")
     size = np.bincount(numbers, streets.lane_metres[inside])
-    total = np.bincount(part, size)
-    outside = np.flatnonzero(part != np.argmax(total))
+    outside = np.flatnonzero(part != np.argmax(np.bincount(part, size)))
     return None if not len(outside) else int(used[outside[np.argmin(size[outside])]])
 
 
@@ -123,9 +116,7 @@ def _gravity(streets: Streets, members: np.ndarray) -> np.ndarray:
 def names(streets: Streets, regions: EdgeNumbers) -> tuple[str, ...]:
     """Name each region by its place: centre, north, south-west 2, ..."""
     places, middle = positions(streets, regions), _gravity(streets, regions >= 0)
-    radius = np.sqrt(
-        (((streets.centre - middle) ** 2).sum(axis=1) * streets.lane_metres).sum() / (streets.lane_metres.sum())
-    )
+    radius = np.sqrt(np.average(((streets.centre - middle) ** 2).sum(axis=1), weights=streets.lane_metres))
     plain: list[str] = []
     for x, y in places - middle:
         central = np.hypot(x, y) < 0.35 * radius

@@ -160,18 +160,6 @@ def ensure_built(network: RegionalModel) -> SumoFiles:
 
     Raises InputError for a wrong [sumo] table of network.toml, a missing file, or an error of netconvert.
     """
-    files = sources(network)
-    if len(files) == 1:
-        return _built(files[0], network)
-    for key, file in zip(("net", "regions"), files, strict=True):
-        if not file.is_file():
-            path = network_folder(network) / "network.toml"
-            raise config.error(path, f"sumo.{key}", f"no such file: {file}; give the path of an existing one")
-    return SumoFiles(net_file=files[0], regions_csv=files[1])
-
-
-def sources(network: RegionalModel) -> tuple[Path, ...]:
-    """Return the files that define the city: a recipe, or network and regions, which need not exist."""
     folder = network_folder(network)
     path = folder / "network.toml"
     content = config.read(path)
@@ -181,9 +169,12 @@ def sources(network: RegionalModel) -> tuple[Path, ...]:
         )
     table = config.checked(CityTable, content["sumo"], path, "sumo.")
     if table.recipe is not None:
-        return (folder / table.recipe,)
-    assert table.net is not None and table.regions is not None  # CityTable takes no table without either
-    return folder / table.net, folder / table.regions
+        return _built(folder / table.recipe, network)
+    net, regions = (folder / str(name) for name in (table.net, table.regions))  # both, by CityTable
+    for key, file in (("net", net), ("regions", regions)):
+        if not file.is_file():
+            raise config.error(path, f"sumo.{key}", f"no such file: {file}; give the path of an existing one")
+    return SumoFiles(net_file=net, regions_csv=regions)
 
 
 def _built(recipe_file: Path, network: RegionalModel) -> SumoFiles:

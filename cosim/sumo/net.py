@@ -6,6 +6,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
@@ -67,8 +68,10 @@ class City:
     inside: Mapping[str, float] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class _Connection:
+_Lane: TypeAlias = tuple[float, float, str]  # length [m], speed [m/s], id
+
+
+class _Connection(NamedTuple):
     """A link from lane to lane; via: lane on the junction; link: index in the signal's state."""
 
     source: str
@@ -91,7 +94,7 @@ def load_city(net_file: Path, regions_csv: Path, regions: int) -> City:
 
     Raises InputError for a broken file, an unknown edge, an edge without a region and a region without edges.
     """
-    lanes_of, cars, internal, connections = _read_net(Path(net_file))
+    lanes_of, internal, connections = _read_net(Path(net_file))
     given = _read_regions(Path(regions_csv), regions)
     for edge in given:
         if edge not in lanes_of and edge not in internal:
@@ -105,7 +108,8 @@ def load_city(net_file: Path, regions_csv: Path, regions: int) -> City:
         raise InputError(
             f"{regions_csv}: region {min(empty)} has no edges; every region from 0 to {regions - 1} needs one"
         )
-    links = [c for c in connections if (c.source, c.lane) in cars and (c.target, c.to_lane) in cars]
+    cars = {lane for lanes in lanes_of.values() for _, _, lane in lanes}
+    links = [c for c in connections if cars.issuperset((f"{c.source}_{c.lane}", f"{c.target}_{c.to_lane}"))]
     over = _turns_over_junctions(links, connections)
     successors: dict[str, list[str]] = {edge: [] for edge in edges}
     for source, target in sorted({(c.source, c.target) for c in links}):
@@ -165,23 +169,17 @@ def edge_shapes(city: City) -> list[Points]:
     return [shapes[edge] for edge in city.edges]
 
 
-def _read_net(
-    path: Path,
-) -> tuple[
-    dict[str, list[tuple[float, float, str]]], set[tuple[str, int]], dict[str, tuple[float, float]], list[_Connection]
-]:
-    """Return edge -> (length, speed, id) of car lanes; these; internal edge -> (time [s], length [m]); connections."""
-    cars: set[tuple[str, int]] = set()
-    lanes_of: dict[str, list[tuple[float, float, str]]] = {}
+def _read_net(path: Path) -> tuple[dict[str, list[_Lane]], dict[str, tuple[float, float]], list[_Connection]]:
+    """Return edge -> lanes for cars; internal edge -> (time [s], length [m]); connections."""
+    lanes_of: dict[str, list[_Lane]] = {}
     internal: dict[str, tuple[float, float]] = {}
     connections: list[_Connection] = []
     with network_root(path) as root:
         for element in root.iterfind("edge"):
-            edge, open_lanes = attribute(element, "id"), [one for one in element.iter("lane") if for_cars(one)]
+            edge, open_lanes = attribute(element, "id"), filter(for_cars, element.iter("lane"))
             lanes = [(size(one, "length"), size(one, "speed"), attribute(one, "id")) for one in open_lanes]
             if element.get("function", "normal") in NORMAL:
                 lanes_of[edge] = lanes
-                cars |= {(edge, int(attribute(lane, "index"))) for lane in open_lanes}
             else:
                 internal[edge] = max(((long / speed, long) for long, speed, _ in lanes), default=(0.0, 0.0))
         for element in root.iterfind("connection"):
@@ -192,7 +190,7 @@ def _read_net(
             connections.append(_Connection(source, target, via, element.get("tl"), *map(int, numbers)))
     if not lanes_of:
         raise InputError(f"{path}: has no edges; build it with netconvert")
-    return lanes_of, cars, internal, connections
+    return lanes_of, internal, connections
 
 
 def size(lane: ElementTree.Element, name: str) -> float:

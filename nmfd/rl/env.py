@@ -208,16 +208,10 @@ class RegionsEnv(ParallelEnv):
         theta = splits if self._guidance else None
         self._seen, vehicles, over = self._env.advance(Controls(perimeter=perimeter, splits=theta))
         amounts = np.full(len(vehicles), vehicles.sum()) if self._cooperative else vehicles
-        agents, rewards = self.agents, (-amounts / self._env.unit).tolist()
-        result = (
-            self._observations(),
-            dict(zip(agents, rewards, strict=True)),
-            dict.fromkeys(agents, False),
-            dict.fromkeys(agents, over),
-            {agent: {"time_s": self._seen.time} for agent in agents},
-        )
-        self.agents = [] if over else agents
-        return result
+        agents, self.agents = self.agents, [] if over else self.agents
+        rewards = dict(zip(agents, (-amounts / self._env.unit).tolist(), strict=True))
+        info = {agent: {"time_s": self._seen.time} for agent in agents}
+        return self._observations(), rewards, dict.fromkeys(agents, False), dict.fromkeys(agents, over), info
 
     def state(self) -> Vector:
         """Return the observation of all regions together."""
