@@ -325,15 +325,17 @@ def test_ctrl_c_leaves_no_lock_behind(tmp_path):
     run, interrupts = trajectory(), 0
 
     def interrupt():
-        for _ in range(10):
+        while interrupts < 10:
             time.sleep(0.1)
             os.kill(os.getpid(), signal.SIGINT)
 
-    threading.Thread(target=interrupt).start()
+    (thread := threading.Thread(target=interrupt)).start()
     while interrupts < 10:
         with suppress(KeyboardInterrupt):
             while True:
                 run.write(tmp_path / "a.nc")
                 Result.read(tmp_path / "a.nc")
         interrupts += 1
+    with suppress(KeyboardInterrupt):
+        thread.join()
     xr.testing.assert_identical(Result.read(tmp_path / "a.nc").data, run.data)

@@ -117,9 +117,7 @@ def run_many(
                     if show:
                         show(done, len(todo), run.name)
         except KeyboardInterrupt:
-            raise KeyboardInterrupt(
-                f"finished runs are in {out}; the same command with --out {out} continues"
-            ) from None
+            raise KeyboardInterrupt(f"finished runs are in {out}; the same command with --out {out} goes on") from None
         finally:
             table = _table([rows[file] for file in keys if file in rows])
             write_table(out / TABLE, table)
