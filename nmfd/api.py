@@ -23,7 +23,7 @@ from nmfd.runs.run_many import raise_failures as raise_failures
 from nmfd.studies import benchmark as benchmark_study
 from nmfd.studies import bound as bound_study
 from nmfd.studies import robustness as robustness_study
-from nmfd.studies.benchmark import PLANTS, REFERENCE, draw_scenario, key_of, processes
+from nmfd.studies.benchmark import PLANTS, REFERENCE, closed_loop_of, key_of, processes
 from nmfd.studies.benchmark import summary_table as summary_table
 from nmfd.studies.measured import identify as identify
 from nmfd.studies.robustness import SIGMAS_VEH_S
@@ -135,16 +135,25 @@ def benchmark(
     _check_plant(plant)
     strategies = parse_many(controllers, scenario, regional=True)
     check_policies(files, strategies)
-    return benchmark_study.benchmark(
-        scenario,
-        strategies,
-        range(seeds) if isinstance(seeds, int) else list(seeds),
-        plant,
-        out=default_folder(scenario.name) if out is None else Path(out),
-        policies=files,
-        workers=workers,
-        progress=progress,
-    )
+    key = key_of(scenario, strategies, plant, files)
+    runs = [
+        Run(
+            run_name(strategy.name, seed),
+            key(strategy.name),
+            partial(closed_loop_of, strategy, seed, scenario=scenario, plant=plant, policy=files.get(strategy.name)),
+        )
+        for strategy in strategies
+        for seed in (range(seeds) if isinstance(seeds, int) else seeds)
+    ]
+    out = default_folder(scenario.name) if out is None else Path(out)
+    with locked(out):
+        rows = run_many(runs, out, **processes(strategies, workers), progress=progress)
+        done = rows[rows["failure"] == ""]
+        names = [run_name(name, seed) for name, seed in zip(done["controller"], done["seed"], strict=True)]
+        if names:
+            benchmark_study.draw_accumulations(out, scenario, [Result.read(out / f"{name}.nc") for name in names])
+            benchmark_study.draw_scenario(out, scenario)
+    return rows
 
 
 def robustness(
@@ -262,7 +271,7 @@ def show(scenario: Scenario | Path | str, *, out: Path | str | None = None) -> s
     scenario = _loaded(scenario)
     folder = Path("runs") / f"{file_name(scenario.name)}-show" if out is None else Path(out)
     folder.mkdir(parents=True, exist_ok=True)
-    files = draw_scenario(folder, scenario)
+    files = benchmark_study.draw_scenario(folder, scenario)
     total = scenario.step * scenario.demand.sum()
     line = (
         f"{scenario.name}: {scenario.network.regions} regions, {total:,.0f} trips between "

@@ -36,7 +36,7 @@ def in_process(monkeypatch):
     def here(*args, **options):
         return run_many(*args, **{**options, "workers": 0})
 
-    monkeypatch.setattr("nmfd.studies.benchmark.run_many", here)
+    monkeypatch.setattr("nmfd.api.run_many", here)
 
 
 def arrays(folder):

@@ -3,7 +3,6 @@
 import math
 import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,8 +14,6 @@ from nmfd.errors import InputError
 from nmfd.metrics import COUNTED, decision_ms, percent_change
 from nmfd.model.plant import AcyclicPlant, NmfdPlant
 from nmfd.model.scenario import Scenario, perturbed
-from nmfd.runs.progress import Progress
-from nmfd.runs.run_many import Run, locked, run_many, run_name
 from nmfd.runs.tables import text_table
 from nmfd.studies import plots
 from nmfd.types import Plant, Result
@@ -52,42 +49,6 @@ def closed_loop_of(
     controller, actual = strategy.make(scenario, policy), perturbed(scenario, sigma, seed) if sigma else scenario
     result = closed_loop.run(PLANTS[plant](actual), controller, actual, seed=seed)
     return result.assign(controller=strategy.name, plant=plant)
-
-
-def benchmark(
-    scenario: Scenario,
-    strategies: Sequence[Strategy],
-    seeds: Sequence[int],
-    plant: str,
-    *,
-    out: Path,
-    policies: Mapping[str, Path],
-    workers: int = 1,
-    progress: Progress = None,
-) -> "pd.DataFrame":
-    """Do the runs that are not in the folder `out`, draw the figures, and return one row per run (`run_many`).
-
-    Raises:
-        InputError: a controller cannot be made
-    """
-    key = key_of(scenario, strategies, plant, policies)
-    runs = [
-        Run(
-            run_name(strategy.name, seed),
-            key(strategy.name),
-            partial(closed_loop_of, strategy, seed, scenario=scenario, plant=plant, policy=policies.get(strategy.name)),
-        )
-        for strategy in strategies
-        for seed in seeds
-    ]
-    with locked(out):
-        rows = run_many(runs, out, **processes(strategies, workers), progress=progress)
-        done = rows[rows["failure"] == ""]
-        names = [run_name(name, seed) for name, seed in zip(done["controller"], done["seed"], strict=True)]
-        if names:
-            draw_accumulations(out, scenario, [Result.read(out / f"{name}.nc") for name in names])
-            draw_scenario(out, scenario)
-    return rows
 
 
 def processes(strategies: Sequence[Strategy], workers: int) -> dict:
