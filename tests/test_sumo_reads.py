@@ -29,6 +29,7 @@ CALIBRATOR = """<calibrator id="c" edge="B2C2" pos="0">
 TRIP, ENDS = '<trip id="{0}" depart="{1}" ', 'from="A1B1" to="C1D1"'
 FLOW, ROUTED = '<flow id="{0}" begin="{1}" ', '<vehicle id="{0}" depart="{1}" '
 FORMS = {
+    "line": FLOW.replace("{1}", "{1}.4") + 'end="25" period="1" line="7" departPos="base" ' + ENDS + "/>",
     "trip": TRIP + ENDS + "/>",
     "via": TRIP + ENDS + ' via="B2C2"/>',
     "blanks": TRIP + 'from=" A1B1 " to="C1D1&#9;" via=" B2C2 "/>',
@@ -91,7 +92,8 @@ OPTIONS = {  # of SUMO
 
 
 # SUMO draws these with other random numbers of a run, or differs by itself: the same vehicles, driven otherwise.
-OF_CHANCE = ("per_hour", "places", "last", "walker", "waits_for_a_person")
+DRIVEN = ("meso", "lateral", "equipped", "window")
+OF_CHANCE = ("per_hour", "places", "last", "walker", "waits_for_a_person", "line")
 DRAWN = ("chance", "hourly", "shared", "references", "alternatives")  # their destinations
 
 
@@ -138,8 +140,8 @@ def test_an_import_reads_what_sumo_reads(tmp_path, options):
     traffic = read_traffic(case, streets, seed=0)
     read = {vehicle.get("id"): n for n, vehicle in enumerate(traffic.vehicles)}
     assert traffic.left_out == (0.0, 0.0)
-    timed = set(driven) - {"waits_for_a_person"}
-    assert timed <= set(read) if "max-depart-delay" in case.options else timed == set(read)
+    timed = {name for name in driven if not name.startswith(("waits_for_a_person", "line"))}
+    assert timed <= set(read) and ("max-depart-delay" in case.options or timed == set(read)), timed ^ set(read)
     for name in timed:
         start, end = (driven[name][key].rpartition("_")[0] for key in ("departLane", "arrivalLane"))
         assert streets.edges[traffic.origin[read[name]]] == start, name
@@ -149,16 +151,22 @@ def test_an_import_reads_what_sumo_reads(tmp_path, options):
         assert -0.02 <= traffic.depart[read[name]] - due < case.step_length + 0.02, name
 
 
-@pytest.mark.parametrize("options", ["", *map(OPTIONS.__getitem__, ("meso", "lateral", "equipped", "window"))])
-def test_seed_0_without_control_is_plain_sumo(tmp_path, options):
-    config = city(tmp_path, [name for name in FORMS if name not in OF_CHANCE], options)
+SURE = [name for name in FORMS if name not in OF_CHANCE]
+
+
+@pytest.mark.parametrize(
+    "forms, options", [(["line", "until_then"], ""), (SURE, "")] + [(SURE, OPTIONS[name]) for name in DRIVEN]
+)
+def test_seed_0_without_control_is_plain_sumo(tmp_path, forms, options):
+    """Buses wait in one queue with cars."""
+    config = city(tmp_path, forms, options)
     imported(config)
     out = tmp_path / "t.xml"
     run(tmp_path / "scenarios" / "x", "no-control", seed=0, sumo_output={"tripinfo": out}, progress=False)
     keys = ("depart", "arrival", "routeLength", "departLane", "arrivalLane", "timeLoss")
     mine, alone = ({name: [trip[key] for key in keys] for name, trip in t.items()} for t in (trips(out), plain(config)))
     ended = {name: trip for name, trip in alone.items() if trip[1] != "-1.00"}  # the import simulates longer
-    assert {name: mine[name] for name in ended} == ended and len(ended) > 55 and set(mine) == set(alone)
+    assert {name: mine[name] for name in ended} == ended and len(ended) > 25 and set(mine) == set(alone)
 
 
 def test_vehicles_of_a_loaded_state_begin_where_they_are(tmp_path):

@@ -67,9 +67,14 @@ class Launch:
         """Return a simulation whose trips, drivers and reroutes follow from `seed`."""
         settings, routes = self._settings, self._folder / "trips.rou.xml"
         self.vehicles = self._write_vehicles(routes, seed)
+        beside = own_files(self._scenario, settings.background)
+        if settings.routes and beside and not seed:
+            files = recorded.merge(routes, beside, self._folder / "beside.rou.xml")
+        else:
+            files = [routes, *beside]
         return Session(
             self._city.net_file,
-            [routes, *own_files(self._scenario, settings.background)],
+            files,
             seed=seed,
             step_length=settings.step_length,
             time_to_teleport=settings.time_to_teleport,

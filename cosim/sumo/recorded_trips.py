@@ -176,6 +176,21 @@ def write_recorded_trips(originals: RecordedTrips, drawn: Sequence[DrawnTrip], p
     _write(path, [_departing(originals.elements[n], name, depart) for depart, n, name in drawn])
 
 
+def merge(path: Path, beside: Sequence[Path], rest: Path) -> list[Path]:
+    """Put the timed vehicles of the files `beside` into the route file `path`, and all else of them into `rest`.
+
+    In one file vehicles queue in the order of their departures, as in the city's own files.
+    Returns both files, types first.
+    """
+    elements, others = list(read_xml(path)), list[ElementTree.Element]()
+    for element in (element for file in beside for element in read_xml(file)):
+        timed = element.tag in ("vehicle", "trip") and element.get("depart", "").replace(".", "", 1).isdecimal()
+        (elements if timed else others).append(element)
+    _write(path, sorted(elements, key=lambda element: float(element.get("depart", 0))))
+    _write(rest, others)
+    return [rest, path]
+
+
 def write_held_trips(
     originals: RecordedTrips,
     drawn: Sequence[DrawnTrip],
