@@ -1,4 +1,4 @@
-"""The SUMO session: the only module that imports libsumo. At most one simulation per process."""
+"""The SUMO session; only it and `departures` import libsumo. At most one simulation per process."""
 
 import ctypes
 import os
