@@ -220,7 +220,7 @@ def _start(job: Callable[[], Result | str], folder: str) -> tuple[connection.Con
             signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
     ours, theirs = context.Pipe()
     process = context.Process(target=_work, args=(theirs, folder, environment), daemon=True)
-    with STARTING:  # without the user's script, which would do everything again
+    with STARTING, _uninterrupted():  # without the user's script, which would do everything again
         main, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
         try:
             process.start()
@@ -228,6 +228,21 @@ def _start(job: Callable[[], Result | str], folder: str) -> tuple[connection.Con
             sys.modules["__main__"] = main
     theirs.close()
     return ours, process
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Delay Ctrl-C and SIGTERM: the server shows a traceback if a process ends while it asks for another one."""
+    held: list[int] = []
+    numbers = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
+    before = {number: signal.signal(number, lambda received, _: held.append(received)) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for received in held[:1]:
+            signal.raise_signal(received)
 
 
 def _work(channel: connection.Connection, folder: str, environment: Mapping[str, str]) -> None:
