@@ -1,6 +1,8 @@
 """Every form in which SUMO takes vehicles: an import drives the same ones, trip by trip."""
 
 import shutil
+import subprocess
+import sys
 import xml.etree.ElementTree as ElementTree
 
 import pytest
@@ -196,3 +198,18 @@ def test_what_is_left_out_is_said_first_and_last(tmp_path):
     assert last in (tmp_path / "networks" / "x" / "verdict.txt").read_text()
     config.write_text(config.read_text().replace("<end", '<ignore-route-errors value="true"/><end'))
     assert " 0.0% of the vehicles and 0.0% of the distance left out" in imported(config)
+
+
+def test_a_script_without_a_guard_reads_vehicles(tmp_path):
+    """A process that ran the script again would end the import."""
+    script = tmp_path / "script.py"
+    script.write_text(f"""
+from pathlib import Path
+from cosim.importing.case import read_sumo_input
+from cosim.importing.demand import read_traffic
+from cosim.importing.streets import read_streets
+case = read_sumo_input(Path({str(city(tmp_path, ["trip", "count"]))!r}))
+print(len(read_traffic(case, read_streets(case.net, case.additional), seed=0).vehicles))
+""")
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=120)
+    assert done.stdout.split() == [str(len(plain(tmp_path / "c.sumocfg")))], done.stderr

@@ -2,20 +2,19 @@
 
 import heapq
 import math
-import multiprocessing
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import chdir, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import count
 
 import libsumo
 
 from cosim.sumo.session import ERRORS, REFUSALS, one_line, start_quietly
-from nmfd.errors import InputError, RunFailed
+from nmfd.errors import InputError
 from nmfd.runs.files import temporary_folder
+from nmfd.runs.run_many import Run, processes
 
 IDLE_S = 86400.0  # without a new vehicle: the end of a simulation that has no end
 # No vehicle or person leaves its queue; trips get routes when they are due.
@@ -58,19 +57,19 @@ def read_departures(options: Mapping[str, object], *, end: float | None, where: 
     options: of SUMO, with absolute paths. SUMO runs in a process of its own.
     Raises InputError with SUMO's words and the file `where`.
     """
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        try:
-            return pool.submit(_said, {**options, **UNDRIVEN}, math.inf if end is None else end).result()
-        except (RunFailed, BrokenProcessPool) as error:
-            raise InputError(f"{where}: sumo cannot run it: {error}; correct the input") from None
+    job = Run("departures", {}, partial(_said, {**options, **UNDRIVEN}, math.inf if end is None else end))
+    [(_, outcome)] = processes([job], 1)
+    if isinstance(outcome, str):
+        raise InputError(f"{where}: sumo cannot run it: {outcome}; correct the input")
+    return outcome
 
 
-def _said(options: Mapping[str, object], end: float) -> list[Departure]:
-    """Return `_read`. Raises RunFailed with SUMO's words: libsumo's errors do not leave a process."""
+def _said(options: Mapping[str, object], end: float) -> list[Departure] | str:
+    """Return `_read`, or SUMO's words if it refuses the files."""
     try:
         return _read(options, end)
     except ERRORS as error:
-        raise RunFailed(one_line(error)) from None
+        return one_line(error)
 
 
 def _read(options: Mapping[str, object], end: float) -> list[Departure]:

@@ -61,13 +61,14 @@ class Run:
     name: stem of its file (`run_name`)
     key: everything the result depends on, as JSON types: hashes, settings, versions. Its item "controller" holds what
         only runs of this controller depend on; all else is the same for all runs of a folder
-    job: a picklable function without arguments that returns the Result, or why there is none
+    job: a picklable function without arguments that returns the Result, or the reason why there is none; `processes`
+        takes any outcome for a Result
     folder: below that of all runs
     """
 
     name: str
     key: Mapping[str, Any]
-    job: Callable[[], Result | str]
+    job: Callable[[], Any]
     folder: str = ""
 
     @property
@@ -165,9 +166,7 @@ def _alone(job: Callable[[], Result | str], folder: str, time_limit: float | Non
     return list(_processes([Run("", {}, job)], 1, time_limit, folder))[0][1]
 
 
-def processes(
-    todo: Sequence[Run], workers: int, time_limit: float | None = None
-) -> Generator[tuple[Run, Result | str]]:
+def processes(todo: Sequence[Run], workers: int, time_limit: float | None = None) -> Generator[tuple[Run, Any]]:
     """Yield every run with its outcome from a process of its own, `workers` at a time; no process is left."""
     try:
         yield from _processes(todo, workers, time_limit)
