@@ -39,6 +39,7 @@ def imported(config, tmp_path_factory):
     """(project folder, what the import printed)."""
     project = tmp_path_factory.mktemp("project")
     text = good(cosim("import", config, "--regions", 3, "--out", project / "networks" / "tiny"))
+    shutil.copytree(project, project.with_name("as-imported"))  # runs build something in the other one
     return project, text
 
 
@@ -106,7 +107,7 @@ def test_gateways_and_quality_add_up(imported):
 
 
 def test_import_is_deterministic_and_atomic(imported, config, tmp_path):
-    project = imported[0]
+    project = imported[0].with_name("as-imported")
     good(cosim("import", config, "--regions", 3, "--out", tmp_path / "networks" / "tiny"))
     for folder in ("networks", "scenarios"):
         here, there = (sorted((root / folder).rglob("*")) for root in (project, tmp_path))
