@@ -23,7 +23,7 @@ from nmfd.runs.run_many import raise_failures as raise_failures
 from nmfd.studies import benchmark as benchmark_study
 from nmfd.studies import bound as bound_study
 from nmfd.studies import robustness as robustness_study
-from nmfd.studies.benchmark import PLANTS, REFERENCE, closed_loop_of, key_of, processes
+from nmfd.studies.benchmark import PLANTS, REFERENCE, closed_loop_of, key_of, workers_for
 from nmfd.studies.benchmark import summary_table as summary_table
 from nmfd.studies.measured import identify as identify
 from nmfd.studies.robustness import SIGMAS_VEH_S
@@ -147,7 +147,7 @@ def benchmark(
     ]
     out = default_folder(scenario.name) if out is None else Path(out)
     with locked(out):
-        rows = run_many(runs, out, **processes(strategies, workers), progress=progress)
+        rows = run_many(runs, out, workers=workers_for(strategies, workers), progress=progress)
         done = rows[rows["failure"] == ""]
         names = [run_name(name, seed) for name, seed in zip(done["controller"], done["seed"], strict=True)]
         if names:
@@ -189,7 +189,7 @@ def robustness(
     ]
     out = default_folder(scenario.name) if out is None else Path(out)
     with locked(out):
-        rows = run_many(runs, out, **processes(strategies, workers), progress=progress)
+        rows = run_many(runs, out, workers=workers_for(strategies, workers), progress=progress)
         if (rows["failure"] == "").any():
             robustness_study.draw(out, rows)
     return rows

@@ -66,7 +66,7 @@ class Commands(click.Group):
             return super().invoke(ctx)
         except (KeyboardInterrupt, Exception) as error:
             if stops or isinstance(error, KeyboardInterrupt):
-                told = str(error) * isinstance(error, KeyboardInterrupt)
+                told = str(error) if isinstance(error, KeyboardInterrupt) else ""
                 text, status = ": ".join(filter(None, ["interrupted", told])), 130
             elif isinstance(error, BrokenPipeError) or not isinstance(error, (RunFailed, InputError, OSError)):
                 raise  # click ends without a word if nobody reads on

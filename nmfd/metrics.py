@@ -2,11 +2,11 @@
 
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from nmfd.arrays import PerRegion
+from nmfd.arrays import PerRegion, StatesOverTime
 from nmfd.types import Result, Status
 
 # Counts of decisions that are not OK: column -> its heading in every table, and its meaning.
@@ -54,6 +54,11 @@ def total_time_spent(result: Result) -> float:
         return float(result.time_spent.sum())
     vehicles = result.accumulation[:-1].sum() + result.backlog[:-1].sum() + result.removed[:-1].sum()
     return float(result.step * vehicles)
+
+
+def largest_accumulation(states: Iterable[StatesOverTime]) -> PerRegion:
+    """Return the largest accumulation (R,) [veh] of each region in any run. states: (T+1, R, R) [veh] of each run"""
+    return np.max([x.sum(axis=2).max(axis=0) for x in states], axis=0)
 
 
 def percent_change(value: float, reference: float) -> float:

@@ -9,6 +9,7 @@ from cosim.evaluation.results import Finished, Level
 from nmfd.arrays import PerRegion
 from nmfd.controllers.rules import Gating, PiGating
 from nmfd.controllers.strategy import ALONE, Strategy, parse
+from nmfd.metrics import largest_accumulation
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.studies.benchmark import REFERENCE
@@ -46,7 +47,8 @@ def city(level: Level, finished: Finished) -> str:
     if len(known := np.flatnonzero(~np.isnan(peak))):
         most = known[np.argmax(peak[known])]
         state += f"; {names[most]} is nearest, with {peak[most]:.1f} times"
-    state += f"; that of {len(names) - len(known)} regions was not seen" * (len(known) < len(names))
+    if unseen := len(names) - len(known):
+        state += f"; that of {unseen} regions was not seen"
     if hot := [
         f"{names[r]} ({beyond[r]:.0%} of the time, up to {peak[r]:.1f} times)"
         for r in np.flatnonzero(beyond > SMALL_SHARE)
@@ -123,7 +125,7 @@ def _never_reached(strategy: Strategy, scenario: Scenario, runs: Sequence[Result
     gate = strategy.make(scenario) if strategy.controller.options is Gating else None
     if not isinstance(gate, PiGating):
         return []
-    most = np.max([run.accumulation.sum(axis=2).max(axis=0) for run in runs], axis=0)
+    most = largest_accumulation(run.accumulation for run in runs)
     return [
         f"{scenario.network.region_names[region]} never reaches the set point of its gate, {goal:.0f} vehicles, with "
         f"{most[region]:.0f} at most"

@@ -22,6 +22,7 @@ from cosim.sumo.build import network_folder
 from cosim.sumo.net import city_of
 from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
+from nmfd.metrics import largest_accumulation
 from nmfd.model import authority, identification, mfd
 from nmfd.model.identification import observed_split_ratios
 from nmfd.model.planning import GUIDED, GUIDING
@@ -149,7 +150,7 @@ def _protected(scenario: Scenario, regions: tuple[int, ...], *, write: bool) -> 
         text = path.read_text(encoding="utf-8")
         top, bracket, tables = text.partition("\n[")
         top, count = re.subn(r"(?m)^protected\s*=\s*\[[^\]]*\].*$", line, top)
-        changed = top + f"\n{line}\n" * (not count) + bracket + tables
+        changed = (top if count else f"{top}\n{line}\n") + bracket + tables
         if tomllib.loads(changed) != tomllib.loads(text) | {"protected": list(regions)}:
             raise InputError(f"{path}: protected: cannot be changed here; write {line} yourself")
         files.write_text(path, changed)
@@ -212,7 +213,7 @@ def run_verdict(scenario: Scenario, network: RegionalModel, results: Sequence[Re
     return authority.verdict(
         network,
         boundaries,
-        most=np.max([result.accumulation.sum(axis=2).max(axis=0) for result in results], axis=0),
+        most=largest_accumulation(result.accumulation for result in results),
         started=started,
         waiting=max(float(result.backlog.sum(axis=(1, 2)).max()) for result in results),
         slowness=trip / (trip - lost) if trip > lost else np.nan,

@@ -14,6 +14,7 @@ from cosim.evaluation.simulate import regional_outflow
 from cosim.sumo.arrays import Points, RegionCounts
 from nmfd.arrays import Adjacency
 from nmfd.controllers.strategy import parse
+from nmfd.metrics import largest_accumulation
 from nmfd.model.dynamics import advance, parameters
 from nmfd.model.identification import Observed
 from nmfd.model.regional_model import RegionalModel
@@ -133,7 +134,7 @@ def prediction_errors(found: Finished, model: Path | None = None) -> pd.DataFram
         for controller, rows in level.rows.groupby("controller", sort=False):
             network = parse(controller).planning(scenario, model).network
             runs = [observed(level.read(controller, seed)) for seed in rows["seed"]]
-            most = np.max([run.accumulation.sum(axis=2).max(axis=0) for run in runs], axis=0)
+            most = largest_accumulation(run.accumulation for run in runs)
             columns = {
                 "demand": level.demand,
                 "controller": controller,

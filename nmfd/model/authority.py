@@ -93,7 +93,8 @@ def verdict(
     guidance = f"cosim evaluate {scenario} --controllers no-control,route-guidance"
     pressure = f"{guidance},no-control+max-pressure"
     names, flow, load = network.titles, boundaries.flow.sum(), most / network.seen_critical
-    passed = f"; {boundaries.controlled.sum() / max(flow, 1):.0%} of the {flow:,.0f} crossings {where} passed one"
+    part = f"{boundaries.controlled.sum() / max(flow, 1):.0%} of the {flow:,.0f} crossings {where}"
+    passed = f"; {part} passed one" if flow else ""
     guess = ", a guess" if network.placeholder else ""
     ratios = ", ".join(
         f"{name} above {network.critical_above[r]:.0f} veh, not seen" if np.isnan(ratio) else f"{name} {ratio:.2f}"
@@ -104,7 +105,7 @@ def verdict(
     traffic += "" if np.isnan(slowness) else f", and a trip took {slowness:.1f} times its free-flow time"
     details = [
         f"Of {boundaries.gateways.sum()} gateways {boundaries.controllable.sum()} have a signal that perimeter control "
-        f"can use{passed * bool(flow)}.",
+        f"can use{passed}.",
         f"Highest accumulation {where}, as a multiple of the critical one{guess}: {ratios}.",
         f"There, {traffic}.",
     ]

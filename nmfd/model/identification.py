@@ -16,6 +16,7 @@ from jaxtyping import Float, Real
 from torch import Tensor
 
 from nmfd.arrays import PairsOverTime, StatesOverTime, TurnsOverTime
+from nmfd.metrics import largest_accumulation
 from nmfd.model import dynamics
 from nmfd.model.mfd import Mfd
 from nmfd.model.regional_model import RegionalModel
@@ -59,7 +60,7 @@ class _Model(torch.nn.Module):
 
         self.adjacency, self._fastest = torch.tensor(network.adjacency, dtype=torch.float32), fastest
         self._u_max = network.u_max
-        largest = np.max([run.accumulation.sum(axis=2).max(axis=0) for run in runs], axis=0)
+        largest = largest_accumulation(run.accumulation for run in runs)
         flow = np.max([run.crossings.max(axis=0) for run in runs], axis=0) / step
         self.free_rate = free(np.log([min(mfd.c, 0.5 * fastest) for mfd in network.mfds]))
         self.drop, self.bend = free(np.full(network.regions, 0.5)), free(np.zeros(network.regions))

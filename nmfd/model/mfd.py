@@ -41,7 +41,7 @@ class Mfd:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if not np.isfinite(value) or (name == "jam" and value <= 0):
-                allowed = "a number" + " above 0" * (name == "jam")
+                allowed = "a number above 0" if name == "jam" else "a number"
                 raise InputError(f"Mfd: {name}: expected {allowed}, got {value:g} instead; give a finite one")
 
     def rate(self, accumulation: Values | float) -> Values:

@@ -51,10 +51,10 @@ def closed_loop_of(
     return result.assign(controller=strategy.name, plant=plant)
 
 
-def processes(strategies: Sequence[Strategy], workers: int) -> dict:
-    """Return the options of `run_many`: this process for one worker, unless the user's own controllers may crash."""
+def workers_for(strategies: Sequence[Strategy], workers: int) -> int:
+    """Return `workers` for `run_many`: 0, this process, for one, unless the user's own controllers may crash."""
     own = any(strategy.controller.own for strategy in strategies)
-    return {"workers": workers if own or workers > 1 else 0}
+    return workers if own or workers > 1 else 0
 
 
 def key_of(

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from nmfd.arrays import PerRegion, Points, StatesOverTime
+from nmfd.metrics import largest_accumulation
 from nmfd.model import identification, mfd
 from nmfd.model.identification import Observed
 from nmfd.model.regional_model import RegionalModel
@@ -62,7 +63,7 @@ def with_guesses(
 
 def _largest(samples: Samples, accumulations: States) -> PerRegion:
     if len(accumulations):
-        return np.max([state.sum(axis=2).max(axis=0) for state in accumulations], axis=0)
+        return largest_accumulation(accumulations)
     return np.array([np.concatenate(list(cloud.values()))[:, 0].max(initial=0.0) for cloud in samples])
 
 
