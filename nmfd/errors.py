@@ -1,7 +1,10 @@
-"""Errors that end a command in one line."""
+"""Errors that end a command in one line, and the delay of Ctrl-C."""
 
 import difflib
-from collections.abc import Iterable
+import signal
+import threading
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 
 
@@ -29,3 +32,18 @@ def need(what: str, extra: str, *modules: str) -> None:
         raise InputError(
             f"{what}: needs {', '.join(missing)}; install the extra {extra} with: pip install -e '.[{extra}]'"
         )
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Delay Ctrl-C and SIGTERM until the end of the block, for code that they would leave with a lock held."""
+    held: list[int] = []
+    numbers = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
+    before = {number: signal.signal(number, lambda received, _: held.append(received)) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for received in held[:1]:
+            signal.raise_signal(received)

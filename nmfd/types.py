@@ -1,8 +1,7 @@
 """Types that plants, controllers and the closed loop exchange, and the result of a run."""
 
 import os
-from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Flag
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 from nmfd.arrays import PerPair, PerRegion, PerTurn
-from nmfd.errors import InputError
+from nmfd.errors import InputError, uninterrupted
 
 if TYPE_CHECKING:
     import pandas
@@ -151,12 +150,6 @@ class Quantity(NamedTuple):
         return self.dimensions, array, {"long_name": self.text} | ({"units": self.unit} if self.unit else {})
 
 
-def _apart(function: Callable, *arguments: Any, **options: Any) -> Any:
-    """Call `function` in a thread, which Ctrl-C does not interrupt: else xarray would keep its lock for ever."""
-    with ThreadPoolExecutor(1) as thread:
-        return thread.submit(function, *arguments, **options).result()
-
-
 _PAIRS = ("time", "region", "destination")
 _TURNS = ("interval", "region", "next_region", "destination")
 VARIABLES: dict[str, Quantity] = {
@@ -213,7 +206,8 @@ class Result:
         import xarray
 
         try:
-            data = _apart(xarray.load_dataset, path, engine="netcdf4", decode_times=False, mask_and_scale=False)
+            with uninterrupted():
+                data = xarray.load_dataset(path, engine="netcdf4", decode_times=False, mask_and_scale=False)
         except FileNotFoundError:
             raise InputError(f"{path}: no such run") from None
         except Exception as error:
@@ -237,8 +231,9 @@ class Result:
         path = Path(path)
         temporary = path.with_name(f".{path.stem}-{os.getpid()}.tmp")
         try:
-            _apart(data.to_netcdf, temporary, engine="netcdf4", encoding=encoding)
-            os.replace(temporary, path)
+            with uninterrupted():  # xarray would keep its lock for ever
+                data.to_netcdf(temporary, engine="netcdf4", encoding=encoding)
+                os.replace(temporary, path)
         except RuntimeError as error:  # netCDF hides the reason of the system
             raise InputError(f"{path}: cannot be written ({error}); is the disk full?") from None
         finally:

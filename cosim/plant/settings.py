@@ -30,7 +30,8 @@ class Settings(config.Settings):
     background: Texts = setting("route files of traffic outside the demand: public transport, persons", ())
     additional: Texts = setting("additional files: vehicle types, stops, signal programmes", ())
     options: dict[Text, Text] = setting(
-        "SUMO's own options that change what drives, such as max-depart-delay, as texts; the settings here go first", {}
+        "SUMO's options that change the traffic, such as max-depart-delay; other keys of [sumo] override them",
+        {},
     )
     signals: Signals = setting("control of the signals", FIXED)
     leave_signals: Texts = setting("signals that perimeter control does not change", ())

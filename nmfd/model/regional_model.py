@@ -179,23 +179,36 @@ class RegionTable(Settings):
     adjacent: Regions = setting("regions into which roads lead from here")
     mfd: MfdTable | None = setting("own MFD instead of [mfd]", None)
     exit_rates: config.PositiveNumbers | None = setting(
-        "rate at which vehicles leave, relative to the MFD, per destination region", None, unit="-"
+        "rate at which vehicles leave, relative to the MFD, per destination region; for all regions or none",
+        None,
+        unit="-",
     )
     capacity: config.PositiveNumbers | None = setting(
-        "largest flow into each adjacent region while that is empty, under max; with storage", None, unit="veh/s"
+        "largest flow into each adjacent region while that is empty, at the largest u, in the order of adjacent; with "
+        "storage, for all regions or none",
+        None,
+        unit="veh/s",
     )
     storage: float | None = setting(
-        "accumulation that lets no vehicle in; with capacity", None, unit="veh", gt=0.0, le=MOST_VEHICLES
+        "accumulation at which no vehicle can enter; with capacity", None, unit="veh", gt=0.0, le=MOST_VEHICLES
     )
     controllable: Annotated[tuple[Share, ...], Field(strict=False)] | None = setting(
-        "share of the flow into each adjacent region that passes signals under control", None, unit="-"
+        "share of the flow into each adjacent region that passes signals under control, in the order of adjacent; for "
+        "all regions or none",
+        None,
+        unit="-",
     )
     critical_above: float | None = setting(
-        "largest accumulation of data without falling branch; the critical one is above", None, unit="veh", ge=0.0
+        "largest accumulation in data that show no falling branch; the critical one is above it",
+        None,
+        unit="veh",
+        ge=0.0,
     )
     doubts: config.Texts = setting("warnings of cosim identify about the fit", ())
     observed_split_ratios: dict[str, dict[str, Share]] = setting(
-        "measured: destination = { next region = share }, sum 1; elsewhere vehicles cross the fewest boundaries", {}
+        "measured shares: destination region = { next region = share }, sum 1; elsewhere vehicles cross the fewest "
+        "boundaries",
+        {},
     )
 
 

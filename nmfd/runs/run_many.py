@@ -36,7 +36,7 @@ from urllib.parse import unquote
 from filelock import FileLock, Timeout
 
 from nmfd import __version__
-from nmfd.errors import InputError, RunFailed, need
+from nmfd.errors import InputError, RunFailed, need, uninterrupted
 from nmfd.metrics import summary
 from nmfd.runs.files import run_name as run_name
 from nmfd.runs.files import write_table, write_text
@@ -219,7 +219,8 @@ def _start(job: Callable[[], Result | str], folder: str) -> tuple[connection.Con
             signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
     ours, theirs = context.Pipe()
     process = context.Process(target=_work, args=(theirs, folder, environment), daemon=True)
-    with STARTING, _uninterrupted():  # without the user's script, which would do everything again
+    # Without the user's script, which would do everything again; the server shows a traceback of a request cut short.
+    with STARTING, uninterrupted():
         main, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
         try:
             process.start()
@@ -227,21 +228,6 @@ def _start(job: Callable[[], Result | str], folder: str) -> tuple[connection.Con
             sys.modules["__main__"] = main
     theirs.close()
     return ours, process
-
-
-@contextmanager
-def _uninterrupted() -> Iterator[None]:
-    """Delay Ctrl-C and SIGTERM: the server shows a traceback if a process ends while it asks for another one."""
-    held: list[int] = []
-    numbers = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
-    before = {number: signal.signal(number, lambda received, _: held.append(received)) for number in numbers}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-        for received in held[:1]:
-            signal.raise_signal(received)
 
 
 def _work(channel: connection.Connection, folder: str, environment: Mapping[str, str]) -> None:
