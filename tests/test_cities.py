@@ -49,7 +49,7 @@ def check(folder: Path, name: str, intervals: int) -> None:
     "name, expected",
     [
         ("cross", None),
-        ("grid6", None),
+        pytest.param("grid6", None, marks=pytest.mark.slow),
         ("corridor", None),
         ("DRT", "names no vehicles for the streets of cars"),
         ("ramp", "no two regions can be made"),

@@ -43,7 +43,10 @@ def small(tmp_path_factory):
     return scenario.folder
 
 
-@pytest.mark.parametrize("controller", ["no-control", "pi-gating", "mpc-pc", "mpc-pcrg", "dpc-pc", "dpc-pcrg"])
+@pytest.mark.parametrize(
+    "controller",
+    ["no-control", "mpc-pcrg", "dpc-pcrg", *(pytest.param(o, marks=pytest.mark.slow) for o in ("pi-gating", "mpc-pc"))],
+)
 def test_every_controller_runs(small, tmp_path, controller):
     out = tmp_path / "run"
     text = good(cosim("run", small, "--controller", controller, "--steps", STEPS, "--out", out))

@@ -49,7 +49,7 @@ def test_ctrl_c_at_any_moment_is_one_line(tmp_path, after, wait):
     assert returned == 130 and said.startswith("nmfd: interrupted") and said.count("\n") == 1, said
 
 
-@pytest.mark.parametrize("streams", ["<&- >&- 2>&-", "2>&1 | true"])
+@pytest.mark.parametrize("streams", ["<&- >&- 2>&-", pytest.param("2>&1 | true", marks=pytest.mark.slow)])
 def test_runs_are_kept_without_standard_streams(tmp_path, streams):
     command = [sys.executable, "-m", "nmfd", "benchmark", str(tiny.write(tmp_path)), "--controllers", "no-control"]
     subprocess.run([f"{shlex.join(command)} --workers 2 --seeds 2 --out {tmp_path}/out {streams}"], shell=True)
@@ -58,22 +58,25 @@ def test_runs_are_kept_without_standard_streams(tmp_path, streams):
 
 @pytest.mark.parametrize(
     "by, status",
-    [(signal.SIGINT, 130), (signal.SIGTERM, 130), (signal.SIGKILL, -9)],
-    ids=["Ctrl-C", "SIGTERM", "kill -9"],
+    [
+        pytest.param(signal.SIGINT, 130, id="Ctrl-C"),
+        pytest.param(signal.SIGTERM, 130, id="SIGTERM", marks=pytest.mark.slow),
+        pytest.param(signal.SIGKILL, -9, id="kill -9"),
+    ],
 )
 def test_a_stopped_benchmark_continues(tmp_path, by, status):
     scenario = tiny.write(tmp_path)
-    command = ("benchmark", scenario, "--controllers", "no-control,pi-gating", "--seeds", 20, "--workers", 2)
+    command = ("benchmark", scenario, "--controllers", "no-control,pi-gating", "--seeds", 10, "--workers", 2)
     returned, said = stopped("nmfd", *command, out=tmp_path / "out", by=by)
     assert returned == status and "Traceback" not in said, said
     if status == 130:
         assert said.splitlines()[-1].startswith("nmfd: interrupted: finished runs are in"), said
     first = results(tmp_path / "out")
-    assert 0 < len(first) < 40
+    assert 0 < len(first) < 20
     good(nmfd(*command, "--out", tmp_path / "out"))
     good(nmfd(*command, "--out", tmp_path / "whole"))
     whole = results(tmp_path / "whole")
-    assert len(whole) == 40 and same(results(tmp_path / "out"), whole)
+    assert len(whole) == 20 and same(results(tmp_path / "out"), whole)
     assert same(first, {name: whole[name] for name in first})
 
 

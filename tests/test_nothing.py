@@ -31,7 +31,7 @@ def rows() -> pd.DataFrame:
         "benchmark scenario --controllers no-control,pi-gating,mpc-pcrg --seeds 2 --out out",
         "robustness scenario --controllers pi-gating --scenarios 2 --out out",
         "show scenario --out out",
-        "bound scenario --controller bound-pc --out plan.npz",
+        pytest.param("bound scenario --controller bound-pc --out plan.npz", marks=pytest.mark.slow),
     ],
 )
 def test_commands_without_demand(tmp_path, monkeypatch, command):

@@ -244,6 +244,7 @@ def test_processes_that_die_or_hang_are_rows_and_give_the_same_numbers(tmp_path)
     assert one.data.identical(other.data)
 
 
+@pytest.mark.slow
 def test_a_script_without_a_guard_is_not_run_again_by_its_processes(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(f"""

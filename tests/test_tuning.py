@@ -85,6 +85,7 @@ def test_numbers_of_a_list_without_a_range_stay_as_they_are(city, tmp_path):
     assert tuple(table["numbers"]) == (9.0, 1.0, 0.0, 7.0, 0.6, 0.5, 1.0, 1.2)
 
 
+@pytest.mark.slow
 def test_more_trials_continue_a_search(city, tmp_path, runs):
     done, _ = runs
     whole = tune(order(city, tmp_path / "whole", trials=13))

@@ -176,6 +176,7 @@ def test_a_process_that_dies_is_an_error(scenario, strategy):
         show.close()
 
 
+@pytest.mark.slow
 def test_watching_ends_when_the_runs_have_ended_and_nobody_looks(scenario, strategy, monkeypatch, capsys):
     monkeypatch.setattr(live, "OPENING_S", 0.0)
     jobs = [Simulation(scenario, strategy, seed=3)]

@@ -6,6 +6,7 @@
 <folder>/[<subfolder>/]<controller>-<seed>.nc    the Dataset of a run (nmfd.types.Result)
 """
 
+import atexit
 import json
 import math
 import multiprocessing
@@ -51,6 +52,7 @@ DASK_PATIENCE_S = 10.0  # for the scheduler to answer
 POLL_S, EXIT_S = 0.2, 5.0  # between looks at the time limit; for a process to end after its outcome
 PRELOADED = "xarray", "dask.array"  # which a Result imports, if they are there
 STARTING = threading.Lock()  # held while a process starts
+SERVED: set[str] = set()  # modules of the jobs that the server has imported
 PACKAGES = ("numpy", "torch", "casadi", "libsumo")  # whose versions are in the manifest
 
 
@@ -163,24 +165,13 @@ def _outcomes(
 def _alone(job: Callable[[], Result | str], folder: str, time_limit: float | None) -> Result | str:
     """Do `job` in a new process in `folder`, from a worker of Dask."""
     multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]  # may have a child
-    return list(_processes([Run("", {}, job)], 1, time_limit, folder))[0][1]
+    return list(processes([Run("", {}, job)], 1, time_limit, folder))[0][1]
 
 
-def processes(todo: Sequence[Run], workers: int, time_limit: float | None = None) -> Generator[tuple[Run, Any]]:
-    """Yield every run with its outcome from a process of its own, `workers` at a time; no process is left."""
-    try:
-        yield from _processes(todo, workers, time_limit)
-    finally:
-        server: Any = forkserver._forkserver
-        if server._forkserver_pid is not None:  # it may still import
-            os.kill(server._forkserver_pid, signal.SIGTERM)
-            server._stop()
-
-
-def _processes(
-    todo: Sequence[Run], workers: int, time_limit: float | None, folder: str = ""
-) -> Generator[tuple[Run, Result | str]]:
-    """Yield runs and outcomes as `processes`, from processes in `folder`."""
+def processes(
+    todo: Sequence[Run], workers: int, time_limit: float | None = None, folder: str = ""
+) -> Generator[tuple[Run, Any]]:
+    """Yield every run with its outcome from a process of its own in `folder`, `workers` at a time."""
     waiting, live = list(reversed(todo)), dict[connection.Connection, tuple[Run, BaseProcess, float]]()
     try:
         while waiting or live:
@@ -202,25 +193,30 @@ def _processes(
 def _start(job: Callable[[], Result | str], folder: str) -> tuple[connection.Connection, BaseProcess]:
     """Start a process, and return it behind the channel for a job and its outcome.
 
-    Where the system can, it is forked from a server that has imported the module of `job`.
+    Where the system can, it is forked from a server that has imported the module of `job`, and that later jobs of this
+    module use, too.
     """
     method, environment = "forkserver" if hasattr(os, "fork") else "spawn", dict(os.environ)
     context: Any = multiprocessing.get_context(method)
-    if method == "forkserver":
-        context.set_forkserver_preload([__name__, getattr(job, "func", job).__module__, *PRELOADED])
-        resource_tracker.ensure_running()  # first, as it lets Ctrl-C through
-        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        os.environ |= {"PYTHONSAFEPATH": "1", "PYTHONPATH": os.pathsep.join(sys.path)}  # the modules of this process
-        try:
-            forkserver.ensure_running()
-        finally:
-            os.environ.clear()
-            os.environ |= environment
-            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
-    ours, theirs = context.Pipe()
-    process = context.Process(target=_work, args=(theirs, folder, environment), daemon=True)
+    module = getattr(job, "func", job).__module__
     # Without the user's script, which would do everything again; the server shows a traceback of a request cut short.
     with STARTING, uninterrupted():
+        if method == "forkserver":
+            if module not in SERVED:
+                _stop_server()
+                SERVED.add(module)
+            context.set_forkserver_preload([__name__, *PRELOADED, *sorted(SERVED)])
+            resource_tracker.ensure_running()  # first, as it lets Ctrl-C through
+            blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+            os.environ |= {"PYTHONSAFEPATH": "1", "PYTHONPATH": os.pathsep.join(sys.path)}  # to find the same modules
+            try:
+                forkserver.ensure_running()
+            finally:
+                os.environ.clear()
+                os.environ |= environment
+                signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+        ours, theirs = context.Pipe()
+        process = context.Process(target=_work, args=(theirs, folder, environment), daemon=True)
         main, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
         try:
             process.start()
@@ -228,6 +224,14 @@ def _start(job: Callable[[], Result | str], folder: str) -> tuple[connection.Con
             sys.modules["__main__"] = main
     theirs.close()
     return ours, process
+
+
+@atexit.register
+def _stop_server() -> None:
+    server: Any = forkserver._forkserver
+    if server._forkserver_pid is not None:  # it may still import
+        os.kill(server._forkserver_pid, signal.SIGTERM)
+        server._stop()
 
 
 def _work(channel: connection.Connection, folder: str, environment: Mapping[str, str]) -> None:
