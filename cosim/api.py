@@ -8,7 +8,6 @@ import sys
 import webbrowser
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -231,24 +230,16 @@ def evaluate(
     return "\n".join([*text, f"Written to {out}: see evaluate.md, runs.csv and the figures"])
 
 
-def compare(folder: Path, *, controller: str | None = None, seed: int | None = None, model: Path | None = None) -> str:
-    """Compare finished runs, or one, with what the regional model predicts; write tables and figures beside them.
+def compare(folder: Path, *, model: Path | None = None) -> str:
+    """Compare finished runs with what the regional model predicts; write a table and figures beside them.
 
     model: folder of the network that predicts, the controller's model if None
     """
     finished = results.read(folder)
-    if controller is None:
-        with locked(folder):
-            rows = model_validation.prediction_errors(finished, model)
-            write_table(folder / "foresight.csv", rows, float_format="%.6g")
-        return f"{model_validation.prediction_table(rows)}\nWritten to {folder / 'foresight.csv'}"
-    level = finished.level()
-    result = level.read(controller, seed or 0)
-    scenario = with_demand(finished.scenario, steps=level.key["steps"], factor=level.demand)
-    scenario = replace(scenario, network=parse(controller).planning(scenario, model).network)
     with locked(folder):
-        rows = model_validation.write_comparison(level.folder, scenario, result)
-    return f"{model_validation.error_table(rows)}\nWritten to {level.folder}"
+        rows = model_validation.compare(finished, model)
+        write_table(folder / "foresight.csv", rows, float_format="%.6g")
+    return f"{model_validation.prediction_table(rows)}\nWritten to {folder}: see foresight.csv and the figures"
 
 
 def report(folders: Sequence[Path], *, seed: int | None = None, out: Path | None = None) -> Path:

@@ -164,18 +164,16 @@ def evaluate(scenario: Path, controllers: tuple[str, ...], seeds: int, first_see
 
 @main.command()
 @click.argument("folder", type=FOLDER, metavar="RUN")
-@click.option("--controller", metavar="NAME[+...]", help="Controller of one run. [default: all runs of the folder]")
-@click.option("--seed", type=SEED, help="Seed of that run. [default: 0]")
 @click.option("--model", type=FOLDER, metavar="DIR", help="Network that predicts. [default: the controller's model]")
 def compare(folder: Path, **options: Any) -> None:
     """Compare finished runs with the regional model.
 
     RUN is a folder of `cosim run` or `cosim evaluate`. The regional model gets the recorded departures and controls.
-    Tables and figures go into RUN.
+    A table of all runs, and a figure of the first run of every controller, go into RUN.
 
     \b
     Example:
-      cosim compare runs/gating --controller pi-gating --seed 3
+      cosim compare runs/grid7_peak-evaluate
     """
     click.echo(cosim.api.compare(folder, **options))
 

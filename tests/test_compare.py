@@ -10,13 +10,13 @@ import torch
 import trajectories
 
 from cosim.evaluation.identify import _protected, as_it_was, static_model
-from cosim.evaluation.model_validation import error_table, errors, held_up, outflow_samples, predict
+from cosim.evaluation.model_validation import held_up, observed, outflow_samples, predict
 from nmfd.api import load_scenario
 from nmfd.controllers.strategy import parse
 from nmfd.model import dynamics, mfd
 from nmfd.model.identification import observed_split_ratios
 from nmfd.model.regional_model import load_network, network_toml
-from nmfd.studies.fit_quality import fit_table, nearly_empty, region_fits, with_guesses
+from nmfd.studies.fit_quality import fit_table, nearly_empty, predictions, region_fits, with_guesses
 
 ROOT = Path(__file__).parents[1]
 
@@ -57,21 +57,20 @@ def result(scenario):
 
 
 def test_a_perfect_model_has_no_error(scenario, result):
-    rows = errors(scenario, result, predict(scenario, result))
-    assert list(rows["region"]) == [*range(7), "all"]
-    assert rows[["rmse_veh", "bias_veh", "next_interval_rmse_veh"]].abs().to_numpy().max() < 1e-6
+    assert np.abs(predict(scenario, result).accumulation - result.accumulation).max() < 1e-6
+    rows = predictions(scenario.network, [observed(result)], scenario.scheme)
+    assert rows[["next_interval_rmse_share", "ahead_rmse_share"]].to_numpy().max() < 1e-4
 
 
 def test_a_model_that_discharges_too_slowly_holds_too_many(scenario, result):
     slow = tuple(replace(m, a=0.9 * m.a, b=0.9 * m.b, c=0.9 * m.c) for m in scenario.network.mfds)
     wrong = replace(scenario, network=replace(scenario.network, mfds=slow))
-    rows = errors(wrong, result, predict(wrong, result))
-    whole = rows.iloc[-1]
-    assert whole["bias_veh"] > 100 and whole["rmse_share"] > 0.01
-    assert whole["next_interval_rmse_veh"] < whole["rmse_veh"]
-    simulated = result.accumulation.sum(axis=(1, 2))
-    assert whole["persistence_rmse_veh"] == pytest.approx(np.sqrt((simulated**2).mean()))
-    assert error_table(rows).splitlines()[0].count("if nothing changed") == 2
+    off = predict(wrong, result).accumulation.sum(axis=2) - result.accumulation.sum(axis=2)
+    assert off.sum(axis=1).mean() > 100
+    rows = predictions(wrong.network, [observed(result)], wrong.scheme)
+    whole = np.sqrt((off**2).mean(axis=0)) / wrong.network.critical
+    assert (rows["next_interval_rmse_share"] < rows["ahead_rmse_share"]).all()
+    assert rows["next_interval_rmse_share"].mean() < whole.mean()
 
 
 def test_the_model_of_those_who_drive():

@@ -94,7 +94,7 @@ def test_every_table_of_predictions_has_persistence():
     shares = ("next_interval_rmse_share", "next_interval_persistence_rmse_share")
     rows = pd.DataFrame({"demand": [1.0, 1.0], "controller": "x", "runs": 1, "model": "", "most_share": 1.0})
     rows = rows.assign(**dict.fromkeys(shares, 0.25), ahead_s=900.0)
-    rows = rows.assign(ahead_rmse_share=0.1, ahead_persistence_rmse_share=0.1)
+    rows = rows.assign(ahead_rmse_share=0.1, ahead_persistence_rmse_share=0.1, whole_run_rmse_share=0.5)
     line = model_validation.prediction_table(rows).splitlines()
     assert line[0].count("if nothing changed") == 2 and line[1].count("25.0 %") == 2
 

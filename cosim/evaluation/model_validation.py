@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,22 +21,16 @@ from nmfd.model.identification import Observed
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs import files
-from nmfd.runs.tables import text_columns, text_table
+from nmfd.runs.tables import text_table
 from nmfd.studies import plots
 from nmfd.studies.fit_quality import SPILLBACK, predictions
 from nmfd.types import Result
 
 COLLAPSED_SHARE = 0.7  # of the largest outflow so far, below which a denser region is collapsed
 FEWEST_VEHICLES = 5.0  # in a region during an interval that counts as a sample
-OF_ONE_RUN = (
-    "RMSE, bias: of the accumulation predicted for the whole run from its start [veh]; next interval: predicted from "
-    "every recorded state; if nothing changed: RMSE of constant accumulation; bias > 0: the model holds too many"
-)
-HEADINGS = ["region", "name", "critical", "mean", "RMSE", "of critical", "if nothing changed", "bias"]
-HEADINGS += ["next interval RMSE", "of critical", "if nothing changed"]
-OF_ALL_RUNS = (
-    "RMSE of the accumulation predicted from every recorded state, and most: largest accumulation of any region, as "
-    "shares of the critical accumulation; RMSE: mean of the regions"
+CAPTION = (
+    "RMSE of the accumulation predicted from the start of a run, and from every recorded state, and most: largest "
+    "accumulation of any region, as shares of the critical accumulation; RMSE: mean of the regions"
 )
 
 
@@ -52,76 +47,16 @@ def observed(result: Result) -> Observed:
 
 def predict(scenario: Scenario, result: Result) -> Result:
     """Run the regional model from the same start under the recorded departures and controls."""
-    states = [result.accumulation[0]]
-    for k in range(len(result.perimeter)):
-        states.append(_advanced(scenario, result, states[-1], k))
-    return result.assign(accumulation=np.stack(states), backlog=np.zeros_like(result.backlog), plant="nmfd")
+    known, x = parameters(scenario.network), torch.from_numpy(result.accumulation[0])
+    given = (result["departures"] / scenario.step, result.perimeter, result.splits)
+    states = [x]
+    for interval in zip(*map(torch.from_numpy, given), strict=True):
+        states.append(advance(known, states[-1], *interval, **scenario.scheme))
+    return result.assign(accumulation=torch.stack(states).numpy(), backlog=np.zeros_like(result.backlog), plant="nmfd")
 
 
-def _advanced(scenario: Scenario, result: Result, state: np.ndarray, intervals: int | slice) -> np.ndarray:
-    """Return the states (..., R, R) [veh] one interval later under the departures and controls of these intervals."""
-    recorded = (result["departures"] / scenario.step, result.perimeter, result.splits)
-    given = map(torch.from_numpy, (state, *(values[intervals] for values in recorded)))
-    return advance(parameters(scenario.network), *given, **scenario.scheme).numpy()
-
-
-def errors(scenario: Scenario, result: Result, predicted: Result) -> pd.DataFrame:
-    """Return the prediction errors of a run, a row per region and one for "all" together.
-
-    The next interval is predicted from every recorded state under the recorded departures and controls.
-    """
-    network, simulated = scenario.network, result.accumulation.sum(-1)
-    following = _advanced(scenario, result, result.accumulation[:-1], slice(None))
-    parts = (simulated, predicted.accumulation.sum(-1) - simulated, following.sum(-1) - simulated[1:])
-    seen, off, next_off = (np.column_stack([values, values.sum(axis=1)]) for values in parts)
-    critical = np.append(network.seen_critical, network.seen_critical.sum())
-    return pd.DataFrame(
-        {
-            "region": [*range(network.regions), "all"],
-            "name": [*network.region_names, "all regions"],
-            "critical_veh": critical,
-            "mean_veh": seen.mean(axis=0),
-            "rmse_veh": _rms(off),
-            "rmse_share": _rms(off) / critical,
-            "persistence_rmse_veh": _rms(seen[0] - seen),
-            "bias_veh": off.mean(axis=0),
-            "next_interval_rmse_veh": _rms(next_off),
-            "next_interval_rmse_share": _rms(next_off) / critical,
-            "next_interval_persistence_rmse_veh": _rms(np.diff(seen, axis=0)),
-        }
-    )
-
-
-def _rms(values: np.ndarray) -> np.ndarray:
-    return np.sqrt((values**2).mean(axis=0))
-
-
-def error_table(rows: pd.DataFrame) -> str:
-    """Return the prediction errors of a run as text."""
-    shown = {name: [str(cell) for cell in rows[name]] for name in rows}
-    for name in rows.columns[2:]:
-        percent = name.endswith("share")
-        shown[name] = [f"{100 * value:.1f} %" if percent else f"{value:.1f}" for value in rows[name]]
-    return text_columns(HEADINGS, zip(*shown.values(), strict=True), OF_ONE_RUN)
-
-
-def write_comparison(folder: Path, scenario: Scenario, result: Result) -> pd.DataFrame:
-    """Write compare-<run>.csv and a figure beside a run; return the rows of `errors`."""
-    network, predicted = scenario.network, predict(scenario, result)
-    rows, name = errors(scenario, result, predicted), files.run_name(result.controller, result.seed)
-    files.write_table(folder / f"compare-{name}.csv", rows)
-    drawing, axes = plots.panels(network.regions + 1)
-    for region, ax in enumerate(axes[:-1]):
-        plots.region_accumulation(ax, network, region, [result, predicted])
-    plots.total_accumulation(axes[-1], [result.assign(backlog=np.zeros_like(result.backlog)), predicted])
-    axes[-1].set_title("all regions", fontsize="medium")
-    plots.legend_below(drawing, axes, columns=4)
-    plots.save(drawing, folder / f"compare-{name}-accumulation.png")
-    return rows
-
-
-def prediction_errors(found: Finished, model: Path | None = None) -> pd.DataFrame:
-    """Return the prediction errors of all runs of a folder, a row per strategy, demand level and region.
+def compare(found: Finished, model: Path | None = None) -> pd.DataFrame:
+    """Draw the runs of a folder beside predictions; return the errors by strategy, demand level and region.
 
     model: folder of the predicting network; None for that with which each controller plans
 
@@ -129,12 +64,13 @@ def prediction_errors(found: Finished, model: Path | None = None) -> pd.DataFram
         InputError: if the city has changed since the runs.
     """
     found.map()
-    scenario, tables = found.scenario, []
+    tables = []
     for level in found.levels:
-        for controller, rows in level.rows.groupby("controller", sort=False):
-            network = parse(controller).planning(scenario, model).network
-            runs = [observed(level.read(controller, seed)) for seed in rows["seed"]]
-            most = largest_accumulation(run.accumulation for run in runs)
+        for controller in level.rows["controller"].unique():
+            network, results = parse(controller).planning(found.scenario, model).network, level.results(controller)
+            scenario, runs = replace(found.scenario, network=network), list(map(observed, results))
+            predicted = [predict(scenario, result) for result in results]
+            off = [a.accumulation.sum(2) - b.accumulation.sum(2) for a, b in zip(predicted, results, strict=True)]
             columns = {
                 "demand": level.demand,
                 "controller": controller,
@@ -142,10 +78,26 @@ def prediction_errors(found: Finished, model: Path | None = None) -> pd.DataFram
                 "model": os.path.normpath(network.folder) if network.folder else "",
                 "region": range(network.regions),
                 "critical_veh": network.seen_critical,
-                "most_share": most / network.seen_critical,
+                "most_share": largest_accumulation(run.accumulation for run in runs) / network.seen_critical,
+                "whole_run_rmse_share": np.sqrt((np.concatenate(off) ** 2).mean(axis=0)) / network.seen_critical,
             }
             tables.append(pd.DataFrame(columns).join(predictions(network, runs, scenario.scheme)))
+            draw(
+                level.folder / f"compare-{files.run_name(controller, results[0].seed)}.png", network, results, predicted
+            )
     return pd.concat(tables, ignore_index=True)
+
+
+def draw(path: Path, network: RegionalModel, results: Sequence[Result], predicted: Sequence[Result]) -> None:
+    """Draw the accumulations of the regions in the first of some runs, and as the model predicts them."""
+    drawing, axes = plots.panels(network.regions + 1)
+    both = [results[0], predicted[0]]
+    for region, ax in enumerate(axes[:-1]):
+        plots.region_accumulation(ax, network, region, both)
+    plots.total_accumulation(axes[-1], [run.assign(backlog=np.zeros_like(run.backlog)) for run in both])
+    axes[-1].set_title("all regions", fontsize="medium")
+    plots.legend_below(drawing, axes, columns=4)
+    plots.save(drawing, path)
 
 
 def prediction_table(rows: pd.DataFrame) -> str:
@@ -160,13 +112,14 @@ def prediction_table(rows: pd.DataFrame) -> str:
                 "runs": first["runs"],
                 "model": Path(first["model"]).name,
                 "most": f"{group['most_share'].max():.1f}",
+                "whole run": mean["whole_run_rmse_share"],
                 "next interval": mean["next_interval_rmse_share"],
                 "if nothing changed": mean["next_interval_persistence_rmse_share"],
                 "later": f"{mean['ahead_rmse_share']} ({first['ahead_s']:g} s)",
                 "if nothing changed ": mean["ahead_persistence_rmse_share"],
             }
         )
-    return text_table(lines, OF_ALL_RUNS)
+    return text_table(lines, CAPTION)
 
 
 def outflow_samples(network: RegionalModel, results: Sequence[Result]) -> list[dict[str, Points]]:
