@@ -342,7 +342,6 @@ def identify(
     seeds: int = 2,
     city: str | None = None,
     network: Path | None = None,
-    protect: bool = False,
     iterations: int = 600,
     workers: int = 1,
     scheduler: str | None = None,
@@ -355,7 +354,6 @@ def identify(
     seeds: loading runs per level, from seed 1000
     city: strategy options of the loading runs, such as "guided+max-pressure" or "own"; own, then guided, if None
     network: folder of the model, the scenario's network if None
-    protect: write the regions to protect into the scenario, those of the first model
     """
     scenario = shipped.found(scenario, shipped.SCENARIO, shipped.NETWORK)
     if (scenario / "network.toml").exists():
@@ -378,7 +376,6 @@ def identify(
                 options=[word for word in strategy.words if word != "guided"],
                 network=network,
                 iterations=iterations,
-                protect=protect and not report,
                 out=folder,
                 workers=workers,
                 scheduler=scheduler,

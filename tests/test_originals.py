@@ -1,7 +1,6 @@
-"""A city's own vehicles: what seeds and demand factors do to them; demand files, forecasts, one-way neighbours."""
+"""A city's own vehicles: what seeds and demand factors do to them; demand files, one-way neighbours."""
 
 import xml.etree.ElementTree as ElementTree
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -123,16 +122,10 @@ def with_demand_file(folder, rows):
     return scenario
 
 
-def test_demand_file_and_forecast(tmp_path):
+def test_demand_file(tmp_path):
     folder = with_demand_file(tmp_path, "0,0,1,2.5\n3,1,0,1.0\n3,1,0,0.5\n99,0,1,7\n")
     scenario = load_scenario(folder)
     assert scenario.demand[0, 0, 1] == 2.5 and scenario.demand[3, 1, 0] == 1.5 and scenario.demand.sum() == 4.0
-    assert scenario.forecast is scenario.demand
-    many = replace(scenario, demand=np.ones((2000, 12, 12)), forecast_error=0.3)
-    error = np.log(many.forecast)
-    assert error.std() == pytest.approx(0.3, rel=0.1) and many.forecast.mean() == pytest.approx(1.0, abs=0.06)
-    assert error.mean(axis=0).std() == pytest.approx(0.3 / np.sqrt(2), rel=0.2)  # wrong about the day
-    assert (many.forecast == replace(many, name="again").forecast).all()
 
 
 @pytest.mark.parametrize("row", ["0,0,2,1.0", "0,0,1,-1", "0,0,1,nan"])

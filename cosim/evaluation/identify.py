@@ -6,8 +6,6 @@ prediction error.
 """
 
 import os
-import re
-import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import chain
@@ -52,7 +50,6 @@ def identify(
     options: Sequence[str],
     network: Path | None,
     iterations: int,
-    protect: bool,
     out: Path,
     workers: int,
     scheduler: str | None,
@@ -66,7 +63,7 @@ def identify(
     guided: with route guidance, first towards the drivers' own split ratios, then probing
     options: words of the strategies, such as max-pressure
     network: folder whose network.toml is written; None for the scenario's own or, if guided, its folder GUIDED
-    iterations: of the fit; protect: write the regions to protect into the scenario
+    iterations: of the fit
 
     Raises:
         InputError: for a network without a folder, or a target that must not be written.
@@ -78,8 +75,6 @@ def identify(
         what = f"--with: {loaded.name} runs on {target}, the model of its own drivers and signals"
         raise InputError(f"{what}; name another folder with --network")
     _check_target(target, own)
-    if protect:
-        shipped.beside(loaded.folder or Path(), "scenario.toml", "a scenario of your own")
     stages = ("route-guidance", "probing-pcrg") if guided else ("no-control", "probing-pc")
 
     def load(stage: int, **setup: object) -> list[Result]:
@@ -135,27 +130,17 @@ def identify(
     target.mkdir(parents=True, exist_ok=True)
     files.write_text(target / "network.toml", network_toml(model, sumo, comment))
     files.write_text(target / authority.FILE, verdict.text())
-    proposed = _protected(loaded, verdict.protect, write=protect)
+    proposed = _protected(loaded, verdict.protect)
     where = f"Written to {os.path.normpath(target / 'network.toml')}; samples and figures to {out}"
     return "\n".join([text, *wrapped("\n".join([*verdict.sentences, *proposed])), where])
 
 
-def _protected(scenario: Scenario, regions: tuple[int, ...], *, write: bool) -> list[str]:
-    """Return the proposal to protect `regions`, unless the scenario does; if told to, write it. Raises InputError."""
+def _protected(scenario: Scenario, regions: tuple[int, ...]) -> list[str]:
+    """Return the proposal to protect `regions`, unless the scenario does."""
     if not regions or set(regions) == set(scenario.protected):
         return []
-    now, names, path = ", ".join(map(str, scenario.protected)), scenario.network.titles, Path(scenario.where)
-    line = f"protected = [{', '.join(map(str, regions))}]"
-    if write:
-        text = path.read_text(encoding="utf-8")
-        top, bracket, tables = text.partition("\n[")
-        top, count = re.subn(r"(?m)^protected\s*=\s*\[[^\]]*\].*$", line, top)
-        changed = (top if count else f"{top}\n{line}\n") + bracket + tables
-        if tomllib.loads(changed) != tomllib.loads(text) | {"protected": list(regions)}:
-            raise InputError(f"{path}: protected: cannot be changed here; write {line} yourself")
-        files.write_text(path, changed)
-    what = "was written there" if write else "with --protect it is written there"
-    return [f"Protect {', '.join(names[r] for r in regions)}: {line} instead of [{now}] in {path}; {what}."]
+    names, now = ", ".join(scenario.network.titles[region] for region in regions), list(scenario.protected)
+    return [f"Protect {names}: write protected = {list(regions)} instead of {now} into {scenario.where}."]
 
 
 def _named(progress: Callable[..., None] | None, stage: str) -> Callable[..., None] | None:

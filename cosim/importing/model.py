@@ -151,7 +151,6 @@ def scenario_text(
         f"protected = [{protected}]             # the densest region; {network.region_names[protected]}\n"
         'demand_file = "demand.csv"  # veh/s by interval and pair of regions, counted from the vehicles\n'
         f"demand_factor = {factor:g}         # vehicles are left out, or drive twice\n"
-        "forecast_error = 0.0        # standard deviation of the logarithm of forecast over demand\n"
         "\n[sumo]\n"
         f"begin = {times['begin']}\n"
         f"step_length = {times['step-length']}\n"

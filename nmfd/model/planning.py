@@ -85,7 +85,7 @@ def planning_model(scenario: Scenario, controller: str = "", table: str = "") ->
     shared = {name: copy.deepcopy(getattr(scenario, name)) for name in own}
     if controller:
         shared["controller_options"][controller] = copy.deepcopy(merged)
-    return PlanningModel(**shared, network=copy.deepcopy(network), forecast=scenario.forecast.copy())
+    return PlanningModel(**shared, network=copy.deepcopy(network), forecast=scenario.demand.copy())
 
 
 def other_model(scenario: Scenario, folder: Path, where: str = "") -> RegionalModel:

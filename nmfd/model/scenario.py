@@ -70,7 +70,6 @@ class Scenario(Horizon):
     demand: (T, R, R) [veh/s], [k, i, j]: vehicles that start in i bound for j during interval k
     process_std: standard deviation of the Gaussian noise on each x_ij of the regional plants after an interval [veh]
     demand_factor: factor already applied to the demand, for a city with vehicles of its own
-    forecast_error: standard deviation of the logarithm of forecast over demand [-]
     faults: injected into every run (nmfd.faults)
     sumo: table [sumo], checked by cosim
     """
@@ -78,7 +77,6 @@ class Scenario(Horizon):
     demand: PairsOverTime
     process_std: float = 0.0
     demand_factor: float = 1.0
-    forecast_error: float = 0.0
     faults: tuple[str, ...] = ()
     sumo: Mapping[str, Any] = field(default_factory=dict)
 
@@ -88,24 +86,10 @@ class Scenario(Horizon):
         return np.zeros(self.demand.shape[1:]) if self.initial is None else self.initial.copy()
 
     @cached_property
-    def forecast(self) -> PairsOverTime:
-        """Demand (T, R, R) [veh/s] as predictive controllers know it.
-
-        Each pair is off by a factor for the whole run and one per interval, lognormal with mean 1 and equal variance.
-        """
-        if not self.forecast_error:
-            return self.demand
-        random = np.random.default_rng([0, 0x666F72])
-        spread = self.forecast_error / np.sqrt(2.0)
-        normal = random.standard_normal((1, *self.demand.shape[1:])) + random.standard_normal(self.demand.shape)
-        return self.demand * np.exp(spread * normal - spread**2)
-
-    @cached_property
     def hash(self) -> str:
         """Hash of all that a run depends on, whatever the names of its files."""
         content = [self.network.hash, self.step, self.steps, self.measurement_std, self.integrator, self.substeps]
         content += [self.protected, self.controller_options]
-        content += [[self.forecast_error, 0]] if self.forecast_error else []
         content += [self.faults] if self.faults else []
         content += [["process_std", self.process_std]] if self.process_std else []
         content += [self.initial.tolist()] if self.initial is not None else []
@@ -183,7 +167,6 @@ class ScenarioTable(Settings):
     process_std: float = setting(
         "standard deviation of the noise on the state after each interval; not in SUMO", 0.0, unit="veh", ge=0.0, le=1e6
     )
-    forecast_error: float = setting("standard deviation of log(forecast / demand)", 0.0, unit="-", ge=0.0, le=2.0)
     initial: Annotated[tuple[Numbers, ...], Field(strict=False)] = setting(
         "vehicles at the start, regional model only: one row per region, by destination", (), unit="veh"
     )
