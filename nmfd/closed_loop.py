@@ -99,7 +99,13 @@ def noise_of(seed: int) -> np.random.Generator:
 
 def noisy(state: State, noise: PerPair) -> Observation:
     """Return the measurement of the state with `noise` (R, R) [veh] on the accumulation."""
-    return Observation(step=state.step, time=state.time, accumulation=state.accumulation + noise, backlog=state.backlog)
+    return Observation(
+        step=state.step,
+        time=state.time,
+        accumulation=state.accumulation + noise,
+        backlog=state.backlog,
+        realised=state.realised,
+    )
 
 
 def _checked(controls: Controls, where: str) -> Controls:

@@ -76,4 +76,5 @@ class Sensors:
             observation = replace(observation, accumulation=np.where(np.isfinite(x), x, last))
             problems.append(f"{missing} of {x.size} entries missing, last ones used")
         self._last = observation.accumulation
+        observation = replace(observation, realised=self._seen[-1].realised)  # which no sensor measures
         return observation, f"measurement {', '.join(problems)}" if problems else ""

@@ -50,6 +50,8 @@ class State:
     removed: (R, R) [veh], [i, j] = removed from the simulation in i, or before they entered it, on their way to j,
         since the start; None for zero, as in the NMFD
     problem: the part of the last command that the plant could not execute, "" if none
+    realised: (R, R) [-], u that passed in the last interval, where that may differ from the command; None before the
+        first one, and in regional plants, which do what is commanded
     """
 
     step: int
@@ -59,6 +61,7 @@ class State:
     completed: float
     removed: PerPair | None = None
     problem: str = ""
+    realised: PerPair | None = None
 
     @property
     def unfinished(self) -> PerPair:
@@ -74,12 +77,14 @@ class Observation:
     step, time: those of the State
     accumulation: (R, R) [veh], [i, j] = in region i bound for j
     backlog: (R, R) [veh], [i, j] = waiting outside the network to enter region i, bound for j
+    realised: that of the State, from the signals
     """
 
     step: int
     time: float
     accumulation: PerPair
     backlog: PerPair
+    realised: PerPair | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

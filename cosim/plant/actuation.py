@@ -7,8 +7,9 @@ import numpy as np
 from cosim.plant.gates import GatewaySignal, ResponsiveSignal
 from cosim.plant.incidents import Incidents
 from cosim.plant.max_pressure import FACTS, MaxPressure
+from cosim.plant.room import Room
 from cosim.plant.settings import CYCLIC, Settings
-from cosim.sumo.arrays import PerGateway
+from cosim.sumo.arrays import PerEdge, PerGateway
 from cosim.sumo.net import City, Gateway, gateway_movements
 from cosim.sumo.session import Phase, Session
 from cosim.sumo.signals import GREEN, Signal
@@ -18,6 +19,8 @@ from nmfd.model.regional_model import RegionalModel
 
 class Actuation:
     """All signals under control: `command` once per control interval, `play` before every simulation step.
+
+    Between them, `update` from time to time shares the command over the gateways again (cosim.plant.room).
 
     original_green: (G,) [s] per control interval in the original programme, mean of the gateway's links; NaN where no
         command arrives
@@ -57,14 +60,33 @@ class Actuation:
                 self._controls.append(ResponsiveSignal(session, plan, links, show=show, release=incidents.release))
         phases |= {plan.signal: plan.phases for plan in own if plan.static or plan.actuated}
         self.original_green = _programmed_green(city, phases, step)
+        self._shares = settings.chain_limit > 0
+        self.room = Room(session, city, self.original_green, limit=settings.chain_limit, lanes=not settings.mesoscopic)
         self.states: dict[str, list[tuple[float, str]]] = {signal: [] for signal in session.signals()}
 
-    def command(self, perimeter: PerPair) -> None:
-        """Set u (R, R) [-] of the control interval that begins."""
+    def command(self, perimeter: PerPair, vehicles: PerEdge) -> None:
+        """Set u (R, R) [-] of the control interval that begins. vehicles: (E,) [veh] on the streets"""
         network = self._network
         share = np.clip((perimeter - network.u_min) / (network.u_max - network.u_min), 0.0, 1.0)
+        self.room.command(share, vehicles)
+        self._obey()
+
+    def update(self, vehicles: PerEdge) -> None:
+        """Share the command over the gateways again. vehicles: (E,) [veh] on the streets"""
+        self.room.update(vehicles)
+        self._obey()
+
+    def realised(self) -> PerPair | None:
+        """Return u (R, R) [-] that the gateways were given since the last command; None for the command itself."""
+        if not self._shares:
+            return None
+        network = self._network
+        realised = network.u_min + self.room.realised() * (network.u_max - network.u_min)
+        return np.where(network.adjacency, realised, 0.0)
+
+    def _obey(self) -> None:
         for control in self._controls:
-            control.command(share)
+            control.command(self.room.share)
 
     def play(self) -> None:
         """Set all states from now on."""

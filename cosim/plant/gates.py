@@ -1,7 +1,6 @@
 """Perimeter control to green: how commands limit the green of gateway links, signal by signal.
 
-With s = (u_ih - u_min) / (u_max - u_min), the share that is commanded, and m the minimum green, a gateway link i -> h
-keeps m + s (L - m) seconds
+With s the share of its gateway (cosim.plant.room), and m the minimum green, a gateway link keeps m + s (L - m) seconds
 
 - of every window of L seconds at a fixed-time signal (GatewaySignal), from its beginning,
 - of every cycle at a signal that SUMO times by detectors (ResponsiveSignal) or max-pressure runs (Ration): L is the
@@ -15,14 +14,14 @@ from bisect import bisect_right
 from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import accumulate
 
+from cosim.sumo.arrays import PerGateway
 from cosim.sumo.session import Phase, Programme, Session
 from cosim.sumo.signals import GREEN, is_stage
-from nmfd.arrays import PerPair
 
 MIN_GREEN_S = 5.0  # of a gateway link, and of every stage under max-pressure
 DEFAULT_YELLOW_S = 3.0  # where the original programme has none after a green
 NEVER = float("inf")
-Movements = Mapping[int, tuple[int, int]]  # index of a gateway link -> (i, h)
+Movements = Mapping[int, int]  # index of a gateway link -> number of its gateway
 Show = Callable[[str, str], None]  # (signal, state): sets the state
 
 
@@ -32,15 +31,15 @@ class GatewaySignal:
     def __init__(self, programme: Programme, movements: Movements, *, start: float, show: Show):
         """start: simulation time at which the programme was read [s]"""
         self._signal, self._phases, self._show = programme.signal, programme.phases, show
-        self._movements = {link: _Movement(pair, programme, link) for link, pair in movements.items()}
+        self._movements = {link: _Movement(gateway, programme, link) for link, gateway in movements.items()}
         self._cycle, self._cycle_start = programme.cycle, start - programme.position
         self._ends = list(accumulate(phase.duration for phase in programme.phases))
         self._shown, self._since, self.next_change = "", start, start
 
-    def command(self, share: PerPair) -> None:
-        """Set the shares (R, R) [-] of the windows or cycles that begin from now on."""
+    def command(self, share: PerGateway) -> None:
+        """Set the shares (G,) [-] of the windows or cycles that begin from now on."""
         for movement in self._movements.values():
-            movement.share = float(share[movement.pair])
+            movement.share = float(share[movement.gateway])
 
     def play(self, now: float) -> None:
         """Set the state from `now` [s] on."""
@@ -94,8 +93,8 @@ class _Movement:
     windows: phase -> length [s] of the green window that begins there, which may pass the cycle's end
     """
 
-    def __init__(self, pair: tuple[int, int], programme: Programme, link: int):
-        self.pair, self.green_time, self.share = pair, 0.0, 1.0
+    def __init__(self, gateway: int, programme: Programme, link: int):
+        self.gateway, self.green_time, self.share = gateway, 0.0, 1.0
         phases, self.yellow = programme.phases, yellow_time(programme.phases, link)
         green = [phase.state[link] in GREEN for phase in phases]
         starts = [n for n in range(len(phases)) if green[n] and not green[n - 1]]
@@ -136,12 +135,12 @@ def run_length(phases: Sequence[Phase], first: int, link: int, lights: Collectio
 class Ration:
     """The green of one gateway link, limited per cycle.
 
-    pair: (i, h), whose command it follows; share: [-] of the cycles that begin from now on, 1 is no limit
+    gateway: its number, whose share it follows; share: [-] of the cycles that begin from now on, 1 is no limit
     """
 
-    def __init__(self, pair: tuple[int, int], *, cycle: float, yellow: float, start: float, full: float | None = None):
+    def __init__(self, gateway: int, *, cycle: float, yellow: float, start: float, full: float | None = None):
         """start: time at which the first cycle begins [s]; full: green of share 1 in a cycle, the cycle if None [s]"""
-        self.pair, self._green_time = pair, 0.0
+        self.gateway, self._green_time = gateway, 0.0
         self._full = cycle if full is None else full
         self._cycle, self._least, self._yellow = cycle, min(MIN_GREEN_S, self._full), yellow
         self.share, self._budget, self._spent = 1.0, NEVER, 0.0
@@ -222,17 +221,17 @@ class ResponsiveSignal:
         phases, start = programme.phases, session.time
         full = {link: sum(p.duration for p in phases if p.state[link] in GREEN) for link in movements}
         self._rations = {
-            link: Ration(pair, cycle=programme.cycle, yellow=yellow_time(phases, link), start=start, full=full[link])
-            for link, pair in movements.items()
+            link: Ration(gateway, cycle=programme.cycle, yellow=yellow_time(phases, link), start=start, full=full[link])
+            for link, gateway in movements.items()
         }
         self._least = least_times(phases)
         self._always = {link for link in movements if all(phase.state[link] in GREEN for phase in phases)}
         self._base, self._since, self._next, self._held, self._limited = "", start, start, False, False
 
-    def command(self, share: PerPair) -> None:
-        """Set the shares (R, R) [-] from the next cycle on."""
+    def command(self, share: PerGateway) -> None:
+        """Set the shares (G,) [-] from the next cycle on."""
         for ration in self._rations.values():
-            ration.share = float(share[ration.pair])
+            ration.share = float(share[ration.gateway])
         self._limited = any(ration.share < 1.0 for ration in self._rations.values())
         self._next = self._since
 

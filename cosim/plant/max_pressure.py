@@ -26,10 +26,10 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from cosim.plant.gates import MIN_GREEN_S, NEVER, Movements, Ration, Show, ends_bare, run_length, yellow_time
+from cosim.sumo.arrays import PerGateway
 from cosim.sumo.net import City, gateway_movements
 from cosim.sumo.session import Phase, Session
 from cosim.sumo.signals import GREEN, Link, Signal, is_stage, lane_id
-from nmfd.arrays import PerPair
 
 LEVELS = "rgG"  # from red to the right of way
 FACTS = {  # columns of the table of runs
@@ -67,20 +67,20 @@ class MaxPressure:
         self._session, self._show, self._cyclic = session, show, cyclic
         roads = Roads(city, signals, flows)
         self._roads, self._start = roads, session.time
-        pairs = gateway_movements(city)
+        movements = gateway_movements(city)
         self._programmed = float(np.mean([_intergreen(signal.phases) for signal in signals]))
-        self._junctions = [Junction(signal, session.time, pairs.get(signal.id)) for signal in signals]
+        self._junctions = [Junction(signal, session.time, movements.get(signal.id)) for signal in signals]
         self._approaches = [Approaches(signal, roads.watched, session.time) for signal in signals]
         self._rationed = [junction for junction in self._junctions if junction.rations]
         self._next = session.time
         for junction in self._junctions:
             show(junction.signal, junction.state)
 
-    def command(self, share: PerPair) -> None:
-        """Set the shares (R, R) [-], (u - u_min) / (u_max - u_min), of the cycles that begin from now on."""
+    def command(self, share: PerGateway) -> None:
+        """Set the shares (G,) [-] of the cycles that begin from now on."""
         for junction in self._rationed:
             for ration in junction.rations.values():
-                ration.share = float(share[ration.pair])
+                ration.share = float(share[ration.gateway])
 
     def green_time(self) -> dict[str, dict[int, float]]:
         """Return signal -> gateway link -> green so far [s]."""
@@ -162,8 +162,8 @@ class Junction:
         self._green_since, self.stage_since = now, now
         cycle = sum(phase.duration for phase in phases)
         self.rations = {
-            link: Ration(pair, cycle=cycle, yellow=yellow_time(phases, link), start=now)
-            for link, pair in (gateways or {}).items()
+            link: Ration(gateway, cycle=cycle, yellow=yellow_time(phases, link), start=now)
+            for link, gateway in (gateways or {}).items()
         }
         self.movement = {link.index: (link.from_edge, link.to_edge) for link in signal.links}
         self._coming: list[tuple[float, str]] = []

@@ -128,7 +128,7 @@ class SumoPlant:
             min(max(1, round(seconds / session.step_length)), steps) for seconds in (READING_PERIOD_S, SAMPLE_PERIOD_S)
         )
         self._incidents.begin(self._k)
-        self._actuation.command(controls.perimeter)
+        self._actuation.command(controls.perimeter, self._sampler.last[0])
         splits = controls.splits
         if controls.prices is not None or (splits is None and self._settings.guided):  # by travel times alone
             splits = scenario.network.nominal_splits
@@ -148,14 +148,17 @@ class SumoPlant:
                 self._estimation.sample()
             if n % sampling == 0:
                 self._sampler.sample()
+                if n < steps:
+                    self._actuation.update(self._sampler.last[0])
                 self._observer.sampled(session.time, *self._sampler.last)
             self._guide.apply(events)
         self._k += 1
         state = self._meter.state(self._k, self._k * scenario.step)
         self._streets = streets = self._sampler.finish(self._incidents.closed)
+        realised = self._actuation.realised()
         if self._estimation:
-            self._estimation.update(controls)
-        self._state = replace(state, problem=self._incidents.problem())
+            self._estimation.update(controls if realised is None else replace(controls, perimeter=realised))
+        self._state = replace(state, problem=self._incidents.problem(), realised=realised)
         row = self._recorder.add(streets)
         self._observer.recorded(controls, self._state, row)
         return self._state
@@ -164,8 +167,13 @@ class SumoPlant:
         """Return the estimate; None if the exact state is measured."""
         if (known := self._estimation) is None:
             return None
-        time = self._state.time
-        return Observation(step=self._k, time=time, accumulation=known.accumulation, backlog=known.backlog())
+        return Observation(
+            step=self._k,
+            time=self._state.time,
+            accumulation=known.accumulation,
+            backlog=known.backlog(),
+            realised=self._state.realised,
+        )
 
     def close(self) -> None:
         """End the simulation and remove its files."""

@@ -33,6 +33,8 @@ RECORD: Mapping[str, Quantity] = {
     "edge_vehicles": Quantity(("interval", "edge"), "veh", "vehicles on the edge to 0.1 %, mean of the same samples"),
     "gateway_green": Quantity(_GATEWAYS, "s", "green shown, mean of the gateway's links; NaN without a signal"),
     "gateway_original_green": Quantity(_GATEWAYS, "s", "green in the original programme, mean of the gateway's links"),
+    "gateway_command": Quantity(_GATEWAYS, "1", "share of the boundary's capacity that was commanded"),
+    "gateway_share": Quantity(_GATEWAYS, "1", "share of the green that the gateway was given, mean over the interval"),
     "gateway_flow": Quantity(_GATEWAYS, "veh", "vehicles that crossed the boundary"),
     "gateway_queue": Quantity(_GATEWAYS, "veh", "vehicles halting on the edge before it, mean of samples"),
     "gateway_queue_max": Quantity(_GATEWAYS, "veh", "vehicles halting on the edge before it, largest of samples"),
@@ -80,6 +82,8 @@ class Recorder:
             **{key: a.astype(np.int32) if a.dtype.kind == "i" else a for key, a in added.items()},
             "gateway_green": self._actuation.as_shown(added["gateway_green"]),
             "gateway_original_green": self._actuation.original_green,
+            "gateway_command": self._actuation.room.command_of_gateways(),
+            "gateway_share": self._actuation.room.gateway_shares(),
             "production": streets.production,
             "mean_accumulation": streets.accumulation,
             "edge_vehicles": streets.vehicles.astype(np.float16),  # to 0.1 %, as small as an integer
@@ -109,6 +113,10 @@ class Recorder:
             **self._booked(),
             "teleports": np.array(self._meter.teleports),
             "guided": self._guide.realised.copy(),
+            "gateway_command": Quantity(_GATEWAYS, "1", "share of the boundary's capacity that was commanded"),
+            "gateway_share": Quantity(
+                _GATEWAYS, "1", "share of the green that the gateway was given, mean over the interval"
+            ),
             "gateway_flow": self._meter.gateway_flow(),
             "gateway_green": self._actuation.green_time(),
         }

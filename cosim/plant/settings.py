@@ -35,6 +35,11 @@ class Settings(config.Settings):
     )
     signals: Signals = setting("control of the signals", FIXED)
     leave_signals: Texts = setting("signals that perimeter control does not change", ())
+    chain_limit: Share = setting(
+        "share of the room before a gateway beyond which no command holds vehicles there; 0: no limit, and the same "
+        "share for all gateways of a boundary",
+        0.6,
+    )
     gateways_fixed: bool = setting("signals with gateways stay fixed-time if the others are actuated", True)
     guided: bool = setting("drivers are guided by travel times if the controller does not guide them", False)
     compliance: Share = setting("probability that a driver follows the guidance in a region", 1.0)

@@ -285,13 +285,12 @@ def _gateways(links: list[_Connection], region_of: dict[str, int]) -> tuple[Gate
     )
 
 
-def gateway_movements(city: City) -> dict[str, dict[int, tuple[int, int]]]:
-    """Return signal -> link index -> (i, h), of the links that lead over a boundary."""
-    movements: dict[str, dict[int, tuple[int, int]]] = {}
-    for gateway in city.gateways:
+def gateway_movements(city: City) -> dict[str, dict[int, int]]:
+    """Return signal -> link index -> number of the gateway, of the links that lead over a boundary."""
+    movements: dict[str, dict[int, int]] = {}
+    for number, gateway in enumerate(city.gateways):
         if gateway.signal is not None:
-            pair = gateway.source, gateway.target
-            movements.setdefault(gateway.signal, {}).update(dict.fromkeys(gateway.links, pair))
+            movements.setdefault(gateway.signal, {}).update(dict.fromkeys(gateway.links, number))
     return movements
 
 

@@ -79,7 +79,8 @@ class PiGating:
         u_hp(k) = clip(u_hp(k-1) + kp (n_p(k-1) - n_p(k)) / n_cr + ki dt (n_set - n_p(k)) / n_cr,  u_min, u_max)
 
     n_cr is the critical accumulation of p, dt the control interval, n_set the option set_point or the accumulation of
-    outflow_share. The clipped value is carried on, which prevents windup. All other entries stay at u_max.
+    outflow_share. u_hp(k-1) is the clipped value, or, if the city reports it, the mean u that its gates realised, so that
+    the integral does not wind up. All other entries stay at u_max.
     """
 
     name = "pi-gating"
@@ -108,6 +109,9 @@ class PiGating:
     def act(self, observation: Observation) -> Controls:
         now = observation.accumulation.sum(axis=1)[self.regions]
         before = now if self._before is None else self._before
+        if observation.realised is not None:
+            realised = observation.realised[:, self.regions]
+            self._gate = np.average(realised, axis=0, weights=self._entries)
         change = self._kp * (before - now) + self._ki * (self.set_point - now)
         self._gate = np.clip(self._gate + change / self.critical, *self._bounds)
         self._before = now
