@@ -35,8 +35,8 @@ def play(phases, movements, commands, *, position=0.0, interval=90):
 
 @pytest.mark.parametrize("phases", [PHASES, SINGLE])
 def test_u_max_is_the_original_programme(phases):
-    movements = {link: (0, 1) for link in range(1, len(phases[0][0]))}
-    states = play(phases, movements, [np.ones((2, 2))] * 4, position=17.0)
+    movements = {link: 0 for link in range(1, len(phases[0][0]))}
+    states = play(phases, movements, [np.ones(1)] * 4, position=17.0)
     original = [s for s, d in phases for _ in range(int(d))]
     assert states == [original[(second + 17) % 90] for second in range(360)]
 
@@ -46,8 +46,8 @@ def test_random_commands_are_safe(phases):
     random = np.random.default_rng(3)
     for _ in range(40):
         links = random.permutation(len(phases[0][0]))[: random.integers(1, len(phases[0][0]) + 1)]
-        movements = {int(link): (0, int(link) + 1) for link in links}
-        commands = random.uniform(-0.2, 1.2, (30, 6, 6)).clip(0, 1)
+        movements = {int(link): int(link) for link in links}
+        commands = random.uniform(-0.2, 1.2, (30, 6)).clip(0, 1)
         states = play(
             phases,
             movements,
@@ -61,7 +61,7 @@ def test_random_commands_are_safe(phases):
 def test_green_falls_from_the_original_to_the_minimum():
     green = []
     for share in np.linspace(0.0, 1.0, 11):
-        states = play(PHASES, {0: (0, 1)}, [np.full((2, 2), share)] * 3)
+        states = play(PHASES, {0: 0}, [np.full(1, share)] * 3)
         green.append(sum(s[0] in "Gg" for s in states[90:180]))
     assert green[0] == MIN_GREEN and green[-1] == 30
     assert green[2] == 10 and green[4] == 15 and green[6] == 20  # 5 s and so much of the other 25 s
@@ -70,14 +70,14 @@ def test_green_falls_from_the_original_to_the_minimum():
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.7])
 def test_a_green_that_is_cut_has_the_yellow_of_the_programme_and_no_more(share):
-    states = play(SINGLE, {0: (0, 1)}, [np.full((2, 2), share)] * 4)
+    states = play(SINGLE, {0: 0}, [np.full(1, share)] * 4)
     assert [length for shown, length in runs(states, 0)[2:-1] if shown == "y"] == [3, 3, 3]
 
 
 @pytest.mark.parametrize("position", [0.0, 17.0])
 def test_a_link_that_is_never_red_is_held_once_per_cycle(position):
     """Its window is the cycle; the one that had begun before the simulation is left whole."""
-    states = play(PHASES, {3: (0, 1)}, [np.full((2, 2), 0.4)] * 4, position=position)
+    states = play(PHASES, {3: 0}, [np.full(1, 0.4)] * 4, position=position)
     first = round(90 - position) if position else 90
     assert "".join(state[3] for state in states[first : first + 180]) == 2 * (39 * "g" + 3 * "y" + 48 * "r")
     assert {state[3] for state in states[: round(90 - position)]} == {"g"}
@@ -85,7 +85,7 @@ def test_a_link_that_is_never_red_is_held_once_per_cycle(position):
 
 def test_a_time_just_before_the_end_of_the_cycle_is_in_its_last_phase():
     """Sums of simulation steps are off by some rounding."""
-    signal, shown = gateway_signal(SINGLE, {0: (0, 1)})
+    signal, shown = gateway_signal(SINGLE, {0: 0})
     signal.play(90.0 - 1e-7)
     signal.play(90.0)
     assert shown == ["ry", "Gr"]
@@ -93,14 +93,14 @@ def test_a_time_just_before_the_end_of_the_cycle_is_in_its_last_phase():
 
 def test_every_window_of_a_link_keeps_its_minimum_green():
     phases = [("G", 20), ("y", 3), ("G", 10), ("y", 3), ("r", 54)]
-    held = "".join(play(phases, {0: (0, 1)}, [np.zeros((2, 2))] * 2)[90:])
+    held = "".join(play(phases, {0: 0}, [np.zeros(1)] * 2)[90:])
     assert held == 5 * "G" + 3 * "y" + 15 * "r" + 5 * "G" + 3 * "y" + 59 * "r"
 
 
 def test_u_max_is_the_original_programme_to_the_fraction_of_a_second():
     phases = [("Gr", 42.4), ("yr", 3), ("rG", 41.6), ("ry", 3)]
-    signal, _ = gateway_signal(phases, {0: (0, 1)})
-    signal.command(np.ones((2, 2)))
+    signal, _ = gateway_signal(phases, {0: 0})
+    signal.command(np.ones(1))
     while signal.next_change < 270.0:
         signal.play(signal.next_change)
     assert signal.green_time()["s"][0] == pytest.approx(3 * 42.4)
@@ -146,7 +146,7 @@ USUAL, TWICE, ALWAYS = 2 * lit("30G", "3y", "27r"), lit("10G", "3y", "7r", "20G"
 )
 def test_a_ration_of_green_is_spent_in_every_cycle(lights, share, full, expected):
     """Compare each second with the green worked out by hand; `show` is called only when the ration asks for it."""
-    ration, shown, again = Ration((0, 1), cycle=60.0, yellow=3.0, start=0.0, full=full), "", 0.0
+    ration, shown, again = Ration(0, cycle=60.0, yellow=3.0, start=0.0, full=full), "", 0.0
     ration.share = share
     for second, light in enumerate(lights):
         if second >= again or light != lights[second - 1]:

@@ -71,7 +71,7 @@ def test_stages_that_serve_nothing_more_are_left_out(states, kept):
 def test_rationed_green(phases):
     """Random switching and commands: all is safe; no cycle has more green than its ration; u_max rations nothing."""
     random, links = np.random.default_rng(3), (0, 1)
-    junction = Junction(signal(phases), 0.0, {link: (0, 1) for link in links})
+    junction = Junction(signal(phases), 0.0, {link: 0 for link in links})
     cycle, states, budgets = int(sum(d for _, d in phases)), [], []
     for second in range(40 * cycle):
         now = float(second)
@@ -96,7 +96,7 @@ def test_rationed_green(phases):
 
 def test_the_minimum_green():
     """Of a stage, and of a gateway whose ration is the least."""
-    held = Junction(signal(CROSS), 0.0, {0: (0, 1)})
+    held = Junction(signal(CROSS), 0.0, {0: 0})
     held.rations[0].share = 0.0
     assert held.may_switch(MIN_GREEN) and not held.may_switch(MIN_GREEN - 1.0)
     while held.next_change < 66.0:
@@ -314,7 +314,7 @@ def test_a_spent_ration_exerts_no_pressure():
     )
     shown, session = [], SimpleNamespace(time=0.0, lane_vehicles=lambda lane: {"a": 50.0, "c": 1.0}.get(lane[0], 0.0))
     control = MaxPressure(session, town, [CROSSING], FLOWS, show=lambda name, state: shown.append(state))
-    control.command(np.full((2, 2), 5.0 / 61.0))  # 5 s, and so much of the other 61 s
+    control.command(np.full(1, 5.0 / 61.0))  # 5 s, and so much of the other 61 s
     assert control.green_time() == {"s": {0: 0.0}}
     for second in range(66):
         session.time = float(second)

@@ -58,7 +58,7 @@ def opened(town):
 def drive(folder, gates, faults=(), **overrides):
     """A run under u = gates[k] in interval k: what every signal shows second by second, and more."""
     scenario = replace(load_scenario(folder), steps=len(gates), faults=tuple(faults))
-    plant = SumoPlant(scenario, settings=settings(scenario).changed(**overrides))
+    plant = SumoPlant(scenario, settings=settings(scenario).changed(**({"chain_limit": 0.0} | overrides)))
     try:
         plant.reset(1)
         shown = watched(plant)

@@ -113,10 +113,6 @@ class Recorder:
             **self._booked(),
             "teleports": np.array(self._meter.teleports),
             "guided": self._guide.realised.copy(),
-            "gateway_command": Quantity(_GATEWAYS, "1", "share of the boundary's capacity that was commanded"),
-            "gateway_share": Quantity(
-                _GATEWAYS, "1", "share of the green that the gateway was given, mean over the interval"
-            ),
             "gateway_flow": self._meter.gateway_flow(),
             "gateway_green": self._actuation.green_time(),
         }

@@ -3,7 +3,7 @@
 A command u_ih is the share s = (u_ih - u_min) / (u_max - u_min) of what the boundary i -> h can let through. Gateway g
 of this boundary gets the share of green
 
-    s_g = clip(f_g - o_g + m, floor_g, 1)
+    s_g = f_g - o_g + m, but at least floor_g and at most 1
 
 f_g: share of the room before g that is taken: on its own lanes or, if that is more, on these and all streets that lead
     there past no signal, up to CHAIN_M away

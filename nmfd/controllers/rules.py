@@ -79,8 +79,8 @@ class PiGating:
         u_hp(k) = clip(u_hp(k-1) + kp (n_p(k-1) - n_p(k)) / n_cr + ki dt (n_set - n_p(k)) / n_cr,  u_min, u_max)
 
     n_cr is the critical accumulation of p, dt the control interval, n_set the option set_point or the accumulation of
-    outflow_share. u_hp(k-1) is the clipped value, or, if the city reports it, the mean u that its gates realised, so that
-    the integral does not wind up. All other entries stay at u_max.
+    outflow_share. u_hp(k-1) is the clipped value or, if the city reports it, the mean u that its gates realised, so
+    that the integral does not wind up. All other entries stay at u_max.
     """
 
     name = "pi-gating"
