@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from cosim.evaluation import evaluate as evaluation
-from cosim.evaluation import identify as identification
 from cosim.evaluation import model_validation, results, statistics
+from cosim.evaluation.identify import identify as identify
 from cosim.evaluation.runs import runs_of
 from cosim.evaluation.signal_proof import sheets
 from cosim.evaluation.simulate import Simulation, simulate
@@ -26,7 +26,6 @@ from nmfd.controllers.strategy import parse, parse_many
 from nmfd.errors import InputError, RunFailed
 from nmfd.metrics import summary
 from nmfd.model.scenario import Scenario, with_demand
-from nmfd.runs import shipped
 from nmfd.runs.files import default_folder, file_name, write_table
 from nmfd.runs.progress import Progress, watched
 from nmfd.runs.run_many import locked, raise_failures, run_many
@@ -257,37 +256,27 @@ def tune(
     *,
     options: Mapping[str, tuple[float, float]],
     settings: Mapping[str, Any] | None = None,
-    trials: int = 40,
     seeds: int | Sequence[int] = 2,
-    levels: Sequence[float] = (1.0,),
     steps: int | None = None,
-    search_seed: int = 0,
     workers: int = 1,
-    scheduler: str | None = None,
     out: Path | None = None,
+    **how: Any,
 ) -> str:
     """Search the options of a controller in SUMO by CMA-ES; return the best ones as text.
 
     options: KEY, or KEY[N] for one number of a list, -> (low, high)
-    trials: number of candidates, the scenario's own options first
     seeds: runs per candidate and demand level, from seed 1000, or the seeds
+    how: trials, levels and search_seed of cosim.evaluation.tuning.Tuning
     """
     from cosim.evaluation import tuning
 
     loaded = with_demand(load_scenario(scenario, settings), steps=steps)
-    order = tuning.Tuning(
-        scenario=loaded,
-        strategy=parse(controller),
-        options=options,
-        trials=trials,
-        seeds=range(1000, 1000 + seeds) if isinstance(seeds, int) else list(seeds),
-        levels=levels,
-        search_seed=search_seed,
-        out=out or Path("runs") / f"{file_name(loaded.name)}-tune",
-    )
-    tuning.tune(order, workers=workers, scheduler=scheduler)
-    best = (order.out / "tune.toml").read_text(encoding="utf-8")
-    return f"{best}Written to {order.out}: see tune.toml and tune.csv"
+    numbers = range(1000, 1000 + seeds) if isinstance(seeds, int) else list(seeds)
+    out = out or Path("runs") / f"{file_name(loaded.name)}-tune"
+    order = tuning.Tuning(scenario=loaded, strategy=parse(controller), options=options, seeds=numbers, out=out, **how)
+    tuning.tune(order, workers=workers)
+    best = (out / "tune.toml").read_text(encoding="utf-8")
+    return f"{best}Written to {out}: see tune.toml and tune.csv"
 
 
 def get(name: str | None, out: Path | None = None) -> str:
@@ -332,57 +321,6 @@ def import_city(
             progress=lambda stage, share=0.0: show and show(round(100 * share), 100, stage),
         )
     return f"{text}\nWritten to {out} (see map.png, quality.csv, gateways.csv) and {scenario}"
-
-
-def identify(
-    scenario: Path | str,
-    *,
-    settings: Mapping[str, Any] | None = None,
-    levels: Sequence[float] = (0.6, 0.8, 1.0),
-    seeds: int = 2,
-    city: str | None = None,
-    network: Path | None = None,
-    iterations: int = 600,
-    workers: int = 1,
-    scheduler: str | None = None,
-    out: Path | None = None,
-) -> str:
-    """Fit the regional model of a SUMO city to loading runs and write its network.toml; return a report.
-
-    scenario: a scenario, or a network with a scenario of its name beside it; name or folder
-    levels: factors on the demand of the loading runs
-    seeds: loading runs per level, from seed 1000
-    city: strategy options of the loading runs, such as "guided+max-pressure" or "own"; own, then guided, if None
-    network: folder of the model, the scenario's network if None
-    """
-    scenario = shipped.found(scenario, shipped.SCENARIO, shipped.NETWORK)
-    if (scenario / "network.toml").exists():
-        scenario = scenario.resolve().parent.parent / "scenarios" / scenario.name
-    loaded = load_scenario(scenario, settings)
-    strategy = parse("no-control", "" if city == "own" else city or "")
-    kinds = [False, True] if city is None and network is None and identification.without_model(loaded) else []
-    report: list[str] = []
-    for guided in kinds or [strategy.guides]:
-        loaded = load_scenario(scenario, settings)  # the second model takes the split ratios of the first
-        folder = Path("runs") / f"{file_name(loaded.name)}-identify{'-guided' * guided}"
-        if out is not None:
-            folder = out / "guided" if len(kinds) > 1 and guided else out
-        with locked(folder), watched("identify", None) as show:
-            text = identification.identify(
-                loaded,
-                levels=levels,
-                seeds=range(1000, 1000 + seeds),
-                guided=guided,
-                options=[word for word in strategy.words if word != "guided"],
-                network=network,
-                iterations=iterations,
-                out=folder,
-                workers=workers,
-                scheduler=scheduler,
-                progress=show,
-            )
-        report.append(text)
-    return "\n".join(report)
 
 
 def _has_screen() -> bool:

@@ -64,7 +64,6 @@ def evaluated(city, tmp_path, *, controllers=("no-control", "pi-gating"), seeds=
         "identify CITY --with own --out OUT",
         "report OUT",
         "compare OUT",
-        "compare OUT --controller no-control --seed 2000",
     ],
 )
 def test_one_command_writes_into_a_folder_at_a_time(city, tmp_path, ran, command):

@@ -6,10 +6,11 @@ prediction error.
 """
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -18,6 +19,7 @@ from cosim.evaluation.model_validation import observed, outflow_samples
 from cosim.evaluation.runs import runs_of
 from cosim.sumo.build import network_folder
 from cosim.sumo.net import city_of
+from nmfd.api import load_scenario
 from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
 from nmfd.metrics import largest_accumulation
@@ -27,7 +29,8 @@ from nmfd.model.planning import GUIDED, GUIDING
 from nmfd.model.regional_model import RegionalModel, network_toml
 from nmfd.model.scenario import Scenario
 from nmfd.runs import config, files, shipped
-from nmfd.runs.run_many import raise_failures, run_many
+from nmfd.runs.progress import watched
+from nmfd.runs.run_many import locked, raise_failures, run_many
 from nmfd.runs.tables import wrapped
 from nmfd.studies import fit_quality, plots
 from nmfd.types import Result
@@ -42,6 +45,51 @@ def without_model(scenario: Scenario) -> bool:
 
 
 def identify(
+    scenario: Path | str,
+    *,
+    settings: Mapping[str, Any] | None = None,
+    levels: Sequence[float] = (0.6, 0.8, 1.0),
+    seeds: int = 2,
+    city: str | None = None,
+    network: Path | None = None,
+    iterations: int = 600,
+    workers: int = 1,
+    out: Path | None = None,
+) -> str:
+    """Fit the regional model of a SUMO city to loading runs and write its network.toml; return a report.
+
+    The same call continues after an interruption.
+
+    scenario: a scenario, or a network with a scenario of its name beside it; name or folder
+    levels: factors on the demand of the loading runs
+    seeds: loading runs per level, from seed 1000
+    city: strategy options of the loading runs, such as "guided+max-pressure" or "own"; own, then guided, if None
+    network: folder of the model; if None the scenario's network or, of guided drivers alone, its folder GUIDED
+    iterations: of the fit
+    out: folder of samples, figures and loading runs, runs/SCENARIO-identify if None
+    Raises: InputError for a network without a folder or one that must not be written, RunFailed if a run failed
+    """
+    scenario = shipped.found(scenario, shipped.SCENARIO, shipped.NETWORK)
+    if (scenario / "network.toml").exists():
+        scenario = scenario.resolve().parent.parent / "scenarios" / scenario.name
+    loaded = load_scenario(scenario, settings)
+    strategy = parse("no-control", "" if city == "own" else city or "")
+    options = [word for word in strategy.words if word != "guided"]
+    how: dict[str, Any] = {"levels": levels, "seeds": range(1000, 1000 + seeds), "options": options}
+    how |= {"network": network, "iterations": iterations, "workers": workers}
+    both = city is None and network is None and without_model(loaded)
+    report: list[str] = []
+    for guided in [False, True] if both else [strategy.guides]:
+        loaded = load_scenario(scenario, settings)  # the second model takes the split ratios of the first
+        folder = Path("runs") / f"{files.file_name(loaded.name)}-identify{'-guided' * guided}"
+        if out is not None:
+            folder = out / "guided" if both and guided else out
+        with locked(folder), watched("identify", None) as show:
+            report.append(_identify(loaded, guided=guided, out=folder, progress=show, **how))
+    return "\n".join(report)
+
+
+def _identify(
     loaded: Scenario,
     *,
     levels: Sequence[float],
@@ -52,22 +100,12 @@ def identify(
     iterations: int,
     out: Path,
     workers: int,
-    scheduler: str | None,
     progress: Callable[..., None] | None,
 ) -> str:
-    """Load a city, fit its regional model, and write its network.toml and verdict.txt; return the fit as text.
+    """Load a city, fit one regional model, and write its network.toml and verdict.txt; return the fit as text.
 
-    Samples, figures and loading runs go to `out`; the same call continues after an interruption.
-
-    levels: multiples of the scenario's demand; seeds: of the runs at every level
     guided: with route guidance, first towards the drivers' own split ratios, then probing
     options: words of the strategies, such as max-pressure
-    network: folder whose network.toml is written; None for the scenario's own or, if guided, its folder GUIDED
-    iterations: of the fit
-
-    Raises:
-        InputError: for a network without a folder, or a target that must not be written.
-        RunFailed: if a loading run failed.
     """
     own = network_folder(loaded.network)
     target = network or (own / GUIDED if guided and not options and without_model(loaded) else own)
@@ -85,7 +123,7 @@ def identify(
         each = (runs_of(tuned, [strategy], seeds, demand=level, folder=f"level-{level:g}") for level in levels)
         runs = list(chain.from_iterable(each))
         show = _named(progress, f"loading runs {stage + 1} of 2; ")
-        raise_failures(run_many(runs, out, workers=workers, scheduler=scheduler, progress=show))
+        raise_failures(run_many(runs, out, workers=workers, progress=show))
         return [Result.read(out / run.file) for run in runs]
 
     first = load(0)

@@ -127,7 +127,7 @@ class Tuning:
         return self.out / "policies" / f"{number:03d}.pt"
 
 
-def tune(order: Tuning, *, workers: int = 1, scheduler: str | None = None, progress: Progress = None) -> pd.DataFrame:
+def tune(order: Tuning, *, workers: int = 1, progress: Progress = None) -> pd.DataFrame:
     """Run the candidates and return the table of tune.csv; the same call resumes, and one with more trials continues.
 
     A candidate with a failed run has no score.
@@ -150,7 +150,7 @@ def tune(order: Tuning, *, workers: int = 1, scheduler: str | None = None, progr
                 study.ask(order.space)
             running = [trial for trial in study.get_trials(deepcopy=False) if trial.state == TrialState.RUNNING]
             runs = _runs(order, running, city, workers)
-            rows = run_many(runs, order.out / "runs", workers=workers, scheduler=scheduler, progress=progress)
+            rows = run_many(runs, order.out / "runs", workers=workers, progress=progress)
             for trial in running:
                 totals = np.maximum(list(_totals(order, rows, trial.number).values()), 1.0)  # a city may be empty
                 score = float(np.exp(np.log(totals).mean()))
