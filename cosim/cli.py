@@ -280,6 +280,7 @@ def import_(source: Path | None, bbox: str | None, **options: Any) -> None:
     "guided, a model each]",
 )
 @click.option("--network", type=FOLDER, metavar="DIR", help="Folder of the model. [default: the scenario's network]")
+@click.option("--protect", is_flag=True, help="Write the regions to protect into the scenario.")
 @WORKERS
 @out_option("runs/SCENARIO-identify", "Folder of loading runs, samples and figures.")
 def identify(scenario: Path, **options: Any) -> None:

@@ -191,8 +191,15 @@ def test_an_empty_region_keeps_its_model_in_identification(scenario, result):
     assert (kept.exit_rates[1:] == 2.0).all() and (kept.storage[1:] == 10.0).all()
 
 
-def test_the_regions_to_protect_are_proposed(tmp_path):
+def test_the_regions_to_protect_are_proposed_and_written(tmp_path):
     loaded = load_scenario(tiny.write(tmp_path, network=tiny.row_network(3)))
-    assert _protected(loaded, ()) == _protected(loaded, (1,)) == []
-    (line,) = _protected(loaded, (0, 2))
-    assert f"protected = [0, 2] instead of [1] into {loaded.where}" in line
+    file = loaded.folder / "scenario.toml"
+    assert _protected(loaded, (), write=True) == _protected(loaded, (1,), write=True) == []
+    before = file.read_text()
+    (line,) = _protected(loaded, (0, 2), write=False)
+    assert "protected = [0, 2] instead of [1] in" in line and file.read_text() == before
+    _protected(loaded, (0, 2), write=True)
+    assert file.read_text() == before.replace("protected = [1]", "protected = [0, 2]")
+    file.write_text(before.replace("protected = [1]\n", ""))
+    _protected(loaded, (2,), write=True)
+    assert load_scenario(loaded.folder).protected == (2,)

@@ -6,6 +6,8 @@ prediction error.
 """
 
 import os
+import re
+import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
@@ -52,6 +54,7 @@ def identify(
     seeds: int = 2,
     city: str | None = None,
     network: Path | None = None,
+    protect: bool = False,
     iterations: int = 600,
     workers: int = 1,
     out: Path | None = None,
@@ -65,6 +68,7 @@ def identify(
     seeds: loading runs per level, from seed 1000
     city: strategy options of the loading runs, such as "guided+max-pressure" or "own"; own, then guided, if None
     network: folder of the model; if None the scenario's network or, of guided drivers alone, its folder GUIDED
+    protect: write the regions to protect into the scenario, those of the first model
     iterations: of the fit
     out: folder of samples, figures and loading runs, runs/SCENARIO-identify if None
     Raises: InputError for a network without a folder or one that must not be written, RunFailed if a run failed
@@ -85,7 +89,9 @@ def identify(
         if out is not None:
             folder = out / "guided" if both and guided else out
         with locked(folder), watched("identify", None) as show:
-            report.append(_identify(loaded, guided=guided, out=folder, progress=show, **how))
+            report.append(
+                _identify(loaded, guided=guided, protect=protect and not report, out=folder, progress=show, **how)
+            )
     return "\n".join(report)
 
 
@@ -98,6 +104,7 @@ def _identify(
     options: Sequence[str],
     network: Path | None,
     iterations: int,
+    protect: bool,
     out: Path,
     workers: int,
     progress: Callable[..., None] | None,
@@ -168,17 +175,27 @@ def _identify(
     target.mkdir(parents=True, exist_ok=True)
     files.write_text(target / "network.toml", network_toml(model, sumo, comment))
     files.write_text(target / authority.FILE, verdict.text())
-    proposed = _protected(loaded, verdict.protect)
+    proposed = _protected(loaded, verdict.protect, write=protect)
     where = f"Written to {os.path.normpath(target / 'network.toml')}; samples and figures to {out}"
     return "\n".join([text, *wrapped("\n".join([*verdict.sentences, *proposed])), where])
 
 
-def _protected(scenario: Scenario, regions: tuple[int, ...]) -> list[str]:
-    """Return the proposal to protect `regions`, unless the scenario does."""
+def _protected(scenario: Scenario, regions: tuple[int, ...], *, write: bool) -> list[str]:
+    """Return the proposal to protect `regions`, unless the scenario does; if told to, write it. Raises InputError."""
     if not regions or set(regions) == set(scenario.protected):
         return []
     names, now = ", ".join(scenario.network.titles[region] for region in regions), list(scenario.protected)
-    return [f"Protect {names}: write protected = {list(regions)} instead of {now} into {scenario.where}."]
+    line, path = f"protected = {list(regions)}", Path(scenario.where)
+    if write:
+        text = path.read_text(encoding="utf-8")
+        top, bracket, tables = text.partition("\n[")
+        top, count = re.subn(r"(?m)^protected\s*=\s*\[[^\]]*\].*$", line, top)
+        changed = (top if count else f"{top}\n{line}\n") + bracket + tables
+        if tomllib.loads(changed) != tomllib.loads(text) | {"protected": list(regions)}:
+            raise InputError(f"{path}: protected: cannot be changed here; write {line} yourself")
+        files.write_text(path, changed)
+    what = "was written there" if write else "with --protect it is written there"
+    return [f"Protect {names}: {line} instead of {now} in {path}; {what}."]
 
 
 def _named(progress: Callable[..., None] | None, stage: str) -> Callable[..., None] | None:
