@@ -337,7 +337,7 @@ def new_controller(file: Path) -> None:
 )
 @click.option("--regions", type=FILE, metavar="CSV", help="Table detid,region, if no other table has the region.")
 @click.option("--about", type=FILE, metavar="CSV", help="Table of regions: region, lane_km, trip_length, x, y (m).")
-@click.option("--adjacency", type=FILE, metavar="CSV|TOML", help="Table region,neighbour, or a network.toml.")
+@click.option("--adjacency", type=FILE, metavar="CSV", help="Table region,neighbour. [default: by position]")
 @click.option("--trip-length", type=float, metavar="M", help="Mean trip length in a region. [default: from its size]")
 @click.option("--city", metavar="NAME", help="City, if the tables hold several.")
 @click.option("--skip-bad", is_flag=True, help="Leave out doubled rows and impossible numbers, and count them.")

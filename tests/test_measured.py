@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-import tiny
 from commands import good
 from commands import nmfd as command
 
@@ -97,18 +96,6 @@ def test_what_is_given_replaces_what_is_assumed(tmp_path, made):
     assert north.critical == pytest.approx(4.0 * south.critical, rel=0.02)  # four times the streets
     assert north.capacity == pytest.approx(8.0 * south.capacity, rel=0.02)  # and trips half as long
     assert list(found.fits["doubts"]) == [("low coverage 25 %",), ("coverage unknown",)]
-
-
-@pytest.mark.usefixtures("without_pictures")
-def test_regions_and_adjacency_of_another_network(tmp_path, made):
-    counts, detectors = made
-    tiny.write(tmp_path, network=tiny.row_network(2))
-    files = written(tmp_path, counts, detectors.assign(region=detectors["region"].map({"north": 1, "south": 0})))
-    files["adjacency"] = tmp_path / "network" / "network.toml"
-    found = nmfd.identify(**files, out=tmp_path / "city", trip_length=TRIP)
-    base = nmfd.load_network(tmp_path / "network")
-    assert found.network.region_names == base.region_names and (found.network.positions == base.positions).all()
-    assert found.network.mfds != base.mfds
 
 
 @pytest.mark.usefixtures("without_pictures")

@@ -20,7 +20,7 @@ from nmfd.arrays import Adjacency, Points
 from nmfd.errors import InputError
 from nmfd.model import detector_tables, mfd
 from nmfd.model.detector_tables import VEHICLE_LENGTH_M
-from nmfd.model.regional_model import NetworkTable, RegionalModel, load_network, network_toml
+from nmfd.model.regional_model import NetworkTable, RegionalModel, network_toml
 from nmfd.runs import config, files
 from nmfd.runs.tables import wrapped
 from nmfd.studies import fit_quality, plots
@@ -83,7 +83,7 @@ def identify(
 
     counts, detectors, regions, about: tables (nmfd.model.detector_tables)
     out: folder of the network, whose name it gets
-    adjacency: csv file region,neighbour, or a network.toml of the same regions; None: by the detectors' positions
+    adjacency: csv file region,neighbour; None: by the detectors' positions
     city: of several in the tables
     skip_bad: leave out doubled rows and those with missing or impossible numbers
     trip_length: mean trip length within a region [m]; None: assumed from the size of the region
@@ -98,9 +98,7 @@ def identify(
         raise InputError(f"{out / 'network.toml'}: exists; choose another --out")
     rows, left = detector_tables.read_counts(counts, city=city, skip_bad=skip_bad)
     stations = detector_tables.read_detectors(paths[0], paths[1], rows, counts, city=city)
-    base = _base_network(paths[3], stations)
-    by_number = sorted(set(stations["region"]), key=lambda name: name.rjust(9) if name.isdecimal() else name)
-    names = list(base.region_names) if base else by_number
+    names = sorted(set(stations["region"]), key=lambda name: name.rjust(9) if name.isdecimal() else name)
     speed = rows["flow"].sum() * VEHICLE_LENGTH_M / 3600.0 / max(rows["occ"].sum(), 1e-9)
     if not detector_tables.SPEEDS_M_S[0] <= speed <= detector_tables.SPEEDS_M_S[1]:
         what = f"a mean speed of {speed:.3g} m/s, with {VEHICLE_LENGTH_M:g} m for a vehicle over a loop"
@@ -130,13 +128,15 @@ def identify(
             f"{100 * LEAST_REPORTING:g} % of its detectors reporting; give more data, or join it to another region"
             + "".join(f"; {line}" for line in broken)
         )
-    new: dict = {"name": out.absolute().name}
-    if base is None:
-        places, pairs = _positions(stations, table), _adjacency(paths[3], stations, names)
-        new |= {"region_names": tuple(names), "positions": places, "adjacency": pairs, "u_min": U_MIN, "u_max": U_MAX}
-    new["mfds"] = tuple(mfd.fit(*fit_quality.own_points(cloud).T) for cloud in samples)
-    fresh: dict = {"exit_rates": None, "capacity": None, "storage": None, "placeholder": False}
-    network = replace(base, **new, **fresh) if base else RegionalModel(**new)
+    network = RegionalModel(
+        name=out.absolute().name,
+        region_names=tuple(names),
+        positions=_positions(stations, table),
+        adjacency=_adjacency(paths[3], stations, names),
+        mfds=tuple(mfd.fit(*fit_quality.own_points(cloud).T) for cloud in samples),
+        u_min=U_MIN,
+        u_max=U_MAX,
+    )
     if (network.hops < 0).any():
         i, j = np.argwhere(network.hops < 0)[0]
         remedy = "give all pairs of neighbours, region,neighbour, with --adjacency"
@@ -184,19 +184,6 @@ def _cloud(part: pd.DataFrame) -> dict[str, Points]:
     rising = part.groupby("day")["accumulation_veh"].diff().fillna(0.0) >= 0
     points, occupied = part[["accumulation_veh", "outflow_veh_s"]].to_numpy(dtype=float), part["accumulation_veh"] > 0
     return {"loading": points[occupied & rising], "unloading": points[occupied & ~rising]}
-
-
-def _base_network(path: Path | None, detectors: pd.DataFrame) -> RegionalModel | None:
-    """Return the model of a network.toml with the same regions, by name or number, and rename those of `detectors`."""
-    if path is None or path.suffix != ".toml":
-        return None
-    network = load_network(path.parent)
-    numbers = {str(n): name for n, name in enumerate(network.region_names) if str(n) not in network.region_names}
-    detectors["region"] = detectors["region"].replace(numbers)
-    if odd := set(detectors["region"]) ^ set(network.region_names):
-        known = ", ".join(network.region_names)
-        raise InputError(f"{path}: region {min(odd)!r} is not in both; the regions must be the same, {known}")
-    return network
 
 
 def _positions(detectors: pd.DataFrame, about: pd.DataFrame) -> np.ndarray:
