@@ -80,7 +80,7 @@ def test_compare(small, tmp_path):
         return rows[rows["controller"] == "pi-gating"][["next_interval_rmse_share", "whole_run_rmse_share"]].to_numpy()
 
     own = foreseen()
-    assert own.shape == (7, 2) and (out / "compare-pi-gating-0.png").stat().st_size > 10_000
+    assert own.shape == (7, 2) and (out / "compare-pi-gating-0-region_accumulation.png").stat().st_size > 10_000
     run, scenario = Result.read(out / "pi-gating-0.nc"), load_scenario(small)
     off = predict(scenario, run).accumulation.sum(axis=2) - run.accumulation.sum(axis=2)
     np.testing.assert_allclose(own[:, 1], np.sqrt((off**2).mean(axis=0)) / scenario.network.seen_critical, rtol=1e-3)

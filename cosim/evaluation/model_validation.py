@@ -22,7 +22,7 @@ from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs import files
 from nmfd.runs.tables import text_table
-from nmfd.studies import plots
+from nmfd.studies.benchmark import draw_accumulations
 from nmfd.studies.fit_quality import SPILLBACK, predictions
 from nmfd.types import Result
 
@@ -82,22 +82,10 @@ def compare(found: Finished, model: Path | None = None) -> pd.DataFrame:
                 "whole_run_rmse_share": np.sqrt((np.concatenate(off) ** 2).mean(axis=0)) / network.seen_critical,
             }
             tables.append(pd.DataFrame(columns).join(predictions(network, runs, scenario.scheme)))
-            draw(
-                level.folder / f"compare-{files.run_name(controller, results[0].seed)}.png", network, results, predicted
-            )
+            both = [run.assign(backlog=np.zeros_like(run.backlog)) for run in (results[0], predicted[0])]
+            prefix = f"compare-{files.run_name(controller, results[0].seed)}-"
+            draw_accumulations(level.folder, scenario, both, prefix=prefix)
     return pd.concat(tables, ignore_index=True)
-
-
-def draw(path: Path, network: RegionalModel, results: Sequence[Result], predicted: Sequence[Result]) -> None:
-    """Draw the accumulations of the regions in the first of some runs, and as the model predicts them."""
-    drawing, axes = plots.panels(network.regions + 1)
-    both = [results[0], predicted[0]]
-    for region, ax in enumerate(axes[:-1]):
-        plots.region_accumulation(ax, network, region, both)
-    plots.total_accumulation(axes[-1], [run.assign(backlog=np.zeros_like(run.backlog)) for run in both])
-    axes[-1].set_title("all regions", fontsize="medium")
-    plots.legend_below(drawing, axes, columns=4)
-    plots.save(drawing, path)
 
 
 def prediction_table(rows: pd.DataFrame) -> str:

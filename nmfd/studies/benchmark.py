@@ -128,23 +128,24 @@ def draw_accumulations(
     *,
     seed: int | None = None,
     title: str | None = None,
+    prefix: str = "",
 ) -> None:
     """Draw total and regional accumulation over time, as png files in `folder`.
 
-    seed: shown instead of the mean over seeds; title: above both pictures
+    seed: shown instead of the mean over seeds; title: above both pictures; prefix: of their names
     """
     network = scenario.network
     drawing = plots.figure(8.0, 4.6)
     ax = plots.total_accumulation(drawing.subplots(), trajectories, seed)
     drawing.suptitle(title, fontsize="medium")
     plots.legend_below(drawing, [ax], columns=6)
-    plots.save(drawing, folder / "total_accumulation.png")
+    plots.save(drawing, folder / f"{prefix}total_accumulation.png")
     drawing, axes = plots.panels(network.regions)
     for region, ax in enumerate(axes):
         plots.region_accumulation(ax, network, region, trajectories, seed)
     drawing.suptitle(title, fontsize="medium")
     plots.legend_below(drawing, axes, columns=3)
-    plots.save(drawing, folder / "region_accumulation.png")
+    plots.save(drawing, folder / f"{prefix}region_accumulation.png")
 
 
 def draw_scenario(folder: Path, scenario: Scenario) -> list[Path]:
