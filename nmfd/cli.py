@@ -308,7 +308,7 @@ def bound(scenario: Path, settings: dict, controller: str, **options: Any) -> No
 def new_controller(file: Path) -> None:
     """Write a commented template of a controller.
 
-    Every command takes it as FILE:Class. Packages can offer controllers by entry points of the group nmfd.controllers.
+    Every command takes it as FILE:Class.
 
     \b
     Example:

@@ -70,7 +70,8 @@ def compare(found: Finished, model: Path | None = None) -> pd.DataFrame:
             network, results = parse(controller).planning(found.scenario, model).network, level.results(controller)
             scenario, runs = replace(found.scenario, network=network), list(map(observed, results))
             predicted = [predict(scenario, result) for result in results]
-            off = [a.accumulation.sum(2) - b.accumulation.sum(2) for a, b in zip(predicted, results, strict=True)]
+            both = zip(predicted, results, strict=True)
+            off = np.concatenate([a.accumulation.sum(2) - b.accumulation.sum(2) for a, b in both])
             columns = {
                 "demand": level.demand,
                 "controller": controller,
@@ -79,12 +80,13 @@ def compare(found: Finished, model: Path | None = None) -> pd.DataFrame:
                 "region": range(network.regions),
                 "critical_veh": network.seen_critical,
                 "most_share": largest_accumulation(run.accumulation for run in runs) / network.seen_critical,
-                "whole_run_rmse_share": np.sqrt((np.concatenate(off) ** 2).mean(axis=0)) / network.seen_critical,
+                "whole_run_rmse_share": np.sqrt((off**2).mean(axis=0)) / network.seen_critical,
+                "whole_run_bias_share": off.mean(axis=0) / network.seen_critical,
             }
             tables.append(pd.DataFrame(columns).join(predictions(network, runs, scenario.scheme)))
-            both = [run.assign(backlog=np.zeros_like(run.backlog)) for run in (results[0], predicted[0])]
+            drawn = [run.assign(backlog=np.zeros_like(run.backlog)) for run in (results[0], predicted[0])]
             prefix = f"compare-{files.run_name(controller, results[0].seed)}-"
-            draw_accumulations(level.folder, scenario, both, prefix=prefix)
+            draw_accumulations(level.folder, scenario, drawn, prefix=prefix)
     return pd.concat(tables, ignore_index=True)
 
 
