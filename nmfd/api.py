@@ -216,29 +216,19 @@ def train(
     anyway: train even on placeholder MFDs or if no gateway can be controlled
     progress: see `benchmark`
     """
-    scenario, device = _loaded(scenario), training.available(device)
-    strategy = parse(controller)
+    scenario, strategy = _loaded(scenario), parse(controller)
+    options: dict[str, Any] = {"seed": seed, "steps": steps, "device": training.available(device), "resume": resume}
     chosen = training.settings(scenario, strategy, steps)
     file = _file(scenario, f"{controller}.pt", out)
     believed = strategy.planning(scenario).network
     for region, doubts in zip(believed.region_names, believed.doubts, strict=False):
         if doubts:
             print(f"nmfd: the model of region {region} is doubtful: {'; '.join(doubts)}", file=sys.stderr)
-    compiled = chosen.descend and chosen.steps >= training.WORTH_COMPILING and rollout.can_compile(device)
+    worth = chosen.descend and chosen.steps >= training.WORTH_COMPILING
+    options |= {"anyway": anyway, "compiled": worth and rollout.can_compile(options["device"])}
     try:
         with watched(controller, progress) as show:
-            return training.train(
-                scenario,
-                strategy,
-                seed=seed,
-                out=file,
-                steps=steps,
-                resume=resume,
-                device=device,
-                compiled=compiled,
-                anyway=anyway,
-                progress=show,
-            )
+            return training.train(scenario, strategy, out=file, progress=show, **options)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"the best policy so far, if any, is {file}; add --resume to continue") from None
 

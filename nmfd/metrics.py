@@ -21,22 +21,6 @@ KINDS = Status.SOLVER_FAILURE, Status.FALLBACK, Status.LATE, Status.SENSOR_FAULT
 
 # Attributes of a Result that are no column of a table of runs.
 NO_COLUMNS = {"step", "estimated", "wall_time", "key", "scenario_folder"}
-# Columns of a table of runs on any plant, and their meaning.
-SUMMARY: dict[str, str] = {
-    "controller": "the strategy",
-    "seed": "of trips, drivers and guidance",
-    "plant": "what was driven: a regional model, or the city in SUMO",
-    "total_time_spent_veh_s": "on the road and waiting to enter; in SUMO of private vehicles, until they are removed",
-    "final_accumulation_veh": "inside at the end",
-    "max_accumulation_veh": "inside at the end of an interval, the most",
-    "completed_veh": "trips that reached their end",
-    "evaluation_time_s": "processor time of all decisions, of all threads",
-    "control_step_ms_first": "processor time of the first decision",
-    "control_step_ms_median": "of the median decision",
-    "control_step_ms_max": "of the longest decision",
-    **{column: text for column, (_, text) in COUNTED.items()},
-    "wall_time_s": "wall time of the run",
-}
 
 
 def total_time_spent(result: Result) -> float:
@@ -99,7 +83,7 @@ def notes(result: Result, most: int = 3) -> str:
 
 
 def summary(result: Result) -> dict[str, float | int | str]:
-    """Return one row of a table of runs: the figures of merit (SUMMARY) and all scalar facts of the run.
+    """Return one row of a table of runs: the figures of merit and all scalar facts of the run.
 
     >>> round(summary(nmfd.run("economic_mpc", "no-control", steps=20))["max_accumulation_veh"])
     12558
@@ -112,10 +96,10 @@ def summary(result: Result) -> dict[str, float | int | str]:
     return {
         **{name: facts.pop(name) for name in ("controller", "seed", "plant")},
         "total_time_spent_veh_s": total_time_spent(result),
-        "final_accumulation_veh": float(total[-1]),
-        "max_accumulation_veh": float(total.max()),
-        "completed_veh": float(facts.pop("completed_veh", result.completed[-1])),
-        "evaluation_time_s": float(result.decision_time.sum()),
+        "final_accumulation_veh": float(total[-1]),  # inside at the end
+        "max_accumulation_veh": float(total.max()),  # inside at the end of an interval, the most
+        "completed_veh": float(facts.pop("completed_veh", result.completed[-1])),  # trips that reached their end
+        "evaluation_time_s": float(result.decision_time.sum()),  # processor time of all decisions, of all threads
         "control_step_ms_first": float(decision_ms[0]),
         "control_step_ms_median": float(np.median(decision_ms)),
         "control_step_ms_max": float(decision_ms.max()),

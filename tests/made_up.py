@@ -13,7 +13,7 @@ from cosim.evaluation.simulate import FACTS
 from cosim.sumo.net import city_of
 from nmfd.api import load_scenario
 from nmfd.controllers.strategy import parse
-from nmfd.metrics import COUNTED, SUMMARY
+from nmfd.metrics import COUNTED
 from nmfd.model.scenario import with_demand
 from nmfd.runs import run_many
 from nmfd.types import Result
@@ -100,7 +100,8 @@ def folder(out: Path, *, controllers=tuple(SHARE), seeds=(2000, 2001), levels=(1
 
 def rows_of(values: dict[tuple[float, str], dict[int, float]]) -> pd.DataFrame:
     """(level, controller) -> seed -> TTS; everything else is 1 or empty."""
-    blank = {name: 1.0 for name in (*SUMMARY, *FACTS)} | dict.fromkeys(("teleports", *COUNTED), 0)
+    figures = ("completed_veh", *(f"control_step_ms_{which}" for which in ("first", "median", "max")))
+    blank = {name: 1.0 for name in (*figures, *FACTS)} | dict.fromkeys(("teleports", *COUNTED), 0)
     return pd.DataFrame(
         [
             blank | {"demand": level, "controller": name, "seed": seed, statistics.TTS: tts}
