@@ -34,8 +34,8 @@ class Published:
     start: str
 
 
-def _github(repository: str, commit: str, **rest: str) -> Published:
-    folder = f"{repository.partition('/')[2]}-{commit}/scenario"
+def _github(repository: str, commit: str, folder: str = "scenario", **rest: str) -> Published:
+    folder = f"{repository.partition('/')[2]}-{commit}/{folder}"
     return Published(source=f"https://github.com/{repository}/archive/{commit}.zip", folder=folder, **rest)
 
 
@@ -44,7 +44,18 @@ def _resco(name: str, about: str, regions: int) -> Published:
     return Published(about=about, licence=RESCO, source=source, folder=f"sumo_rl/nets/RESCO/{name}", start=start)
 
 
+def _dlr(folder: str, **rest: str) -> Published:
+    commit, licence = "629e34cb444db1c7c48c852760af7b4349248837", "EPL-2.0, by DLR, Institute of Transportation Systems"
+    return _github("DLR-TS/sumo-scenarios", commit, folder, licence=licence, **rest)
+
+
 CITIES: Mapping[str, Published] = {
+    "bologna": _dlr("bologna/joined", about="Bologna, measured demand of a peak hour", start="run.sumocfg --regions 4"),
+    "hamburg": _dlr(
+        "TAVF-Hamburg",
+        about="Hamburg, the test field for automated driving, 43 signals, an hour",
+        start="run_simulation.sumocfg --regions 3 --end 1:00:00",
+    ),
     "cologne8": _resco("cologne8", "Cologne, a corridor of 8 signals, 7:00 to 8:00, demand of TAPASCologne", 3),
     "ingolstadt21": _resco("ingolstadt21", "Ingolstadt, a corridor of 21 signals, 16:00 to 17:00, from InTAS", 4),
     "lust": _github(
