@@ -156,7 +156,7 @@ def _identify(
         without = replace(fitted(kept, outflow_samples(static, kept)), critical_above=model.critical_above)
         unseen = [observed(run) for run in runs if run.seed == seeds[-1]]
         errors = fit_quality.predictions(without, unseen, loaded.scheme)
-        text += "\n" + fit_quality.prediction_table(without, errors, loaded.step)
+        text += "\n".join(["", *wrapped(fit_quality.prediction_text(errors, loaded.step))])
     files.write_text(out / "fit.txt", text + "\n")
     fit_quality.write_fits(out / "fit.csv", fits, errors)
     clouds = ((i, branch, points) for i, cloud in enumerate(samples) for branch, points in cloud.items())

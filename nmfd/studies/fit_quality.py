@@ -13,7 +13,7 @@ from nmfd.model import identification, mfd
 from nmfd.model.identification import Observed
 from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import files
-from nmfd.runs.tables import text_columns, text_table, wrapped
+from nmfd.runs.tables import text_table, wrapped
 
 Samples = Sequence[Mapping[str, Points]]  # by region, label -> (n, 2) of accumulation [veh] and outflow [veh/s]
 States = Sequence[StatesOverTime]  # accumulations of each run
@@ -36,10 +36,7 @@ MEANINGS = {  # beginning of a doubt -> meaning and remedy
     ),
     ALONE: "there is no held-out error; give --seeds 2 or more",
 }
-HELD_OUT = (
-    "RMSE of the accumulation in percent of the critical one, in the runs of the last seed, by a fit without them; "
-    "unchanged: of the prediction that no accumulation changes"
-)
+HELD_OUT = "RMSE of accumulations, in percent of critical ones, in the runs of the last seed, by a fit without them: "
 
 
 def with_guesses(
@@ -186,14 +183,11 @@ def predictions(network: RegionalModel, runs: Sequence[Observed], scheme: dict) 
     return pd.DataFrame({**columns, "ahead_s": ahead * scheme["step"]})
 
 
-def prediction_table(network: RegionalModel, errors: pd.DataFrame, step: float) -> str:
-    """Return `predictions` in runs that the fit did not use, as text; step: control interval [s]."""
-    shown = errors.filter(like="rmse_share")
-    shown = pd.concat([shown, shown.mean().to_frame().T])
-    names = [*(f"{region} {name}" for region, name in enumerate(network.region_names)), "mean"]
-    lines = [[name, *(f"{100 * value:.1f} %" for value in row)] for name, row in zip(names, shown.values, strict=True)]
-    headings = ["region", f"{step:g} s ahead", "unchanged", f"{errors['ahead_s'][0]:g} s ahead", "unchanged"]
-    return text_columns(headings, lines, HELD_OUT)
+def prediction_text(errors: pd.DataFrame, step: float) -> str:
+    """Return the means of `predictions` in runs that the fit did not use, as text; step: control interval [s]."""
+    means = (100.0 * errors.filter(like="rmse_share").mean()).map("{:.1f} %".format)
+    whens = zip((step, errors["ahead_s"][0]), means[::2], means[1::2], strict=True)
+    return HELD_OUT + ", ".join(f"{model} {when:g} s ahead (unchanged: {same})" for when, model, same in whens)
 
 
 def write_fits(path: Path, fits: pd.DataFrame, held_out: pd.DataFrame | None = None) -> None:
