@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from html import escape
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from cosim.view.city_map import CityMap
 from cosim.view.curves import HOUR, MINUTE, OF_REGION, Curves, Load
 from cosim.view.picture import CityPicture, Frame
 
+HERE = Path(__file__).parent
 PLAY_PERIOD_MS = 150  # wall time per control interval
 NARROWEST = 330  # pixels, of a plot; on a narrower screen plots stand below each other
 KEY = (
@@ -20,34 +22,6 @@ KEY = (
     f"<span style='color:{colours.QUEUE}'>●</span> halo: queue before it &ensp; "
     f"<span style='color:{colours.GUIDED}'>▲</span> drivers guided from region to region"
 )
-# The tables hold a row per control interval (film) or region (choices) for every source that changes with it.
-SLIDER_JS = """
-const k = Math.round(slider.value / slider.step)
-const put = (tables, row) => {
-  for (const [source, table, columns] of tables) {
-    for (const name of columns) source.data[name] = table.data[name][row]
-    source.change.emit()
-  }
-}
-if (cb_obj === region) {
-  put(choices, Number(region.value))
-  titles.forEach((title, n) => { title.text = texts[n][Number(region.value)] })
-}
-put(film, k)
-numbers.text = words[k]
-for (const span of spans) span.location = slider.value
-for (const one of present) one.indices = k > 0 ? [k] : []
-"""
-PLAY_JS = """
-clearInterval(window.playing)
-cb_obj.label = cb_obj.active ? "Pause" : "Play"
-const last = () => slider.value > slider.end - slider.step / 2
-if (cb_obj.active && last()) slider.value = slider.start
-if (cb_obj.active) window.playing = setInterval(() => {
-  if (last()) cb_obj.active = false
-  else slider.value = Math.min(slider.value + slider.step, slider.end)
-}, period)
-"""
 
 
 class Page:
@@ -152,10 +126,11 @@ def with_slider(picture: CityPicture, runs: Mapping[str, Sequence[Frame]]) -> La
     args = {"slider": slider, "region": page.regions, "film": film, "choices": choices}
     args |= {"titles": page.curves.titles, "texts": texts, "numbers": page.numbers, "words": words}
     args |= {"present": page.curves.present, "spans": [*(load.now for load in page.loads), *page.curves.now]}
-    callback = CustomJS(args=args, code=SLIDER_JS)
+    callback = CustomJS.from_file(HERE / "slider.js", **args)
     slider.js_on_change("value", callback)
     page.regions.js_on_change("value", callback)
-    play.js_on_change("active", CustomJS(args={"slider": slider, "period": PLAY_PERIOD_MS}, code=PLAY_JS))
+    playing = CustomJS.from_file(HERE / "play.js", slider=slider, period=PLAY_PERIOD_MS)
+    play.js_on_change("active", playing)
     return page.layout([play, slider, page.regions])
 
 
