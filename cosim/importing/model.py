@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -16,34 +17,13 @@ from nmfd.arrays import PairsOverTime
 from nmfd.model.identification import observed_split_ratios
 from nmfd.model.mfd import JAM_DENSITY, guess
 from nmfd.model.regional_model import RegionalModel
-from nmfd.runs.config import quoted
+from nmfd.runs.config import filled
 
 SIGNAL_SPEED_SHARE = 0.5  # speed with signals over the speed limit
 DEFAULT_CYCLE_S = 90.0
 SHORTEST_STEP_S, LONGEST_STEP_S = 60.0, 180.0  # control intervals; shorter cycles are taken several times
 IDLE_S = 900.0  # before the first departure, at most
 RECOVERY_S = 1800.0  # after the last departure, for the network to empty
-# A policy that relies on one identified model gains there and not in SUMO: it starts from no control and trains on many
-# models and demand levels. With guidance a compact policy adds prices to travel times.
-TRAINING = """
-[controllers.dpc-pc]        # training
-steps = 600
-learning_rate = 2e-3
-demand_low = 0.8            # every rollout has another demand level and another regional model
-demand_high = 1.3
-mfd_spread = 0.15
-from_no_control = true      # what training finds no reason to change stays open
-
-[controllers.dpc-pcrg]      # a gate and prices that can be read, beside guidance by travel times
-compact = true
-numbers = [1.5, 1.0, 0.0, 1.0, 0.6, 0.0, 0.6, 1.5]  # it begins with: the gate open
-steps = 200
-learning_rate = 2e-3
-demand_low = 0.8
-demand_high = 1.3
-mfd_spread = 0.15
-detour_cost = 600.0         # s per diverted vehicle
-"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,35 +110,15 @@ def scenario_text(
     clock: Clock,
     case: SumoInput,
     *,
-    name: str,
-    network_path: str,
-    protected: int,
     files: Mapping[str, Sequence[str]],
     leave: Sequence[str],
-    factor: float,
-    mesoscopic: bool,
+    **values: str | float,
 ) -> str:
-    """Return the scenario.toml; `files` maps routes, background and additional to file names beside it."""
-    times = options(case, clock)
-    lists = {key: values for key, values in {**files, "leave_signals": leave}.items() if values}
-    return (
-        f"# Imported from {case.source.name}: its own vehicles, with their routes, departures and types.\n"
-        f"name = {quoted(name)}\n"
-        f"network = {quoted(network_path)}\n"
-        f"step = {clock.step:.1f}                 # s, control interval = most common signal cycle\n"
-        f"steps = {clock.steps}\n"
-        f"substeps = {int(np.ceil(clock.step / min(30.0, 0.5 / max(mfd.c for mfd in network.mfds))))}\n"
-        f"protected = [{protected}]             # the densest region; {network.region_names[protected]}\n"
-        'demand_file = "demand.csv"  # veh/s by interval and pair of regions, counted from the vehicles\n'
-        f"demand_factor = {factor:g}         # vehicles are left out, or drive twice\n"
-        "\n[sumo]\n"
-        f"begin = {times['begin']}\n"
-        f"step_length = {times['step-length']}\n"
-        f"time_to_teleport = {times['time-to-teleport']}      # s; every table counts the teleports\n"
-        "ways_return = true          # guided drivers may leave a region and come back, as main roads here do\n"
-        + "".join(f"{key} = [{', '.join(map(quoted, values))}]\n" for key, values in lists.items())
-        + ("mesoscopic = true           # SUMO's queue model: fast, without lanes\n" if mesoscopic else "")
-        + "\n[sumo.options]              # of SUMO, as the city has them\n"
-        + "".join(f"{quoted(key)} = {quoted(value)}\n" for key, value in sorted(case.options.items()))
-        + TRAINING
-    )
+    """Return the scenario.toml; `files` maps routes, background and additional to file names beside it.
+
+    values: name, network_path, protected (region), factor of the demand, mesoscopic
+    """
+    substeps = int(np.ceil(clock.step / min(30.0, 0.5 / max(mfd.c for mfd in network.mfds))))
+    lists, times = {**files, "leave_signals": leave}, options(case, clock)
+    known = {"network": network, "clock": clock, "case": case, "times": times, "lists": lists, "substeps": substeps}
+    return filled(Path(__file__).with_name("scenario.toml.j2"), **known, **values)

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +16,7 @@ from nmfd.arrays import Adjacency, Hops, PerPair, PerRegion, PerTurn, Positions,
 from nmfd.errors import InputError
 from nmfd.model.mfd import Mfd
 from nmfd.runs import config, shipped
-from nmfd.runs.config import Problem, Regions, Rows, Settings, Share, got, quoted, setting
+from nmfd.runs.config import Problem, Regions, Rows, Settings, Share, filled, got, setting
 
 # Flow over a boundary with a capacity: a smooth minimum of desired flow and limit, (desired^-n + limit^-n)^(-1/n), 84 %
 # of either where they are equal, because demand within a control interval is not even.
@@ -322,33 +322,7 @@ def check_step(network: RegionalModel, step: float, where: str) -> None:
 
 def network_toml(network: RegionalModel, sumo: Mapping[str, str], comment: str) -> str:
     """Return network.toml of `network` with this table [sumo]."""
-    lines = [f"# {comment}", f"name = {quoted(network.name)}", *["placeholder = true"] * network.placeholder]
-    lines += ["", "[perimeter]", f"min = {network.u_min:g}", f"max = {network.u_max:g}"]
-    if sumo:
-        lines += ["", "[sumo]", *(f"{key} = {quoted(value)}" for key, value in sumo.items())]
-    for region, (x, y) in enumerate(network.positions):
-        onward, curve = network.adjacency[region], network.mfds[region]
-        lines += ["", "[[regions]]", f"name = {quoted(network.region_names[region])}"]
-        lines += [f"position = [{x:.6g}, {y:.6g}]", f"adjacent = {np.flatnonzero(onward).tolist()}"]
-        if network.exit_rates is not None:
-            lines.append(f"exit_rates = {_listed(network.exit_rates[region])}")
-        if network.capacity is not None and network.storage is not None:
-            lines.append(f"capacity = {_listed(network.capacity[region, onward])}")
-            lines.append(f"storage = {network.storage[region]:.6g}")
-        if network.controllable is not None:
-            lines.append(f"controllable = {_listed(network.controllable[region, onward])}")
-        if region in network.critical_above:
-            lines.append(f"critical_above = {network.critical_above[region]:.6g}")
-        if network.doubts and network.doubts[region]:
-            lines.append(f"doubts = [{', '.join(map(quoted, network.doubts[region]))}]")
-        lines += ["", "[regions.mfd]", *(f"{name} = {getattr(curve, name):.6g}" for name in ("a", "b", "c", "jam"))]
-        observed = sorted((j, shares) for (i, j), shares in network.observed_split_ratios.items() if i == region)
-        if observed:
-            lines += ["", "[regions.observed_split_ratios]"]
-        for j, shares in observed:
-            lines.append(f"{j} = {{ {', '.join(f'{h} = {share:.4f}' for h, share in shares.items())} }}")
-    return "\n".join([*lines, ""])
-
-
-def _listed(values: Sequence[float] | np.ndarray) -> str:
-    return f"[{', '.join(f'{value:.4g}' for value in values)}]"
+    ratios = sorted(network.observed_split_ratios.items())
+    observed = [[(j, shares) for (i, j), shares in ratios if i == region] for region in range(network.regions)]
+    values = {"network": network, "sumo": sumo, "comment": comment, "observed": observed}
+    return filled(Path(__file__).with_name("network.toml.j2"), **values)

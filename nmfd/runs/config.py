@@ -117,6 +117,17 @@ def quoted(text: str) -> str:
     return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
 
 
+def filled(template: Path, **values: Any) -> str:
+    """Return the TOML file that a template of Jinja makes of `values`; its filters are `quoted` and numbers(form)."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined  # few commands write a file
+
+    loader = FileSystemLoader(template.parent)
+    how: Any = {"trim_blocks": True, "keep_trailing_newline": True, "undefined": StrictUndefined}
+    environment = Environment(loader=loader, **how)
+    environment.filters |= {"quoted": quoted, "numbers": lambda row, form: ", ".join(form % number for number in row)}
+    return environment.get_template(template.name).render(values)
+
+
 def _first_problem(invalid: ValidationError) -> str:
     first = invalid.errors(include_url=False)[0]
     path = "".join(f"[{place}]" if isinstance(place, int) else f".{place}" for place in first["loc"]).lstrip(".")
