@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from xml.etree.ElementTree import Element, ElementTree
+from xml.etree.ElementTree import Element, ElementTree, SubElement
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from cosim.importing.case import SumoInput, seconds
 from cosim.importing.streets import Streets
 from cosim.sumo.arrays import PerTrip, TripNumbers
 from cosim.sumo.departures import Departure, read_departures
-from cosim.sumo.recorded_trips import BOUND
+from cosim.sumo.recorded_trips import BOUND, QUEUED_AFTER
 from cosim.sumo.xml_files import file_list, read_xml
 from nmfd.errors import InputError
 from nmfd.runs.files import temporary_folder
@@ -90,6 +90,7 @@ def read_traffic(case: SumoInput, streets: Streets, seed: int) -> Traffic:
             kind.attrib.pop("scale", None)  # SUMO has multiplied the vehicles already
     names = {route.get("id", "") for element in shared for route in element.iter("route")}
     kept: list[tuple[float, int, int, Element]] = []
+    queue = Counter[float]()  # time of departure -> vehicles of `kept`
     seen, metres = set[str](), np.zeros(2)  # that all vehicles would drive, and those left out
     for departed in departures:
         original = _original(departed.id, given)
@@ -115,6 +116,7 @@ def read_traffic(case: SumoInput, streets: Streets, seed: int) -> Traffic:
             element.set("departSpeed", "max")
             notes["fixed speeds at the departure, made the highest safe ones"] += 1
         if departed.line or departed.kind in BOUND:
+            SubElement(element, "param", {"key": QUEUED_AFTER, "value": str(queue[departed.depart])})
             background.append(element)
             notes["public transport and other classes left alone"] += 1
         else:
@@ -122,6 +124,7 @@ def read_traffic(case: SumoInput, streets: Streets, seed: int) -> Traffic:
                 edges[int(place) if (place := element.get(key, "")).isdecimal() else default]
                 for key, default in (("departEdge", 0), ("arrivalEdge", -1))
             )
+            queue[departed.depart] += 1
             kept.append((departed.depart, first, last, element))
     if unknown:
         notes["vehicles without a route that SUMO could drive, left out"] = unknown

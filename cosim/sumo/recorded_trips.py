@@ -25,6 +25,7 @@ BOUND = frozenset(
     "bus coach tram rail rail_urban rail_electric rail_fast subway cable_car ship aircraft bicycle pedestrian scooter "
     "wheelchair container drone".split()
 )
+QUEUED_AFTER = "queued_after"  # parameter of buses and the like: cars that depart at the same time and come first
 DrawnTrip = tuple[float, int, str]  # departure [s], number of the vehicle, id
 HELD = "held."  # prefix of the ids of routes that only one vehicle uses
 # Attribute of a vehicle -> argument of Session.begin_trip, whose defaults are those of the attributes.
@@ -179,14 +180,23 @@ def write_recorded_trips(originals: RecordedTrips, drawn: Sequence[DrawnTrip], p
 def merge(path: Path, beside: Sequence[Path], rest: Path) -> list[Path]:
     """Put the timed vehicles of the files `beside` into the route file `path`, and all else of them into `rest`.
 
-    In one file vehicles queue in the order of their departures, as in the city's own files.
-    Returns both files, types first.
+    In one file vehicles queue in the order of their departures and, at the same time, of QUEUED_AFTER, as in the city's
+    own files. Returns both files, types first.
     """
-    elements, others = list(read_xml(path)), list[ElementTree.Element]()
+    queue = list[tuple[float, float, ElementTree.Element]]()  # time, place among those of that time
+    others, places = list[ElementTree.Element](), Counter[float]()
+    for element in read_xml(path):
+        depart = float(element.get("depart", 0))
+        queue.append((depart, places[depart] + 0.5, element))
+        places[depart] += 1
     for element in (element for file in beside for element in read_xml(file)):
-        timed = element.tag in ("vehicle", "trip") and element.get("depart", "").replace(".", "", 1).isdecimal()
-        (elements if timed else others).append(element)
-    _write(path, sorted(elements, key=lambda element: float(element.get("depart", 0))))
+        if element.tag in ("vehicle", "trip") and element.get("depart", "").replace(".", "", 1).isdecimal():
+            place = element.find(f"param[@key='{QUEUED_AFTER}']")
+            first = math.inf if place is None else float(attribute(place, "value"))
+            queue.append((float(attribute(element, "depart")), first, element))
+        else:
+            others.append(element)
+    _write(path, [element for *_, element in sorted(queue, key=lambda row: row[:2])])
     _write(rest, others)
     return [rest, path]
 
