@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse import csr_array
-from scipy.sparse.csgraph import breadth_first_order, connected_components
+from scipy.sparse.csgraph import connected_components
 
 from cosim.importing.case import seconds
 from cosim.sumo.arrays import EdgeMask, EdgeNumbers, PerEdge, Points
@@ -78,17 +78,6 @@ class Streets:
     def core(self) -> EdgeMask:
         """Largest set of edges (E,) of which each can be reached from each."""
         return self._largest("strong")
-
-    def connected(self, pairs: Iterable[tuple[int, int]], *, cars: bool) -> set[tuple[int, int]]:
-        """Return the pairs with a path from the first edge to the second, for cars, or for any vehicle."""
-        onward, ends = graph(self.links if cars else self.all_links, len(self.edges)), dict[int, set[int]]()
-        for first, last in pairs:
-            ends.setdefault(first, set()).add(last)
-        return {
-            (first, last)
-            for first in ends
-            for last in ends[first].intersection(breadth_first_order(onward, first, return_predecessors=False).tolist())
-        }
 
     def _largest(self, kind: str) -> EdgeMask:
         count, part = connected_components(graph(self.links, len(self.edges)), directed=True, connection=kind)

@@ -20,7 +20,6 @@ KINDS = {
     "edgedata": "edgedata.xml",
     "emission": "emission.xml.gz",
 }
-EMISSION_CLASS = "HBEFA4/PC_petrol_Euro-4"  # SUMO's default
 KG_PER_MG = 1e-6
 END_TAG_BYTES = 200  # these last bytes of a file hold the end tag of its root
 
@@ -43,7 +42,7 @@ class TripReader:
     """Reader of SUMO's tripinfo output while SUMO writes it.
 
     completed, removed: vehicles so far, at the last edge of their route or before
-    co2, fuel: of all vehicles [kg] (EMISSION_CLASS), at the end of the simulation of those on the road, too
+    co2, fuel: of all vehicles [kg], at the end of the simulation of those on the road, too
     under_way: vehicle on the road at the end of the simulation -> time loss [s]
     """
 
