@@ -21,15 +21,15 @@ from nmfd.api import load_scenario
 from nmfd.types import Controls
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
-TRIP = '<tripinfo id="v" depart="{}" arrival="{}" duration="{}"><emissions CO2_abs="2e6" fuel_abs="1e6"/></tripinfo>'
+TRIP = '<tripinfo id="v" depart="{}" arrival="{}" duration="{}"/>'
 
 
-def test_vehicles_under_way_have_emitted_too(tmp_path):
+def test_vehicles_under_way_have_not_ended(tmp_path):
     path = tmp_path / "trips.xml"
     path.write_text(f"<tripinfos>{TRIP.format(10, 110, 100)}{TRIP.format(50, -1, 70)}</tripinfos>")
     reader = TripReader(path)
     assert [end.time for end in reader.finish()] == [110.0]
-    assert (reader.completed, reader.co2, reader.fuel) == (1, 4.0, 2.0)
+    assert reader.completed == 1 and list(reader.under_way) == ["v"]
 
 
 def test_trips_that_never_began_count_with_what_they_have_waited():
@@ -39,9 +39,13 @@ def test_trips_that_never_began_count_with_what_they_have_waited():
         Trip(1, True, "waiting", 400.0, 400.0),
         Trip(1, True, "given up", 25.0, 25.0),
         Trip(0, False, "waiting", 9000.0, 9000.0),
+        Trip(1, False, "completed", 0.0, 90.0, 40.0, True),
+        Trip(1, False, "waiting", 80.0, 80.0, public=True),
     ]
     row = simulate.trip_measures(trips)
-    assert (row["trips"], row["removed_veh"], row["removed_waiting_veh"], row["other_trips"]) == (4, 1, 1, 1)
+    assert (row["trips"], row["removed_veh"], row["removed_waiting_veh"], row["other_trips"]) == (4, 1, 1, 3)
+    assert (row["public_transport_trips"], row["public_transport_delay_s"]) == (2, 40.0)
+    np.testing.assert_array_equal(simulate.time_by_origin(trips, 3), [87.5, 212.5, np.nan])
     assert (row["mean_trip_time_s"], row["mean_departure_delay_s"], row["mean_time_loss_s"]) == (150.0, 107.5, 20.0)
     assert row["lost_time_gini"] == pytest.approx((212.5 - 22.5) / (2 * (212.5 + 22.5)))
     nobody = simulate.trip_measures([])
@@ -87,11 +91,17 @@ def test_measures_of_a_city_are_those_of_tripinfo(tmp_path, steps):
     scenario = tiny_city.imported(tmp_path, source=config)
     result = cosim.run(scenario, "no-control", steps=steps, seed=1, sumo_output={"tripinfo": info})
     row = metrics.summary(result)
-    trips = pd.DataFrame([trip.attrib for trip in ElementTree.parse(info).iter("tripinfo")])
+    root = ElementTree.parse(info)
+    trips = pd.DataFrame([trip.attrib for trip in root.iter("tripinfo")])
     trips = trips.astype({name: float for name in ("depart", "arrival", "duration", "departDelay", "timeLoss")})
     trips = trips[trips["duration"] + trips["departDelay"] > 0]  # the others are due at the end itself
     time, other = trips["duration"] + trips["departDelay"], trips["vType"].str.startswith("citybus")
+    bus_on_road = other & (trips["depart"] >= 0)
     begun, ended = ~other & (trips["depart"] >= 0), ~other & (trips["arrival"] >= 0)
+    emissions = {trip.get("id"): float(trip.find("emissions").get("CO2_abs")) for trip in root.iter("tripinfo")}
+    assert row["co2_kg"] == pytest.approx(1e-6 * sum(emissions.values()), rel=1e-3)
+    assert result.co2.sum() == pytest.approx(row["co2_kg"], rel=1e-5) and result.co2.min() >= 0.0
+    assert row["longest_queue_veh"] == result.queue_max.max() >= result.gateway_queue_max.max()
     private, delay = time[~other], trips["departDelay"]
     expected = {"total_time_spent_veh_s": private.sum(), "trips": len(private), "departed_veh": sum(begun)}
     expected |= {"completed_veh": sum(ended), "final_backlog_veh": sum(~other & ~begun)}
@@ -100,6 +110,10 @@ def test_measures_of_a_city_are_those_of_tripinfo(tmp_path, steps):
     expected |= {"mean_departure_delay_s": delay[~other].mean(), "mean_time_loss_s": trips["timeLoss"][begun].mean()}
     expected |= {"other_trips": sum(other), "other_time_spent_veh_s": time[other].sum()}
     expected |= {"other_departure_delay_veh_s": delay[other].sum()}
+    expected |= {
+        "public_transport_trips": sum(other),
+        "public_transport_delay_s": trips["timeLoss"][bus_on_road].mean(),
+    }
     assert {name: row[name] for name in expected} == pytest.approx(expected, rel=1e-5)  # of hundredths of seconds
     assert result.time_spent.shape == (steps,) and min(expected.values()) > 0
     assert result.other_time_spent.sum() == pytest.approx(time[other].sum())
@@ -113,8 +127,12 @@ def test_gini_coefficients():
 
 
 def test_vehicles_under_way_have_emitted(run):
-    _, record, running, trips = run
+    plant, record, running, trips = run
     assert record.arrivals.sum() < 0.2 * record.departures.sum()  # hardly any trip has ended
+    totals = plant.edge_totals()
+    assert totals["co2"].sum() == pytest.approx(trips["co2_kg"], rel=1e-5)
+    edges = [plant.city.edges.index(gateway.from_edge) for gateway in plant.city.gateways]
+    assert (totals["queue_max"][edges] == record.gateway_queue_max.max(axis=0)).all()
     litres = trips["fuel_kg"] / 0.745
     assert 0.3 < litres / sum(running) * 3600 < 5.0  # per vehicle and hour, in city traffic
     assert trips["co2_kg"] / trips["fuel_kg"] == pytest.approx(3.1, abs=0.15)  # kg of CO2 from a kg of petrol

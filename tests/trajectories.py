@@ -5,14 +5,14 @@ from tiny import made
 
 from cosim.evaluation.signal_proof import SHEET
 from cosim.evaluation.simulate import FACTS
-from cosim.plant.record import RECORD
+from cosim.plant.record import RECORD, TOTALS
 from nmfd.types import Result, Status
 
 
 def recorded(run: Result, arrays: dict[str, np.ndarray], facts: dict) -> Result:
     """`run` in a city, with the arrays of a Record and its facts, and one signal that kept its rules."""
     sheet = {name: np.zeros(1) for name in SHEET} | {"signal": np.array(["J"])}
-    return run.add(facts, {**RECORD, **SHEET}, **sheet, **arrays)
+    return run.add(facts, {**RECORD, **SHEET, **TOTALS}, **sheet, **arrays)
 
 
 def record(steps: int, *, regions: int, gateways: int = 3, edges: int = 5) -> dict[str, np.ndarray]:

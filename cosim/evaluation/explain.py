@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cosim.evaluation import statistics
+from cosim.evaluation import by_region, statistics
 from cosim.evaluation.results import Finished, Level
 from nmfd.arrays import PerRegion
 from nmfd.controllers.rules import Gating, PiGating
@@ -21,6 +21,7 @@ OPEN_SHARE = 0.1  # of the range of u below its upper bound: a policy never quit
 FULL_SHARE = 0.02  # more full edges before gateways than under the reference
 INTERGREEN_SHARE = 0.03  # more time between two stages than in the original programmes
 WAIT_S = 1.0  # before a trip begins
+LONGER_PERCENT = 5.0  # trips from one region, while the whole gains
 
 
 def load(network: RegionalModel, runs: Sequence[Result]) -> tuple[PerRegion, PerRegion]:
@@ -75,7 +76,8 @@ def paragraph(level: Level, finished: Finished, name: str) -> str:
     spread = f"± {pair.percent_half:.1f} % over {pair.seeds} seeds" if pair.seeds > 1 else "on one seed, no proof"
     reasons = _reasons(level, finished.scenario, name, against, gains=clear and gains) + _removed(level, name)
     size = f"{pair.percent:+.1f} % total time spent against {against} {spread}"
-    return f"{name} {verdict} ({size}){': ' if reasons else ''}{'; '.join(reasons)}."
+    losers = _losers(level, finished.scenario.network.region_names, name, against) if clear and gains else ""
+    return f"{name} {verdict} ({size}){': ' if reasons else ''}{'; '.join(reasons)}.{losers}"
 
 
 def _reasons(level: Level, scenario: Scenario, name: str, against: str, *, gains: bool) -> list[str]:
@@ -118,6 +120,13 @@ def _reasons(level: Level, scenario: Scenario, name: str, against: str, *, gains
         f"its signals are between stages {between[0]:.0%} of the time, the original programmes {between[1]:.0%}": slow,
     }
     return done + [words for words, true in limits.items() if true]
+
+
+def _losers(level: Level, region_names: Sequence[str], name: str, against: str) -> str:
+    """Return a sentence about the regions from which trips take much longer, "" if there are none."""
+    longer = by_region.longer_trips(level, name, against)
+    worst = [f"{region_names[r]} ({longer[r]:+.0f} %)" for r in np.argsort(-longer) if longer[r] > LONGER_PERCENT]
+    return f" Some lose: trips from {', '.join(worst)} take longer." if worst else ""
 
 
 def _never_reached(strategy: Strategy, scenario: Scenario, runs: Sequence[Result]) -> list[str]:

@@ -16,7 +16,7 @@ from cosim.evaluation.signal_proof import SHEET, VIOLATIONS, proof_sheet
 from cosim.plant.max_pressure import FACTS as PRESSURE_FACTS
 from cosim.plant.meter import COMPLETED, GIVEN_UP, REMOVED, UNDER_WAY, WAITING, Trip
 from cosim.plant.plant import Observer, SumoPlant
-from cosim.plant.record import RECORD, settled
+from cosim.plant.record import RECORD, TOTALS, settled
 from cosim.plant.settings import own_files, settings
 from cosim.sumo.arrays import RegionCounts
 from cosim.sumo.net import City, Gateway, gateway_room_taken
@@ -45,6 +45,8 @@ FACTS = {  # attribute of a result, column of runs.csv -> meaning
     "mean_departure_delay_s": "wanted to actual departure, mean over all trips",
     "mean_time_loss_s": "delay: time lost against driving freely (SUMO's timeLoss), mean of trips that entered",
     "lost_time_gini": "Gini coefficient of delay plus departure delay, means of regions of origin",
+    "public_transport_trips": "trips due of public transport",
+    "public_transport_delay_s": "their delay on the road, as mean_time_loss_s; time at stops is none",
     "other_trips": "trips due of public transport, and of classes that no controller commands",
     "other_time_spent_veh_s": "their total time spent",
     "other_departure_delay_veh_s": "their total departure delay",
@@ -53,6 +55,7 @@ FACTS = {  # attribute of a result, column of runs.csv -> meaning
     "fuel_kg": "fuel of all vehicles, same model",
     "gateway_queue_mean_veh": "vehicles halting on edges before gateways, mean over edges and time",
     "gateway_queue_max_veh": "longest queue before a gateway",
+    "longest_queue_veh": "most vehicles halting on one street at a time",
     "gateway_full_share": "share of these edges and intervals that were full",
     "notes": "most frequent notes of decisions that were not OK",
     "outside_training": "how demand is outside the training range of the policy",
@@ -124,17 +127,20 @@ def simulate(
         plant_facts, leaks, emissions = plant.facts(), set(plant.leaks()), plant.trip_facts()
         programmes, end = own_files(scenario, chosen.additional), chosen.begin + scenario.steps * scenario.step
         sheet = proof_sheet(plant.signal_states(), [plant.city.net_file, *programmes], end=end, step=chosen.step_length)
-        result = settled(result.add({}, {**RECORD, **SHEET}, **plant.record(), **sheet))
+        trips, totals = plant.trips(), plant.edge_totals()
+        totals["trip_time_by_origin"] = time_by_origin(trips, plant.city.regions)
+        result = settled(result.add({}, {**RECORD, **SHEET, **TOTALS}, **plant.record(), **sheet, **totals))
         facts = {
             "scenario": job.scenario.name,
             "scenario_folder": str(scenario.folder or ""),
             "demand": float(job.demand),
             **plant_facts,
-            **trip_measures(plant.trips()),
+            **trip_measures(trips),
             **emissions,
             "teleports": int(result.teleports.sum()),
             "signal_violations": int(sum(sheet[name].sum() for name in VIOLATIONS)),
             **queue_facts(result, plant.city),
+            "longest_queue_veh": int(result.queue_max.max()),
             "notes": metrics.notes(result),
             "outside_training": strategy.outside_training(scenario, job.demand, job.policy),
             "leaking_share": leaking_share(result, plant.city, leaks),
@@ -160,7 +166,8 @@ def trip_measures(trips: Sequence[Trip]) -> dict[str, float]:
     table = pd.DataFrame(trips, columns=Trip._fields).astype(Trip.__annotations__)
     private, other = table[table["private"]], table[~table["private"]]
     count = Counter(private["outcome"])
-    entered = private[private["outcome"].isin((COMPLETED, REMOVED, UNDER_WAY))]
+    entered = table[table["outcome"].isin((COMPLETED, REMOVED, UNDER_WAY))]
+    public, entered = entered[entered["public"]], entered[entered["private"]]
     lost = (private["time_loss"] + private["departure_delay"]).groupby(private["origin"])
     return {
         "trips": len(private),
@@ -177,10 +184,18 @@ def trip_measures(trips: Sequence[Trip]) -> dict[str, float]:
         "mean_departure_delay_s": private["departure_delay"].mean(),
         "mean_time_loss_s": entered["time_loss"].mean(),
         "lost_time_gini": metrics.gini(lost.mean().to_numpy(), lost.size().to_numpy(float)),
+        "public_transport_trips": int(table["public"].sum()),
+        "public_transport_delay_s": public["time_loss"].mean(),
         "other_trips": len(other),
         "other_time_spent_veh_s": other["time"].sum(),
         "other_departure_delay_veh_s": other["departure_delay"].sum(),
     }
+
+
+def time_by_origin(trips: Sequence[Trip], regions: int) -> PerRegion:
+    """Return the mean time (R,) [s] of private trips that were due, by region of origin; NaN without any."""
+    table = pd.DataFrame(trips, columns=Trip._fields).astype(Trip.__annotations__)
+    return table[table["private"]].groupby("origin")["time"].mean().reindex(range(regions)).to_numpy()
 
 
 def queue_facts(result: Result, city: City) -> dict[str, float]:

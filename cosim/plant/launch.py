@@ -39,7 +39,8 @@ def own_vehicles(scenario: Scenario, settings: Settings, city: City) -> Recorded
 class Launch:
     """Starts SUMO for one run after the other, with files in a temporary folder that `close` removes.
 
-    vehicles: ids of those of the last run; held: its trips under metering; trip_file: SUMO's tripinfo output
+    vehicles: ids of those of the last run; held: its trips under metering
+    trip_file, emission_file: SUMO's tripinfo output, and its emissions by edge at the end of the run
     """
 
     def __init__(
@@ -62,6 +63,7 @@ class Launch:
         self.vehicles: list[str] = []
         self.held: HeldTrips | None = None
         self.trip_file = outputs.get("tripinfo", self._folder / "tripinfo.xml")
+        self.emission_file = self._folder / "emissions.xml"
 
     def start(self, seed: int) -> Session:
         """Return a simulation whose trips, drivers and reroutes follow from `seed`."""
@@ -103,9 +105,7 @@ class Launch:
         for key, value in more.items():
             if f"--{key}" not in options and key not in GIVEN:
                 options += [f"--{key}", value]
-        if additional := self._additional():
-            options += ["--additional-files", file_list(additional)]
-        return options
+        return [*options, "--additional-files", file_list(self._additional())]
 
     def _additional(self) -> list[Path]:
         """Return the additional files in SUMO's order of reading: the last programme of a signal runs."""
@@ -122,7 +122,9 @@ class Launch:
             write_loops(self._city, self._layout, scenario.step, additional[-1])
         if "edgedata" in self._outputs:
             additional.append(folder / "edgedata.add.xml")
-            outputs.write_edge_data(additional[-1], self._outputs["edgedata"], scenario.step)
+            outputs.write_edge_data(additional[-1], self._outputs["edgedata"], "edgedata", freq=f"{scenario.step:g}")
+        additional.append(folder / "emissions.add.xml")
+        outputs.write_edge_data(additional[-1], self.emission_file, "cosim-emissions", **outputs.EMISSION_DATA)
         return additional
 
     def _write_vehicles(self, path: Path, seed: int) -> list[str]:

@@ -36,6 +36,7 @@ class _Vehicle:
     edge: str  # last one of its route
     free: bool  # guidance may reroute it
     private: bool  # `Session.is_private`
+    public: bool  # `Session.is_public`
     due: float = 0.0  # [s]
     waited: float = 0.0  # departure delay [s]
     departed: bool = False
@@ -60,7 +61,8 @@ class Event(NamedTuple):
 class Trip(NamedTuple):
     """A trip that was due.
 
-    origin: region; outcome: COMPLETED, REMOVED on the road, UNDER_WAY, WAITING to enter, or GIVEN_UP before that
+    origin: region; public: public transport
+    outcome: COMPLETED, REMOVED on the road, UNDER_WAY, WAITING to enter, or GIVEN_UP before that
     departure_delay, time, time_loss: [s], waiting to enter; in all, until its end or now; against driving freely, NaN
         if it is not known yet
     """
@@ -71,6 +73,7 @@ class Trip(NamedTuple):
     departure_delay: float
     time: float
     time_loss: float = 0.0
+    public: bool = False
 
 
 class Meter:
@@ -326,7 +329,9 @@ class Meter:
         if vehicle not in self._vehicles:
             session, route = self._session, self._session.route(vehicle)
             origin, destination = (self._city.region_of.get(edge, 0) for edge in (route[0], route[-1]))
-            known = _Vehicle(origin, destination, route[-1], session.is_free(vehicle), session.is_private(vehicle))
+            private = session.is_private(vehicle)
+            public = not private and session.is_public(vehicle)
+            known = _Vehicle(origin, destination, route[-1], session.is_free(vehicle), private, public)
             self._vehicles[vehicle] = known
             self._time(vehicle, known)
         return self._vehicles[vehicle]
@@ -404,4 +409,4 @@ class Meter:
 def _trip(known: _Vehicle, outcome: str, end: float, time_loss: float = 0.0) -> Trip:
     time = max(end - known.due, 0.0)
     waited = known.waited if known.departed else time
-    return Trip(known.origin, known.private, outcome, waited, time, time_loss)
+    return Trip(known.origin, known.private, outcome, waited, time, time_loss, known.public)

@@ -21,7 +21,7 @@ from cosim.plant.settings import settings as settings_of
 from cosim.plant.stuck import Junctions
 from cosim.sumo.arrays import PerEdge
 from cosim.sumo.net import City, Gateway, check_adjacency, city_of
-from cosim.sumo.outputs import TripReader
+from cosim.sumo.outputs import TripReader, edge_emissions
 from cosim.sumo.session import Session
 from nmfd.model.planning import PlanningModel, planning_model
 from nmfd.model.scenario import Scenario
@@ -206,7 +206,17 @@ class SumoPlant:
         else:
             self._trips.finish()
         self._recorder.close()
-        return {"co2_kg": self._trips.co2, "fuel_kg": self._trips.fuel}
+        self._emissions = edge_emissions(self._launch.emission_file)
+        co2, fuel = np.array([(0.0, 0.0), *self._emissions.values()]).sum(axis=0).tolist()
+        return {"co2_kg": co2, "fuel_kg": fuel}
+
+    def edge_totals(self) -> dict[str, np.ndarray]:
+        """Return the arrays over edges of cosim.plant.record.TOTALS; call it after `trip_facts`."""
+        emitted = {edge: co2 for edge, (co2, _) in self._emissions.items()}
+        co2 = {edge: emitted.get(edge, 0.0) for edge in self.city.edges}
+        for (_, edge), turn in self.city.over.items():
+            co2[edge] += sum(emitted.get(inside, 0.0) for inside in turn)
+        return {"co2": np.array([*co2.values()], np.float32), "queue_max": self._sampler.longest_queue.astype(np.int32)}
 
     def trips(self) -> list[Trip]:
         """Return all trips that were due; after `trip_facts` with their whole time losses."""

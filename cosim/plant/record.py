@@ -43,6 +43,14 @@ RECORD: Mapping[str, Quantity] = {
     "other_time_spent": Quantity(("interval",), "veh s", "by public transport and classes that nothing commands"),
     "guided": Quantity(_TURNS, "veh", "reroutes by route guidance"),
 }
+# Over the whole run.
+TOTALS: Mapping[str, Quantity] = {
+    "co2": Quantity(("edge",), "kg", "CO2 of all vehicles on the edge and on the turns over junctions into it"),
+    "queue_max": Quantity(("edge",), "veh", "vehicles halting on the edge, largest of samples"),
+    "trip_time_by_origin": Quantity(
+        ("region",), "s", "mean time of private trips that began here, as mean_trip_time_s; NaN without any"
+    ),
+}
 
 
 def settled(result: Result) -> Result:

@@ -36,7 +36,11 @@ class StreetMeans:
 
 
 class StreetSampler:
-    """Sums over the samples of one control interval. last: vehicles (E,) and their mean speed (E,) [m/s] then"""
+    """Sums over the samples of one control interval.
+
+    last: vehicles (E,) and their mean speed (E,) [m/s] in the last sample
+    longest_queue: (E,) [veh] halting, the most in all samples so far
+    """
 
     def __init__(self, session: Session, city: City):
         self._session, self._city = session, city
@@ -46,6 +50,7 @@ class StreetSampler:
         self._upstream = sorted({g.from_edge for g in city.gateways})  # gateways may share the edge before them
         self._upstream_of = np.array([self._upstream.index(g.from_edge) for g in city.gateways], dtype=int)
         self.last = np.zeros(len(city.edges)), np.zeros(len(city.edges))
+        self.longest_queue = np.zeros(len(city.edges))
         self._begin()
 
     def _begin(self) -> None:
@@ -64,6 +69,8 @@ class StreetSampler:
         for n in np.flatnonzero(counts):
             speeds[n], routing[n] = session.speeds(edges[n])
         self.last = counts, speeds
+        for n in np.flatnonzero(counts > self.longest_queue):  # only these can have a longer queue
+            self.longest_queue[n] = max(self.longest_queue[n], session.halting(edges[n]))
         for edge in crossed:
             if count := session.vehicle_count(edge):
                 n, (speed, _) = self._inside[edge], session.speeds(edge)

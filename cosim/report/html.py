@@ -13,11 +13,11 @@ from bokeh.embed import components
 from bokeh.resources import Resources
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from cosim.evaluation import explain, statistics
+from cosim.evaluation import by_region, explain, statistics
 from cosim.evaluation.results import Finished, Level
 from cosim.report import card, figures
 from cosim.view.page import with_slider
-from cosim.view.picture import CityPicture, frames
+from cosim.view.picture import CityPicture, frames, totals
 from nmfd.errors import InputError
 from nmfd.runs import files
 
@@ -62,8 +62,7 @@ def write_page(path: Path, runs: Sequence[Finished], *, seed: int | None = None)
 def _map(run: Finished, seed: int | None) -> tuple[str, str, str]:
     """Return title, script and HTML of the best run beside its reference, with a slider over their time."""
     level = run.level()
-    against = statistics.compared_with(level.rows)
-    names = [against, *(name for name in figures.ranked(level.rows) if name != against)][:2]
+    names = _pair(level.rows)
     seeds = [set(level.rows.loc[level.rows["controller"] == name, "seed"]) for name in names]
     if not set.intersection(*seeds):
         names, seeds = names[:1], seeds[:1]
@@ -72,10 +71,17 @@ def _map(run: Finished, seed: int | None) -> tuple[str, str, str]:
         raise InputError(f"--seed: {' and '.join(names)} have no run with seed {seed}; choose from {common}")
     seed = common[0] if seed is None else seed
     picture = CityPicture.of(run.scenario, run.map())
-    whole = {name: frames(picture, level.read(name, seed)) for name in names}
+    results = {name: level.read(name, seed) for name in names}
+    whole = {name: frames(picture, result) for name, result in results.items()}
     picture = replace(picture, steps=max(map(len, whole.values())) - 1)
-    script, div = components(with_slider(picture, whole), wrap_script=False)
+    script, div = components(with_slider(picture, whole, totals(picture, list(results.values()))), wrap_script=False)
     return f"{' and '.join(names)}, seed {seed}", script, div
+
+
+def _pair(rows: pd.DataFrame) -> list[str]:
+    """Return the reference and the best other controller, if there is one."""
+    against = statistics.compared_with(rows)
+    return [against, *(name for name in figures.ranked(rows) if name != against)][:2]
 
 
 def _run(run: Finished) -> dict:
@@ -103,9 +109,11 @@ def _level(run: Finished, level: Level) -> dict:
     """Return what the page shows of a demand level."""
     rows = level.rows
     draw = partial(figures.draw_level, finished=run, level=level)
+    regions = by_region.table(level, run.map(), run.scenario.network.region_names, _pair(rows))
     return {
         "title": f"Demand times {level.demand:g}",
         "tables": [_html(table) for table in statistics.shown(statistics.statistics(rows))],
+        "regions": None if regions is None else _html(regions),
         "pairs": _html(statistics.pairs(rows).drop(columns="demand")),
         "runs": _html(rows),
         "pictures": _pictures(draw, PICTURES),

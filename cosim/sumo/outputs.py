@@ -21,6 +21,7 @@ KINDS = {
     "emission": "emission.xml.gz",
 }
 KG_PER_MG = 1e-6
+EMISSION_DATA = {"type": "emissions", "withInternal": "true"}  # attributes of SUMO's edge data over the whole run
 END_TAG_BYTES = 200  # these last bytes of a file hold the end tag of its root
 
 
@@ -42,7 +43,6 @@ class TripReader:
     """Reader of SUMO's tripinfo output while SUMO writes it.
 
     completed, removed: vehicles so far, at the last edge of their route or before
-    co2, fuel: of all vehicles [kg], at the end of the simulation of those on the road, too
     under_way: vehicle on the road at the end of the simulation -> time loss [s]
     """
 
@@ -51,7 +51,6 @@ class TripReader:
         self._path, self._flush, self._offset = path, flush, 0
         self._parser: ElementTree.XMLPullParser[Element] = ElementTree.XMLPullParser()
         self.completed = self.removed = 0
-        self.co2 = self.fuel = 0.0
         self.under_way: dict[str, float] = {}
 
     def ends(self) -> list[End]:
@@ -86,9 +85,6 @@ class TripReader:
         depart, loss = float(attribute(element, "depart")), max(float(element.get("timeLoss", 0.0)), 0.0)
         ended = float(attribute(element, "arrival")) >= 0 or (depart >= 0 and left(vehicle))
         edge, time = element.get("arrivalLane", "").rpartition("_")[0], depart + float(attribute(element, "duration"))
-        for emissions in element.iter("emissions"):
-            self.co2 += KG_PER_MG * float(attribute(emissions, "CO2_abs"))
-            self.fuel += KG_PER_MG * float(attribute(emissions, "fuel_abs"))
         element.clear()
         if ended:
             self.completed, self.removed = self.completed + (not reason), self.removed + bool(reason)
@@ -118,16 +114,29 @@ def options(trip_file: Path, outputs: Mapping[str, Path]) -> list[str]:
     files = {"tripinfo": trip_file, **{kind: outputs[kind] for kind in ("summary", "emission") if kind in outputs}}
     others = "--tripinfo-output.write-unfinished true --tripinfo-output.write-undeparted true"
     written = [word for kind, file in files.items() for word in (f"--{kind}-output", str(file))]
-    return [*written, *others.split(), "--device.emissions.probability", "1"]
+    # SUMO draws a random number for every vehicle in both cases, so that the same vehicles have other devices.
+    emitting = str(int("tripinfo" in outputs or "emission" in outputs))
+    return [*written, *others.split(), "--device.emissions.probability", emitting]
 
 
-def write_edge_data(path: Path, target: Path, period: float) -> None:
-    """Write an additional file that makes SUMO write means per edge over every `period` [s] to `target`."""
-    path.write_text(
-        f'<additional><edgeData id="edgedata" freq="{period:g}" excludeEmpty="true" '
-        f"file={quoteattr(str(target.resolve()))}/></additional>\n",
-        encoding="utf-8",
-    )
+def write_edge_data(path: Path, target: Path, name: str, **attributes: str) -> None:
+    """Write an additional file that makes SUMO write data `name` per edge with `attributes` to `target`."""
+    given = {"id": name, "excludeEmpty": "true", "file": str(target.resolve()), **attributes}
+    words = " ".join(f"{key}={quoteattr(value)}" for key, value in given.items())
+    path.write_text(f"<additional><edgeData {words}/></additional>\n", encoding="utf-8")
+
+
+def edge_emissions(path: Path) -> dict[str, tuple[float, float]]:
+    """Return edge, normal or on a junction -> CO2 and fuel [kg] of all vehicles.
+
+    path: file of EMISSION_DATA, complete at the end of the simulation
+    Raises: RunFailed for a file that is not whole
+    """
+    try:
+        edges = [edge.attrib for edge in ElementTree.parse(path).iter("edge")]
+        return {edge["id"]: (KG_PER_MG * float(edge["CO2_abs"]), KG_PER_MG * float(edge["fuel_abs"])) for edge in edges}
+    except BROKEN as error:
+        raise unfinished(path, error) from None
 
 
 def check_whole(outputs: Mapping[str, Path]) -> None:

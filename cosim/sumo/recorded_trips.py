@@ -20,11 +20,9 @@ from nmfd.runs import files
 
 STREAM = 7102  # keeps these random numbers apart from others of the same seed
 MESOSCOPIC = {"mesosim": "true", "meso-junction-control": "true"}  # options of SUMO
+PUBLIC = frozenset("bus coach tram rail rail_urban rail_electric rail_fast subway cable_car ship".split())
 # Vehicle classes that keep to their lines, or do not use the road as cars do.
-BOUND = frozenset(
-    "bus coach tram rail rail_urban rail_electric rail_fast subway cable_car ship aircraft bicycle pedestrian scooter "
-    "wheelchair container drone".split()
-)
+BOUND = PUBLIC.union("aircraft bicycle pedestrian scooter wheelchair container drone".split())
 QUEUED_AFTER = "queued_after"  # parameter of buses and the like: cars that depart at the same time and come first
 DrawnTrip = tuple[float, int, str]  # departure [s], number of the vehicle, id
 HELD = "held."  # prefix of the ids of routes that only one vehicle uses

@@ -13,7 +13,7 @@ from typing import Any
 
 import libsumo
 
-from cosim.sumo.recorded_trips import BOUND
+from cosim.sumo.recorded_trips import BOUND, PUBLIC
 from cosim.sumo.xml_files import file_list
 from nmfd.errors import InputError, RunFailed
 
@@ -181,6 +181,10 @@ class Session:
     def is_private(self, vehicle: str) -> bool:
         """Return False for public transport, and for classes that no controller commands."""
         return libsumo.vehicle.getVehicleClass(vehicle) not in BOUND and not libsumo.vehicle.getLine(vehicle)
+
+    def is_public(self, vehicle: str) -> bool:
+        """Return True for public transport: by its class, or a vehicle with a line."""
+        return libsumo.vehicle.getVehicleClass(vehicle) in PUBLIC or bool(libsumo.vehicle.getLine(vehicle))
 
     def departure(self, vehicle: str) -> tuple[float, float]:
         """Return the time of the departure, or else now, and the departure delay until then [s]; < 0: not due yet."""

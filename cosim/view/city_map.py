@@ -1,17 +1,18 @@
 """The map of one run: streets by density, regions with their numbers, gates with their green."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from bokeh.models import ColorBar, ColumnDataSource, FixedTicker, HoverTool, LinearColorMapper, ScaleBar
+from bokeh.models import ColorBar, ColumnDataSource, FixedTicker, HoverTool, LinearColorMapper, Model, ScaleBar
 from bokeh.plotting import figure
 from bokeh.transform import linear_cmap
 
-from cosim.sumo.arrays import Points
+from cosim.sumo.arrays import PerEdge, Points
 from cosim.view import colours
 from cosim.view.picture import CityPicture, Frame
 
+DENSITY = "density [veh/km and lane]"
 JAM_DENSITY = 1000.0 / 7.5  # veh/km and lane
 LINE_OFFSET = 0.006  # of the map's width, by which the two directions of a street are drawn apart
 MAP_HEIGHT = 500  # pixels
@@ -20,10 +21,15 @@ ARROW_WIDTH = 9.0  # pixels, of the widest arrow
 
 
 class CityMap:
-    """One run on the map; `show` sets its sources to a frame."""
+    """One run on the map; `show` sets its sources to a frame.
 
-    def __init__(self, picture: CityPicture, title: str):
-        self._picture = picture
+    layers: label -> what shows the streets by this quantity; all but the first, DENSITY, are hidden
+    """
+
+    def __init__(self, picture: CityPicture, title: str, totals: Mapping[str, tuple[PerEdge, float]] = {}):
+        """totals: label -> values (E,) of other layers, and the upper end of their scale"""
+        self._picture, self._totals = picture, totals
+        self.layers: dict[str, list[Model]] = {}
         self._radius = next(radius for count, radius in GATE_RADII if len(picture.gates) <= count)
         size = {"height": MAP_HEIGHT, "sizing_mode": "stretch_width", "match_aspect": True, "lod_threshold": None}
         bare = {"tools": "pan,wheel_zoom,reset", "toolbar_location": None, "outline_line_color": None}
@@ -83,12 +89,22 @@ class CityMap:
             edge=list(picture.edges),
             density=np.zeros(len(picture.edges)),
             width=thin + per_lane * picture.lanes,
+            **{label: values for label, (values, _) in self._totals.items()},
         )
-        colour = linear_cmap("density", colours.SCALE, 0.0, JAM_DENSITY)
-        self.plot.add_layout(colour_bar(colour.transform, "density [veh/km and lane]", [0.0, 50.0, 100.0]), "below")
-        drawn = self.plot.multi_line("xs", "ys", source=source, line_width="width", line_cap="round", line_color=colour)
-        self._hover(drawn, ("street", "@edge"), ("density [veh/km and lane]", "@density{0.0}"))
+        self._add_layer(source, "density", DENSITY, JAM_DENSITY, [0.0, 50.0, 100.0])
+        for label, (_, top) in self._totals.items():
+            self._add_layer(source, label, label, top, [0.0, top / 2.0, top])
         return source
+
+    def _add_layer(self, source: ColumnDataSource, column: str, label: str, top: float, ticks: list[float]) -> None:
+        shown, colour = not self.layers, linear_cmap(column, colours.SCALE, 0.0, top)
+        bar = colour_bar(colour.transform, label, ticks)
+        bar.visible = shown
+        self.plot.add_layout(bar, "below")
+        style = {"line_width": "width", "line_cap": "round", "line_color": colour, "visible": shown}
+        drawn = self.plot.multi_line("xs", "ys", source=source, **style)
+        self._hover(drawn, ("street", "@edge"), (label, f"@{{{column}}}{{0.0}}"))
+        self.layers[label] = [drawn, bar]
 
     def _add_gates(self) -> ColumnDataSource:
         gates = self._picture.gates

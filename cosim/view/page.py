@@ -9,6 +9,7 @@ import numpy as np
 from bokeh.layouts import column, row
 from bokeh.models import ColumnDataSource, CustomJS, Div, LayoutDOM, Select, Slider, Toggle
 
+from cosim.sumo.arrays import PerEdge
 from cosim.view import colours
 from cosim.view.city_map import CityMap
 from cosim.view.curves import HOUR, MINUTE, OF_REGION, Curves, Load
@@ -16,6 +17,7 @@ from cosim.view.picture import CityPicture, Frame
 
 HERE = Path(__file__).parent
 PLAY_PERIOD_MS = 150  # wall time per control interval
+TOP_SHARE = 0.02  # of the streets; short ones would leave all others pale
 NARROWEST = 330  # pixels, of a plot; on a narrower screen plots stand below each other
 KEY = (
     f"<span style='color:{colours.GREEN}'>◕</span> gate, green part: share of its original green time &ensp; "
@@ -27,9 +29,18 @@ KEY = (
 class Page:
     """Maps, curves and numbers of the runs `names` side by side."""
 
-    def __init__(self, picture: CityPicture, names: Sequence[str]):
+    def __init__(self, picture: CityPicture, names: Sequence[str], totals: Mapping[str, Sequence[PerEdge]] = {}):
+        """totals: label -> values (E,) of every run, which the maps can show instead of the density"""
         self.picture, self.names = picture, names
-        self.maps = [CityMap(picture, name) for name in names]
+        tops = {label: top_of(values) for label, values in totals.items()}
+        self.maps = [
+            CityMap(picture, name, {label: (values[n], tops[label]) for label, values in totals.items()})
+            for n, name in enumerate(names)
+        ]
+        layers = [[label, parts] for one in self.maps for label, parts in one.layers.items()]
+        labels = list(self.maps[0].layers)
+        self.streets = Select(title="Streets by", name="streets", width=190, value=labels[0], options=labels)
+        self.streets.js_on_change("value", CustomJS.from_file(HERE / "layers.js", layers=layers))
         self.loads = [Load(picture, f"{name}: load of the regions") for name in names]
         self.curves = Curves(picture, names)
         self.numbers = Div(sizing_mode="stretch_width", styles={"overflow-x": "auto"})
@@ -81,12 +92,20 @@ class Page:
         )
 
 
-def with_slider(picture: CityPicture, runs: Mapping[str, Sequence[Frame]]) -> LayoutDOM:
+def top_of(values: Sequence[PerEdge]) -> float:
+    """Return the upper end of a scale for the values of all runs: all but TOP_SHARE are below, two digits."""
+    return float(f"{np.quantile(np.concatenate(values), 1.0 - TOP_SHARE):.2g}") or 1.0
+
+
+def with_slider(
+    picture: CityPicture, runs: Mapping[str, Sequence[Frame]], totals: Mapping[str, Sequence[PerEdge]] = {}
+) -> LayoutDOM:
     """Return the page of finished runs, which needs no server.
 
     It starts where two runs differ most, or where one has most vehicles. runs: whole frames by name
+    totals: as in `Page`
     """
-    page, whole = Page(picture, list(runs)), list(runs.values())
+    page, whole = Page(picture, list(runs), totals), list(runs.values())
     last, step = max(map(len, whole)) - 1, picture.step / MINUTE
     padded = [[*frames, *[frames[-1]] * (last + 1 - len(frames))] for frames in whole]
     inside = [[frame.accumulation.sum() for frame in frames] for frames in padded]
@@ -131,7 +150,7 @@ def with_slider(picture: CityPicture, runs: Mapping[str, Sequence[Frame]]) -> La
     page.regions.js_on_change("value", callback)
     playing = CustomJS.from_file(HERE / "play.js", slider=slider, period=PLAY_PERIOD_MS)
     play.js_on_change("active", playing)
-    return page.layout([play, slider, page.regions])
+    return page.layout([play, slider, page.regions, *[page.streets] * bool(totals)])
 
 
 def _add_row(tables: Sequence[Sequence[Any]]) -> None:

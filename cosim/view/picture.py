@@ -188,6 +188,17 @@ def frames(picture: CityPicture, result: Any) -> list[Frame]:
     return made
 
 
+def totals(picture: CityPicture, results: Sequence[Any]) -> dict[str, list[PerEdge]]:
+    """Return label -> values (E,) over whole runs, one of each result, to colour the streets by; {} without them."""
+    if any("co2" not in result for result in results):
+        return {}
+    kilometres = picture.lane_km / picture.lanes
+    return {
+        "CO2 [kg/km]": [result.co2 / kilometres for result in results],
+        "longest queue [veh]": [result.queue_max.astype(float) for result in results],
+    }
+
+
 def _gates(city: City, shapes: Mapping[str, Points]) -> tuple[Gate, ...]:
     """Return one gate for every edge that ends at a boundary and region behind it."""
     members: dict[tuple[str, int], list[int]] = {}

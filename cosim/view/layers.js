@@ -1,0 +1,3 @@
+for (const [label, parts] of layers) {
+  for (const part of parts) part.visible = label === cb_obj.value
+}
