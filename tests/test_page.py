@@ -5,6 +5,7 @@ from dataclasses import replace
 from html.parser import HTMLParser
 
 import made_up
+import numpy as np
 import pytest
 from commands import cosim, error_line
 
@@ -70,6 +71,9 @@ def test_every_number_of_the_tables_is_there(content, evaluation):
     cells = Page(content).cells
     for row in results.read(evaluation).rows.to_dict("records"):
         assert f"{row['total_time_spent_veh_s']:.7g}" in cells
+    level = results.read(evaluation).level()
+    emitted = np.mean([run.co2.sum() for run in level.results("dpc-pcrg")])
+    assert "By region" in content and {"1,300", "+30.0 %", f"{emitted:,.0f}"} <= set(cells)
     for row in statistics.statistics(results.read(evaluation).rows).to_dict("records"):
         half = row["change_half_interval_percent"]
         assert row["controller"] == "no-control" or any(

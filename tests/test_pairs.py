@@ -49,6 +49,7 @@ def test_reasons_name_what_the_controller_did_and_what_limits_it(folder):
     level.rows["removed_veh"], level.rows["trips"] = 10.0, 1000.0
     gains = explain.paragraph(level, finished, "dpc-pcrg")
     assert "holds vehicles back in" in gains and "times per trip" in gains and "removal" not in gains
+    assert gains.endswith(f". Some lose: trips from {finished.scenario.network.region_names[2]} (+30 %) take longer.")
     level.rows["removed_veh"] = 11.0
     assert explain.city(level, finished).endswith("; 1.1% of its trips end by removal.")
     level.rows["total_time_spent_veh_s"] *= level.rows["controller"].map({"dpc-pcrg": 9.0, "pi-gating": 1.0})

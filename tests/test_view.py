@@ -120,7 +120,14 @@ def test_finished_runs_on_one_page_with_a_slider(drawn, plain):
     later = picture.frames(drawn, plain)
     emptier = [replace(frame, density=frame.density / 2, accumulation=frame.accumulation / 2) for frame in later]
     runs = {"plain": later, EVIL: emptier}
-    layout = page.with_slider(drawn, runs)
+    layout = page.with_slider(drawn, runs, picture.totals(drawn, [plain, plain]))
+    choose = next(layout.select({"name": "streets"}))
+    layers = choose.js_property_callbacks["change:value"][0].args["layers"]
+    shown = [label for label, parts in layers if all(part.visible for part in parts)]
+    assert len(choose.options) == 3 and len(layers) == 6 and shown == [choose.value] * 2
+    streets = layers[1][1][0].data_source.data
+    kilometres = streets["CO2 [kg/km]"] * drawn.lane_km / drawn.lanes
+    np.testing.assert_allclose(kilometres, plain.co2, rtol=1e-5)
     slider = next(layout.select({"name": "time"}))
     arguments = slider.js_property_callbacks["change:value"][0].args
     film = [table.data["density"] for _, table, names in arguments["film"] if names == ["density"]]
