@@ -25,53 +25,13 @@ from nmfd import closed_loop, metrics
 from nmfd.arrays import PerRegion
 from nmfd.controllers.strategy import Strategy
 from nmfd.model.scenario import Scenario, with_demand
+from nmfd.runs import config
 from nmfd.runs.files import atomic
 from nmfd.types import Result
 
 FULL_SHARE = 0.8  # of an edge's room: a queue that reaches its upstream end leaves gaps that move backwards
-FACTS = {  # attribute of a result, column of runs.csv -> meaning
-    "scenario": "name of the scenario",
-    "demand": "multiple of the scenario's demand",
-    "trips": "trips of private vehicles that were due; so are all trips below",
-    "departed_veh": "trips that entered",
-    "final_backlog_veh": "trips waiting to enter at the end",
-    "total_backlog_veh_s": "total departure delay: time spent waiting to enter",
-    "removed_veh": "vehicles removed before the end of their trips",
-    "removed_waiting_veh": "those of them removed before they entered",
-    "mean_trip_time_s": "from the wanted departure to the end, the removal, or the end of the run; all trips",
-    "mean_finished_trip_time_s": "the same of completed trips",
-    "median_trip_time_s": "50th percentile of all trips",
-    "p95_trip_time_s": "95th percentile of all trips",
-    "mean_departure_delay_s": "wanted to actual departure, mean over all trips",
-    "mean_time_loss_s": "delay: time lost against driving freely (SUMO's timeLoss), mean of trips that entered",
-    "lost_time_gini": "Gini coefficient of delay plus departure delay, means of regions of origin",
-    "public_transport_trips": "trips due of public transport",
-    "public_transport_delay_s": "their delay on the road, as mean_time_loss_s; time at stops is none",
-    "other_trips": "trips due of public transport, and of classes that no controller commands",
-    "other_time_spent_veh_s": "their total time spent",
-    "other_departure_delay_veh_s": "their total departure delay",
-    "teleports": "vehicles that SUMO took out of jams",
-    "co2_kg": "CO2 of all vehicles, SUMO's HBEFA4 petrol car",
-    "fuel_kg": "fuel of all vehicles, same model",
-    "gateway_queue_mean_veh": "vehicles halting on edges before gateways, mean over edges and time",
-    "gateway_queue_max_veh": "longest queue before a gateway",
-    "longest_queue_veh": "most vehicles halting on one street at a time",
-    "gateway_full_share": "share of these edges and intervals that were full",
-    "notes": "most frequent notes of decisions that were not OK",
-    "outside_training": "how demand is outside the training range of the policy",
-    "leaking_share": "share of the boundary flow that passes no signal under control",
-    "estimate_rmse_share": "error of estimated accumulations, share of the critical ones",
-    "estimate_cell_rmse_veh": "error of estimated accumulations by destination",
-    "sumo_time_s": "wall time of SUMO's own steps",
-    "overhead_share": "share of the wall time outside SUMO",
-    "setup_time_s": "wall time before the first interval",
-    "signals_left_alone": "signals with their own programmes",
-    "signal_violations": "green, yellow and red that their original programmes rule out (columns of signals.csv)",
-    "freed_veh": "vehicles in a gridlocked junction that were moved on",
-    "led_on_veh": "guided vehicles that could not change lanes and went on where theirs led",
-    "jumps": "vehicles that entered another region without a gateway",
-    **PRESSURE_FACTS,
-}
+# Attribute of a result, column of runs.csv -> meaning.
+FACTS = config.read(Path(__file__).with_name("columns.toml"))["runs"] | PRESSURE_FACTS
 
 
 @dataclass(frozen=True)

@@ -2,39 +2,21 @@
 
 import math
 from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from nmfd.metrics import COUNTED, decision_ms, percent_change
+from nmfd.runs import config
 from nmfd.runs.tables import markdown_table, text_table, wrapped
 from nmfd.studies import benchmark
 from nmfd.studies.benchmark import REFERENCE, interval
 
 TTS = "total_time_spent_veh_s"
-COLUMNS = {  # heading without unit -> meaning
-    "TTS": "total time spent by private vehicles, on the road and waiting to enter, mean over seeds ± 95 % interval",
-    "change": "of TTS against no-control, or the controller in the heading, paired by seed, mean of the percentages ± "
-    "95 % interval, * if that excludes zero",
-    "completed": "trips that ended on the last edge of their route",
-    "removed": "vehicles removed by SUMO, in TTS until then",
-    "backlog": "trips waiting to enter at the end, and total departure delay",
-    "teleports": "all seeds",
-    "trip": "mean, median and 95th percentile of all trips, departure delay included, unfinished ones until the end",
-    "finished": "mean of completed trips",
-    "departure delay": "mean time between wanted and actual departure",
-    "delay": "mean time lost on the road against driving freely",
-    "public transport": "its mean delay; `-` without any",
-    "other": "total time spent by public transport and classes that no controller commands",
-    "CO2": "all vehicles, SUMO's HBEFA4 petrol car",
-    "queue": "vehicles halting on edges before gateways, mean / longest",
-    "longest": "most vehicles halting on one street at a time, mean over seeds",
-    "full": "share of these edges and intervals that were full",
-    "decision": "processor time, first / median / longest",
-    **dict(COUNTED.values()),
-    "outside SUMO": "share of the wall time outside SUMO",
-}
+COLUMNS = config.read(Path(__file__).with_name("columns.toml"))["evaluation"]  # heading without unit -> meaning
+COLUMNS |= dict(COUNTED.values()) | {"outside SUMO": "share of the wall time outside SUMO"}
 CAPTION = "; ".join(f"{heading}: {text}" for heading, text in COLUMNS.items())
 
 
