@@ -33,6 +33,7 @@ class Streets:
         self.teleports, self.running, self.road = lambda: 0, lambda: tuple(self.places), self.places.__getitem__
         self.known, self.pending = lambda: (*self.places, *self.held), lambda: tuple(self.waiting)
         self.is_free = self.is_private = lambda vehicle: vehicle not in self.bound
+        self.is_public = lambda vehicle: vehicle in self.bound
 
     def route(self, vehicle):
         return self.routes[vehicle]

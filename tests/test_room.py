@@ -21,7 +21,7 @@ TOWN = SimpleNamespace(
     regions=2,
     edges=("a", "b", "c", "d", "e", "x", "y"),
     length={"a": 150.0, "b": 150.0, "c": 75.0, "d": 300.0, "e": 75.0, "x": 75.0, "y": 75.0},
-    lanes=dict.fromkeys(("a", "b", "c", "d", "e", "x", "y"), 1),
+    lanes=dict.fromkeys("abcdexy", 1),
     successors={"a": ("x",), "b": ("y",), "c": ("a",), "d": ("a",), "e": ("d",), "x": (), "y": ()},
     signals={"a": "s", "b": "s", "c": "t"},
     gateways=tuple(
@@ -62,8 +62,7 @@ def test_the_chain_ends_at_a_signal_and_400_m_before_the_gateway():
 
 
 def test_the_fuller_gateway_gets_more_and_a_full_one_is_open():
-    half = np.array([[1.0, 0.5], [1.0, 1.0]])
-    gates = room(on_lanes=(4, 0))
+    half, gates = np.array([[1.0, 0.5], [1.0, 1.0]]), room(on_lanes=(4, 0))
     gates.command(half, vehicles(a=4))
     assert gates.share == pytest.approx([0.6, 0.4])  # 4 of 20 places taken
     gates.command(half, vehicles(a=4, x=5))  # the street behind is half full

@@ -163,7 +163,7 @@ def test_webster_in_sumo(scenario, plant_of):
     plant.reset(1)
     plans = {name: plant.session.programme(name) for name in plant.session.signals()}
     command = plant.session.command
-    _, offsets = command[command.index("--additional-files") + 1].split(",")
+    offsets = command[command.index("--additional-files") + 1].split(",")[1]
     for logic in ElementTree.parse(offsets).getroot():  # a later offset is a later beginning
         programme = plans[logic.get("id")]
         assert programme.position == pytest.approx(-float(logic.get("offset")) % programme.cycle)
