@@ -118,6 +118,13 @@ def test_measures_of_a_city_are_those_of_tripinfo(tmp_path, steps):
     assert result.other_time_spent.sum() == pytest.approx(time[other].sum())
 
 
+def test_outputs_do_not_change_who_reroutes(tmp_path):
+    scenario = load_scenario(tiny_city.imported(tmp_path), {"sumo.rerouting": 0.5, "steps": 4})
+    files = ({}, {"tripinfo": tmp_path / "a.xml"})
+    plain, written = (cosim.run(scenario, "no-control", seed=1, sumo_output=each) for each in files)
+    assert (plain.edge_vehicles == written.edge_vehicles).all() and plain.co2_kg == written.co2_kg > 0
+
+
 def test_gini_coefficients():
     assert metrics.gini(np.array([5.0, 5.0, 5.0]), np.array([1.0, 9.0, 0.0])) == 0.0
     assert metrics.gini(np.array([0.0, 0.0, 3.0]), np.array([1.0, 1.0, 1.0])) == pytest.approx(2 / 3)

@@ -114,8 +114,8 @@ def options(trip_file: Path, outputs: Mapping[str, Path]) -> list[str]:
     files = {"tripinfo": trip_file, **{kind: outputs[kind] for kind in ("summary", "emission") if kind in outputs}}
     others = "--tripinfo-output.write-unfinished true --tripinfo-output.write-undeparted true"
     written = [word for kind, file in files.items() for word in (f"--{kind}-output", str(file))]
-    # SUMO draws a random number for every vehicle in both cases, so that the same vehicles have other devices.
-    emitting = str(int("tripinfo" in outputs or "emission" in outputs))
+    # Not 0: SUMO draws a random number for every vehicle unless it is 0, and others decide who has a rerouting device.
+    emitting = "1" if "tripinfo" in outputs or "emission" in outputs else "1e-12"
     return [*written, *others.split(), "--device.emissions.probability", emitting]
 
 
