@@ -1,5 +1,6 @@
 """A command per boundary, shared over its gateways by the room before and behind them."""
 
+from contextlib import closing
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -57,8 +58,7 @@ def test_the_mean_by_capacity_is_the_command_unless_floors_let_more_through(seed
 
 def test_the_chain_ends_at_a_signal_and_400_m_before_the_gateway():
     assert upstream(TOWN, "a") == ["a", "d"] and upstream(TOWN, "b") == ["b"]
-    nearer = SimpleNamespace(**{**vars(TOWN), "length": TOWN.length | {"d": 200.0}})
-    assert upstream(nearer, "a") == ["a", "d", "e"]
+    assert upstream(SimpleNamespace(**{**vars(TOWN), "length": TOWN.length | {"d": 200.0}}), "a") == ["a", "d", "e"]
 
 
 def test_the_fuller_gateway_gets_more_and_a_full_one_is_open():
@@ -94,23 +94,16 @@ def town(tmp_path_factory):
 @pytest.mark.parametrize("limit, held", [(0.6, True), (0.0, False)])
 def test_no_command_fills_the_street_before_a_gateway(town, limit, held):
     scenario = replace(load_scenario(town), steps=4)
-    plant = SumoPlant(scenario, settings=settings(scenario).changed(chain_limit=limit))
-    try:
+    with closing(SumoPlant(scenario, settings=settings(scenario).changed(chain_limit=limit))) as plant:
         plant.reset(1)
         closed = Controls(perimeter=np.where(scenario.network.adjacency, scenario.network.u_min, 0.0), splits=None)
-        states = [plant.step(closed) for _ in range(4)]
-        record = plant.record()
-        number = {edge: n for n, edge in enumerate(plant.city.edges)}
-        before = [number[g.from_edge] for g in plant.city.gateways if g.signal]
-        lanes = 2 * 200.0 / 7.5  # places on two lanes
-        assert (record["edge_vehicles"][:, before].max() < 0.75 * lanes) == held
+        realised = [plant.step(closed) for _ in range(4)][-1].realised
+        record, streets = plant.record(), plant.city.edges
+        before = [streets.index(gateway.from_edge) for gateway in plant.city.gateways if gateway.signal]
+        room = 2 * 200.0 / 7.5  # of two lanes
+        assert (record["edge_vehicles"][:, before].max() < 0.75 * room) == held
         assert (record["gateway_command"] == 0.0).all() and (record["gateway_share"].max() > 0.3) == held
-        if held:
-            assert states[-1].realised.max() > scenario.network.u_min + 0.05
-        else:
-            assert states[-1].realised is None
-    finally:
-        plant.close()
+        assert realised.max() > scenario.network.u_min + 0.05 if held else realised is None
 
 
 def test_the_integral_goes_on_from_what_was_realised():

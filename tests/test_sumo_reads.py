@@ -168,8 +168,8 @@ def test_buses_keep_their_place_among_cars_that_depart_with_them(tmp_path):
     """SUMO puts vehicles of files before those that flows make at the same time."""
     config = city(tmp_path, ["trip"])
     flow = '<flow id="f" begin="0" end="60" period="10" from="A1B1" to="C1D1"/>'
-    route = '<route edges="A1B1 B1C1 C1D1"/>'
-    buses = "".join(f'<vehicle id="b{t}" line="1" depart="{t}">{route}</vehicle>' for t in range(0, 60, 10))
+    bus = '<vehicle id="b{0}" line="1" depart="{0}"><route edges="A1B1 B1C1 C1D1"/></vehicle>'
+    buses = "".join(map(bus.format, range(0, 60, 10)))
     config.with_name("c.rou.xml").write_text(f"<routes>{flow}{buses}</routes>")
     drive_and_compare(config, ended=12)
 
