@@ -120,6 +120,8 @@ def _identify(
         what = f"--with: {loaded.name} runs on {target}, the model of its own drivers and signals"
         raise InputError(f"{what}; name another folder with --network")
     _check_target(target, own)
+    if protect:
+        shipped.beside(loaded.folder or Path(), "scenario.toml", "a scenario of your own")
     stages = ("route-guidance", "probing-pcrg") if guided else ("no-control", "probing-pc")
 
     def load(stage: int, **setup: object) -> list[Result]:
