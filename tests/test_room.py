@@ -11,7 +11,7 @@ from test_responsive import imported
 from cosim.plant.plant import SumoPlant
 from cosim.plant.room import Room, shared, upstream
 from cosim.plant.settings import settings
-from cosim.sumo.net import Gateway
+from cosim.sumo.net import Gateway, predecessors
 from nmfd.api import load_scenario
 from nmfd.controllers.rules import PiGating
 from nmfd.model.planning import planning_model
@@ -57,8 +57,9 @@ def test_the_mean_by_capacity_is_the_command_unless_floors_let_more_through(seed
 
 
 def test_the_chain_ends_at_a_signal_and_400_m_before_the_gateway():
-    assert upstream(TOWN, "a") == ["a", "d"] and upstream(TOWN, "b") == ["b"]
-    assert upstream(SimpleNamespace(**{**vars(TOWN), "length": TOWN.length | {"d": 200.0}}), "a") == ["a", "d", "e"]
+    before, nearer = predecessors(TOWN), SimpleNamespace(**{**vars(TOWN), "length": TOWN.length | {"d": 200.0}})
+    assert upstream(TOWN, "a", before) == ["a", "d"] and upstream(TOWN, "b", before) == ["b"]
+    assert upstream(nearer, "a", before) == ["a", "d", "e"]
 
 
 def test_the_fuller_gateway_gets_more_and_a_full_one_is_open():
@@ -100,8 +101,7 @@ def test_no_command_fills_the_street_before_a_gateway(town, limit, held):
         realised = [plant.step(closed) for _ in range(4)][-1].realised
         record, streets = plant.record(), plant.city.edges
         before = [streets.index(gateway.from_edge) for gateway in plant.city.gateways if gateway.signal]
-        room = 2 * 200.0 / 7.5  # of two lanes
-        assert (record["edge_vehicles"][:, before].max() < 0.75 * room) == held
+        assert (record["edge_vehicles"][:, before].max() < 0.75 * 2 * 200.0 / 7.5) == held  # room of two lanes
         assert (record["gateway_command"] == 0.0).all() and (record["gateway_share"].max() > 0.3) == held
         assert realised.max() > scenario.network.u_min + 0.05 if held else realised is None
 

@@ -60,7 +60,6 @@ class Actuation:
                 self._controls.append(ResponsiveSignal(session, plan, links, show=show, release=incidents.release))
         phases |= {plan.signal: plan.phases for plan in own if plan.static or plan.actuated}
         self.original_green = _programmed_green(city, phases, step)
-        self._shares = settings.chain_limit > 0
         self.room = Room(session, city, self.original_green, limit=settings.chain_limit, lanes=not settings.mesoscopic)
         self.states: dict[str, list[tuple[float, str]]] = {signal: [] for signal in session.signals()}
 
@@ -73,16 +72,17 @@ class Actuation:
 
     def update(self, vehicles: PerEdge) -> None:
         """Share the command over the gateways again. vehicles: (E,) [veh] on the streets"""
+        before = self.room.share
         self.room.update(vehicles)
-        self._obey()
+        if (self.room.share != before).any():
+            self._obey()
 
     def realised(self) -> PerPair | None:
         """Return u (R, R) [-] that the gateways were given since the last command; None for the command itself."""
-        if not self._shares:
+        network, share = self._network, self.room.realised()
+        if share is None:
             return None
-        network = self._network
-        realised = network.u_min + self.room.realised() * (network.u_max - network.u_min)
-        return np.where(network.adjacency, realised, 0.0)
+        return np.where(network.adjacency, network.u_min + share * (network.u_max - network.u_min), 0.0)
 
     def _obey(self) -> None:
         for control in self._controls:

@@ -16,10 +16,12 @@ the gates: Keyvan-Ekbatani, Carlson, Knoop and Papageorgiou, "Optimizing distrib
 perimeter control: queue and delay balancing approaches", 2021.
 """
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 
 from cosim.sumo.arrays import PerEdge, PerGateway
-from cosim.sumo.net import JAM_SPACING, City, edge_room
+from cosim.sumo.net import JAM_SPACING, City, edge_room, predecessors
 from cosim.sumo.session import Session
 from nmfd.arrays import PerPair
 
@@ -38,7 +40,7 @@ class Room:
         limit: share of the room; 0: all gateways of a boundary get the same share
         """
         gateways, number = city.gateways, {edge: n for n, edge in enumerate(city.edges)}
-        self._session, self._limit, self._regions = session, limit, city.regions
+        self._session, self._limit = session, limit
         self._source, self._target = np.array([(g.source, g.target) for g in gateways], dtype=int).reshape(-1, 2).T
         self._capacity = np.nan_to_num(green) * [len(g.lanes) for g in gateways]
         obedient = np.flatnonzero(self._capacity > 0)
@@ -48,17 +50,17 @@ class Room:
         }
         self._room = edge_room(city)
         self._behind = np.array([number[g.to_edge] for g in gateways], dtype=int)
-        before = {edge: upstream(city, edge) for edge in sorted({g.from_edge for g in gateways})}
-        self._chains = [[number[edge] for edge in before[g.from_edge]] for g in gateways]
+        leading_to = predecessors(city)
+        self._chains = [[number[edge] for edge in upstream(city, g.from_edge, leading_to)] for g in gateways]
         self._lanes = [[f"{g.from_edge}_{lane}" for lane in g.lanes] if lanes else [] for g in gateways]
         self._lane_room = np.array([len(g.lanes) * max(city.length[g.from_edge] / JAM_SPACING, 1.0) for g in gateways])
         self._commanded = np.ones((city.regions, city.regions))
-        self._sums: list[PerGateway] = []
+        self._shares: list[PerGateway] = []  # since the last command
         self.share = np.ones(len(gateways))
 
     def command(self, share: PerPair, vehicles: PerEdge) -> None:
         """Set the shares (R, R) [-] of the boundaries. vehicles: (E,) [veh] on the streets"""
-        self._commanded, self._sums = share, []
+        self._commanded, self._shares = share, []
         self.update(vehicles)
 
     def update(self, vehicles: PerEdge) -> None:
@@ -68,13 +70,9 @@ class Room:
             before, behind = self._taken(vehicles), vehicles[self._behind] / self._room[self._behind]
             floor = np.clip(2.0 * before / self._limit - 1.0, 0.0, 1.0)
             for pair, members in self._boundaries.items():
-                self.share[members] = shared(
-                    self._commanded[pair],
-                    (before - behind)[members],
-                    floor[members],
-                    self._capacity[members],
-                )
-        self._sums.append(self.share)
+                urgency, capacity = (before - behind)[members], self._capacity[members]
+                self.share[members] = shared(self._commanded[pair], urgency, floor[members], capacity)
+        self._shares.append(self.share)
 
     def command_of_gateways(self) -> PerGateway:
         """Return (G,) [-], the share commanded of the boundary of every gateway."""
@@ -82,10 +80,12 @@ class Room:
 
     def gateway_shares(self) -> PerGateway:
         """Return (G,) [-], the mean shares since the last command."""
-        return np.mean(self._sums, axis=0)
+        return np.mean(self._shares, axis=0)
 
-    def realised(self) -> PerPair:
-        """Return (R, R) [-], the mean shares of the boundaries since the last command; that itself without a gate."""
+    def realised(self) -> PerPair | None:
+        """Return the mean shares (R, R) [-] since the command, which counts where no gate obeys; None without limit."""
+        if self._limit == 0:
+            return None
         realised, share = self._commanded.copy(), self.gateway_shares()
         for pair, members in self._boundaries.items():
             realised[pair] = np.average(share[members], weights=self._capacity[members])
@@ -108,16 +108,12 @@ def shared(share: float, urgency: PerGateway, floor: PerGateway, capacity: PerGa
     return np.clip(urgency + np.interp(share, means, bends), floor, 1.0)
 
 
-def upstream(city: City, edge: str) -> list[str]:
+def upstream(city: City, edge: str, leading_to: Mapping[str, Sequence[str]]) -> list[str]:
     """Return `edge` and all streets that lead there past no signal and end less than CHAIN_M before its end."""
-    before: dict[str, list[str]] = {}
-    for source, targets in city.successors.items():
-        for target in targets:
-            before.setdefault(target, []).append(source)
     chain, waiting = {edge: city.length[edge]}, [edge]
     while waiting:
         street = waiting.pop(0)
-        for source in before.get(street, []):
+        for source in leading_to[street]:
             if chain[street] < CHAIN_M and source not in city.signals and source not in chain:
                 chain[source] = chain[street] + city.length[source]
                 waiting.append(source)

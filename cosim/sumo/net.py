@@ -294,6 +294,15 @@ def gateway_movements(city: City) -> dict[str, dict[int, int]]:
     return movements
 
 
+def predecessors(city: City) -> dict[str, list[str]]:
+    """Return edge -> edges that lead there, sorted."""
+    before: dict[str, list[str]] = {edge: [] for edge in city.edges}
+    for edge, after in city.successors.items():
+        for other in after:
+            before[other].append(edge)
+    return before
+
+
 def edge_room(city: City) -> PerEdge:
     """Return (E,) [veh] that can stand on each edge at JAM_SPACING."""
     return np.array([max(city.lanes[edge] * city.length[edge] / JAM_SPACING, 1.0) for edge in city.edges])

@@ -13,7 +13,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from cosim.sumo.arrays import PerEdge, PerMove, PerTrip, TripNumbers
-from cosim.sumo.net import City
+from cosim.sumo.net import City, predecessors
 from nmfd.arrays import PairsOverTime
 from nmfd.errors import InputError
 
@@ -180,10 +180,7 @@ def _departures(
 def _ends(city: City, region: int, *, departing: bool) -> tuple[list[str], np.ndarray]:
     """Return the edges where trips of a region start or end, with cumulated weights: if there are any, good ones."""
     edges = [edge for edge in city.edges if city.region_of[edge] == region]
-    before: dict[str, list[str]] = {edge: [] for edge in city.edges}
-    for edge, after in city.successors.items():
-        for other in after:
-            before[other].append(edge)
+    before = predecessors(city)
     onward: Mapping[str, Sequence[str]] = city.successors if departing else before
     good = [
         edge
