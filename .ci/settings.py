@@ -6,7 +6,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from cosim.plant.settings import Settings
-from cosim.sumo.build import RecipeTable
+from cosim.sumo.net import CityTable
 from nmfd.controllers.strategy import CONTROLLERS
 from nmfd.model.regional_model import NetworkTable
 from nmfd.model.scenario import ScenarioTable
@@ -14,8 +14,7 @@ from nmfd.model.scenario import ScenarioTable
 PAGE = Path(__file__).parents[1] / "scenarios" / "settings.md"
 FILES = (
     ("scenario.toml", [ScenarioTable, ("sumo", Settings)]),
-    ("network.toml", [NetworkTable]),
-    ("city.toml", [RecipeTable]),
+    ("network.toml", [NetworkTable, ("sumo", CityTable)]),
 )
 
 

@@ -3,7 +3,6 @@
 import gc
 import os
 import sys
-from pathlib import Path
 
 import pytest
 from jaxtyping import config, install_import_hook
@@ -40,15 +39,6 @@ def pytest_configure(config: pytest.Config) -> None:
     if config.getoption("annotations") == "on" and not config.getoption("benchmark_only"):
         install_import_hook("nmfd", "annotations.check")
         install_import_hook(SHAPED, "annotations.check_arrays")
-
-
-def pytest_sessionstart(session: pytest.Session) -> None:
-    """The city that most tests drive is built once, before workers use and copy it."""
-    if not hasattr(session.config, "workerinput") and not session.config.option.collectonly:
-        from cosim.sumo.build import ensure_built  # not before annotations are checked
-        from nmfd.model.regional_model import load_network
-
-        ensure_built(load_network(Path(__file__).parents[1] / "networks" / "grid7"))
 
 
 @pytest.hookimpl(wrapper=True)

@@ -1,4 +1,4 @@
-"""The city grid7: built from its recipe, cut into regions, signalised; and the one-line errors of its files."""
+"""The city grid7: cut into regions, signalised; and the one-line errors of its files."""
 
 import re
 import shutil
@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from cosim.sumo.build import build, ensure_built, read_recipe
-from cosim.sumo.net import check_adjacency, load_city
+from cosim.sumo.net import check_adjacency, city_files, load_city
 from nmfd.errors import InputError
 from nmfd.model.regional_model import load_network
 
@@ -18,31 +17,12 @@ GRID7 = Path(__file__).parents[1] / "networks" / "grid7"
 
 @pytest.fixture(scope="module")
 def files():
-    return ensure_built(load_network(GRID7))
+    return city_files(load_network(GRID7))
 
 
 @pytest.fixture(scope="module")
 def city(files):
-    return load_city(files.net_file, files.regions_csv, 7)
-
-
-def test_same_recipe_same_bytes(files):
-    recipe = read_recipe(GRID7 / "city.toml", 7)
-    assert build(recipe, "city.toml") == (files.net_file.read_bytes(), files.regions_csv.read_bytes())
-
-
-def test_a_changed_recipe_is_built_again(tmp_path):
-    shutil.copytree(GRID7, tmp_path / "grid7", ignore=shutil.ignore_patterns("build"))
-    network = load_network(tmp_path / "grid7")
-    files = ensure_built(network)
-    before = files.net_file.stat().st_mtime_ns
-    ensure_built(network)
-    assert files.net_file.stat().st_mtime_ns == before
-    recipe = tmp_path / "grid7" / "city.toml"
-    recipe.write_text(recipe.read_text().replace("cycle = 90", "cycle = 80"))
-    ensure_built(network)
-    assert files.net_file.stat().st_mtime_ns > before
-    assert [path.name for path in files.net_file.parent.glob(".*")] == []
+    return load_city(*files, 7)
 
 
 def test_gateways_join_the_adjacent_regions(city):
@@ -106,21 +86,13 @@ def test_missing_and_broken_nets_give_one_line(files, tmp_path):
         load_city(broken, files.regions_csv, 7)
 
 
-def test_wrong_recipes_give_one_line(tmp_path):
-    shutil.copytree(GRID7, tmp_path / "grid7", ignore=shutil.ignore_patterns("build"))
-    path = tmp_path / "grid7" / "city.toml"
-    good = path.read_text()
-    for old, new, message in (
-        ("speed =", "sped =", "centre.sped: unknown key; did you mean speed"),
-        ("0 0 0 0 0 1 1 1 1", "0 0 0 0 0 1 1 1 9", r"expected a region from 0 to 6 .* got '9'"),
-        ("cycle = 90", "cycle = 90\nwrong = 1", "signals.wrong: unknown key"),
-    ):
-        path.write_text(good.replace(old, new, 1))
-        with pytest.raises(InputError, match=message):
-            ensure_built(load_network(tmp_path / "grid7"))
-    network_file = tmp_path / "grid7" / "network.toml"
-    network_file.write_text(network_file.read_text().replace('recipe = "city.toml"', 'net = "a.net.xml"'))
+def test_wrong_tables_of_a_city_give_one_line(tmp_path):
+    shutil.copy(GRID7 / "network.toml", tmp_path)
+    with pytest.raises(InputError, match="sumo.net: no such file"):
+        city_files(load_network(tmp_path))
+    text = (tmp_path / "network.toml").read_text()
+    (tmp_path / "network.toml").write_text(text.replace('regions = "regions.csv"\n', ""))
     with pytest.raises(InputError, match="sumo.regions: missing"):
-        ensure_built(load_network(tmp_path / "grid7"))
+        city_files(load_network(tmp_path))
     with pytest.raises(InputError, match="no city to simulate"):
-        ensure_built(load_network(GRID7.parent / "hexagon7"))
+        city_files(load_network(GRID7.parent / "hexagon7"))

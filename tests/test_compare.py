@@ -112,7 +112,7 @@ def test_own_splits_are_the_crossings_shares_and_the_network_file_comes_back(sce
     network = replace(network, observed_split_ratios=observed_split_ratios(network, crossings))
     assert network.observed_split_ratios[0, 6] == pytest.approx({1: 0.25, 3: 0.75})
     for kind in (network, tiny.limited(network)):
-        text = network_toml(kind, {"recipe": "city.toml"}, "a test")
+        text = network_toml(kind, {"net": "city.net.xml"}, "a test")
         (tmp_path / "network.toml").write_text(text)
         again = load_network(tmp_path)
         np.testing.assert_allclose(again.nominal_splits, kind.nominal_splits)
@@ -121,7 +121,7 @@ def test_own_splits_are_the_crossings_shares_and_the_network_file_comes_back(sce
             assert (there is None) == (here is None)
             if there is not None:
                 np.testing.assert_allclose(here, there, rtol=1e-3)
-    assert '[sumo]\nrecipe = "city.toml"' in text
+    assert '[sumo]\nnet = "city.net.xml"' in text
 
 
 @pytest.mark.parametrize("jam", [9000.0, 2500.0])

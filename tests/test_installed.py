@@ -111,7 +111,7 @@ def test_a_new_user(installed):
 # Every scenario that comes along can be loaded, every city simulated, every policy read.
 EVERYTHING = """
 from cosim.plant.settings import settings
-from cosim.sumo.build import ensure_built
+from cosim.sumo.net import city_files
 from nmfd.api import controller, load_scenario
 from nmfd.runs import config, shipped
 
@@ -119,7 +119,7 @@ for folder in shipped.folders(shipped.SCENARIO):
     scenario = load_scenario(folder.name)
     assert shipped.installed(scenario.folder) and shipped.installed(scenario.network.folder)
     if "sumo" in config.read(scenario.network.folder / "network.toml"):
-        settings(scenario), ensure_built(scenario.network)
+        settings(scenario), city_files(scenario.network)
     for file in folder.glob("dpc-*.pt"):
         assert controller(file.stem, scenario)
 """

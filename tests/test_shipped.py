@@ -10,8 +10,6 @@ import tiny
 from commands import call, error_line, good, nmfd
 
 from cosim.api import run as cosim_run
-from cosim.sumo import build
-from cosim.sumo.build import ensure_built
 from nmfd import __version__
 from nmfd.api import controller as make_controller
 from nmfd.api import load_scenario
@@ -118,15 +116,12 @@ def test_a_missing_policy_is_trained_elsewhere(installed):
     assert make_controller("dpc-pc", scenario, policy=Path("economic_mpc/dpc-pc.pt"))  # as `nmfd show` calls it
 
 
-def test_cities_are_built_in_the_cache(installed, tmp_path, monkeypatch):
-    monkeypatch.setattr(build, "build", lambda recipe, where: (b"<net/>", b"edge,region"))
-    for name in ("grid7", "grid7_guided"):
-        assert ensure_built(load_network(name)).net_file.parent.parent == tmp_path / "cache"
-    assert len(list((tmp_path / "cache").iterdir())) == 1  # of the recipe that both name
+def test_what_is_made_for_a_city_goes_to_the_cache(installed, tmp_path, monkeypatch):
+    assert shipped.build_folder(installed / "networks" / "grid7").parent == tmp_path / "cache"
     (tmp_path / "file").touch()
     monkeypatch.setenv(shipped.CACHE, str(tmp_path / "file"))
     with pytest.raises(InputError, match="COSIM_CACHE"):
-        ensure_built(load_network("grid7"))
+        shipped.build_folder(installed / "networks" / "grid7")
 
 
 def test_what_is_listed(installed):

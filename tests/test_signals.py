@@ -14,8 +14,7 @@ from signal_rules import MIN_GREEN, watched
 from cosim.plant.max_pressure import Roads
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import Settings
-from cosim.sumo.build import ensure_built
-from cosim.sumo.net import load_city
+from cosim.sumo.net import city_of
 from cosim.sumo.signals import read_signals
 from cosim.sumo.trips import make_trips, turning_flows
 from nmfd.api import load_scenario
@@ -33,8 +32,7 @@ def scenario():
 
 @pytest.fixture(scope="module")
 def city(scenario):
-    files = ensure_built(scenario.network)
-    return load_city(files.net_file, files.regions_csv, scenario.network.regions)
+    return city_of(scenario.network)
 
 
 @pytest.fixture

@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim.sumo.build import ensure_built
-from cosim.sumo.net import load_city
+from cosim.sumo.net import city_of
 from cosim.sumo.trips import make_trips, write_trips
 from nmfd.api import load_scenario
 
@@ -21,8 +20,7 @@ def scenario():
 
 @pytest.fixture(scope="module")
 def city(scenario):
-    files = ensure_built(scenario.network)
-    return load_city(files.net_file, files.regions_csv, 7)
+    return city_of(scenario.network)
 
 
 @pytest.fixture(scope="module")

@@ -19,8 +19,7 @@ import pandas as pd
 
 from cosim.evaluation.model_validation import observed, outflow_samples
 from cosim.evaluation.runs import runs_of
-from cosim.sumo.build import network_folder
-from cosim.sumo.net import city_of
+from cosim.sumo.net import city_of, network_folder
 from nmfd.api import load_scenario
 from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
@@ -37,7 +36,7 @@ from nmfd.runs.tables import wrapped
 from nmfd.studies import fit_quality, plots
 from nmfd.types import Result
 
-PATHS = ("recipe", "net", "regions")  # keys of [sumo] in network.toml
+PATHS = ("net", "regions")  # keys of [sumo] in network.toml
 
 
 def without_model(scenario: Scenario) -> bool:

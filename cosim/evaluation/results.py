@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from cosim.sumo.build import ensure_built
-from cosim.sumo.net import City, city_of
+from cosim.sumo.net import City, city_files, city_of
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
@@ -55,7 +54,7 @@ class Finished:
 
     def map(self) -> City:
         """Return the city. Raise InputError if it has changed since the runs."""
-        files = ensure_built(self.scenario.network)
+        files = city_files(self.scenario.network)
         for key, file in (("net_file_hash", files.net_file), ("regions_hash", files.regions_csv)):
             if self.levels[0].key[key] != file_hash(file):
                 raise InputError(f"{self.path}: {file} has changed since the runs; run them again")

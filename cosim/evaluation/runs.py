@@ -13,8 +13,7 @@ from cosim.plant.launch import own_vehicles
 from cosim.plant.programmes import check_strategy
 from cosim.plant.settings import FILES, PRESSURES, own_files, settings
 from cosim.sumo import outputs
-from cosim.sumo.build import ensure_built
-from cosim.sumo.net import check_adjacency, load_city
+from cosim.sumo.net import check_adjacency, city_files, load_city
 from cosim.sumo.signals import HELD, read_signals
 from cosim.sumo.xml_files import read_xml
 from nmfd.controllers.strategy import Strategy
@@ -68,8 +67,8 @@ def runs_of(
 def city_key(scenario: Scenario, strategies: Sequence[Strategy]) -> dict[str, object]:
     """Check that the strategies can run in the city; return what all runs there depend on. Raises InputError."""
     chosen = settings(scenario)
-    files = ensure_built(scenario.network)
-    city = load_city(files.net_file, files.regions_csv, scenario.network.regions)
+    files = city_files(scenario.network)
+    city = load_city(*files, scenario.network.regions)
     check_adjacency(city, scenario.network)
     own_vehicles(scenario, chosen, city)
     used = {strategy.city.get("signals", chosen.signals) for strategy in strategies}

@@ -6,19 +6,15 @@ of the equilibrium; a city in car-following gets more iterations in that model, 
 """
 
 import gzip
-import os
-import subprocess
-import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import sumo
 
 from cosim.importing.case import Progress
-from cosim.sumo.build import run_sumo
+from cosim.sumo.programs import run_sumo, run_tool
 from cosim.sumo.xml_files import attribute, child, file_list, read_xml
 from nmfd.errors import InputError
 from nmfd.runs.files import temporary_folder
@@ -96,16 +92,9 @@ def assign(
 
 def _iterate(folder: Path, n: int, options: Sequence[str], *, where: str) -> None:
     """Run step n of duaIterate.py: routes, except in step 0, and a simulation."""
-    program = Path(sumo.SUMO_HOME) / "tools" / "assign" / "duaIterate.py"
     start = ["--skip-first-routing", "--routes", str(_routes(folder, 0))] if n == 0 else ["--trips", f"{NAME}.xml"]
-    done = subprocess.run(
-        [sys.executable, program, *start, "--first-step", str(n), "--last-step", str(n + 1), *ALWAYS, *options],
-        cwd=folder,
-        capture_output=True,
-        stdin=subprocess.DEVNULL,
-        env=os.environ | {"SUMO_HOME": sumo.SUMO_HOME, "PYTHONHASHSEED": "0"},
-    )
-    if done.returncode:
+    steps = ["--first-step", str(n), "--last-step", str(n + 1)]
+    if run_tool("assign/duaIterate.py", *start, *steps, *ALWAYS, *options, folder=folder).returncode:
         log = folder / "dua.log"
         lines = log.read_text(encoding="utf-8", errors="replace").splitlines() if log.exists() else []
         reason = " ".join(next((line for line in lines if "rror" in line), "no reason given").split())

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from cosim.importing.case import Progress
 from cosim.importing.streets import Streets
 from cosim.sumo.arrays import EdgeNumbers, PerEdge
-from cosim.sumo.build import run_sumo
+from cosim.sumo.programs import run_sumo
 from cosim.sumo.recorded_trips import MESOSCOPIC, draw, read_recorded_trips, write_recorded_trips
 from cosim.sumo.xml_files import attribute, child, file_list, read_xml
 from nmfd.arrays import PerRegion, PerTurn

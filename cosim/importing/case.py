@@ -1,10 +1,8 @@
 """Sources of an import: a sumocfg with all it names, a bare network, OpenStreetMap as a file or a box."""
 
 import math
-import os
 import re
 import subprocess
-import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -14,9 +12,8 @@ from typing import Protocol
 from urllib.parse import unquote
 
 import numpy as np
-import sumo
 
-from cosim.sumo.build import run_sumo
+from cosim.sumo.programs import HOME, run_sumo, run_tool
 from cosim.sumo.xml_files import BROKEN, attribute, file_list, opened, read_xml
 from nmfd.errors import InputError
 from nmfd.runs.files import temporary_folder
@@ -104,7 +101,7 @@ def sumo_input(source: Path | Box, progress: Progress) -> Iterator[SumoInput]:
             progress("fetching OpenStreetMap")
             source = fetch_osm(source, folder)
         progress("netconvert")
-        net, types = folder / "osm.net.xml", Path(sumo.SUMO_HOME) / "data" / "typemap" / "osmNetconvert.typ.xml"
+        net, types = folder / "osm.net.xml", HOME / "data" / "typemap" / "osmNetconvert.typ.xml"
         options = {"osm-files": file_list([source.resolve()]), "type-files": types, "output-file": net}
         run_sumo("netconvert", options, *NETCONVERT, where=str(source))
         west, south, east, north = map(float, _root(net, "location").attrib["origBoundary"].split(","))
@@ -208,21 +205,10 @@ def parse_box(text: str) -> Box:
 def fetch_osm(box: Box, folder: Path) -> Path:
     """Fetch the streets within a box by SUMO's osmGet.py from a public server. Raises InputError."""
     where = ",".join(f"{value:g}" for value in box)
-    program = [sys.executable, str(Path(sumo.SUMO_HOME) / "tools" / "osmGet.py"), f"--bbox={where}"]
-    options = ["--output-dir", str(folder), "--prefix", "osm", "--gzip", "--url", SERVERS, "--retries", "2"]
+    options = [f"--bbox={where}", "--prefix", "osm", "--gzip", "--url", SERVERS, "--retries", "2"]
     options += ["--road-types", '{"highway": ["."]}']
-    environment = os.environ | {"SUMO_HOME": sumo.SUMO_HOME}
     try:
-        subprocess.run(
-            [*program, *options],
-            timeout=SERVER_TIME_LIMIT_S,
-            env=environment,
-            capture_output=True,
-            check=True,
-            text=True,
-            errors="replace",
-            stdin=subprocess.DEVNULL,
-        )
+        run_tool("osmGet.py", *options, folder=folder, seconds=SERVER_TIME_LIMIT_S).check_returncode()
         return next(folder.glob("osm_bbox.osm.xml.gz"))
     except (subprocess.SubprocessError, StopIteration) as error:
         reason = (getattr(error, "stderr", "") or str(error)).strip().splitlines()[-1:]

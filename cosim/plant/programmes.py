@@ -2,8 +2,6 @@
 
 import hashlib
 import re
-import subprocess
-import sys
 from collections.abc import Iterable, Sequence
 from importlib import metadata
 from pathlib import Path
@@ -11,12 +9,11 @@ from xml.etree.ElementTree import Element, ElementTree, SubElement
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
-import sumo
 
 from cosim.plant.gates import MIN_GREEN_S, least_times
 from cosim.plant.settings import ACTUATED, FIXED, PRESSURES, Settings, check_lanes, own_files, settings
-from cosim.sumo.build import network_folder
-from cosim.sumo.net import City
+from cosim.sumo.net import City, network_folder
+from cosim.sumo.programs import run_tool
 from cosim.sumo.signals import FIXED as FIXED_TIME
 from cosim.sumo.signals import HELD, Signal, phases_of, read_signals
 from cosim.sumo.xml_files import attribute, read_xml
@@ -103,9 +100,7 @@ def optimised_plans(
             ("tlsCycleAdaptation.py", "cycles.xml", unified),
             ("tlsCoordinator.py", "offsets.xml", ("-a", "cycles.xml")),
         ):
-            program = str(Path(sumo.SUMO_HOME) / "tools" / tool)
-            command = [sys.executable, program, "-n", network, "-r", "routes.xml", "-o", output, *options]
-            result = subprocess.run(command, cwd=scratch, capture_output=True, text=True, check=False)
+            result = run_tool(tool, "-n", network, "-r", "routes.xml", "-o", output, *options, folder=scratch)
             if result.returncode:
                 words = (result.stderr.strip() or "no message").splitlines()[-1]
                 raise InputError(f"{city.net_file}: {tool} cannot plan its signals ({words}); choose other signals")

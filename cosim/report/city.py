@@ -11,7 +11,6 @@ from cosim.importing import maps, quality
 from cosim.importing.streets import read_streets
 from cosim.plant.settings import own_files, settings
 from cosim.sumo import net
-from cosim.sumo.build import ensure_built
 from nmfd.api import load_scenario
 from nmfd.model.regional_model import RegionalModel, load_network
 from nmfd.model.scenario import Scenario
@@ -42,7 +41,7 @@ class City:
         setup = None if self.scenario is None else settings(self.scenario)
         additional = own_files(self.scenario, setup.additional) if self.scenario and setup else ()
         left = setup.leave_signals if setup else ()
-        self._streets = read_streets(ensure_built(self.network).net_file, additional)
+        self._streets = read_streets(net.city_files(self.network).net_file, additional)
         built = net.city_of(self.network)
         self._regions = np.array([built.region_of.get(edge, -1) for edge in self._streets.edges])
         of_region = [self._streets.drivable & (self._regions == r) for r in range(self.network.regions)]

@@ -12,14 +12,29 @@ import numpy as np
 from jaxtyping import Float
 
 from cosim.sumo.arrays import PerEdge, Points
-from cosim.sumo.build import ensure_built
 from cosim.sumo.xml_files import attribute, network_root
 from nmfd.errors import InputError
 from nmfd.model.regional_model import RegionalModel
+from nmfd.runs import config
+from nmfd.runs.config import Settings, Text, setting
 from nmfd.runs.files import check_file
 
 JAM_SPACING = 7.5  # m of lane per standing vehicle
 NORMAL = "normal", "connector"  # functions of edges outside junctions
+
+
+class CityTable(Settings):
+    """The table [sumo] of network.toml."""
+
+    net: Text = setting("SUMO's network, relative to the folder of network.toml")
+    regions: Text = setting("csv with the columns edge, region")
+
+
+class CityFiles(NamedTuple):
+    """The files of a city: SUMO's network, and the region of every edge."""
+
+    net_file: Path
+    regions_csv: Path
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,10 +98,33 @@ class _Connection(NamedTuple):
     to_lane: int
 
 
+def network_folder(network: RegionalModel) -> Path:
+    """Return the folder of `network`. Raises InputError for one that was not loaded from a file."""
+    if network.folder is None:
+        raise InputError(f"network {network.name}: was not loaded from a folder; load it with load_network")
+    return network.folder
+
+
+def city_files(network: RegionalModel) -> CityFiles:
+    """Return the SUMO files of `network`. Raises InputError for a wrong table [sumo] or a missing file."""
+    folder = network_folder(network)
+    path = folder / "network.toml"
+    content = config.read(path)
+    if "sumo" not in content:
+        raise InputError(
+            f"{path}: sumo: missing; this network has no city to simulate: add [sumo] with net and regions"
+        )
+    table = config.checked(CityTable, content["sumo"], path, "sumo.")
+    files = CityFiles(folder / table.net, folder / table.regions)
+    for key, file in zip(("net", "regions"), files, strict=True):
+        if not file.is_file():
+            raise config.error(path, f"sumo.{key}", f"no such file: {file}; give the path of an existing one")
+    return files
+
+
 def city_of(network: RegionalModel) -> City:
-    """Return the city of `network`, built first if need be. Raises InputError."""
-    files = ensure_built(network)
-    return load_city(files.net_file, files.regions_csv, network.regions)
+    """Return the city of `network`. Raises InputError."""
+    return load_city(*city_files(network), network.regions)
 
 
 def load_city(net_file: Path, regions_csv: Path, regions: int) -> City:

@@ -14,7 +14,7 @@ import platformdirs
 from nmfd.errors import InputError, did_you_mean
 
 SCENARIO, NETWORK = "scenario", "network"  # kinds of folders: in folders of that name + "s", with NAME.toml in each
-CACHE = "COSIM_CACHE"  # environment variable: folder for the files that are built of installed cities
+CACHE = "COSIM_CACHE"  # environment variable: folder for the signal plans of installed cities
 _HERE = Path(str(resources.files("nmfd")))
 _DATA = _HERE / "data"  # as pyproject.toml maps it
 
@@ -81,7 +81,7 @@ def beside(folder: Path, file: str, option: str, *, scenario: bool = False) -> P
 
 
 def build_folder(folder: Path) -> Path:
-    """Make the folder for files that are built of the city in `folder`, and return it. Raises InputError.
+    """Make the folder for what is computed for the city in `folder`, and return it. Raises InputError.
 
     It is `folder`/build, or, if that cannot be written to, one in the user's cache ($COSIM_CACHE).
     """
@@ -92,5 +92,5 @@ def build_folder(folder: Path) -> Path:
     try:
         where.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{where}: {error.strerror}; name a folder for built cities in {CACHE}") from None
+        raise InputError(f"{where}: {error.strerror}; name a folder for such files in {CACHE}") from None
     return where
