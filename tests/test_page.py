@@ -62,7 +62,7 @@ def content(evaluation):
 def test_the_page_is_valid_and_needs_nothing_else(content):
     read = Page(content)
     pictures = [link for link in read.links if link.startswith("data:image/png;base64,")]
-    assert len(pictures) == 2 + 5 and set(read.links) == {*pictures, "data:,"}
+    assert len(pictures) == 2 + 3 and set(read.links) == {*pictures, "data:,"}
     assert content.startswith("<!DOCTYPE html>") and len(content) < 8_000_000
     assert "a<b>" not in content and "a<b>&c" in read.words
 

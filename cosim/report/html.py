@@ -26,9 +26,6 @@ PICTURES = {  # file -> caption
     "region_accumulation": "Vehicles in each region over time, and the critical accumulation of the regional model.",
     "mfd": "Macroscopic fundamental diagram of each region. Dots: control intervals; line: the regional model; "
     "hatched: beyond all dots.",
-    "perimeter": "Perimeter control: commanded u of the boundaries that were closed most, green shown and flow, as "
-    "shares of the original programme.",
-    "splits": "Route guidance: commanded and realised split ratios.",
 }
 PICTURE_DPI, CSS_DPI = 150, 96  # of nmfd.studies.plots.save, and of browsers
 LEVEL_PICTURES = {

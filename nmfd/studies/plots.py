@@ -43,7 +43,7 @@ COLOURS = {
 }
 OTHER_COLOURS = ("#17becf", "#5254a3", "#843c39", "#66c2a5", "#bc80bd", "#1b5e20", "#fb8072", "#556b2f")
 PLANT_LABELS = {"nmfd": "regional model", "acyclic": "acyclic model", "sumo": "SUMO", "estimate": "estimate"}
-LINE_STYLES = ("-", "--", ":", "-.")
+LINE_STYLES, MARKERS = ("-", "--", ":", "-."), "o^sDvPX"
 CRITICAL, UNSEEN = "critical accumulation of the model", "beyond all samples: a guess"
 LAST = CRITICAL, UNSEEN  # labels at the end of legends
 
@@ -112,6 +112,18 @@ def region_accumulation(
     highest = max((t.accumulation[:, region].sum(axis=1).max() for t in trajectories), default=0.0)
     ax.set(ylabel="accumulation [veh]", ylim=(0.0, 1.06 * np.nanmax([highest, 1.25 * critical])))
     ax.set_title(network.titles[region], fontsize="medium")
+    return ax
+
+
+def with_intervals(ax: Axes, values: Mapping[str, Mapping[float, tuple[float, float]]]) -> Axes:
+    """Draw controller -> x -> mean and half of its interval as lines with error bars, slightly apart."""
+    tones, places = colours([*values]), [x for points in values.values() for x in points]
+    for number, (controller, points) in enumerate(values.items()):
+        mean, half = np.array([*points.values()]).reshape(-1, 2).T
+        aside = 0.012 * max(np.ptp(places or [0.0]), 0.1) * (number - (len(values) - 1) / 2)
+        style = {"color": tones[controller], "marker": MARKERS[number % len(MARKERS)], "markersize": 4, "capsize": 3}
+        ax.errorbar(np.array([*points]) + aside, mean, np.nan_to_num(half), label=controller, linewidth=1.6, **style)
+    ax.spines[["top", "right"]].set_visible(False)
     return ax
 
 

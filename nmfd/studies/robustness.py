@@ -8,8 +8,6 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from nmfd.controllers.strategy import Strategy
 from nmfd.metrics import percent_change, summary
 from nmfd.model.scenario import Scenario, perturbed
@@ -58,14 +56,8 @@ def draw(folder: Path, rows: "pd.DataFrame") -> None:
     drawing = plots.figure(8.0, 4.8)
     ax = drawing.subplots()
     ax.axhline(0.0, color=plots.COLOURS[REFERENCE], linewidth=1.0)
-    colours = plots.colours(names := _compared(rows))
-    for number, name in enumerate(names):
-        gains = improvements(rows, name)
-        mean, half = np.array(list(gains.values())).reshape(-1, 2).T
-        style = dict(marker="o^sDv"[number % 5], markersize=4, capsize=3, linewidth=1.6, color=colours[name])
-        ax.errorbar(list(gains), mean, np.nan_to_num(half), label=name, **style)
+    plots.with_intervals(ax, {name: improvements(rows, name) for name in _compared(rows)})
     ax.set(xlabel="standard deviation of the noise on the demand [veh/s]", ylabel="total time spent saved [%]")
-    ax.spines[["top", "right"]].set_visible(False)
     plots.legend_below(drawing, [ax])
     plots.save(drawing, folder / "robustness.png")
 
