@@ -262,19 +262,19 @@ def test_every_rollout_has_a_model_of_its_own(scenario):
     nominal = rollout.parameters
     rollout.draw_model(4000, 0.2, torch.Generator().manual_seed(0))
     p = rollout.parameters
-    assert torch.log(p.jam / nominal.jam).std().item() == pytest.approx(0.2, rel=0.15)  # cut at two deviations
-    assert torch.log(p.jam / nominal.jam).abs().max().item() == pytest.approx(0.4, rel=1e-3)
+    assert torch.log(p.mfd.jam / nominal.mfd.jam).std().item() == pytest.approx(0.2, rel=0.15)  # cut at two deviations
+    assert torch.log(p.mfd.jam / nominal.mfd.jam).abs().max().item() == pytest.approx(0.4, rel=1e-3)
     assert torch.log(p.capacity / nominal.capacity)[:, 0, 1].std().item() == pytest.approx(0.1, rel=0.15)
-    torch.testing.assert_close(p.storage / nominal.storage, p.jam / nominal.jam)
-    fastest = (p.c.unsqueeze(-1) * p.exit_rates).max().item()
+    torch.testing.assert_close(p.storage / nominal.storage, p.mfd.jam / nominal.mfd.jam)
+    fastest = (p.mfd.c.unsqueeze(-1) * p.exit_rates).max().item()
     assert fastest * limited.step / limited.substeps <= 1.0 + 1e-6
-    x = 0.5 * p.jam  # the same curve along a stretched axis, and scaled by one factor
+    x = 0.5 * p.mfd.jam  # the same curve along a stretched axis, and scaled by one factor
     scale = torch.from_numpy(np.array([m.rate(0.5 * m.jam) / m.c for m in limited.network.mfds])).float()
-    torch.testing.assert_close(dynamics.rate(p, x) / p.c, scale.expand(4000, -1), rtol=1e-4, atol=0.0)
+    torch.testing.assert_close(dynamics.rate(p, x) / p.mfd.c, scale.expand(4000, -1), rtol=1e-4, atol=0.0)
     rollout.draw_model(4000, 0.0, torch.Generator().manual_seed(0))
     assert rollout.parameters is nominal
     rollout.draw_model(3, 0.0, torch.Generator().manual_seed(0), scale=0.75)
-    torch.testing.assert_close(rollout.parameters.jam, 0.75 * nominal.jam.expand(3, -1))
+    torch.testing.assert_close(rollout.parameters.mfd.jam, 0.75 * nominal.mfd.jam.expand(3, -1))
     shorter = dynamics.rate(rollout.parameters, 0.75 * x[:3])
     torch.testing.assert_close(shorter, dynamics.rate(nominal, x[:3]))
 

@@ -12,14 +12,16 @@ from tiny import random_controls
 
 from nmfd.controllers.mpc import ipopt
 from nmfd.model import dynamics
-from nmfd.model.mfd import Mfd
+from nmfd.model.mfd import Cubic
 from nmfd.model.regional_model import LEAST_ROOM, load_network
 
 STEP = 30.0
 NETWORK = load_network(Path(__file__).parents[1] / "networks" / "hexagon7")
 PARAMETERS = dynamics.parameters(NETWORK)
 LIMITED = tiny.limited(NETWORK)
-KINDS = pytest.mark.parametrize("network", [NETWORK, LIMITED], ids=["published", "limited"])
+KINDS = pytest.mark.parametrize(
+    "network", [NETWORK, LIMITED, tiny.mixed(NETWORK)], ids=["published", "limited", "mixed"]
+)
 
 
 def random_tensors(seed, *, filling, batch=()):
@@ -66,7 +68,7 @@ def test_who_is_where_he_wants_to_be_is_not_sent_on(network):
 
 
 def test_one_region_with_a_linear_mfd_decays_exponentially():
-    mfds, adjacency = (Mfd(a=0.0, b=0.0, c=0.0042, jam=10_000.0),), np.zeros((1, 1), dtype=bool)
+    mfds, adjacency = (Cubic(a=0.0, b=0.0, c=0.0042, jam=10_000.0),), np.zeros((1, 1), dtype=bool)
     p = dynamics.parameters(replace(NETWORK, region_names=("only",), adjacency=adjacency, mfds=mfds))
     none = torch.zeros(1, 1, dtype=torch.float64)
     x = dynamics.advance(p, none + 5000.0, none, none, none[None], 600.0, integrator="rk4", substeps=600)
@@ -129,11 +131,12 @@ def test_torch_and_casadi_agree(integrator, substeps, network):
     assert most > 1.5 * NETWORK.mfds[0].jam
 
 
-def test_both_rates_are_those_of_the_mfd():
+@KINDS
+def test_both_rates_are_those_of_the_mfd(network):
     accumulation = np.linspace(0.0, 20_000.0, 7)
-    expected = [mfd.rate(n) for mfd, n in zip(NETWORK.mfds, accumulation, strict=True)]
-    torch_rate = dynamics.rate(PARAMETERS, torch.from_numpy(accumulation)).numpy()
-    casadi_rate = ipopt.rate(ipopt.parameters(NETWORK), ca.DM(accumulation)).full().ravel()
+    expected = [mfd.rate(n) for mfd, n in zip(network.mfds, accumulation, strict=True)]
+    torch_rate = dynamics.rate(dynamics.parameters(network), torch.from_numpy(accumulation)).numpy()
+    casadi_rate = ipopt.rate(ipopt.parameters(network), ca.DM(accumulation)).full().ravel()
     np.testing.assert_allclose(torch_rate, expected, rtol=1e-13)
     np.testing.assert_allclose(casadi_rate, expected, rtol=1e-13)
 

@@ -10,7 +10,7 @@ import tiny
 from cosim.evaluation import model_validation
 from nmfd.model.authority import Boundaries, verdict
 from nmfd.model.identification import Observed
-from nmfd.model.mfd import Mfd
+from nmfd.model.mfd import Cubic
 from nmfd.model.regional_model import load_network
 from nmfd.studies.fit_quality import (
     MEANINGS,
@@ -51,7 +51,7 @@ def test_good_fits_have_no_warning_and_bad_ones_say_what_is_wrong(network):
     assert doubts(network, [good_one] * 3, most=0.4)[0] == ("no falling branch (critical above 136 veh, not seen)",)
     assert doubts(network, [good_one] * 3, seeds=1)[2] == ("one seed",)
     assert doubts(network, [cloud(x, np.ones(200))] * 3)[0] == ("R2 nan",)
-    endless = replace(network, mfds=(Mfd(a=0.0, b=-1e-6, c=0.004, jam=1000.0), *network.mfds[1:]))
+    endless = replace(network, mfds=(Cubic(a=0.0, b=-1e-6, c=0.004, jam=1000.0), *network.mfds[1:]))
     assert doubts(endless, [cloud(x, endless.mfds[0].outflow(x))] * 3)[0] == (
         "no falling branch (critical above 2000 veh, not seen)",
     )

@@ -13,7 +13,7 @@ from nmfd.api import load_scenario
 from nmfd.controllers.rules import Probing
 from nmfd.model import dynamics, identification
 from nmfd.model.identification import Observed
-from nmfd.model.mfd import Mfd
+from nmfd.model.mfd import Cubic
 from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
 
@@ -62,7 +62,7 @@ def test_the_true_model_predicts_without_error(scenario, runs):
 
 
 def test_the_fit_predicts_a_run_that_it_has_not_seen(scenario, runs):
-    line = (Mfd(a=0.0, b=-2e-7, c=0.004, jam=9000.0),) * 7
+    line = (Cubic(a=0.0, b=-2e-7, c=0.004, jam=9000.0),) * 7
     start = replace(scenario.network, exit_rates=None, capacity=None, storage=None, mfds=line)
     fitted = identification.fit(start, runs[:3], step=30.0, iterations=250)
     assert all(mfd.problem() is None for mfd in fitted.mfds)
@@ -119,7 +119,7 @@ def test_any_free_numbers_are_a_valid_model(model):
     for y in (0.0, 0.3, 1.0):
         torch.testing.assert_close(dynamics.rate(p, y * jam), c * (1.0 - first * y - second * y**2))
     torch.testing.assert_close(dynamics.rate(p, 2.0 * jam), 0.5 * c * (1.0 - first - second))
-    fastest = (p.c[:, None] * p.exit_rates).max().item()
+    fastest = (p.mfd.c[:, None] * p.exit_rates).max().item()
     assert fastest <= 1.0 / 30.0 and p.exit_rates.max() <= 8.0 and p.exit_rates.min() >= 1.0 / 8.0
     assert model.penalty().item() > 0.0
 

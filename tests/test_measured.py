@@ -10,10 +10,10 @@ from commands import good
 from commands import nmfd as command
 
 import nmfd
-from nmfd.model.mfd import Mfd
+from nmfd.model.mfd import Cubic
 from nmfd.studies import measured
 
-CURVE = Mfd(a=4e-9, b=-8e-6, c=0.004, jam=1000.0)  # of every region, which holds 10 km of lanes
+CURVE = Cubic(a=4e-9, b=-8e-6, c=0.004, jam=1000.0)  # of every region, which holds 10 km of lanes
 LANE_KM, TRIP, VEHICLE = 10.0, 1200.0, 6.5
 REGIONS = ("north", "south")
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from nmfd.errors import InputError
-from nmfd.model.mfd import Mfd, fit
+from nmfd.model.mfd import Cubic, fit
 
 # The published curve with a tenth of its jam accumulation: the coefficients span nine orders of magnitude.
-TRUTH = Mfd(a=4.133e-9, b=-8.282e-6, c=0.0042, jam=1000.0)
+TRUTH = Cubic(a=4.133e-9, b=-8.282e-6, c=0.0042, jam=1000.0)
 # One sample in each of the 24 bins, the last one at the jam.
 X = TRUTH.jam * (np.arange(24) + 0.5) / 23.5
 
@@ -22,7 +22,7 @@ def same(curve, expected, rel=1e-3):
 
 def test_a_parabola_in_closed_form():
     """g = c x (1 - x / 2 n) has its most, c n / 2, at n; three quarters of it at n / 2, and it ends at 2 n."""
-    curve = Mfd(a=0.0, b=-0.004 / 1000.0, c=0.004, jam=2000.0)
+    curve = Cubic(a=0.0, b=-0.004 / 1000.0, c=0.004, jam=2000.0)
     assert curve.critical == pytest.approx(500.0, abs=0.1)
     assert curve.capacity == pytest.approx(1.0)
     assert curve.reaching(0.75) == pytest.approx(250.0, abs=0.1) and curve.reaching(1.0) == curve.critical
@@ -39,7 +39,7 @@ def test_beyond_the_jam_the_outflow_is_constant():
 
 def test_what_is_no_curve():
     assert TRUTH.problem() is None
-    assert "is not positive at" in Mfd(a=TRUTH.a, b=-9e-6, c=TRUTH.c, jam=TRUTH.jam).problem()
+    assert "is not positive at" in Cubic(a=TRUTH.a, b=-9e-6, c=TRUTH.c, jam=TRUTH.jam).problem()
 
 
 @pytest.mark.parametrize("name, value", [("jam", np.inf), ("jam", 0.0), ("a", np.nan), ("b", -np.inf), ("c", np.inf)])
@@ -58,7 +58,7 @@ def test_a_city_of_another_size_has_the_same_curve_on_other_axes(scale):
     """x and g both times s: c stays, b falls with s, a with its square."""
     same(
         fit(scale * X, scale * TRUTH.outflow(X)),
-        Mfd(a=TRUTH.a / scale**2, b=TRUTH.b / scale, c=TRUTH.c, jam=scale * TRUTH.jam),
+        Cubic(a=TRUTH.a / scale**2, b=TRUTH.b / scale, c=TRUTH.c, jam=scale * TRUTH.jam),
     )
 
 
@@ -80,7 +80,7 @@ def test_every_bin_counts_alike_and_by_its_median():
 
 
 def test_the_jam_is_where_the_outflow_stops_falling():
-    short = Mfd(a=TRUTH.a / 0.6**2, b=TRUTH.b / 0.6, c=TRUTH.c, jam=600.0)
+    short = Cubic(a=TRUTH.a / 0.6**2, b=TRUTH.b / 0.6, c=TRUTH.c, jam=600.0)
     same(fit(X, short.outflow(X)), short, rel=5e-3)
 
 

@@ -36,7 +36,9 @@ def completions(network, accumulation):
     )
 
 
-@pytest.mark.parametrize("network", [SCENARIO.network, LIMITED], ids=["published", "limited"])
+@pytest.mark.parametrize(
+    "network", [SCENARIO.network, LIMITED, tiny.mixed(LIMITED)], ids=["published", "limited", "mixed"]
+)
 @pytest.mark.parametrize("make", [NmfdPlant, AcyclicPlant])
 def test_conservation_and_non_negativity_under_random_controls(make, network):
     """Trip ends, integrated here from the states, account for every vehicle that is no longer there."""
@@ -65,7 +67,9 @@ def test_non_negative_with_other_integrators(make, integrator, substeps):
         assert plant.step(Controls(perimeter=perimeter, splits=splits)).accumulation.min() >= 0.0
 
 
-@pytest.mark.parametrize("network", [SCENARIO.network, LIMITED], ids=["published", "limited"])
+@pytest.mark.parametrize(
+    "network", [SCENARIO.network, LIMITED, tiny.mixed(LIMITED)], ids=["published", "limited", "mixed"]
+)
 def test_without_control_both_plants_are_the_same(network):
     """Shortest ways never turn back."""
     scenario = replace(SCENARIO, network=network)

@@ -105,7 +105,7 @@ def test_no_drawn_model_is_too_fast_for_the_step(scenario, generator, rates):
     )
     rollout = Rollout(planning_model(replace(scenario, network=network)), dtype=torch.float64)
     rollout.draw_model(500, 0.8, generator)
-    drawn = rollout.parameters.c * (rates or 1.0) * scenario.step / scenario.substeps
+    drawn = rollout.parameters.mfd.c * (rates or 1.0) * scenario.step / scenario.substeps
     assert drawn.max().item() == pytest.approx(1.0) and drawn.min() < 0.6
     assert 0.2 < (drawn > 0.999).double().mean() < 0.6
 

@@ -54,7 +54,7 @@ def by_dynamics(network, model, start, demand, plan, *, step, substeps, integrat
 
 
 @BOTH
-@pytest.mark.parametrize("network", [NETWORK, LIMITED], ids=["published", "limited"])
+@pytest.mark.parametrize("network", [NETWORK, LIMITED, tiny.mixed(NETWORK)], ids=["published", "limited", "mixed"])
 @pytest.mark.parametrize("used", [EVERY, SOME], ids=["every", "some"])
 @pytest.mark.parametrize(
     "scheme",

@@ -1,10 +1,11 @@
 """A scenario small enough for tests: two or three regions in a row, 0-1-2, twenty control intervals."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from nmfd.model.mfd import Mfd, PiecewiseLinear, trapezoid
 from nmfd.model.regional_model import RegionalModel
 from nmfd.types import Result
 
@@ -84,6 +85,30 @@ def limited(network: RegionalModel, *, seed: int = 0) -> RegionalModel:
         capacity=random.uniform(0.1, 0.6, shape) * most * network.adjacency,
         storage=random.uniform(0.8, 1.6, network.regions) * np.array([m.jam for m in network.mfds]),
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Exponential(Mfd):
+    """A kind of one's own: g = free n exp(-n / critical)."""
+
+    free: float
+    middle: float
+    jam: float
+
+    def rate_up_to_jam(self, accumulation, xp=np):
+        return self.free * xp.exp(-accumulation / self.middle)
+
+
+def mixed(network: RegionalModel) -> RegionalModel:
+    """`network` with curves of all kinds, about as wide and high as its own."""
+    jam, high = network.mfds[0].jam, network.mfds[0].capacity
+    own = Exponential(free=np.e * high / (0.3 * jam), middle=0.3 * jam, jam=jam)
+    flat = trapezoid(free=4.0 * high / jam, capacity=high, wave=2.0 * high / jam, jam=1.1 * jam)
+    lines = PiecewiseLinear(
+        accumulations=(0.2 * jam, 0.35 * jam, 0.6 * jam, jam), outflows=(0.8 * high, high, 0.7 * high, 0.1 * high)
+    )
+    others = own, flat, lines, replace(flat, outflows=(0.9 * high, high, 0.2 * high))
+    return replace(network, mfds=(*others, *network.mfds)[: network.regions])
 
 
 def random_controls(random, network, batch=()):

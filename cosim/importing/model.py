@@ -118,7 +118,7 @@ def scenario_text(
 
     values: name, network_path, protected (region), factor of the demand, mesoscopic
     """
-    substeps = int(np.ceil(clock.step / min(30.0, 0.5 / max(mfd.c for mfd in network.mfds))))
+    substeps = int(np.ceil(clock.step / min(30.0, 0.5 / max(mfd.rate_up_to_jam(0.0) for mfd in network.mfds))))
     lists, times = {**files, "leave_signals": leave}, options(case, clock)
     known = {"network": network, "clock": clock, "case": case, "times": times, "lists": lists, "substeps": substeps}
     return filled(Path(__file__).with_name("scenario.toml.j2"), **known, **values)

@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float, Int
 
 from nmfd.arrays import PerPair, PerRegion, PerTurn
 from nmfd.model.dynamics import counted
+from nmfd.model.mfd import Mfd, stacked
 from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, RegionalModel
 
 LEAST_SHARE = 1e-6  # of theta left without h = g and h = o: less is the rounding of an optimiser, not a route
@@ -41,7 +42,7 @@ class Acyclic:
     move_from, move_to: (M,) int, cells; move_next: (M,) int, h of each move
     move_onward: (M,) bool, false if the move turns back in a dead end
     fallback: (C,) int, least-bad move of each cell; -1 where the trip ends
-    a, b, c, jam: (R,) of the MFDs
+    mfd: of all regions
     exit_rates: (C,) [-]; capacity: (R, R) [veh/s] under u = 1, or None; storage: (R,) [veh] or None
     """
 
@@ -55,10 +56,7 @@ class Acyclic:
     move_next: MoveIndex
     move_onward: Bool[np.ndarray, " M"]
     fallback: CellIndex
-    a: PerRegion
-    b: PerRegion
-    c: PerRegion
-    jam: PerRegion
+    mfd: Mfd
     exit_rates: PerCell
     capacity: PerPair | None
     storage: PerRegion | None
@@ -87,7 +85,6 @@ def build(network: RegionalModel) -> Acyclic:
             moves.append((cell, cells[target], h, bool(allowed)))
     table = np.array(moves, dtype=int).reshape(-1, 4)
     index = np.array(list(cells), dtype=int)
-    mfds = {name: np.array([getattr(m, name) for m in network.mfds]) for name in ("a", "b", "c", "jam")}
     rates = np.ones(network.adjacency.shape) if network.exit_rates is None else network.exit_rates
     return Acyclic(
         exit_rates=rates[index[:, 2], index[:, 3]],
@@ -103,7 +100,7 @@ def build(network: RegionalModel) -> Acyclic:
         move_next=table[:, 2],
         move_onward=table[:, 3].astype(bool),
         fallback=np.array([fallback.get(n, -1) for n in range(len(cells))]),
-        **mfds,
+        mfd=stacked(network.mfds, np.array),
     )
 
 
@@ -123,10 +120,8 @@ def shares(model: Acyclic, splits: PerTurn) -> tuple[PerMove, Bool[np.ndarray, "
 
 def outflow(model: Acyclic, x: PerCell) -> PerCell:
     """Return the desired outflow (C,) [veh/s] of the state x (C,) [veh]."""
-    accumulation = np.bincount(model.region, x, minlength=len(model.jam))
-    body = np.minimum(accumulation, model.jam)
-    rate = ((model.a * body + model.b) * body + model.c) * model.jam / np.maximum(accumulation, model.jam)
-    return model.exit_rates * rate[model.region] * x
+    accumulation = np.bincount(model.region, x, minlength=len(model.start))
+    return model.exit_rates * model.mfd.rate(accumulation)[model.region] * x
 
 
 def derivative(
@@ -150,7 +145,7 @@ def transfers(model: Acyclic, x: PerCell, leaving: PerCell, perimeter: PerPair, 
     wish, here = theta * leaving[model.move_from], model.region[model.move_from]
     if model.capacity is None:
         return perimeter[here, model.move_next] * wish
-    regions = len(model.jam)
+    regions = len(model.start)
     wish_of_pair = np.bincount(here * regions + model.move_next, wish, minlength=regions**2).reshape(regions, regions)
     room = np.maximum(1.0 - np.bincount(model.region, x, minlength=regions) / model.storage, LEAST_ROOM)
     limit = perimeter * model.capacity * room + LEAST_LIMIT
@@ -166,6 +161,6 @@ def advance_counted(
 
 def translate(model: Acyclic, x: PerCell) -> PerPair:
     """Return x_ij = sum over o, g of x_ogij (R, R) [veh], including o = j and g = j for i = j."""
-    regions = len(model.jam)
+    regions = len(model.start)
     flat = np.bincount(model.region * regions + model.destination, x, minlength=regions**2)
     return flat.reshape(regions, regions)

@@ -4,7 +4,7 @@ After Tumu, Shaw Cortez, Drgona, Vrabie and Glavaski, "Differentiable Predictive
 Networks", and the multi-region models with perimeter control of Geroliminis, Haddad and Ramezani (2013). Regions
 i, j, h; x_i = sum_j x_ij; N_i the regions adjacent to i:
 
-    q_i    = g_i(x_i) / x_i = a x_i^2 + b x_i + c      polynomial, defined at x = 0
+    q_i    = g_i(x_i) / x_i                            defined at x = 0 (nmfd.model.mfd)
     m_ii   = q_i x_ii                                  trips that end in i
     m_ihj  = theta_ihj q_i x_ij                        j != i, h in N_i
     dx_ii/dt = d_ii - m_ii + sum_{h in N_i} u_hi m_hii
@@ -23,21 +23,19 @@ from typing import Any
 
 import torch
 
+from nmfd.model.mfd import Mfd, stacked
 from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, RegionalModel
 from nmfd.tensors import PerPair, PerRegion, PerRollout, PerTurn
 
 
 @dataclass(frozen=True, kw_only=True)
 class Parameters:
-    """Network parameters as tensors. a, b, c, jam: (R,) of the MFDs; adjacency, off_diagonal: (R, R), 0 or 1.
+    """Network parameters as tensors. mfd: of all regions; adjacency, off_diagonal: (R, R), 0 or 1.
 
     exit_rates: (R, R) [-] or None; capacity: (R, R) [veh/s] under u = 1, or None; storage: (R,) [veh]
     """
 
-    a: PerRegion
-    b: PerRegion
-    c: PerRegion
-    jam: PerRegion
+    mfd: Mfd
     adjacency: PerPair
     off_diagonal: PerPair
     exit_rates: PerPair | None = None
@@ -53,11 +51,8 @@ def parameters(
     def tensor(values: Any) -> Any:
         return None if values is None else torch.tensor(values, dtype=dtype, device=device)
 
-    def row(name: str) -> Any:
-        return tensor([getattr(m, name) for m in network.mfds])
-
     return Parameters(
-        **{name: row(name) for name in ("a", "b", "c", "jam")},
+        mfd=stacked(network.mfds, tensor),
         adjacency=tensor(network.adjacency),
         off_diagonal=1.0 - torch.eye(network.regions, dtype=dtype, device=device),
         exit_rates=tensor(network.exit_rates),
@@ -68,8 +63,7 @@ def parameters(
 
 def rate(p: Parameters, accumulation: PerRegion) -> PerRegion:
     """Return q_i = g_i(min(x_i, jam_i)) / x_i (..., R) [1/s] of accumulation (..., R) [veh]."""
-    body = torch.minimum(accumulation, p.jam)
-    return ((p.a * body + p.b) * body + p.c) * p.jam / torch.maximum(accumulation, p.jam)
+    return p.mfd.rate(accumulation, torch)
 
 
 def flows(p: Parameters, x: PerPair, perimeter: PerPair, splits: PerTurn) -> tuple[PerRegion, PerTurn]:

@@ -18,7 +18,7 @@ from torch import Tensor
 from nmfd.arrays import PairsOverTime, StatesOverTime, TurnsOverTime
 from nmfd.metrics import largest_accumulation
 from nmfd.model import dynamics
-from nmfd.model.mfd import Mfd
+from nmfd.model.mfd import Cubic, of_numbers
 from nmfd.model.regional_model import RegionalModel
 from nmfd.tensors import one_thread
 
@@ -62,7 +62,7 @@ class _Model(torch.nn.Module):
         self._u_max = network.u_max
         largest = largest_accumulation(run.accumulation for run in runs)
         flow = np.max([run.crossings.max(axis=0) for run in runs], axis=0) / step
-        self.free_rate = free(np.log([min(mfd.c, 0.5 * fastest) for mfd in network.mfds]))
+        self.free_rate = free(np.log([min(mfd.rate_up_to_jam(0.0), 0.5 * fastest) for mfd in network.mfds]))
         self.drop, self.bend = free(np.full(network.regions, 0.5)), free(np.zeros(network.regions))
         self.jam = free(np.log(np.maximum(0.7 * largest, 1.0)))
         self.exit_rates = free(np.zeros(network.adjacency.shape))
@@ -82,10 +82,7 @@ class _Model(torch.nn.Module):
         rates = EXIT_RATES ** torch.tanh(self.exit_rates)
         rates = torch.minimum(rates, 0.999 * self._fastest / c.unsqueeze(-1))
         return dynamics.Parameters(
-            a=-c * second / jam**2,
-            b=-c * first / jam,
-            c=c,
-            jam=jam,
+            mfd=of_numbers(Cubic, a=-c * second / jam**2, b=-c * first / jam, c=c, jam=jam),
             adjacency=self.adjacency,
             off_diagonal=1.0 - torch.eye(len(jam)),
             exit_rates=rates,
@@ -193,10 +190,10 @@ def _network(network: RegionalModel, model: _Model, runs: Sequence[Observed]) ->
     weight = sum(run.accumulation.sum(axis=0) for run in runs)
     weight[weight.sum(axis=1) == 0] = 1.0  # empty in all runs
     mean = (weight * rates).sum(axis=1) / weight.sum(axis=1)
-    curves = zip(*(part.tolist() for part in (p.a, p.b, p.c, p.jam)), mean, strict=True)
+    curves = zip(*(part.tolist() for part in vars(p.mfd).values()), mean, strict=True)
     return replace(
         network,
-        mfds=tuple(Mfd(a=a * m, b=b * m, c=c * m, jam=jam) for a, b, c, jam, m in curves),
+        mfds=tuple(Cubic(a=a * m, b=b * m, c=c * m, jam=jam) for a, b, c, jam, m in curves),
         exit_rates=rates / mean[:, None],
         capacity=p.capacity.double().numpy() * network.u_max * network.adjacency,
         storage=p.storage.double().numpy(),

@@ -1,32 +1,99 @@
-"""The outflow MFD of a region: g(x) = a x^3 + b x^2 + c x, constant beyond the jam accumulation.
+"""Outflow MFDs: the published cubic, piecewise linear ones, and the protocol of any other.
 
-The tail is not published. The benchmark's cubic rises again beyond 10,019 vehicles: a jammed region would recover by
-itself. With g(jam) beyond the jam accumulation the published figures are consistent.
+Beyond the jam accumulation the outflow is constant. This tail is not published. The benchmark's cubic rises again
+beyond 10,019 vehicles: a jammed region would recover by itself. With g(jam) beyond the jam accumulation the published
+figures are consistent.
 """
 
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
-from jaxtyping import Float, Real
+from jaxtyping import Real
 
 from nmfd.errors import InputError
 
-Values = Float[np.ndarray | np.floating, "*B"]
 Samples = Real[np.ndarray, " N"]
 # Geometric guess of a curve: the shape of the published one, g = c (ALPHA y^2 + BETA y + 1) x with y = x / jam.
 ALPHA, BETA = 0.98405, -1.97190
 JAM_DENSITY = 80.0  # veh per lane-km: 60 % of the lanes full of standing vehicles
 
 
-@dataclass(frozen=True, kw_only=True)
-class Mfd:
-    """Outflow of one region against its accumulation.
+def of_numbers(kind: "type[Mfd]", **numbers: Any) -> Any:
+    """Return a curve of this kind whose numbers are arrays, which need no check."""
+    curve = object.__new__(kind)
+    vars(curve).update(numbers)
+    return curve
 
-    a [veh^-2 s^-1], b [veh^-1 s^-1], c [s^-1]: coefficients of the cubic.
-    jam [veh]: the accumulation beyond which the outflow stays at g(jam).
+
+class Mfd(Protocol):
+    """Outflow of one region against its accumulation; or of R regions, if its numbers are arrays (R,).
+
+    A kind of curve is a frozen dataclass of floats, or tuples of floats, with `jam` [veh] and `rate_up_to_jam`. One
+    formula serves all plants, training and MPC: it takes the functions of NumPy, torch or CasADi from `xp`, under
+    NumPy's names (minimum, maximum, exp, ...).
+    """
+
+    jam: Any
+
+    def rate_up_to_jam(self, accumulation: Any, xp: Any = np) -> Any:
+        """Return the outflow per vehicle q(n) = g(n)/n [1/s] for n [veh] up to the jam, falling and finite at 0."""
+        ...
+
+    def slope_up_to_jam(self, accumulation: Any) -> Any:
+        """Return dq/dn [1/(veh s)] of NumPy's arrays; by finite differences unless a kind states it."""
+        step = 1e-6 * self.jam
+        above, below = self.rate_up_to_jam(accumulation + step), self.rate_up_to_jam(accumulation - step)
+        return (above - below) / (2.0 * step)
+
+    def scaled(self, wide: Any, high: Any) -> "Mfd":
+        """Return the curve with its accumulation axis times `wide` and its rate times `high`."""
+        return _Scaled(self, wide, high)
+
+    def rate(self, accumulation: Any, xp: Any = np) -> Any:
+        """Return q(n) [1/s] of any accumulation [veh]: beyond the jam the outflow stays g(jam)."""
+        body = xp.minimum(accumulation, self.jam)
+        return self.rate_up_to_jam(body, xp) * self.jam / xp.maximum(accumulation, self.jam)
+
+    def outflow(self, accumulation: Any, xp: Any = np) -> Any:
+        """Return g(n) = n q(n) [veh/s]."""
+        return self.rate(accumulation, xp) * accumulation
+
+    @property
+    def critical(self) -> float:
+        """Accumulation of maximum outflow [veh], the smallest if there are several."""
+        grid = np.linspace(0.0, self.jam, 20001)
+        outflow = self.rate_up_to_jam(grid) * grid
+        return float(grid[np.argmax(outflow >= outflow.max() * (1.0 - 1e-13))])
+
+    def reaching(self, share: float) -> float:
+        """Return the smallest accumulation [veh] with `share` of the maximum outflow."""
+        grid = np.linspace(0.0, self.critical, 20001)
+        return float(grid[np.argmax(self.outflow(grid) >= share * self.capacity * (1.0 - 1e-12))])
+
+    @property
+    def capacity(self) -> float:
+        """Maximum outflow [veh/s]."""
+        return float(self.outflow(self.critical))
+
+    def problem(self) -> str | None:
+        """Return why this is no MFD, or None: the outflow must be positive up to the jam."""
+        grid = np.linspace(0.0, self.jam, 2001)
+        rate = self.rate_up_to_jam(grid)
+        if not rate.min() > 0:
+            return f"the outflow is not positive at {grid[rate.argmin()]:.0f} veh, below jam = {self.jam:g}"
+        return None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cubic(Mfd):
+    """Outflow g(n) = a n^3 + b n^2 + c n, constant beyond the jam accumulation.
+
+    a [veh^-2 s^-1], b [veh^-1 s^-1], c [s^-1]: coefficients; jam [veh]
     Raises InputError for a number that is not finite, and for jam <= 0.
 
-        >>> curve = Mfd(a=4.133e-11, b=-8.282e-7, c=0.0042, jam=10000.0)  # the benchmark's
+        >>> curve = Cubic(a=4.133e-11, b=-8.282e-7, c=0.0042, jam=10000.0)  # the benchmark's
         >>> round(curve.critical), round(curve.capacity, 2)
         (3402, 6.33)
         >>> round(float(curve.outflow(8000.0)), 2)  # beyond the critical accumulation
@@ -44,48 +111,125 @@ class Mfd:
                 allowed = "a number above 0" if name == "jam" else "a number"
                 raise InputError(f"Mfd: {name}: expected {allowed}, got {value:g} instead; give a finite one")
 
-    def rate(self, accumulation: Values | float) -> Values:
-        """Return the outflow per vehicle q(x) = g(x)/x [1/s] of `accumulation` (...) [veh]; c at x = 0."""
-        x = np.asarray(accumulation, dtype=float)
-        body = np.minimum(x, self.jam)
-        q = (self.a * body + self.b) * body + self.c
-        return np.where(x > self.jam, q * self.jam / np.maximum(x, self.jam), q)
+    def rate_up_to_jam(self, accumulation: Any, xp: Any = np) -> Any:
+        return (self.a * accumulation + self.b) * accumulation + self.c
 
-    def outflow(self, accumulation: Values | float) -> Values:
-        """Return g(x) [veh/s] of `accumulation` (...) [veh]."""
-        return self.rate(accumulation) * np.asarray(accumulation, dtype=float)
+    def slope_up_to_jam(self, accumulation: Any) -> Any:
+        return 2.0 * self.a * accumulation + self.b
+
+    def scaled(self, wide: Any, high: Any) -> "Cubic":
+        numbers = {"a": high * self.a / wide**2, "b": high * self.b / wide, "c": high * self.c}
+        return of_numbers(Cubic, **numbers, jam=wide * self.jam)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PiecewiseLinear(Mfd):
+    """Outflow along straight lines from (0, 0) through points, the last at the jam accumulation.
+
+    accumulations [veh], rising from above 0; outflows [veh/s]
+
+        >>> trapezoid(free=0.004, capacity=6.0, wave=0.001, jam=8000.0).accumulations
+        (1500.0, 2000.0, 8000.0)
+    """
+
+    accumulations: tuple[float, ...]
+    outflows: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        n, count = np.array([0.0, *self.accumulations]), len(self.outflows)
+        if (
+            not count
+            or len(n) != count + 1
+            or not (np.diff(n) > 0).all()
+            or not np.isfinite([*n, *self.outflows]).all()
+        ):
+            wanted = "as many finite outflows as accumulations, which rise from above 0"
+            raise InputError(f"PiecewiseLinear: expected {wanted}, got {self.accumulations} and {self.outflows}")
 
     @property
-    def critical(self) -> float:
-        """Accumulation of maximum outflow [veh]."""
-        grid = np.linspace(0.0, self.jam, 20001)
-        return float(grid[np.argmax(self.outflow(grid))])
+    def jam(self) -> Any:
+        """Jam accumulation [veh]."""
+        return self.accumulations[-1]
 
-    def reaching(self, share: float) -> float:
-        """Return the smallest accumulation [veh] with `share` of the maximum outflow."""
-        grid = np.linspace(0.0, self.critical, 20001)
-        return float(grid[np.argmax(self.outflow(grid) >= share * self.capacity * (1.0 - 1e-12))])
+    def rate_up_to_jam(self, accumulation: Any, xp: Any = np) -> Any:
+        kinks = self._kinks()
+        q = next(kinks)[1] + 0.0 * accumulation
+        for kink, change in kinks:  # beyond n_k the outflow changes by (n - n_k) times the change of slope
+            q = q + change * (1.0 - kink / xp.maximum(accumulation, kink))
+        return q
 
-    @property
-    def capacity(self) -> float:
-        """Maximum outflow [veh/s]."""
-        return float(self.outflow(self.critical))
+    def slope_up_to_jam(self, accumulation: Any) -> Any:
+        return sum(
+            np.where(accumulation > kink, change * kink / np.maximum(accumulation, 1e-9) ** 2, 0.0)
+            for kink, change in self._kinks()
+        )
 
-    def problem(self) -> str | None:
-        """Return why this is no MFD, or None: the outflow must be positive up to the jam."""
-        grid = np.linspace(0.0, self.jam, 2001)
-        rate = self.rate(grid)
-        if not rate.min() > 0:
-            return f"the outflow is not positive at {grid[rate.argmin()]:.0f} veh, below jam = {self.jam:g}"
-        return None
+    def _kinks(self) -> Iterator[tuple[Any, Any]]:
+        """Yield the accumulations at which the slope of the outflow changes, from 0, and these changes [1/s]."""
+        left, low, before = 0.0, 0.0, 0.0
+        for right, high in zip(self.accumulations, self.outflows, strict=True):
+            slope = (high - low) / (right - left)
+            yield left, slope - before
+            left, low, before = right, high, slope
 
 
-def guess(rate: float, jam: float) -> Mfd:
+def trapezoid(*, free: float, capacity: float, wave: float, jam: float, least: float = 0.05) -> PiecewiseLinear:
+    """Return g(n) = min(free n, capacity, wave (jam - n)), constant below `least` times the capacity.
+
+    free, wave: outflow per vehicle of an empty region, and by which it falls before the jam [1/s]; capacity [veh/s]
+    """
+    last = jam - least * capacity / wave
+    return PiecewiseLinear(
+        accumulations=(capacity / free, jam - capacity / wave, last), outflows=(capacity, capacity, least * capacity)
+    )
+
+
+class _Scaled(Mfd):
+    """Any curve with other axes."""
+
+    def __init__(self, curve: Mfd, wide: Any, high: Any):
+        self.curve, self.wide, self.high, self.jam = curve, wide, high, wide * curve.jam
+
+    def rate_up_to_jam(self, accumulation: Any, xp: Any = np) -> Any:
+        return self.high * self.curve.rate_up_to_jam(accumulation / self.wide, xp)
+
+
+class _Several(Mfd):
+    """Regions with curves of different kinds, each an array over all regions with weights 0 and 1."""
+
+    def __init__(self, kinds: list[tuple[Any, Mfd]]):
+        self.kinds, self.jam = kinds, sum(weight * curve.jam for weight, curve in kinds)
+
+    def rate_up_to_jam(self, accumulation: Any, xp: Any = np) -> Any:
+        return sum(w * curve.rate_up_to_jam(xp.minimum(accumulation, curve.jam), xp) for w, curve in self.kinds)
+
+    def slope_up_to_jam(self, accumulation: Any) -> Any:
+        return sum(w * curve.slope_up_to_jam(np.minimum(accumulation, curve.jam)) for w, curve in self.kinds)
+
+
+def stacked(mfds: Sequence[Mfd], array: Callable[[Sequence[float]], Any]) -> Mfd:
+    """Return the curves of R regions as one, whose numbers are arrays (R,), made by `array`, such as np.array."""
+    keys = [(type(m), *map(np.shape, vars(m).values())) for m in mfds]
+    kinds: dict[tuple, tuple[Any, Mfd]] = {}
+    for key, first in zip(keys, mfds, strict=True):
+        if key in kinds:
+            continue
+        alike = [m if k == key else first for m, k in zip(mfds, keys, strict=True)]  # the others get any numbers
+        columns = {name: [vars(m)[name] for m in alike] for name in vars(first)}
+        numbers = {
+            name: tuple(map(array, zip(*column, strict=True))) if isinstance(column[0], tuple) else array(column)
+            for name, column in columns.items()
+        }
+        kinds[key] = array([float(k == key) for k in keys]), of_numbers(type(first), **numbers)
+    return next(iter(kinds.values()))[1] if len(kinds) == 1 else _Several(list(kinds.values()))
+
+
+def guess(rate: float, jam: float) -> Cubic:
     """Return a curve of the published shape with q(0) = `rate` [1/s]."""
-    return Mfd(a=ALPHA * rate / jam**2, b=BETA * rate / jam, c=rate, jam=jam)
+    return Cubic(a=ALPHA * rate / jam**2, b=BETA * rate / jam, c=rate, jam=jam)
 
 
-def guess_beyond(curve: Mfd, jam: float, seen: float, *, max_rate: float = np.inf) -> Mfd:
+def guess_beyond(curve: Mfd, jam: float, seen: float, *, max_rate: float = np.inf) -> Cubic:
     """Return the guess with the outflow of `curve`, fitted to data without a falling branch, at their end `seen` [veh].
 
     jam: of the region's lanes [veh], raised so that the critical accumulation is above `seen`; max_rate: [1/s]
@@ -94,7 +238,7 @@ def guess_beyond(curve: Mfd, jam: float, seen: float, *, max_rate: float = np.in
     return guess(float(min(curve.outflow(seen) / guess(1.0, jam).outflow(seen), max_rate)), jam)
 
 
-def fit(accumulation: Samples, outflow: Samples, *, max_rate: float = np.inf, bins: int = 24) -> Mfd:
+def fit(accumulation: Samples, outflow: Samples, *, max_rate: float = np.inf, bins: int = 24) -> Cubic:
     """Fit a curve to samples (n,) [veh], (n,) [veh/s] by least squares over the medians of bins of accumulation.
 
     The rate q(x) = a x^2 + b x + c is positive, falling up to the jam accumulation and at most `max_rate` [1/s] (the
@@ -114,7 +258,7 @@ def fit(accumulation: Samples, outflow: Samples, *, max_rate: float = np.inf, bi
     return min(candidates, key=lambda curve: ((curve.outflow(middle_x) - middle_g) ** 2).sum())
 
 
-def _fit_cubic(x: np.ndarray, g: np.ndarray, jam: float, max_rate: float) -> Mfd:
+def _fit_cubic(x: np.ndarray, g: np.ndarray, jam: float, max_rate: float) -> Cubic:
     """Fit a curve with a given jam accumulation."""
     from scipy.optimize import minimize  # slow to import
 
@@ -133,4 +277,4 @@ def _fit_cubic(x: np.ndarray, g: np.ndarray, jam: float, max_rate: float) -> Mfd
         constraints={"type": "ineq", "fun": lambda p: limits @ p - least, "jac": lambda p: limits},
     )
     a, b, c = map(float, result.x * scale)
-    return Mfd(a=a / jam**3, b=b / jam**2, c=c / jam, jam=jam)
+    return Cubic(a=a / jam**3, b=b / jam**2, c=c / jam, jam=jam)

@@ -14,7 +14,7 @@ from scipy.sparse import csgraph, csr_array
 
 from nmfd.arrays import Adjacency, Hops, PerPair, PerRegion, PerTurn, Positions, TurnMask
 from nmfd.errors import InputError
-from nmfd.model.mfd import Mfd
+from nmfd.model.mfd import Cubic, Mfd
 from nmfd.runs import config, shipped
 from nmfd.runs.config import Problem, Regions, Rows, Settings, Share, filled, got, setting
 
@@ -122,7 +122,7 @@ class RegionalModel:
     @cached_property
     def hash(self) -> str:
         """Hash of all that the dynamics depend on; a policy is valid for one network only."""
-        mfds = [[m.a, m.b, m.c, m.jam] for m in self.mfds]
+        mfds = [[*([] if isinstance(m, Cubic) else [type(m).__name__]), *vars(m).values()] for m in self.mfds]
         content = [self.adjacency.astype(int).tolist(), mfds, self.u_min, self.u_max]
         content += [self.nominal_splits.round(12).tolist()]
         options = {"exit_rates": self.exit_rates, "capacity": self.capacity, "storage": self.storage}
@@ -166,9 +166,9 @@ class MfdTable(Settings):
         return self
 
     @property
-    def mfd(self) -> Mfd:
+    def mfd(self) -> Cubic:
         """The curve."""
-        return Mfd(**vars(self))
+        return Cubic(**vars(self))
 
 
 class RegionTable(Settings):

@@ -22,7 +22,7 @@ import nmfd
 from nmfd.controllers.dpc.policy import Architecture, DpcController, Policy
 from nmfd.controllers.mpc import edge_model
 from nmfd.controllers.mpc.controller import EconomicMpc
-from nmfd.model.mfd import Mfd
+from nmfd.model.mfd import Cubic
 from nmfd.model.regional_model import RegionalModel
 from nmfd.studies import plots
 from nmfd.tensors import one_thread
@@ -52,7 +52,7 @@ def network(family: str, regions: int, seed: int = 0) -> RegionalModel:
         region_names=tuple(map(str, range(regions))),
         positions=where,
         adjacency=near & ~np.eye(regions, dtype=bool),
-        mfds=tuple(Mfd(a=a * v / n**2, b=b * v / n, c=c * v, jam=jam * n) for v, n in factors),
+        mfds=tuple(Cubic(a=a * v / n**2, b=b * v / n, c=c * v, jam=jam * n) for v, n in factors),
         u_min=0.1,
         u_max=0.9,
     )

@@ -136,7 +136,8 @@ class CompactPolicy(Policy):
     def _answer(self, x: PerPair, prices: PerRegion) -> PerTurn:
         """Return the split ratios (-, (..., R, R, R)) of the regional model under prices (-, (..., R))."""
         p = self._model
-        rate = torch.maximum(dynamics.rate(p, x.sum(-1)), p.c / MAX_DELAY_FACTOR)
+        free = p.mfd.rate_up_to_jam(torch.zeros_like(p.mfd.jam), torch)
+        rate = torch.maximum(dynamics.rate(p, x.sum(-1)), free / MAX_DELAY_FACTOR)
         leaving = rate.unsqueeze(-1) * (1.0 if p.exit_rates is None else p.exit_rates)
         here = prices.unsqueeze(-1) / leaving * p.off_diagonal
         extra = here

@@ -64,7 +64,7 @@ class Rollout:
         padded = torch.cat([self.demand, torch.zeros_like(self.demand)])
         demand = padded[index] * factor
         weight = uniform(batch, regions, regions) ** 2 * self.bound
-        total = uniform(batch, regions) * uniform(batch, 1) * 0.8 * self._nominal.jam
+        total = uniform(batch, regions) * uniform(batch, 1) * 0.8 * self._nominal.mfd.jam
         x = total.unsqueeze(-1) * weight / weight.sum(-1, keepdim=True).clamp(min=1e-6)
         if levels[0] < levels[1]:
             demand = demand * (levels[0] + (levels[1] - levels[0]) * uniform(batch, 1, 1))
@@ -77,7 +77,7 @@ class Rollout:
             storage), and half of that for its outflow and capacities (-)
         scale: factor of all accumulation axes (-)
         """
-        p, regions = self._nominal, len(self._nominal.jam)
+        p, regions = self._nominal, len(self._nominal.adjacency)
         if spread or scale != 1.0:
 
             def factor(*shape: int, share: float = 1.0) -> torch.Tensor:
@@ -86,14 +86,12 @@ class Rollout:
 
             wide, high = scale * factor(regions), factor(regions, share=0.5)
             # No rate rises above the largest that the integration step was checked for.
-            fastest = p.c if p.exit_rates is None else p.c * p.exit_rates.amax(-1)
+            free = p.mfd.rate_up_to_jam(torch.zeros_like(p.mfd.jam), torch)
+            fastest = free if p.exit_rates is None else free * p.exit_rates.amax(-1)
             high = high.clamp(max=1.0 / (fastest * self.planning.step / self.planning.substeps))
             p = replace(
                 p,
-                a=high * p.a / wide**2,
-                b=high * p.b / wide,
-                c=high * p.c,
-                jam=wide * p.jam,
+                mfd=p.mfd.scaled(wide, high),
                 capacity=None if p.capacity is None else p.capacity * factor(regions, regions, share=0.5),
                 storage=None if p.storage is None else p.storage * wide,
             )

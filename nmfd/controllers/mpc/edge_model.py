@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 from nmfd.arrays import PerRegion
 from nmfd.controllers.mpc.projected_gradient import Late
 from nmfd.model.dynamics import SCHEMES
+from nmfd.model.mfd import Mfd, stacked
 from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, RegionalModel
 
 PerCell = Float[np.ndarray, " C"]
@@ -36,7 +37,7 @@ class Turns:
     edge: edge of every turn, (V,); source, target: cells x_ij and x_hj of every turn, (V,)
     own: nominal theta_ihj (-, (V,))
     region: (C,); ends: cells in which trips end (i = j), (C,)
-    a, b, c, jam: of the MFDs, (R,)
+    mfd: of all regions
     exit_rates: (-, (C,)); capacity: under u = 1 (veh/s, (E,)) or None; storage: (veh, (R,)) or None
     step: control interval (s); substeps, integrator: integration steps in it, and their scheme (dynamics.SCHEMES)
     rounding: width of the rounded kink of the MFDs at the jam accumulation (veh); 0 for the exact model
@@ -51,10 +52,7 @@ class Turns:
     own: PerTurn
     region: Int[np.ndarray, " C"]
     ends: Bool[np.ndarray, " C"]
-    a: PerRegion
-    b: PerRegion
-    c: PerRegion
-    jam: PerRegion
+    mfd: Mfd
     exit_rates: PerCell
     capacity: PerEdge | None
     storage: PerRegion | None
@@ -92,7 +90,7 @@ def build(network: RegionalModel, destinations: Int[np.ndarray, " J"], *, guidan
         own=network.nominal_splits[here, onward, bound],
         region=cells // count,
         ends=cells // count == np.asarray(destinations)[cells % count],
-        **{name: np.array([getattr(m, name) for m in network.mfds]) for name in ("a", "b", "c", "jam")},
+        mfd=stacked(network.mfds, np.array),
         **scheme,
     )
 
@@ -103,19 +101,20 @@ def rate(model: Turns, accumulation: PerRegion) -> tuple[PerRegion, PerRegion]:
     With rounding r, min(x, jam) is (x + jam - sqrt((x - jam)^2 + r^2)) / 2: off by r/2 at the jam accumulation, and by
     less than r^2 / (4 |x - jam|) elsewhere.
     """
-    above = accumulation - model.jam
+    jam = model.mfd.jam
+    above = accumulation - jam
     spread = np.sqrt(above**2 + model.rounding**2)
     share = 0.5 - 0.5 * above / np.maximum(spread, 1e-12)  # d min(x, jam) / dx
-    body = 0.5 * (accumulation + model.jam - spread)
-    top = accumulation - body + model.jam
-    q = ((model.a * body + model.b) * body + model.c) * model.jam / top
-    return q, ((2.0 * model.a * body + model.b) * share * model.jam - q * (1.0 - share)) / top
+    body = 0.5 * (accumulation + jam - spread)
+    top = accumulation - body + jam
+    q = model.mfd.rate_up_to_jam(body) * jam / top
+    return q, (model.mfd.slope_up_to_jam(body) * share * jam - q * (1.0 - share)) / top
 
 
 def derivative(model: Turns, x: PerCell, demand: PerCell, perimeter: PerEdge, splits: PerTurn) -> tuple[PerCell, tuple]:
     """Return dx/dt (veh/s, (C,)) of x (veh, (C,)) under demand (veh/s, (C,)), and the record for `pull_derivative`."""
     cells = len(x)
-    accumulation = x.reshape(len(model.jam), -1).sum(axis=1)
+    accumulation = x.reshape(len(model.mfd.jam), -1).sum(axis=1)
     q, change_of_q = rate(model, accumulation)
     q = model.exit_rates * q[model.region]
     leaving = q * x
@@ -153,7 +152,7 @@ def pull_derivative(
 ) -> tuple[PerCell, PerEdge, PerTurn]:
     """Return the gradients by x (C,), perimeter (E,) and splits (V,), if that by dx/dt is `adjoint` (C,)."""
     x, leaving, q, change_of_q, wish, share, boundary = record
-    regions, edges = len(model.jam), len(model.edges)
+    regions, edges = len(model.mfd.jam), len(model.edges)
     gain = adjoint[model.target] - adjoint[model.source]
     of_perimeter = np.bincount(model.edge, gain * wish, edges)
     of_wish, of_accumulation = share[model.edge] * gain, 0.0

@@ -16,9 +16,11 @@ import numpy as np
 
 from nmfd.arrays import PairsOverTime, PerPair, TurnsOverTime
 from nmfd.model import dynamics
+from nmfd.model.mfd import stacked
 from nmfd.model.planning import PlanningModel
 from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, RegionalModel
 
+XP = SimpleNamespace(**vars(ca) | {"minimum": ca.fmin, "maximum": ca.fmax, "where": ca.if_else})  # NumPy's names
 UNIT = 1000.0  # veh, unit of the accumulations in the solver
 Matrix: TypeAlias = ca.SX | ca.MX | ca.DM
 Turns: TypeAlias = Sequence[Matrix]  # R of them
@@ -87,16 +89,16 @@ class Ipopt:
 
 def parameters(network: RegionalModel) -> Parameters:
     """Return `dynamics.parameters` as constants: vectors (R, 1), but storage (1, R); adjacency 1 or structural zero."""
-    known = vars(dynamics.parameters(network)).items()
-    p = Parameters(**{name: None if values is None else ca.DM(values.numpy()) for name, values in known})
+    known = vars(dynamics.parameters(network)) | {"mfd": None}
+    p = Parameters(**{name: None if values is None else ca.DM(values.numpy()) for name, values in known.items()})
+    p.mfd = stacked(network.mfds, lambda numbers: ca.DM(list(numbers)))
     p.adjacency, p.storage = ca.sparsify(p.adjacency), None if p.storage is None else p.storage.T
     return p
 
 
 def rate(p: Parameters, accumulation: Matrix) -> Matrix:
     """Return q_i = g_i(min(x_i, jam_i)) / x_i (R, 1) [1/s] of accumulation (R, 1) [veh]."""
-    body = ca.fmin(accumulation, p.jam)
-    return ((p.a * body + p.b) * body + p.c) * p.jam / (accumulation + p.jam - body)
+    return p.mfd.rate(accumulation, XP)
 
 
 def flows(p: Parameters, x: Matrix, perimeter: Matrix, splits: Turns) -> tuple[Matrix, list[Matrix]]:
