@@ -1,6 +1,6 @@
 """Python interface of `cosim`: a function for every command, and single runs.
 
-Bokeh, Optuna and scikit-learn are imported in the functions that need them: they take a second.
+Bokeh and Optuna are imported in the functions that need them: they take a second.
 """
 
 import os
@@ -18,7 +18,7 @@ from cosim.evaluation.runs import runs_of
 from cosim.evaluation.signal_proof import sheets
 from cosim.evaluation.simulate import Simulation, simulate
 from cosim.importing import get as cities
-from cosim.importing.case import parse_box, seconds
+from cosim.importing.importer import import_city as import_city
 from cosim.report import figures
 from cosim.sumo.outputs import check
 from nmfd.api import check_policies, load_scenario
@@ -282,45 +282,6 @@ def tune(
 def get(name: str | None, out: Path | None = None) -> str:
     """Download a published city to a folder, cities/NAME if None; without a name list the cities."""
     return cities.listed() if name is None else cities.get(name, out or Path("cities") / name)
-
-
-def import_city(
-    source: Path | str,
-    *,
-    out: Path,
-    regions: int | str,
-    demand: str | None = None,
-    begin: str | None = None,
-    end: str | None = None,
-    **options: Any,
-) -> str:
-    """Write network and scenario of a SUMO city; return a report.
-
-    source: a sumocfg, a net, a file of OpenStreetMap, or a box "W,S,E,N" of it as text
-    regions: number of regions to find, or the file of a table edge,region
-    demand: "peak" generates a morning peak
-    begin, end: time window, in seconds or as h:m:s
-    options: routes, level, mesoscopic, seed, seeds (cosim.importing.importer.import_city)
-    """
-    from cosim.importing import importer
-
-    number = int(regions) if str(regions).isdecimal() else None
-    if number is not None and number < 2:
-        raise InputError(f"--regions: expected 2 or more regions, or a file, got {regions} instead")
-    scenario = out.parent.parent / "scenarios" / out.name
-    with watched("import", None) as show:
-        text = importer.import_city(
-            parse_box(source) if isinstance(source, str) else source,
-            out,
-            scenario,
-            regions=number or Path(str(regions)),
-            peak=demand is not None,
-            begin=None if begin is None else seconds(begin, "--begin"),
-            end=None if end is None else seconds(end, "--end"),
-            **options,
-            progress=lambda stage, share=0.0: show and show(round(100 * share), 100, stage),
-        )
-    return f"{text}\nWritten to {out} (see map.png, quality.csv, gateways.csv) and {scenario}"
 
 
 def _has_screen() -> bool:

@@ -158,7 +158,7 @@ def test_networks_as_they_are(tmp_path):
         ("none", ("--default-junction-type", "priority"), "no gateway has a signal"),
     ):
         net = tiny_city.network(tmp_path, *options, name=f"{name}.net.xml")
-        folder = tiny_city.imported(tmp_path / name, 2, net, peak=True, level=0.1, iterations=1)
+        folder = tiny_city.imported(tmp_path / name, 2, net, demand="peak", level=0.1, iterations=1)
         assert expected in (tmp_path / name / "networks" / "tiny" / "import.txt").read_text()
         scenario = replace(load_scenario(folder), steps=3)
         plant = SumoPlant(scenario)
@@ -379,7 +379,7 @@ def test_identification_gives_both_models_and_the_import_takes_the_second_away(i
 def test_the_chain_in_a_city_without_signals(tmp_path):
     """Perimeter control cannot act, and training says so."""
     net = tiny_city.network(tmp_path, "--default-junction-type", "priority", name="none.net.xml")
-    scenario = tiny_city.imported(tmp_path, 2, net, peak=True, level=0.1, iterations=1)
+    scenario = tiny_city.imported(tmp_path, 2, net, demand="peak", level=0.1, iterations=1)
     good(cosim("run", scenario, "--controller", "pi-gating", "--set", "steps=4", "--out", tmp_path / "out"))
     said = error_line(nmfd("train", scenario, "--controller", "dpc-pc"), "nmfd")
     assert "no gateway has a signal" in said

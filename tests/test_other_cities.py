@@ -206,7 +206,7 @@ def test_phases_that_do_not_follow_in_order(net, city):
 def test_cycles_shorter_than_half_a_second(net, tmp_path):
     """Of a network that somebody made for something else: control intervals are the usual 90 s."""
     (tmp_path / "fast.net.xml").write_text(re.sub(r'(<phase duration=")\d+', r"\g<1>0.05", net.read_text()))
-    _, scenario = imported(tmp_path / "fast.net.xml", peak=True, level=0.1, iterations=1, mesoscopic=True)
+    _, scenario = imported(tmp_path / "fast.net.xml", demand="peak", level=0.1, iterations=1, mesoscopic=True)
     assert scenario.step == 90.0
 
 
@@ -220,7 +220,7 @@ def test_a_city_along_a_straight_road(tmp_path):
     (tmp_path / "e.edg.xml").write_text(f"<edges>{edges}</edges>")
     net = tmp_path / "road.net.xml"
     tiny_city.run("netconvert", "-n", tmp_path / "n.nod.xml", "-e", tmp_path / "e.edg.xml", "-o", net)
-    text, scenario = imported(net, peak=True, level=0.2, iterations=1, mesoscopic=True)
+    text, scenario = imported(net, demand="peak", level=0.2, iterations=1, mesoscopic=True)
     assert "regions instead of" not in text and scenario.network.adjacency.sum() == 2
     sizes = np.bincount(
         np.loadtxt(tmp_path / "networks" / "x" / "regions.csv", dtype=int, delimiter=",", skiprows=1, usecols=1)
@@ -297,5 +297,5 @@ def test_speeds_and_coordinates(city):
 
 def test_a_generated_peak_beside_types_of_the_city(net, city):
     config = city("", '<vType id="car" vClass="passenger" sigma="0.9"/>')
-    text, _ = imported(config, peak=True, level=0.1, iterations=1, mesoscopic=True)
+    text, _ = imported(config, demand="peak", level=0.1, iterations=1, mesoscopic=True)
     assert "trips of a generated morning peak" in text

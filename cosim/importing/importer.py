@@ -3,7 +3,8 @@
 import gzip
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -14,7 +15,7 @@ import pandas as pd
 from cosim.importing import maps, model, quality
 from cosim.importing.assignment import GAP, ITERATIONS, Assigned, assign
 from cosim.importing.baseline import Baseline, averaged_runs
-from cosim.importing.case import Box, Progress, SumoInput, sumo_input
+from cosim.importing.case import Progress, SumoInput, parse_box, seconds, sumo_input
 from cosim.importing.demand import Traffic, read_traffic, wrapped
 from cosim.importing.generated import morning_peak
 from cosim.importing.partition import partition, read_regions
@@ -25,6 +26,7 @@ from nmfd.errors import InputError
 from nmfd.model import authority
 from nmfd.model.regional_model import network_toml
 from nmfd.runs.files import temporary_folder
+from nmfd.runs.progress import watched
 from nmfd.runs.tables import text_table
 from nmfd.studies import plots
 
@@ -42,57 +44,66 @@ CAPTION = (
 
 
 def import_city(
-    source: Path | Box,
+    source: Path | str,
     out: Path,
-    scenario: Path,
+    scenario: Path | None = None,
     *,
-    regions: int | Path,
+    regions: int | Path | str,
     routes: Sequence[Path] = (),
-    peak: bool = False,
+    demand: str | None = None,
     level: float = 1.0,
     mesoscopic: bool = False,
-    begin: float | None = None,
-    end: float | None = None,
+    begin: str | None = None,
+    end: str | None = None,
     seed: int = 0,
     seeds: int = 3,
     iterations: int = ITERATIONS,
-    progress: Progress = lambda stage, share=0.0: None,
 ) -> str:
-    """Write the network and the scenario of a city; return a report.
+    """Write the network and the scenario of a SUMO city; return a report.
 
-    source: a sumocfg, a net.xml, a file of OpenStreetMap, or a box of it
-    out, scenario: new folders of the network and the scenario
-    regions: their number, or the user's own table edge,region
+    source: a sumocfg, a net.xml, a file of OpenStreetMap, or a box "W,S,E,N" of it as text
+    out: new folder of the network
+    scenario: new folder of the scenario; scenarios/NAME beside the folder of networks if None
+    regions: number of regions to find, or the user's own table edge,region
     routes: files with vehicles beside those of the sumocfg
-    peak: generate a morning peak instead
+    demand: "peak" generates a morning peak instead
     level: multiplies the vehicles or the peak [-]
     mesoscopic: the scenario uses SUMO's queue model
-    begin, end: [s], instead of the sumocfg's
+    begin, end: time window, in seconds or as h:m:s, instead of the sumocfg's
     seeds: runs without control whose densities are averaged
     iterations: of the assignment of the peak
 
     Raises:
         InputError: for input that cannot be used; nothing is written then.
     """
+    count = int(str(regions)) if str(regions).isdecimal() else None
+    if count is not None and count < 2:
+        raise InputError(f"--regions: expected 2 or more regions, or a file, got {regions} instead")
+    place = parse_box(source) if isinstance(source, str) else source
+    scenario = scenario or out.parent.parent / "scenarios" / out.name
+    first = None if begin is None else seconds(begin, "--begin")
+    last = None if end is None else seconds(end, "--end")
     for folder in (out, scenario):
         if folder.name in ("", "..") or "," in str(folder):
             raise InputError(f"--out: expected a folder such as networks/mycity, without a comma, got {folder} instead")
         if folder.exists():
             raise InputError(f"--out: {folder} exists; choose another name, or remove it")
-    progress("reading")
-    with sumo_input(source, progress) as case, temporary_folder() as scratch:
+    with ExitStack() as stack:
+        progress = _staged(stack.enter_context(watched("import", None)))
+        progress("reading")
+        case, scratch = stack.enter_context(sumo_input(place, progress)), stack.enter_context(temporary_folder())
+        case = replace(case, begin=case.begin if first is None else first, end=case.end if last is None else last)
         case = replace(case, routes=(*case.routes, *routes))
-        case = replace(case, begin=case.begin if begin is None else begin, end=case.end if end is None else end)
         if case.begin < 0 or (case.end is not None and case.end <= case.begin):
             window = f"begin {case.begin:g} s, end {case.end} s"
             raise InputError(f"{case.source}: expected 0 s <= begin < end, got {window}")
         streets = read_streets(case.net, case.additional)
-        own = None if isinstance(regions, int) else read_regions(streets, regions)
+        own = read_regions(streets, Path(str(regions))) if count is None else None
         traffic = read_traffic(case, streets, seed)
         mesoscopic = mesoscopic or case.mesoscopic
         meso = mesoscopic or streets.drivable.sum() > LARGE_CITY_EDGES
         factor, assigned = level, None
-        if peak:
+        if demand is not None:
             traffic, assigned = _peak(case, streets, traffic, level, seed, iterations, meso, progress)
             factor = 1.0
         elif not len(traffic.depart):
@@ -110,8 +121,8 @@ def import_city(
         baseline = averaged_runs(streets, folder, files, model.options(case, clock), factor, meso, seeds, progress)
         progress("partition")
         left = quality.left_alone(streets, traffic.switched)
-        if isinstance(regions, int):
-            labels = partition(streets, baseline, regions, uncontrollable=left)
+        if count is not None:
+            labels = partition(streets, baseline, count, uncontrollable=left)
         else:
             labels = finish(streets, own, renumber=False)
         if labels.max() < 1:
@@ -129,8 +140,8 @@ def import_city(
             warning = f"WARNING: {_left_out(traffic)}: this is not the traffic of {case.source.name}"
             verdict = replace(verdict, sentences=(*verdict.sentences, warning))
         report = _report(case, streets, traffic, clock, tables, baseline, assigned)
-        if isinstance(regions, int) and network.regions < regions:
-            report.append(f"{network.regions} regions instead of {regions}: others could not be reached, or fell apart")
+        if count is not None and network.regions < count:
+            report.append(f"{network.regions} regions instead of {count}: others could not be reached, or fell apart")
         elif own is not None and (moved := int((own != labels)[streets.drivable & (own >= 0)].sum())):
             report.append(f"{moved:,} streets are in other regions than in {regions}: regions must be connected")
         report += verdict.sentences
@@ -160,8 +171,8 @@ def import_city(
             path.write_text(text, encoding="utf-8")
         pd.DataFrame(tables.quality).to_csv(net_folder / "quality.csv", index=False)
         pd.DataFrame(tables.gateways).to_csv(net_folder / "gateways.csv", index=False)
-        demand = model.region_demand(traffic, labels, clock)
-        rows = [(k, i, j, f"{demand[k, i, j]:.6g}") for k, i, j in np.argwhere(demand > 0)]
+        flows = model.region_demand(traffic, labels, clock)
+        rows = [(k, i, j, f"{flows[k, i, j]:.6g}") for k, i, j in np.argwhere(flows > 0)]
         pd.DataFrame(rows, columns=["interval", "from", "to", "veh_s"]).to_csv(folder / "demand.csv", index=False)
         drawing = plots.figure(6.2, 6.0)
         maps.region_map(drawing.subplots(), streets, labels, network.region_names, network.positions, tables)
@@ -169,7 +180,13 @@ def import_city(
         for temporary, place in ((net_folder, out), (folder, scenario)):
             place.parent.mkdir(parents=True, exist_ok=True)
             shutil.move(temporary, place)
-    return "\n".join(report)
+    written = f"Written to {out} (see map.png, quality.csv, gateways.csv) and {scenario}"
+    return "\n".join([*report, written])
+
+
+def _staged(show: Callable[[int, int, str], None] | None) -> Progress:
+    """Return a callback of stages that are shown as a bar."""
+    return lambda stage, share=0.0: show and show(round(100 * share), 100, stage)
 
 
 def _peak(

@@ -15,7 +15,6 @@ import pandas as pd
 from jaxtyping import Float, Int
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
-from sklearn.cluster import AgglomerativeClustering
 
 from cosim.importing.baseline import Baseline
 from cosim.importing.regions import finish
@@ -93,6 +92,8 @@ def partition(
 
 def cluster(blocks: Blocks, feature: Float[np.ndarray, "B F"], regions: int) -> Int[np.ndarray, " B"]:
     """Return the cluster of every block; -1 in clusters that are too small for a region."""
+    from sklearn.cluster import AgglomerativeClustering  # a second, which other commands do not need
+
     size = blocks.core if np.count_nonzero(blocks.core) >= regions else blocks.weight
     least = SMALLEST_SHARE * size.sum() / regions
     best, most = np.zeros(len(feature), dtype=int), 0
