@@ -2,8 +2,8 @@
 
     >>> import cosim
     >>> result = cosim.run("demo", "pi-gating", seed=1, steps=2)
-    >>> result.accumulation.shape, len(result.to_frame())  # states, regions, destinations; rows
-    ((3, 5, 5), 75)
+    >>> result.accumulation.shape  # states, regions, destinations; as a table: result.data.accumulation.to_dataframe()
+    (3, 5, 5)
 
 `run` is one closed loop in SUMO, `read_run` reads one of a run folder, `City` shows a city. Names here are imported at
 their first use; `cosim.api` has a function for every command.

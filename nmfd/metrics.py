@@ -59,23 +59,6 @@ def decision_ms(row: Mapping[str, float]) -> str:
     return " / ".join(f"{row[f'control_step_ms_{which}']:.3g}" for which in ("first", "median", "max"))
 
 
-def gini(values: PerRegion, weights: PerRegion) -> float:
-    """Return the Gini coefficient of `values` (N,) >= 0, each of `weights` (N,) people:
-
-        G = sum_ij w_i w_j |v_i - v_j| / (2 W sum_i w_i v_i), W = sum_i w_i
-
-    0 if all have the same, nearly 1 if few have everything; NaN without people.
-
-        >>> float(gini(np.array([0.0, 100.0]), np.array([1.0, 1.0])))
-        0.5
-    """
-    people, total = weights.sum(), (weights * values).sum()
-    if not total:
-        return 0.0 if people else math.nan
-    apart = np.abs(values[:, None] - values[None, :])
-    return float(weights @ apart @ weights / (2.0 * people * total))
-
-
 def notes(result: Result, most: int = 3) -> str:
     """Return the `most` frequent notes of decisions that were not OK, such as "2 x solver failed: ..."."""
     counted = Counter(note for note, status in zip(result.note, result.status, strict=True) if status)

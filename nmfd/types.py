@@ -13,7 +13,6 @@ from nmfd.arrays import PerPair, PerRegion, PerTurn
 from nmfd.errors import InputError, uninterrupted
 
 if TYPE_CHECKING:
-    import pandas
     import xarray
 
 
@@ -282,19 +281,6 @@ class Result:
         data = self.data.drop_vars(HOST_TIMES, errors="ignore")
         data.attrs = {name: value for name, value in data.attrs.items() if name not in (*HOST_TIMES, "key")}
         return data
-
-    def to_frame(self) -> "pandas.DataFrame":
-        """Return the states as a table: one row per time and pair of regions, (T+1) R R rows.
-
-        >>> table = nmfd.run("economic_mpc", "no-control", steps=2).to_frame()
-        >>> table.columns.tolist()[3:]
-        ['time_s', 'region', 'destination', 'accumulation_veh', 'backlog_veh']
-        """
-        columns = {"time": "time_s", "accumulation": "accumulation_veh", "backlog": "backlog_veh"}
-        rows = self.data[list(columns)].to_dataframe().reset_index()
-        for place, name in enumerate(("controller", "plant", "seed")):
-            rows.insert(place, name, self.data.attrs[name])
-        return rows.rename(columns=columns)
 
     def _repr_html_(self) -> str:
         return self.data._repr_html_()

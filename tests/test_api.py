@@ -95,11 +95,3 @@ def test_a_controller_and_a_plant_as_objects(tmp_path):
 def test_mistakes_are_input_errors(tmp_path, arguments, options, expected):
     with pytest.raises(nmfd.InputError, match=re.escape(expected)):
         nmfd.run(tiny.write(tmp_path), *arguments, **options)
-
-
-def test_frames_hold_what_the_arrays_hold(tmp_path):
-    trajectory = nmfd.run(tiny.write(tmp_path), "pi-gating")
-    frame = trajectory.to_frame()
-    assert frame["accumulation_veh"].sum() == pytest.approx(trajectory.accumulation.sum())
-    row = frame[(frame["time_s"] == 90.0) & (frame["region"] == 0) & (frame["destination"] == 1)]
-    assert row["accumulation_veh"].item() == trajectory.accumulation[3, 0, 1]

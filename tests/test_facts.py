@@ -47,7 +47,6 @@ def test_trips_that_never_began_count_with_what_they_have_waited():
     assert (row["public_transport_trips"], row["public_transport_delay_s"]) == (2, 40.0)
     np.testing.assert_array_equal(simulate.time_by_origin(trips, 3), [87.5, 212.5, np.nan])
     assert (row["mean_trip_time_s"], row["mean_departure_delay_s"], row["mean_time_loss_s"]) == (150.0, 107.5, 20.0)
-    assert row["lost_time_gini"] == pytest.approx((212.5 - 22.5) / (2 * (212.5 + 22.5)))
     nobody = simulate.trip_measures([])
     assert nobody["trips"] == nobody["other_time_spent_veh_s"] == 0 and np.isnan(nobody["mean_trip_time_s"])
 
@@ -123,13 +122,6 @@ def test_outputs_do_not_change_who_reroutes(tmp_path):
     files = ({}, {"tripinfo": tmp_path / "a.xml"})
     plain, written = (cosim.run(scenario, "no-control", seed=1, sumo_output=each) for each in files)
     assert (plain.edge_vehicles == written.edge_vehicles).all() and plain.co2_kg == written.co2_kg > 0
-
-
-def test_gini_coefficients():
-    assert metrics.gini(np.array([5.0, 5.0, 5.0]), np.array([1.0, 9.0, 0.0])) == 0.0
-    assert metrics.gini(np.array([0.0, 0.0, 3.0]), np.array([1.0, 1.0, 1.0])) == pytest.approx(2 / 3)
-    assert metrics.gini(np.array([0.0, 3.0]), np.array([2.0, 1.0])) == pytest.approx(2 / 3)  # people, not regions
-    assert metrics.gini(np.zeros(2), np.ones(2)) == 0.0 and np.isnan(metrics.gini(np.ones(2), np.zeros(2)))
 
 
 def test_vehicles_under_way_have_emitted(run):

@@ -12,7 +12,7 @@ import tiny_city
 from cosim.plant.metering import FILLING_S, KI, KP, Metering
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
-from cosim.sumo.trips import Trips, held
+from cosim.sumo.recorded_trips import HeldTrips
 from cosim.sumo.xml_files import read_xml
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
@@ -27,14 +27,13 @@ def metering(depart, origin, level=1.2):
     begun, count = [], len(depart)
     session = SimpleNamespace(time=0.0, step_length=1.0)
     session.begin_trip = lambda order: begun.append((session.time, order["vehID"], order["routeID"]))
-    trips = Trips(
+    trips = HeldTrips(
         depart=np.array(depart, dtype=float),
         origin=np.array(origin, dtype=int),
         destination=np.ones(count, dtype=int),
-        routes=(("a", "b"),) * count,
-        arrival=np.zeros(count),
+        orders=tuple({"vehID": f"v{n}", "routeID": f"r{n}"} for n in range(count)),
     )
-    return Metering(session, held(trips), CRITICAL, level=level, step=90.0), session, begun
+    return Metering(session, trips, CRITICAL, level=level, step=90.0), session, begun
 
 
 def played(meters, session, seconds):

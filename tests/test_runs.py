@@ -82,15 +82,6 @@ def test_removed_and_prices_are_zero_by_default():
     assert (run.prices == 0).all() and run.prices.shape == (4, 2)
 
 
-def test_the_tables_of_a_run_row_by_row():
-    run = trajectory()
-    states = run.to_frame()
-    assert list(states.columns[:5]) == ["controller", "plant", "seed", "time_s", "region"]
-    assert list(states.columns[5:]) == ["destination", "accumulation_veh", "backlog_veh"]
-    for n, (k, i, j) in enumerate(np.ndindex(5, 2, 2)):
-        assert tuple(states.loc[n]) == ("no-control", "nmfd", 0, 30.0 * k, i, j, run.accumulation[k, i, j], 0.0)
-
-
 def test_a_row_holds_the_figures_and_the_facts_of_a_run():
     row = metrics.summary(trajectories.recorded(trajectory(), {}, {"trips": 12}))
     assert list(row)[:4] == ["controller", "seed", "plant", "total_time_spent_veh_s"] and list(row)[-1] == "trips"

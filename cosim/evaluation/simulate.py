@@ -128,7 +128,6 @@ def trip_measures(trips: Sequence[Trip]) -> dict[str, float]:
     count = Counter(private["outcome"])
     entered = table[table["outcome"].isin((COMPLETED, REMOVED, UNDER_WAY))]
     public, entered = entered[entered["public"]], entered[entered["private"]]
-    lost = (private["time_loss"] + private["departure_delay"]).groupby(private["origin"])
     return {
         "trips": len(private),
         "departed_veh": len(entered),
@@ -143,7 +142,6 @@ def trip_measures(trips: Sequence[Trip]) -> dict[str, float]:
         "p95_trip_time_s": private["time"].quantile(0.95),
         "mean_departure_delay_s": private["departure_delay"].mean(),
         "mean_time_loss_s": entered["time_loss"].mean(),
-        "lost_time_gini": metrics.gini(lost.mean().to_numpy(), lost.size().to_numpy(float)),
         "public_transport_trips": int(table["public"].sum()),
         "public_transport_delay_s": public["time_loss"].mean(),
         "other_trips": len(other),

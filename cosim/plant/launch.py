@@ -11,10 +11,10 @@ from cosim.plant.settings import ACTUATED, ESTIMATE, WEBSTER, Settings, own_file
 from cosim.sumo import outputs
 from cosim.sumo import recorded_trips as recorded
 from cosim.sumo.net import City
-from cosim.sumo.recorded_trips import RecordedTrips
+from cosim.sumo.recorded_trips import HeldTrips, RecordedTrips, as_recorded
 from cosim.sumo.session import Session
 from cosim.sumo.signals import Signal
-from cosim.sumo.trips import PLANNING_SEEDS, HeldTrips, held, make_trips, turning_flows, write_trips
+from cosim.sumo.trips import PLANNING_SEEDS, make_trips, turning_flows
 from cosim.sumo.xml_files import file_list
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
@@ -59,7 +59,6 @@ class Launch:
         self._layout, self._outputs, self._gui = layout, outputs, gui
         self._temporary = tempfile.TemporaryDirectory(prefix="cosim-", ignore_cleanup_errors=True)
         self._folder = Path(self._temporary.name)
-        self._originals: RecordedTrips | None = None
         self.vehicles: list[str] = []
         self.held: HeldTrips | None = None
         self.trip_file = outputs.get("tripinfo", self._folder / "tripinfo.xml")
@@ -86,10 +85,10 @@ class Launch:
         )
 
     def turning_flows(self) -> Mapping[tuple[str, str], float]:
-        """Return (edge, next edge) -> flow [veh/s] of the vehicles; call it after a `start`."""
-        if self._originals is None:
+        """Return (edge, next edge) -> flow [veh/s] of the vehicles."""
+        if not self._settings.routes:
             return turning_flows(self._city, self._scenario.demand, self._scenario.step)
-        return recorded.own_flows(self._city, self._originals, self._shared_routes, self._scenario.demand_factor)
+        return recorded.own_flows(self._city, self._recorded, self._shared_routes, self._scenario.demand_factor)
 
     def close(self) -> None:
         """Remove the temporary folder."""
@@ -129,27 +128,29 @@ class Launch:
 
     def _write_vehicles(self, path: Path, seed: int) -> list[str]:
         """Write the route file of one run, and return the ids of its vehicles."""
-        scenario, settings, metered = self._scenario, self._settings, self._settings.metering > 0.0
-        if not settings.routes:
-            trips = write_trips(self._city, scenario.demand, scenario.step, seed, path, metered=metered)
-            self.held = held(trips) if metered else None
-            return [f"v{n}" for n in range(len(trips.routes))]
-        if self._originals is None:
-            self._originals = own_vehicles(scenario, settings, self._city)
-        jitter = DEPARTURE_JITTER_S if seed else 0.0
-        how = {"factor": scenario.demand_factor, "jitter": jitter, "begin": settings.begin}
-        drawn = recorded.draw(self._originals, seed=seed, **how)
-        if metered:
-            self.held = recorded.write_held_trips(
-                self._originals, drawn, path, self._shared_routes, self._city.region_of
-            )
-            if not self.held.orders:
+        scenario, settings, originals = self._scenario, self._settings, self._vehicles_of(seed)
+        factor, begin = (scenario.demand_factor, settings.begin) if settings.routes else (1.0, 0.0)
+        jitter = DEPARTURE_JITTER_S if settings.routes and seed else 0.0
+        drawn = recorded.draw(originals, seed=seed, factor=factor, jitter=jitter, begin=begin)
+        if settings.metering > 0.0:
+            self.held = recorded.write_held_trips(originals, drawn, path, self._shared_routes, self._city.region_of)
+            if settings.routes and not self.held.orders:
                 some = f"those without stops, via edges and attributes other than {', '.join(recorded.ORDERED)}"
                 none = "none of the vehicles in sumo.routes can wait: only"
                 raise InputError(f"{scenario.where}: sumo.metering: {none} {some} can; omit it")
         else:
-            recorded.write_recorded_trips(self._originals, drawn, path)
+            recorded.write_recorded_trips(originals, drawn, path)
         return [name for _, _, name in drawn]
+
+    def _vehicles_of(self, seed: int) -> RecordedTrips:
+        """Return the recorded trips, or trips that are made from the demand by `seed`."""
+        if self._settings.routes:
+            return self._recorded
+        return as_recorded(make_trips(self._city, self._scenario.demand, self._scenario.step, seed))
+
+    @cached_property
+    def _recorded(self) -> RecordedTrips:
+        return own_vehicles(self._scenario, self._settings, self._city)
 
     @cached_property
     def _shared_routes(self) -> Mapping[str, tuple[str, ...]]:
@@ -157,11 +158,8 @@ class Launch:
 
     def _planning_trips(self) -> Iterator[tuple[float, Sequence[str]]]:
         """Yield departure [s] and edges of the trips that Webster's plan is made for."""
-        if self._originals is None:
-            trips = make_trips(self._city, self._scenario.demand, self._scenario.step, PLANNING_SEEDS[0])
-            yield from zip(trips.depart.tolist(), trips.routes, strict=True)
-        else:
-            for depart, element in zip(self._originals.depart.tolist(), self._originals.elements, strict=True):
-                edges, driven = recorded.edges_of(element, self._shared_routes)
-                if driven:
-                    yield depart, edges
+        originals = self._vehicles_of(PLANNING_SEEDS[0])
+        for depart, element in zip(originals.depart.tolist(), originals.elements, strict=True):
+            edges, driven = recorded.edges_of(element, self._shared_routes)
+            if driven:
+                yield depart, edges

@@ -12,8 +12,8 @@ from itertools import chain
 
 import numpy as np
 
+from cosim.sumo.recorded_trips import HeldTrips
 from cosim.sumo.session import Session
-from cosim.sumo.trips import HeldTrips
 from nmfd.arrays import PerPair, PerRegion
 
 KP, KI = 1.0, 0.3  # share of the excess vehicles that are kept out in the next control interval [-]; not tuned

@@ -1,4 +1,4 @@
-"""Recorded trips of a city: read from its route files once, then varied by seed and demand factor."""
+"""Vehicles of a city: those of its route files, varied by seed and demand factor, or trips made from the demand."""
 
 import math
 import xml.etree.ElementTree as ElementTree
@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from cosim.sumo.arrays import PerTrip
+from cosim.sumo.arrays import PerTrip, TripNumbers
 from cosim.sumo.net import City
-from cosim.sumo.trips import DRIVER_CLASSES, PEAK_S, PLANNING_SEEDS, HeldTrips, busiest, perception, routes_in
+from cosim.sumo.trips import DRIVER_CLASSES, PEAK_S, PLANNING_SEEDS, Trips, busiest, perception, routes_in
 from cosim.sumo.xml_files import attribute, read_xml
 from nmfd.errors import InputError
 from nmfd.runs import files
@@ -25,6 +25,8 @@ PUBLIC = frozenset("bus coach tram rail rail_urban rail_electric rail_fast subwa
 BOUND = PUBLIC.union("aircraft bicycle pedestrian scooter wheelchair container drone".split())
 QUEUED_AFTER = "queued_after"  # parameter of buses and the like: cars that depart at the same time and come first
 DrawnTrip = tuple[float, int, str]  # departure [s], number of the vehicle, id
+# Attributes of all vehicles that are made from a demand.
+MADE = {"type": "car", "departLane": "best", "departSpeed": "max", "departPos": "random_free"}
 HELD = "held."  # prefix of the ids of routes that only one vehicle uses
 # Attribute of a vehicle -> argument of Session.begin_trip, whose defaults are those of the attributes.
 ORDERED = {
@@ -41,10 +43,25 @@ ORDERED = {
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedTrips:
-    """N vehicles or trips. depart: (N,) [s], sorted; elements: their XML, with types and shared routes elsewhere."""
+    """N vehicles or trips. depart: (N,) [s], sorted; elements: their XML; types: own ones, others are elsewhere."""
 
     depart: PerTrip
     elements: tuple[ElementTree.Element, ...]
+    types: tuple[ElementTree.Element, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeldTrips:
+    """N metered trips, which SUMO gets one by one when they may begin, sorted by departure.
+
+    depart: (N,) [s]; origin, destination: (N,) regions
+    orders: N sets of arguments of `Session.begin_trip`; each names a route that SUMO knows
+    """
+
+    depart: PerTrip
+    origin: TripNumbers
+    destination: TripNumbers
+    orders: tuple[Mapping[str, str], ...]
 
 
 def read_recorded_trips(paths: Sequence[Path]) -> RecordedTrips:
@@ -75,6 +92,17 @@ def read_recorded_trips(paths: Sequence[Path]) -> RecordedTrips:
             )
     order = np.argsort(departs, kind="stable")
     return RecordedTrips(depart=departs[order], elements=tuple(elements[n][1] for n in order))
+
+
+def as_recorded(trips: Trips) -> RecordedTrips:
+    """Return trips that are made from a demand as vehicles v0, v1, ... by departure."""
+    elements = []
+    for n, (route, arrival) in enumerate(zip(trips.routes, trips.arrival, strict=True)):
+        elements.append(ElementTree.Element("vehicle", MADE | {"id": f"v{n}", "arrivalPos": f"{arrival:.1f}"}))
+        ElementTree.SubElement(elements[-1], "route", edges=" ".join(route))
+    return RecordedTrips(
+        depart=trips.depart, elements=tuple(elements), types=(ElementTree.Element("vType", id="car", sigma="0.2"),)
+    )
 
 
 def check_edges(originals: RecordedTrips, city: City, where: str) -> None:
@@ -172,7 +200,7 @@ def draw(originals: RecordedTrips, *, seed: int, factor: float, jitter: float, b
 
 def write_recorded_trips(originals: RecordedTrips, drawn: Sequence[DrawnTrip], path: Path) -> None:
     """Write the vehicles of one run to a SUMO route file."""
-    _write(path, [_departing(originals.elements[n], name, depart) for depart, n, name in drawn])
+    _write(path, [*originals.types, *(_departing(originals.elements[n], name, depart) for depart, n, name in drawn)])
 
 
 def merge(path: Path, beside: Sequence[Path], rest: Path) -> list[Path]:
@@ -211,7 +239,7 @@ def write_held_trips(
     A vehicle with stops, via edges or attributes that libsumo.vehicle.add does not take is not metered.
     shared: `read_routes`; region_of: edge -> region
     """
-    elements, written = [], set[int]()
+    elements, written = list(originals.types), set[int]()
     departs, routes, orders = [], [], []
     for depart, n, name in drawn:
         element = originals.elements[n]

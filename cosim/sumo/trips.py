@@ -4,8 +4,6 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -20,7 +18,6 @@ from nmfd.errors import InputError
 STREAM = 7101  # keeps the random numbers of trips apart from others of the same seed
 DRIVER_CLASSES = 8  # groups of drivers who see different travel times
 CLASS_SPREAD = 0.15  # standard deviation of the logarithm of their travel times
-DEPARTING = {"departLane": "best", "departSpeed": "max", "departPos": "random_free"}  # attributes of every trip
 SHORT_EDGE_M = 30.0  # no trip starts or ends on a shorter edge if its region has longer ones
 POCKET_M = 80.0  # a longer edge is no turn pocket
 PLANNING_SEEDS = (778_001, 778_002, 778_003, 778_004)  # of trips that plans are made for, none of an evaluation
@@ -41,52 +38,6 @@ class Trips:
     destination: TripNumbers
     routes: tuple[tuple[str, ...], ...]
     arrival: PerTrip
-
-
-@dataclass(frozen=True, kw_only=True)
-class HeldTrips:
-    """N metered trips, which SUMO gets one by one when they may begin, sorted by departure.
-
-    depart: (N,) [s]; origin, destination: (N,) regions
-    orders: N sets of arguments of `Session.begin_trip`; each names a route that SUMO knows
-    """
-
-    depart: PerTrip
-    origin: TripNumbers
-    destination: TripNumbers
-    orders: tuple[Mapping[str, str], ...]
-
-
-def held(trips: Trips) -> HeldTrips:
-    """Return metered trips of `write_trips`."""
-    orders = tuple(
-        {"vehID": f"v{n}", "routeID": f"r{n}", "typeID": "car", "arrivalPos": f"{arrival:.1f}", **DEPARTING}
-        for n, arrival in enumerate(trips.arrival)
-    )
-    return HeldTrips(depart=trips.depart, origin=trips.origin, destination=trips.destination, orders=orders)
-
-
-def write_trips(
-    city: City, demand: PairsOverTime, step: float, seed: int, path: Path, *, metered: bool = False
-) -> Trips:
-    """Write the trips of `demand` (T, R, R) [veh/s], intervals of `step` [s], to a SUMO route file.
-
-    The vehicles are v0, v1, ... by departure; metered: only their routes r0, r1, ...
-    """
-    trips = make_trips(city, demand, step, seed)
-    lines = ['<routes>\n  <vType id="car" sigma="0.2"/>\n']
-    departing = " ".join(f'{key}="{value}"' for key, value in DEPARTING.items())
-    for n, route in enumerate(trips.routes):
-        edges = quoteattr(" ".join(route))
-        if metered:
-            lines.append(f'  <route id="r{n}" edges={edges}/>\n')
-        else:
-            lines.append(
-                f'  <vehicle id="v{n}" type="car" depart="{trips.depart[n]:.2f}" {departing} '
-                f'arrivalPos="{trips.arrival[n]:.1f}"><route edges={edges}/></vehicle>\n'
-            )
-    path.write_text("".join([*lines, "</routes>\n"]), encoding="utf-8")
-    return trips
 
 
 def turning_flows(city: City, demand: PairsOverTime, step: float) -> Mapping[tuple[str, str], float]:
