@@ -18,12 +18,13 @@ import tiny_city
 
 import cosim
 from cosim.plant.meter import Meter
-from cosim.sumo.net import load_city
+from cosim.sumo.net import city_of, load_city
 from cosim.sumo.outputs import TripReader, options
 from cosim.sumo.recorded_trips import MESOSCOPIC
 from cosim.sumo.session import Session, _flush_all
 from nmfd import metrics
 from nmfd.ledger import LedgerError
+from nmfd.model.regional_model import load_network
 
 COUNT_EVERY, STEPS = 25, 250
 REGION = {"A": 0, "B": 0, "C": 1, "D": 2}  # by the junction that an edge leads to: 0 and 2 do not touch
@@ -347,8 +348,7 @@ class Meddler:
 def test_a_run_says_who_was_removed_and_counts_them_until_then(tmp_path):
     """Calibrators of the city's own files, and a controller that takes out four vehicles in every interval."""
     scenario = copies.peak(tmp_path)
-    built = tmp_path / "networks" / "grid7" / "build"
-    city = load_city(built / "grid7.net.xml", built / "regions.csv", 7)
+    city = city_of(load_network(tmp_path / "networks" / "grid7"))
     (scenario / "more.add.xml").write_text(
         "<additional>" + "".join(CALIBRATOR.format(edge, 5, flow(1)) for edge in city.edges[::5]) + "</additional>"
     )
