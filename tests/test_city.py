@@ -1,7 +1,9 @@
 """The city grid7: cut into regions, signalised; and the one-line errors of its files."""
 
 import re
+import runpy
 import shutil
+import tomllib
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +15,14 @@ from nmfd.errors import InputError
 from nmfd.model.regional_model import load_network
 
 GRID7 = Path(__file__).parents[1] / "networks" / "grid7"
+
+
+@pytest.mark.parametrize("name", ["demo", "grid7"])
+def test_the_recipe_makes_the_shipped_network(name):
+    folder = GRID7.parent / name
+    table = tomllib.loads((folder / "city.toml").read_text(encoding="utf-8"))
+    net, regions = runpy.run_path(str(GRID7.parent / "build_grid.py"))["build"](table, name)
+    assert net == (folder / "city.net.xml").read_bytes() and regions == (folder / "regions.csv").read_bytes()
 
 
 @pytest.fixture(scope="module")
