@@ -38,6 +38,7 @@ LANES = {
 
 
 def main(folder: Path) -> None:
+    """Write city.net.xml and regions.csv into the folder."""
     table = tomllib.loads((folder / "city.toml").read_text(encoding="utf-8"))
     net, regions = build(table, str(folder / "city.toml"))
     (folder / "city.net.xml").write_bytes(net)
