@@ -84,7 +84,7 @@ def test_the_commands_run(name, tmp_path, monkeypatch):
         shutil.copytree(
             ROOT / folder,
             tmp_path / folder,
-            ignore=shutil.ignore_patterns("reference", "tutorials", "build", "*.md", "ppo.*"),
+            ignore=shutil.ignore_patterns("reference", "tutorials", "*.md", "ppo.*"),
         )
     tiny_city.city(tmp_path)  # city.sumocfg
     done, ran = set(), 0

@@ -32,9 +32,8 @@ def installed(tmp_path, monkeypatch):
         ("networks", "hexagon7"),
         *(("networks", f"grid7{variant}") for variant in ("", "_guided", "_max_pressure", "_rerouting")),
     ):
-        shutil.copytree(ROOT / kind / name, data / kind / name, ignore=shutil.ignore_patterns("reference", "build"))
+        shutil.copytree(ROOT / kind / name, data / kind / name, ignore=shutil.ignore_patterns("reference"))
     monkeypatch.setattr(shipped, "_DATA", data)
-    monkeypatch.setenv(shipped.CACHE, str(tmp_path / "cache"))
     (tmp_path / "a folder").mkdir()
     monkeypatch.chdir(tmp_path / "a folder")
     before = sorted(data.rglob("*"))
@@ -114,14 +113,6 @@ def test_nothing_is_written_into_the_package(installed, command, remedy):
 def test_a_missing_policy_is_trained_elsewhere(installed):
     scenario = load_scenario("economic_mpc")
     assert make_controller("dpc-pc", scenario, policy=Path("economic_mpc/dpc-pc.pt"))  # as `nmfd show` calls it
-
-
-def test_what_is_made_for_a_city_goes_to_the_cache(installed, tmp_path, monkeypatch):
-    assert shipped.build_folder(installed / "networks" / "grid7").parent == tmp_path / "cache"
-    (tmp_path / "file").touch()
-    monkeypatch.setenv(shipped.CACHE, str(tmp_path / "file"))
-    with pytest.raises(InputError, match="COSIM_CACHE"):
-        shipped.build_folder(installed / "networks" / "grid7")
 
 
 def test_what_is_listed(installed):

@@ -6,7 +6,7 @@ from functools import cached_property
 from pathlib import Path
 
 from cosim.plant.detectors import Layout, write_loops
-from cosim.plant.programmes import optimised_plans, write_actuated
+from cosim.plant.programmes import write_actuated, write_optimised
 from cosim.plant.settings import ACTUATED, ESTIMATE, WEBSTER, Settings, own_files
 from cosim.sumo import outputs
 from cosim.sumo import recorded_trips as recorded
@@ -112,7 +112,7 @@ class Launch:
         steered, others = self._signals
         additional = own_files(scenario, settings.additional)
         if settings.signals == WEBSTER:
-            additional += optimised_plans(scenario, self._city, others, self._planning_trips())
+            additional += write_optimised(folder, self._city, others, self._planning_trips())
         if settings.signals == ACTUATED:
             additional.append(folder / "actuated.add.xml")
             write_actuated(additional[-1], steered)

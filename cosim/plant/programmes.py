@@ -1,9 +1,7 @@
 """Signal programmes other than those of the network file: actuated ones, and plans by SUMO's own tools."""
 
-import hashlib
 import re
 from collections.abc import Iterable, Sequence
-from importlib import metadata
 from pathlib import Path
 from xml.etree.ElementTree import Element, ElementTree, SubElement
 from xml.sax.saxutils import quoteattr
@@ -12,7 +10,7 @@ import numpy as np
 
 from cosim.plant.gates import MIN_GREEN_S, least_times
 from cosim.plant.settings import ACTUATED, FIXED, PRESSURES, Settings, check_lanes, own_files, settings
-from cosim.sumo.net import City, network_folder
+from cosim.sumo.net import City
 from cosim.sumo.programs import run_tool
 from cosim.sumo.signals import FIXED as FIXED_TIME
 from cosim.sumo.signals import HELD, Signal, phases_of, read_signals
@@ -20,8 +18,6 @@ from cosim.sumo.xml_files import attribute, read_xml
 from nmfd.controllers.strategy import Strategy
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
-from nmfd.runs import shipped
-from nmfd.runs.files import temporary_folder, write_text
 
 ACTUATED_MAX_GREEN_S = 50.0  # netconvert's default
 
@@ -74,12 +70,11 @@ def write_actuated(path: Path, signals: Iterable[Signal]) -> None:
     ElementTree(root).write(path)
 
 
-def optimised_plans(
-    scenario: Scenario, city: City, others: Sequence[str], trips: Iterable[tuple[float, Sequence[str]]]
+def write_optimised(
+    folder: Path, city: City, others: Sequence[str], trips: Iterable[tuple[float, Sequence[str]]]
 ) -> list[Path]:
-    """Return fixed-time plans by SUMO's own tools: cycles by Webster's formula, then offsets for green waves.
+    """Write fixed-time plans by SUMO's own tools: cycles by Webster's formula, then offsets for green waves.
 
-    They are kept in the build folder of the network.
     others: signals that keep their programme; trips: departure [s] and edges, sorted by departure
     Raises InputError if a tool fails.
     """
@@ -87,31 +82,25 @@ def optimised_plans(
         f'<vehicle id="{n}" depart="{depart:.2f}"><route edges={quoteattr(" ".join(edges))}/></vehicle>'
         for n, (depart, edges) in enumerate(trips)
     ]
-    routes = "\n".join(["<routes>", *rows, "</routes>\n"]).encode()
-    key = hashlib.sha256(routes + city.net_file.read_bytes() + metadata.version("eclipse-sumo").encode()).hexdigest()
-    folder = shipped.build_folder(network_folder(scenario.network))
-    cycles, offsets = (folder / f"webster-{key[:16]}-{kind}.add.xml" for kind in ("cycles", "offsets"))
-    if cycles.is_file() and offsets.is_file():
-        return [cycles, offsets]
-    network, unified = str(city.net_file.resolve()), ("-u", "-y", "3", "-p", "webster", f"--skip={','.join(others)}")
-    with temporary_folder() as scratch:
-        (scratch / "routes.xml").write_bytes(routes)
-        for tool, output, options in (
-            ("tlsCycleAdaptation.py", "cycles.xml", unified),
-            ("tlsCoordinator.py", "offsets.xml", ("-a", "cycles.xml")),
-        ):
-            result = run_tool(tool, "-n", network, "-r", "routes.xml", "-o", output, *options, folder=scratch)
-            if result.returncode:
-                words = (result.stderr.strip() or "no message").splitlines()[-1]
-                raise InputError(f"{city.net_file}: {tool} cannot plan its signals ({words}); choose other signals")
-            if output == "cycles.xml":
-                _keep_times(scratch / output, city.net_file)
-        for output, file in (("cycles.xml", cycles), ("offsets.xml", offsets)):
-            text = re.sub(r"(?s)<!--.*?-->\s*", "", (scratch / output).read_text(encoding="utf-8"))  # date and paths
-            # Whole seconds: perimeter control follows programmes second by second.
-            text = re.sub(r'offset="([^"]+)"', lambda m: f'offset="{round(float(m[1]))}"', text)
-            write_text(file, text)
-    return [cycles, offsets]
+    (folder / "planned.xml").write_text("\n".join(["<routes>", *rows, "</routes>\n"]), encoding="utf-8")
+    plans = [folder / "cycles.add.xml", folder / "offsets.add.xml"]
+    for tool, plan, options in (
+        ("tlsCycleAdaptation.py", plans[0], ("-u", "-y", "3", "-p", "webster", f"--skip={','.join(others)}")),
+        ("tlsCoordinator.py", plans[1], ("-a", plans[0].name)),
+    ):
+        files = "-n", str(city.net_file.resolve()), "-r", "planned.xml", "-o", plan.name
+        result = run_tool(tool, *files, *options, folder=folder)
+        if result.returncode:
+            words = (result.stderr.strip() or "no message").splitlines()[-1]
+            raise InputError(f"{city.net_file}: {tool} cannot plan its signals ({words}); choose other signals")
+        if plan == plans[0]:
+            _keep_times(plan, city.net_file)
+    # Whole seconds: perimeter control follows programmes second by second.
+    whole = re.sub(
+        r'offset="([^"]+)"', lambda m: f'offset="{round(float(m[1]))}"', plans[1].read_text(encoding="utf-8")
+    )
+    plans[1].write_text(whole, encoding="utf-8")
+    return plans
 
 
 def _keep_times(plan: Path, net_file: Path) -> None:

@@ -4,17 +4,13 @@ In a checkout they are its folders scenarios and networks, in an installed packa
 paths lead from one to another in both.
 """
 
-import hashlib
 import os
 from importlib import resources
 from pathlib import Path
 
-import platformdirs
-
 from nmfd.errors import InputError, did_you_mean
 
 SCENARIO, NETWORK = "scenario", "network"  # kinds of folders: in folders of that name + "s", with NAME.toml in each
-CACHE = "COSIM_CACHE"  # environment variable: folder for the signal plans of installed cities
 _HERE = Path(str(resources.files("nmfd")))
 _DATA = _HERE / "data"  # as pyproject.toml maps it
 
@@ -78,19 +74,3 @@ def beside(folder: Path, file: str, option: str, *, scenario: bool = False) -> P
     if folder.is_dir() and not os.access(folder, os.W_OK):
         raise InputError(f"{folder}: cannot be written to; {remedy}")
     return folder / file
-
-
-def build_folder(folder: Path) -> Path:
-    """Make the folder for what is computed for the city in `folder`, and return it. Raises InputError.
-
-    It is `folder`/build, or, if that cannot be written to, one in the user's cache ($COSIM_CACHE).
-    """
-    where = folder / "build"
-    if installed(folder) or not os.access(folder, os.W_OK):
-        cache = os.environ.get(CACHE) or platformdirs.user_cache_dir("perimeter-cosim", appauthor=False)
-        where = Path(cache) / f"{folder.name}-{hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:16]}"
-    try:
-        where.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{where}: {error.strerror}; name a folder for such files in {CACHE}") from None
-    return where
