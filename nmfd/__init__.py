@@ -17,8 +17,11 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from nmfd import api as api
     from nmfd.api import benchmark, controller, identify, load_scenario, run, train
+    from nmfd.controllers.dpc.policy import ModuleController, PerimeterLayer, SplitsLayer
+    from nmfd.controllers.dpc.rollout import Trajectories
     from nmfd.errors import InputError
     from nmfd.metrics import summary, total_time_spent
+    from nmfd.model.mfd import Cubic, Mfd, PiecewiseLinear, trapezoid
     from nmfd.model.planning import PlanningModel
     from nmfd.model.plant import AcyclicPlant, NmfdPlant
     from nmfd.model.regional_model import RegionalModel, load_network
@@ -29,8 +32,11 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"  # of the package perimeter-cosim, nmfd and cosim alike
 _MODULES = {
     "api": ("benchmark", "controller", "identify", "load_scenario", "run", "train"),
+    "controllers.dpc.policy": ("ModuleController", "PerimeterLayer", "SplitsLayer"),
+    "controllers.dpc.rollout": ("Trajectories",),
     "errors": ("InputError",),
     "metrics": ("summary", "total_time_spent"),
+    "model.mfd": ("Cubic", "Mfd", "PiecewiseLinear", "trapezoid"),
     "model.planning": ("PlanningModel",),
     "model.plant": ("AcyclicPlant", "NmfdPlant"),
     "model.regional_model": ("RegionalModel", "load_network"),

@@ -3,7 +3,7 @@
 import re
 import sys
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
@@ -32,6 +32,10 @@ from nmfd.types import Controller, Plant, Result
 
 if TYPE_CHECKING:
     import pandas as pd
+    import torch
+    from torch import nn
+
+    from nmfd.controllers.dpc.rollout import Trajectories
 
 
 def load_scenario(folder: Path | str, settings: Mapping[str, Any] | None = None) -> Scenario:
@@ -197,8 +201,12 @@ def robustness(
 
 def train(
     scenario: Scenario | Path | str,
-    controller: str,
+    controller: str = "dpc-pcrg",
     *,
+    policy: "nn.Module | None" = None,
+    cost: "Callable[[Trajectories], torch.Tensor] | None" = None,
+    sample: "Callable[[torch.Generator, int], tuple] | None" = None,
+    constraints: "Sequence[tuple[Callable[[Trajectories], torch.Tensor], float]]" = (),
     out: Path | str | None = None,
     seed: int = 0,
     steps: int | None = None,
@@ -206,17 +214,51 @@ def train(
     resume: bool = False,
     anyway: bool = False,
     progress: Progress = None,
-) -> Path:
-    """Train a DPC policy and return its file.
+) -> Any:
+    """Train a DPC policy and return its file; or a module of your own, which is returned.
+
+        >>> import torch
+        >>> scenario = nmfd.load_scenario("economic_mpc")
+        >>> gates = torch.nn.Sequential(  # numbers (..., R, R) of any network, and the box of u
+        ...     torch.nn.Flatten(-2), torch.nn.Linear(49, 49), torch.nn.Unflatten(-1, (7, 7)),
+        ...     nmfd.PerimeterLayer(scenario.network))
+        >>> mine = nmfd.train(scenario, "dpc-pc", policy=gates, steps=1, progress=False)
+        >>> nmfd.run(scenario, nmfd.ModuleController(mine, scenario), steps=2).perimeter.shape
+        (2, 7, 7)
+
+    controller: its name; with `policy` the one whose settings and planning model are used
+    policy: module, states (veh, (B, R, R)) -> perimeter, (perimeter, splits) or (perimeter, splits, metering), which
+        nmfd.PerimeterLayer and nmfd.SplitsLayer make admissible by construction; trained in place
+
+    With `policy`, the loss is the mean over the rollouts of cost plus weighted constraints, which are differentiable:
+
+    cost: nmfd.Trajectories -> (B,); by default the total time spent
+    constraints: pairs of a function, nmfd.Trajectories -> penalty (B,) or (), not negative, and its weight
+    sample: (torch.Generator, B) -> initial states (veh, (B, R, R)) and demand (veh/s, (T, B, R, R)); by default those
+        of the settings
+
+    For named controllers:
 
     out: policy file, SCENARIO/NAME.pt if None
-    steps: Adam steps; those of scenario.toml, else 400, if None
-    device: "cpu", which gives the same weights every time, "cuda" or "auto"
     resume: continue an interrupted training
     anyway: train even on placeholder MFDs or if no gateway can be controlled
+
+    For both:
+
+    steps: Adam steps; those of scenario.toml, else 400, if None
+    device: "cpu", which gives the same weights every time, "cuda" or "auto"
     progress: see `benchmark`
     """
     scenario, strategy = _loaded(scenario), parse(controller)
+    own: dict[str, Any] = {"cost": cost, "sample": sample, "constraints": constraints}
+    if policy is not None:
+        if out or resume:
+            raise InputError("policy: a module is returned, not written; omit out and resume, keep its state_dict()")
+        with watched(type(policy).__name__, progress) as show:
+            own |= {"seed": seed, "steps": steps, "device": training.available(device), "progress": show}
+            return training.train_module(scenario, strategy, policy, **own)
+    if any(own.values()):
+        raise InputError("cost, sample and constraints: train a module of your own; add policy=module")
     options: dict[str, Any] = {"seed": seed, "steps": steps, "device": training.available(device), "resume": resume}
     chosen = training.settings(scenario, strategy, steps)
     file = _file(scenario, f"{controller}.pt", out)

@@ -3,22 +3,24 @@
 Random initial states and demand keep gradients alive: a rollout that gridlocks has none.
 """
 
+import copy
 import io
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Generator
+from torch import Generator, nn
 from torch.optim import Adam
 
 from nmfd.controllers.dpc.compact import CompactPolicy, Numbers
 from nmfd.controllers.dpc.options import Training
-from nmfd.controllers.dpc.policy import Architecture, Policy
+from nmfd.controllers.dpc.policy import Architecture, ModuleController, Policy
 from nmfd.controllers.dpc.policy_file import checkpoint, new_policy, read_file
-from nmfd.controllers.dpc.rollout import Rollout, compiled_step
+from nmfd.controllers.dpc.rollout import Demands, Rollout, States, Trajectories, compiled_step
 from nmfd.controllers.rules import PiGating
 from nmfd.controllers.strategy import Strategy
 from nmfd.errors import InputError, RunFailed
@@ -29,8 +31,8 @@ from nmfd.model.scenario import Scenario
 from nmfd.runs.config import error
 from nmfd.runs.files import atomic
 from nmfd.tensors import one_thread
+from nmfd.types import Observation
 
-BATCH = 16  # rollouts per Adam step
 DEMAND_SPREAD = 0.2  # every flow is scaled by a factor drawn from 1 - this to 1 + this
 RANDOM_START_SHARE = 0.5  # of the rollouts start from a random state at a random time
 VALIDATION_PERIOD = 20  # Adam steps
@@ -114,6 +116,10 @@ def train(
     generator = Generator().manual_seed(seed)
     guidance, compact = strategy.controller.guides, planning.protected if setup.compact else ()
     architecture = Architecture(guidance=guidance, local=setup.local, compact=compact, metering=setup.metering)
+    recipe = setup.recipe
+    architecture = replace(
+        architecture, soft_exponential=recipe.activation != "gelu", decoder_layers=recipe.decoder_layers
+    )
     policy = new_policy(planning.network, architecture)
     if setup.numbers and isinstance(policy, CompactPolicy):
         policy.numbers.data.copy_(torch.tensor(Numbers(*setup.numbers)))
@@ -121,11 +127,11 @@ def train(
         begin_as_no_control(policy, planning.network)
     device = "cpu" if setup.compact else device
     policy = policy.to(device)
-    rollout = Rollout(planning, device=device, detour_cost=setup.detour_cost)
+    rollout = Rollout(planning, device=device, detour_cost=setup.detour_cost, process_std=recipe.process_std)
     if setup.from_gating and not resume:
         begin_as_gate(policy, rollout, generator)
     advance = compiled_step(rollout.step) if compiled else rollout.step
-    optimizer = Adam(policy.parameters(), lr=setup.learning_rate)
+    optimizer = Adam(policy.parameters(), lr=setup.learning_rate, weight_decay=recipe.weight_decay)
     first, best = 0, float("inf")
     state_file = out.with_name(out.name + ".resume")
 
@@ -138,9 +144,7 @@ def train(
     if resume:
         first, best = _restore(state_file, configuration, policy, optimizer, generator)
     for step in range(first, steps):
-        for group in optimizer.param_groups:
-            cosine = 0.5 * (1.0 + math.cos(math.pi * step / steps))
-            group["lr"] = setup.learning_rate * (0.1 + 0.9 * cosine)
+        _set_rate(optimizer, setup, step / steps)
         _descend(policy, rollout, setup, generator, advance, optimizer, step)
         if (step + 1) % VALIDATION_PERIOD == 0 or step + 1 == steps:
             best = keep_the_better(best)
@@ -157,6 +161,80 @@ def train(
     return out
 
 
+@one_thread()
+def train_module(
+    scenario: Scenario,
+    strategy: Strategy,
+    module: nn.Module,
+    *,
+    cost: Callable[[Trajectories], torch.Tensor] | None = None,
+    sample: Callable[[Generator, int], tuple] | None = None,
+    constraints: Sequence[tuple[Callable[[Trajectories], torch.Tensor], float]] = (),
+    seed: int = 0,
+    steps: int | None = None,
+    device: str = "cpu",
+    progress: Callable[[int, int, str], None] | None = None,
+) -> nn.Module:
+    """Train a module of the user's own in place and return it with its best weights; arguments as of nmfd.train."""
+    setup = settings(scenario, strategy, steps)
+    empty = np.zeros(scenario.network.adjacency.shape)
+    ModuleController(module, scenario).act(Observation(step=0, time=0.0, accumulation=empty, backlog=empty))
+    recipe, planning = setup.recipe, planning_model(scenario, strategy.controller.name, strategy.table(scenario))
+    rollout, generator = Rollout(planning, device=device, process_std=recipe.process_std), Generator().manual_seed(seed)
+    module = module.to(device).train()
+    optimizer = Adam(module.parameters(), lr=setup.learning_rate, weight_decay=recipe.weight_decay)
+
+    def loss(generator: Generator, batch: int) -> torch.Tensor:
+        rollout.draw_model(batch, setup.mfd_spread, generator, setup.mfd_scale)
+        given = sample(generator, batch) if sample else _draw(rollout, setup, generator, batch)
+        x, demand = (torch.as_tensor(part, dtype=rollout.dtype, device=rollout.device) for part in given)
+        if x.shape != (batch, *rollout.start.shape) or demand.shape[1:] != x.shape or len(demand) < 2:
+            wanted = f"start ({batch}, R, R) and demand (T, {batch}, R, R) with R = {len(rollout.start)} and T > 1"
+            raise InputError(f"sample: expected {wanted}, got {tuple(x.shape)} and {tuple(demand.shape)}; return these")
+        run = rollout.trajectories(module, x, demand, generator)
+        total = (cost(run) if cost else run.total_time_spent).mean()
+        return total + sum(weight * penalty(run).mean() for penalty, weight in constraints)
+
+    best, kept = math.inf, copy.deepcopy(module.state_dict())
+    for step in range(setup.steps):
+        _set_rate(optimizer, setup, step / setup.steps)
+        value = loss(generator, recipe.batch)
+        if not value.requires_grad:
+            raise InputError("cost: has no gradient by the weights of the policy; compute it from the run with torch")
+        optimizer.zero_grad()
+        value.backward()
+        torch.nn.utils.clip_grad_norm_(module.parameters(), recipe.clip)
+        optimizer.step()
+        if (step + 1) % VALIDATION_PERIOD == 0 or step + 1 == setup.steps:
+            with torch.no_grad():
+                score = loss(Generator().manual_seed(seed), VALIDATION_ROLLOUTS).item()
+            if score < best:
+                best, kept = score, copy.deepcopy(module.state_dict())
+        if progress:
+            progress(step + 1, setup.steps, f"best {best:.4g}")
+    if not math.isfinite(best):
+        raise RunFailed(f"{type(module).__name__}: every validation diverged; lower the learning rate")
+    module.load_state_dict(kept)
+    return module.cpu().eval()
+
+
+def _set_rate(optimizer: Adam, setup: Training, done: float) -> None:
+    """Set the learning rate after a share `done` of the steps."""
+    cosine = 0.5 * (1.0 + math.cos(math.pi * done))
+    for group in optimizer.param_groups:
+        group["lr"] = setup.recipe.learning_rate or setup.learning_rate * (0.1 + 0.9 * cosine)
+
+
+def _draw(rollout: Rollout, setup: Training, generator: Generator, batch: int) -> tuple[States, Demands]:
+    """Return initial states and demands of the rollouts of one step."""
+    most, levels = setup.recipe.largest_start, (setup.demand_low, setup.demand_high)
+    spread, share = (0.0, 0.0) if most else (DEMAND_SPREAD, RANDOM_START_SHARE)
+    x, demand = rollout.random_start(batch, spread, share, generator, levels)
+    if most:
+        x = x + most * torch.rand(x.shape, generator=generator).to(x)
+    return x, rollout.perturb(demand, torch.rand(batch, generator=generator), setup.noise, generator)
+
+
 def _descend(
     policy: Policy,
     rollout: Rollout,
@@ -167,19 +245,21 @@ def _descend(
     step: int,
 ) -> None:
     """Do one Adam step."""
-    rollout.draw_model(BATCH, setup.mfd_spread, generator, setup.mfd_scale)
-    levels = setup.demand_low, setup.demand_high
-    x, demand = rollout.random_start(BATCH, DEMAND_SPREAD, RANDOM_START_SHARE, generator, levels)
-    demand = rollout.perturb(demand, torch.rand(BATCH, generator=generator), setup.noise, generator)
+    recipe = setup.recipe
+    rollout.draw_model(recipe.batch, setup.mfd_spread, generator, setup.mfd_scale)
+    x, demand = _draw(rollout, setup, generator, recipe.batch)
+    total = rollout.total_time_spent(policy, x, demand, generator, advance)
     # The logarithm, because a rollout that is heavily loaded must not count for more than the others.
-    loss = torch.log(rollout.total_time_spent(policy, x, demand, generator, advance).clamp(min=1.0)).mean()
+    loss = torch.log(total.clamp(min=1.0)).mean() if recipe.loss == "log" else total.mean()
     optimizer.zero_grad()
     loss.backward()
     if policy.architecture.guidance and not setup.compact:
         # The decoders are trained in turn. Not by requires_grad, which would compile the step once for each.
-        for weights in (policy.splits_decoder if step % 2 == 0 else policy.perimeter_decoder).parameters():
+        for weights in (
+            policy.splits_decoder if step // recipe.epoch % 2 == 0 else policy.perimeter_decoder
+        ).parameters():
             weights.grad = None
-    torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
+    torch.nn.utils.clip_grad_norm_(policy.parameters(), recipe.clip)
     optimizer.step()
     if isinstance(policy, CompactPolicy):
         policy.bound()

@@ -129,7 +129,7 @@ class PiecewiseLinear(Mfd):
     accumulations [veh], rising from above 0; outflows [veh/s]
 
         >>> trapezoid(free=0.004, capacity=6.0, wave=0.001, jam=8000.0).accumulations
-        (1500.0, 2000.0, 8000.0)
+        (1500.0, 2000.0, 7700.0)
     """
 
     accumulations: tuple[float, ...]

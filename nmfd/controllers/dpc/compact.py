@@ -81,7 +81,7 @@ class CompactPolicy(Policy):
         want = gate.unsqueeze(-2) + numbers.relief * (full - 1.0).clamp(min=0.0).unsqueeze(-1)
         share = torch.sigmoid(4.0 * want) if memory is None else (0.5 + want).clamp(0.0, 1.0)
         share = torch.where(self.held, share, torch.ones_like(want))
-        perimeter = (self.u_min + (self.u_max - self.u_min) * share) * self.adjacency
+        perimeter = (self.box.low + (self.box.high - self.box.low) * share) * self.box.allowed
         prices = self.prices(x)
         return perimeter, None if prices is None else self._answer(x.to(self.scale.dtype), prices)
 

@@ -1,11 +1,61 @@
 """Options of DPC policies and of their training."""
 
-from typing import Annotated
+import math
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
 from nmfd.model.planning import Options, PlanningModel
-from nmfd.runs.config import Flow, Numbers, Problem, Share, setting, whole
+from nmfd.runs.config import Flow, Numbers, Problem, Share, Texts, got, setting, whole
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe:
+    """Parts of a training that a preset changes together; by default ours.
+
+    learning_rate: constant; None: that of the settings, along a cosine
+    weight_decay: of Adam; batch: rollouts per Adam step; clip: largest norm of the gradient
+    activation: "gelu" or "soft-exponential"; decoder_layers: hidden layers of each decoder
+    loss: mean over the rollouts of the "log" of the total time spent, or of the "sum" itself
+    epoch: Adam steps after which the decoders take turns
+    process_std: standard deviation of the noise on each x_ij that is not empty, after every interval (veh)
+    largest_start: initial x_ij are uniform up to it, under the demand of the scenario (veh); 0: random states at random
+        times for half of the rollouts, and every flow is scaled
+    """
+
+    learning_rate: float | None = None
+    weight_decay: float = 0.0
+    batch: int = 16
+    clip: float = 1.0
+    activation: str = "gelu"
+    decoder_layers: int = 0
+    loss: str = "log"
+    epoch: int = 1
+    process_std: float = 0.0
+    largest_start: float = 0.0
+
+
+PRESETS = {
+    "ours": Recipe(),
+    # Tumu et al., by section. Training: learning rate (no schedule is named), weight decay, batch, sizes of 128,
+    # alternation by epoch; no clipping is named. Policy Network: SoftExponential, decoders that are networks of hidden
+    # layers. Problem Formulation: plain sum of the accumulations, noise on the state. Conclusion: one scenario.
+    # Not stated: the number of steps, the length of an epoch (here ten batches), hidden layers (here two, one in each
+    # decoder), and initial states (here those of Region Scaling Results, the only ones that are named).
+    "published": Recipe(
+        learning_rate=1e-4,
+        weight_decay=1e-6,
+        batch=256,
+        clip=math.inf,
+        activation="soft-exponential",
+        decoder_layers=1,
+        loss="sum",
+        epoch=10,
+        process_std=0.25,
+        largest_start=100.0,
+    ),
+}
 
 
 class Training(Options):
@@ -31,6 +81,12 @@ class Training(Options):
         "factor of the MFDs' accumulation axes; below 1 for a city that may lock early", 1.0, unit="-", ge=0.1, le=1.0
     )
     detour_cost: float = setting("time lost by a vehicle off the nominal splits", 0.0, unit="s", ge=0.0, le=1e6)
+    preset: Literal["ours", "published"] = setting("recipe of the training; published: that of Tumu et al.", "ours")
+    preset_without: Texts = setting(
+        "parts of the preset that stay ours: learning_rate, weight_decay, batch, clip, activation, decoder_layers, "
+        "loss, epoch, process_std, largest_start",
+        (),
+    )
     from_no_control: bool = setting("the initial policy is nearly no control", False)
     from_gating: bool = setting("the initial policy is nearly a gate at the set point of pi-gating", False)
 
@@ -44,7 +100,18 @@ class Training(Options):
             raise Problem("numbers", "expected 8 to 11 numbers >= 0 of a compact policy; add compact = true")
         if (self.metering or not self.descend) and not self.compact:
             raise Problem("metering" if self.metering else "descend", "only for compact policies; add compact = true")
+        if self.preset != "ours" and (self.compact or self.local or self.from_gating or self.from_no_control):
+            raise Problem("preset", "begins with a random network; omit compact, local, from_gating, from_no_control")
+        parts = vars(PRESETS[self.preset])
+        if self.preset_without and (self.preset == "ours" or not set(self.preset_without) <= set(parts)):
+            problem = got(f"parts of the preset published, of {', '.join(parts)}", list(self.preset_without))
+            raise Problem("preset_without", f"{problem}; correct them or add preset")
         return self
+
+    @property
+    def recipe(self) -> Recipe:
+        """The preset with its exceptions."""
+        return replace(PRESETS[self.preset], **{name: getattr(PRESETS["ours"], name) for name in self.preset_without})
 
     def misfit(self, planning: PlanningModel) -> Problem | None:
         """Return a gate without a protected region as a problem."""

@@ -12,7 +12,9 @@ from jaxtyping import Float, Int
 from torch import nn
 
 from nmfd.arrays import Adjacency
+from nmfd.controllers.custom import checked
 from nmfd.model.regional_model import RegionalModel
+from nmfd.model.scenario import Horizon
 from nmfd.tensors import PerPair, PerRegion, PerTurn
 from nmfd.types import Controls, Observation
 
@@ -30,6 +32,7 @@ class Architecture:
     local: one small network for every boundary with FEATURES inputs, perimeter control only; it fits every city
     compact: protected regions of a compact policy (nmfd.controllers.dpc.compact), () for a network
     metering: the compact policy makes trips wait
+    soft_exponential: activation SoftExponential instead of GELU; decoder_layers: hidden layers of each decoder
     """
 
     width: int = 128
@@ -39,11 +42,62 @@ class Architecture:
     local: bool = False
     compact: tuple[int, ...] = ()
     metering: bool = False
+    soft_exponential: bool = False
+    decoder_layers: int = 0
 
     @property
     def listed(self) -> bool:
         """True if outputs are those towards adjacent regions only."""
         return self.sparse or self.local
+
+
+class PerimeterLayer(nn.Module):
+    """Box of the perimeter control: any numbers (..., R, R) -> u in [u_min, u_max], 0 where h is not adjacent to i."""
+
+    def __init__(self, network: RegionalModel, allowed: torch.Tensor | None = None):
+        """allowed: (R, D), the boundaries that the inputs (..., R, D) stand for; by default the adjacency"""
+        super().__init__()
+        self.low, self.high = network.u_min, network.u_max
+        allowed = torch.as_tensor(network.adjacency if allowed is None else allowed)
+        self.register_buffer("allowed", allowed.float(), persistent=False)
+
+    def forward(self, numbers: Float[torch.Tensor, "*#B R D"]) -> Float[torch.Tensor, "*#B R D"]:
+        return (self.low + (self.high - self.low) * torch.sigmoid(numbers)) * self.allowed
+
+
+class SplitsLayer(nn.Module):
+    """Simplex of the split ratios: any numbers (..., R, R, R) -> theta >= 0 with sum 1 over the allowed turns."""
+
+    def __init__(self, network: RegionalModel, mask: torch.Tensor | None = None):
+        """mask: (R, D, R), the turns that the inputs (..., R, D, R) stand for; by default network.split_mask"""
+        super().__init__()
+        mask = torch.as_tensor(network.split_mask if mask is None else mask)
+        # A softmax over nothing but -inf is NaN: rows without a turn (j = i) get finite logits and become zero.
+        blocked = ~mask & mask.any(dim=1, keepdim=True)
+        self.register_buffer("mask", mask.float(), persistent=False)
+        self.register_buffer("bias", torch.zeros(mask.shape).masked_fill(blocked, -torch.inf), persistent=False)
+
+    def forward(self, numbers: Float[torch.Tensor, "*#B R D R"]) -> Float[torch.Tensor, "*#B R D R"]:
+        return torch.softmax(numbers + self.bias, dim=-2) * self.mask
+
+
+class SoftExponential(nn.Module):
+    """Activation with one trained number a, initially 0 (Godfrey and Gashler, 2015).
+
+    -log(1 - a (x + a)) / a for a < 0, x for a = 0, (exp(a x) - 1) / a + a for a > 0; near a = 0 its series, so that a
+    has a gradient. NeuroMANCER's has none at its own default a = 0: there a network of it stays linear.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.a = nn.Parameter(torch.tensor(0.0))
+
+    def forward(self, x: Float[torch.Tensor, "*B"]) -> Float[torch.Tensor, "*B"]:
+        near = self.a.abs() < 1e-3
+        a = torch.where(near, torch.ones_like(self.a), self.a)
+        falling = -torch.log((1.0 - a * (x + a)).clamp(min=1e-6)) / a
+        rising = torch.expm1((a * x).clamp(max=30.0)) / a + a
+        return torch.where(near, x + self.a * (1.0 + 0.5 * x**2), torch.where(a < 0, falling, rising))
 
 
 class Policy(nn.Module):
@@ -56,13 +110,12 @@ class Policy(nn.Module):
         super().__init__()
         regions = network.regions
         self.architecture, self.regions = architecture, regions
-        self.u_min, self.u_max = network.u_min, network.u_max
         scale = torch.tensor([[m.critical] for m in network.mfds], dtype=torch.float32)
         self.register_buffer("scale", scale, persistent=not architecture.local)
         onward = _neighbours(network.adjacency) if architecture.listed else np.tile(np.arange(regions), (regions, 1))
         here = np.arange(regions)[:, None]
         allowed = torch.tensor(network.adjacency[here, onward] & (np.diff(onward, prepend=-1) != 0))
-        self.register_buffer("adjacency", allowed.float(), persistent=False)
+        self.box = PerimeterLayer(network, allowed)
         self.register_buffer("onward", torch.tensor(onward), persistent=False)
         self._build(network)
 
@@ -70,20 +123,22 @@ class Policy(nn.Module):
         """Create the weights."""
         architecture, regions, width = self.architecture, self.regions, self.architecture.width
         here, onward = np.arange(regions)[:, None], self.onward.numpy()
-        layers: list[nn.Module] = []
-        for layer in range(architecture.layers):
-            inputs = FEATURES if architecture.local else regions**2
-            layers += [nn.Linear(inputs if layer == 0 else width, width), nn.GELU()]
-        self.backbone = nn.Sequential(*layers)
-        self.perimeter_decoder = nn.Linear(width, 1 if architecture.local else onward.size)
+        activation = SoftExponential if architecture.soft_exponential else nn.GELU
+
+        def hidden(inputs: int, layers: int) -> list[nn.Module]:
+            sizes = [inputs, *[width] * layers]
+            return [part for n in range(layers) for part in (nn.Linear(sizes[n], width), activation())]
+
+        def decoder(outputs: int) -> nn.Module:
+            layers = [*hidden(width, architecture.decoder_layers), nn.Linear(width, outputs)]
+            return nn.Sequential(*layers) if len(layers) > 1 else layers[0]
+
+        self.backbone = nn.Sequential(*hidden(FEATURES if architecture.local else regions**2, architecture.layers))
+        self.perimeter_decoder = decoder(1 if architecture.local else onward.size)
         if architecture.guidance:
-            self.splits_decoder = nn.Linear(width, onward.size * regions)
-            mask = torch.tensor(network.split_mask[here, onward]) & self.adjacency.bool().unsqueeze(-1)
-            # A softmax over nothing but -inf is NaN: rows without a turn (j = i) get finite logits and become zero.
-            blocked = ~mask & mask.any(dim=1, keepdim=True)
-            bias = torch.zeros(mask.shape).masked_fill(blocked, -torch.inf)
-            self.register_buffer("split_mask", mask.float(), persistent=False)
-            self.register_buffer("split_bias", bias, persistent=False)
+            self.splits_decoder = decoder(onward.size * regions)
+            mask = torch.tensor(network.split_mask[here, onward]) & self.box.allowed.bool().unsqueeze(-1)
+            self.simplex = SplitsLayer(network, mask)
 
     def forward(self, x: PerPair, memory: Memory | None = None) -> tuple[PerPair, PerTurn | None]:
         """Return perimeter and splits of the states x; memory: what `remember` returned for x, None in rollouts."""
@@ -102,12 +157,10 @@ class Policy(nn.Module):
         """Return perimeter (..., R, D) and splits (..., R, D, R) towards the regions `onward`; D = R if dense."""
         shape = self.onward.shape
         hidden = self.backbone(self._around(x) if self.architecture.local else (x / self.scale).flatten(-2))
-        open_share = torch.sigmoid(self.perimeter_decoder(hidden)).reshape(*x.shape[:-2], *shape)
-        perimeter = (self.u_min + (self.u_max - self.u_min) * open_share) * self.adjacency
+        perimeter = self.box(self.perimeter_decoder(hidden).reshape(*x.shape[:-2], *shape))
         if not self.architecture.guidance:
             return perimeter, None
-        logits = self.splits_decoder(hidden).unflatten(-1, (*shape, self.regions)) + self.split_bias
-        return perimeter, torch.softmax(logits, dim=-2) * self.split_mask
+        return perimeter, self.simplex(self.splits_decoder(hidden).unflatten(-1, (*shape, self.regions)))
 
     def remember(self, x: PerPair, memory: Memory | None) -> Memory | None:
         """Return the memory after states x, from `memory` before them or None; None for a policy without one."""
@@ -125,7 +178,7 @@ class Policy(nn.Module):
         """Return n, the neighbours' mean n, and the vehicles bound for it, in critical n, for i and h of boundaries."""
         critical = self.scale.squeeze(-1)
         full, ending = (n.to(critical.dtype) / critical for n in (x.sum(-1), torch.diagonal(x, dim1=-2, dim2=-1)))
-        beside = (full[..., self.onward] * self.adjacency).sum(-1) / self.adjacency.sum(-1).clamp(min=1.0)
+        beside = (full[..., self.onward] * self.box.allowed).sum(-1) / self.box.allowed.sum(-1).clamp(min=1.0)
         regions = torch.stack([full, beside, ending], dim=-1)
         here = regions.unsqueeze(-2).expand(*regions.shape[:-1], self.onward.shape[1], -1)
         return torch.cat([here, regions[..., self.onward, :]], dim=-1)
@@ -160,3 +213,39 @@ class DpcController:
         if splits is not None:
             splits /= np.maximum(splits.sum(axis=1, keepdims=True), 1e-9)  # float32 misses 1
         return Controls(perimeter=perimeter, splits=splits, prices=prices, metering=metering)
+
+
+def commanded(policy: nn.Module, x: PerPair) -> tuple[PerPair, PerTurn | None, PerRegion | None]:
+    """Return perimeter, splits or None, and metering (veh/s, (..., R)) or None of any policy in the states x."""
+    if isinstance(policy, Policy):
+        return *policy(x), policy.metering(x)
+    values = policy(x)
+    perimeter, splits, metering = (*(values if isinstance(values, tuple) else (values,)), None, None)[:3]
+    return perimeter, splits, metering
+
+
+class ModuleController:
+    """Module of your own as a controller: states (veh, (..., R, R)) -> admissible controls.
+
+    It returns perimeter, (perimeter, splits) or (perimeter, splits, metering). They are checked at every step, as those
+    of a class of your own.
+
+        >>> scenario = nmfd.load_scenario("economic_mpc")
+        >>> gates = nmfd.PerimeterLayer(scenario.network)  # without weights: opens the more, the more vehicles there are
+        >>> nmfd.run(scenario, nmfd.ModuleController(gates, scenario), steps=1).controller
+        'PerimeterLayer'
+    """
+
+    def __init__(self, module: nn.Module, scenario: Horizon):
+        self.module, self.name, self._network = module.eval(), type(module).__name__, scenario.network
+
+    def reset(self, seed: int = 0) -> None:
+        pass
+
+    def act(self, observation: Observation) -> Controls:
+        with torch.inference_mode():
+            like = next(self.module.parameters(), torch.zeros(1))
+            values = commanded(self.module, torch.from_numpy(observation.accumulation).to(like))
+        perimeter, splits, metering = (None if v is None else v.cpu().numpy().astype(float) for v in values)
+        controls = Controls(perimeter=perimeter, splits=splits, metering=metering)
+        return checked(controls, self._network, f"{self.name}: interval {observation.step}")

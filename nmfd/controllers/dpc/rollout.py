@@ -4,14 +4,14 @@ import os
 import shutil
 import warnings
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from jaxtyping import Float
-from torch import Generator
+from torch import Generator, nn
 
-from nmfd.controllers.dpc.policy import Policy
+from nmfd.controllers.dpc.policy import Policy, commanded
 from nmfd.model import dynamics
 from nmfd.model.planning import PlanningModel
 from nmfd.model.scenario import pairs_with_demand
@@ -22,19 +22,53 @@ Demands = Float[torch.Tensor, "T B R R"]  # or states over time
 Levels = Float[torch.Tensor, " B"]
 
 
+@dataclass(frozen=True, kw_only=True)
+class Trajectories:
+    """B rollouts of T control intervals, of which costs and constraints are functions.
+
+    step: control interval (s)
+    states, backlog: inside region i, and waiting to enter it, at the beginning of each interval (veh, (T, B, R, R))
+    demand: (veh/s, (T, B, R, R))
+    rate: outflow per vehicle q_i (1/s, (T, B, R)), in proportion to the mean speed of the region
+    perimeter, splits: commands (-, (T-1, B, R, R)) and (-, (T-1, B, R, R, R)); none follows the last state
+    """
+
+    step: float
+    states: Demands
+    backlog: Demands
+    demand: Demands
+    rate: Float[torch.Tensor, "T B R"]
+    perimeter: Float[torch.Tensor, "K B R R"]
+    splits: Float[torch.Tensor, "K B R R R"]
+
+    @property
+    def total_time_spent(self) -> Levels:
+        """Total time spent (veh s, (B,))."""
+        return self.step * (self.states + self.backlog).sum((0, -2, -1))
+
+
 class Rollout:
     """Regional model of a scenario as tensors; random numbers are drawn on the CPU, so that devices agree."""
 
     def __init__(
-        self, planning: PlanningModel, dtype: torch.dtype = torch.float32, device: str = "cpu", detour_cost: float = 0.0
+        self,
+        planning: PlanningModel,
+        dtype: torch.dtype = torch.float32,
+        device: str = "cpu",
+        *,
+        detour_cost: float = 0.0,
+        process_std: float = 0.0,
     ):
-        """detour_cost: time lost by a vehicle that is guided off the nominal split ratios (s)"""
+        """detour_cost: time lost by a vehicle that is guided off the nominal split ratios (s)
+
+        process_std: as of a scenario (veh)
+        """
 
         def tensor(values: Any) -> torch.Tensor:
             return torch.tensor(values, dtype=dtype, device=device)
 
         network = planning.network
-        self.detour_cost = detour_cost
+        self.detour_cost, self.process_std = detour_cost, process_std
         self.planning, self.dtype, self.device = planning, dtype, torch.device(device)
         self.parameters = self._nominal = dynamics.parameters(network, dtype=dtype, device=device)
         self.demand = tensor(planning.forecast)
@@ -123,16 +157,41 @@ class Rollout:
         """
         noise = torch.randn(demand.shape, generator=generator, dtype=self.dtype).to(self.device)
         noise *= self.planning.measurement_std
+        shocks = self._shocks(demand, generator)
         states, waiting, backlog = [x], [x.new_zeros(len(x))], torch.zeros_like(x)
         for k in range(demand.shape[0] - 1):
             entering = demand[k]
             if policy.architecture.metering:
                 rates = policy.metering(states[-1] + noise[k])
                 entering, backlog = dynamics.admitted(backlog, entering, rates, self.planning.step)
-            states.append((step or self.step)(policy, states[-1], entering, noise[k]))
+            states.append(shaken((step or self.step)(policy, states[-1], entering, noise[k]), shocks, k))
             waiting.append(backlog.sum((-2, -1)))
         exact = torch.stack(states)
         return exact, exact + noise, torch.stack(waiting)
+
+    def trajectories(self, policy: nn.Module, x: States, demand: Demands, generator: Generator) -> "Trajectories":
+        """Return the rollouts of any module from x; arguments as `states`."""
+        noise = torch.randn(demand.shape, generator=generator, dtype=self.dtype).to(self.device)
+        shocks = self._shocks(demand, generator)
+        states, waiting, commands = [x], [torch.zeros_like(x)], []
+        for k in range(len(demand) - 1):
+            perimeter, splits, rates = commanded(policy, states[-1] + self.planning.measurement_std * noise[k])
+            splits = (self.nominal_splits if splits is None else splits).expand(len(x), -1, -1, -1)
+            entering, backlog = dynamics.admitted(waiting[-1], demand[k], rates, self.planning.step)
+            waiting.append(backlog)
+            commands.append((perimeter, splits))
+            after = dynamics.advance(self.parameters, states[-1], entering, perimeter, splits, **self.planning.scheme)
+            states.append(shaken(after, shocks, k))
+        exact, (perimeters, turns) = torch.stack(states), map(torch.stack, zip(*commands, strict=True))
+        return Trajectories(
+            step=self.planning.step,
+            states=exact,
+            backlog=torch.stack(waiting),
+            demand=demand,
+            rate=dynamics.rate(self.parameters, exact.sum(-1)),
+            perimeter=perimeters,
+            splits=turns,
+        )
 
     def total_time_spent(
         self, policy: Policy, x: States, demand: Demands, generator: Generator, step: Callable | None = None
@@ -144,6 +203,12 @@ class Rollout:
             vehicles = vehicles + self.detour_cost * self._diverted(exact, policy(seen)[1]).sum((0, -2, -1))
         return self.planning.step * vehicles
 
+    def _shocks(self, demand: Demands, generator: Generator) -> Demands | None:
+        """Draw the process noise of all intervals (veh, (T, B, R, R)), None without."""
+        if not self.process_std:
+            return None
+        return self.process_std * torch.randn(demand.shape, generator=generator, dtype=self.dtype).to(self.device)
+
     def _diverted(self, x: PerPair, splits: PerTurn) -> PerPair:
         """Return the flow that leaves a region off the nominal split ratios (veh/s, (..., R, R))."""
         p = self.parameters
@@ -151,6 +216,11 @@ class Rollout:
         if p.exit_rates is not None:
             leaving = leaving * p.exit_rates
         return 0.5 * (splits - self.nominal_splits).abs().sum(-2) * leaving
+
+
+def shaken(x: States, shocks: Demands | None, k: int) -> States:
+    """Return x after the process noise of interval k on each x_ij that is not empty; none becomes negative."""
+    return x if shocks is None else torch.where(x > 0, (x + shocks[k]).clamp(min=0.0), x)
 
 
 def can_compile(device: str = "cpu") -> bool:
