@@ -11,6 +11,7 @@ from test_responsive import imported
 from cosim.plant.plant import SumoPlant
 from cosim.plant.room import Room, shared, upstream
 from cosim.plant.settings import settings
+from cosim.plant.supervisor import Supervisor
 from cosim.sumo.net import Gateway, predecessors
 from nmfd.api import load_scenario
 from nmfd.controllers.rules import PiGating
@@ -117,3 +118,17 @@ def test_the_integral_goes_on_from_what_was_realised():
     realised[entries, 3] = np.linspace(0.3, 0.7, entries.sum())
     seen = Observation(step=1, time=30.0, accumulation=accumulation, backlog=accumulation, realised=realised)
     assert controller.act(seen).perimeter[entries, 3] == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("change, full, share, opens", [(1, 1.5, 0.2, True), (0, 1.5, 0.2, True), (-1, 1.5, 0.2, False),
+                                                        (1, 0.5, 0.2, False), (1, 1.5, 0.9, False)])  # fmt: skip
+def test_gates_that_do_not_empty_their_region_open_for_a_while(change, full, share, opens):
+    network = load_scenario("economic_mpc").network
+    supervisor, command = Supervisor(network, 90.0), np.where(network.adjacency, 1.0, 0.0)
+    command[:, 3] *= share
+    accumulation, others = full * network.critical, np.arange(7) != 3
+    opened = [supervisor.opened(command, accumulation + change * k) for k in range(35)]
+    assert not np.array(opened)[:, others].any()
+    assert [k for k, regions in enumerate(opened) if regions[3]] == (
+        [*range(10, 20), *range(30, 35)] if opens else []
+    )  # 900 s of patience, 900 s open

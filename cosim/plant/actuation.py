@@ -9,6 +9,7 @@ from cosim.plant.incidents import Incidents
 from cosim.plant.max_pressure import FACTS, MaxPressure
 from cosim.plant.room import Room
 from cosim.plant.settings import CYCLIC, Settings
+from cosim.plant.supervisor import Supervisor
 from cosim.sumo.arrays import PerEdge, PerGateway
 from cosim.sumo.net import City, Gateway, gateway_movements
 from cosim.sumo.session import Phase, Session
@@ -61,12 +62,17 @@ class Actuation:
         phases |= {plan.signal: plan.phases for plan in own if plan.static or plan.actuated}
         self.original_green = _programmed_green(city, phases, step)
         self.room = Room(session, city, self.original_green, limit=settings.chain_limit, lanes=not settings.mesoscopic)
+        self._supervisor = Supervisor(network, step) if settings.chain_limit > 0 else None
+        self._region_of = [city.region_of[edge] for edge in city.edges]
         self.states: dict[str, list[tuple[float, str]]] = {signal: [] for signal in session.signals()}
 
     def command(self, perimeter: PerPair, vehicles: PerEdge) -> None:
         """Set u (R, R) [-] of the control interval that begins. vehicles: (E,) [veh] on the streets"""
         network = self._network
         share = np.clip((perimeter - network.u_min) / (network.u_max - network.u_min), 0.0, 1.0)
+        if self._supervisor:
+            accumulation = np.bincount(self._region_of, vehicles, minlength=len(share))
+            share[:, self._supervisor.opened(share, accumulation)] = 1.0
         self.room.command(share, vehicles)
         self._obey()
 
