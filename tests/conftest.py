@@ -64,6 +64,23 @@ def _fail_if_skipped(report: pytest.TestReport | pytest.CollectReport, config: p
 
 
 @pytest.fixture
+def plant_of(scenario):
+    """Plants of a module's scenario that are closed in any case: SUMO allows one session per process."""
+    from cosim.plant.plant import SumoPlant  # not before annotations are checked
+    from cosim.plant.settings import Settings
+
+    plants = []
+
+    def make(**overrides):
+        plants.append(SumoPlant(scenario, settings=Settings(**overrides)))
+        return plants[-1]
+
+    yield make
+    for plant in plants:
+        plant.close()
+
+
+@pytest.fixture
 def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
     """No check of annotations: for tests of what users are told who give something of a wrong type."""
     monkeypatch.setattr(config, "jaxtyping_disable", True)

@@ -13,7 +13,6 @@ from commands import nmfd as command
 import cosim
 import nmfd
 from nmfd.controllers import strategy
-from nmfd.studies.benchmark import summary_table
 
 NAMES = ("no-control", "dpc-pc", "dpc-pcrg", "pi-gating")
 
@@ -43,22 +42,6 @@ def test_one_name_many_and_patterns(listed, given, expected):
     assert listed(given) == expected
 
 
-@pytest.mark.parametrize(
-    "given, expected",
-    [
-        ("dcp-*", "controllers: no controller here matches 'dcp-*'; choose from no-control, dpc-pc,"),
-        ("pi-gating,,no-control", "controller '' is unknown"),
-        ("", "at least one controller"),
-        ([], "at least one controller"),
-        ("dpc-prcg", "did you mean dpc-pcrg?"),
-    ],
-    ids=str,
-)
-def test_lists_that_are_none(listed, given, expected):
-    with pytest.raises(nmfd.InputError, match=re.escape(expected)):
-        listed(given)
-
-
 def test_a_pattern_stands_for_what_has_a_policy(tmp_path, monkeypatch):
     monkeypatch.setattr("nmfd.studies.plots.save", lambda *given: None)
     folder = tiny.write(tmp_path)
@@ -73,15 +56,6 @@ def test_a_pattern_stands_for_what_has_a_policy(tmp_path, monkeypatch):
     names = [one.name for one in strategy.ready(nmfd.load_scenario(folder))]
     assert {"dpc-pc", "dpc-pc+max-pressure"} <= set(names)
     assert not {"dpc-pcrg", "dpc-pc+nonsense"} & set(names)
-
-
-def test_a_benchmark_of_one_name_is_a_table(tmp_path, monkeypatch):
-    monkeypatch.setattr("nmfd.studies.plots.save", lambda *given: None)
-    rows = nmfd.benchmark(tiny.write(tmp_path), "no-control", seeds=2, out=tmp_path / "out")
-    assert list(rows["seed"]) == [0, 1] and set(rows["failure"]) == {""}
-    assert "no-control" in summary_table(rows) and "TTS [veh s]" in summary_table(rows)
-    with pytest.raises(nmfd.InputError, match="did you mean acyclic?"):
-        nmfd.benchmark(tmp_path / "scenario", "no-control", plant="acylic", out=tmp_path / "other")
 
 
 def test_progress_is_shown_on_a_terminal_and_in_notebooks_only(monkeypatch, capsys, tmp_path):

@@ -6,7 +6,6 @@ import re
 import shutil
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -26,7 +25,6 @@ from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.model.planning import planning_model
 from nmfd.model.regional_model import load_network
-from nmfd.types import Controls
 
 
 @pytest.fixture(scope="module")
@@ -124,25 +122,15 @@ def test_scenario_drives_the_original_vehicles(imported, config):
     traffic = read_traffic(case, read_streets(case.net, case.additional), seed=0)
     assert scenario.demand.sum() * scenario.step == pytest.approx(len(traffic.vehicles), rel=1e-4)
     assert settings(scenario).begin == 600.0 and settings(scenario).ways_return
-    scenario = replace(scenario, steps=10)
-    network = scenario.network
-    plant = SumoPlant(scenario)
-    try:
-        plant.reset(0)
-        for _ in range(scenario.steps):  # the ledger is checked in every one
-            measurement = plant.step(
-                Controls(perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=network.nominal_splits)
-            )
-        record, due = SimpleNamespace(**plant.record()), len(plant.trips())
+    with tiny_city.played(scenario, 10, 0.9, scenario.network.nominal_splits) as (plant, measurement, record):
+        due = len(plant.trips())
         # every car, and the buses: one, and one per 200 s in ten minutes
-        assert due == (traffic.depart < 600.0 + scenario.steps * scenario.step - 10).sum() + 1 + 3
+        assert due == (traffic.depart < 600.0 + 10 * scenario.step - 10).sum() + 1 + 3
         assert record.departures.sum() == due - measurement.backlog.sum()
         assert record.arrivals.sum() + measurement.accumulation.sum() == record.departures.sum()
         free = plant.session.is_free
         assert not any(free(v) for v in plant.session.running() if v.startswith(("line2", "bus", "stops")))
         assert record.guided.sum() > 0
-    finally:
-        plant.close()
 
 
 def test_own_regions_come_back(imported, config, tmp_path):
@@ -160,15 +148,8 @@ def test_networks_as_they_are(tmp_path):
         net = tiny_city.network(tmp_path, *options, name=f"{name}.net.xml")
         folder = tiny_city.imported(tmp_path / name, 2, net, demand="peak", level=0.1, iterations=1)
         assert expected in (tmp_path / name / "networks" / "tiny" / "import.txt").read_text()
-        scenario = replace(load_scenario(folder), steps=3)
-        plant = SumoPlant(scenario)
-        try:
-            plant.reset(0)
-            for _ in range(3):
-                plant.step(Controls(perimeter=np.where(scenario.network.adjacency, 0.1, 0.0), splits=None))
-            assert SimpleNamespace(**plant.record()).departures.sum() > 0
-        finally:
-            plant.close()
+        with tiny_city.played(load_scenario(folder), 3, 0.1) as (_, _, record):
+            assert record.departures.sum() > 0
 
 
 def test_signals_that_are_left_alone(config, tmp_path):
@@ -188,15 +169,9 @@ def test_signals_that_are_left_alone(config, tmp_path):
 
 
 def test_mesoscopic_keeps_the_ledger(imported):
-    scenario = replace(load_scenario(imported[0] / "scenarios" / "tiny"), steps=4)
-    plant = SumoPlant(scenario, settings=settings(scenario).changed(mesoscopic=True))
-    try:
-        plant.reset(0)
-        for _ in range(scenario.steps):
-            plant.step(Controls(perimeter=np.where(scenario.network.adjacency, 0.5, 0.0), splits=None))
-        assert SimpleNamespace(**plant.record()).crossings.sum() > 0
-    finally:
-        plant.close()
+    scenario = load_scenario(imported[0] / "scenarios" / "tiny")
+    with tiny_city.played(scenario, 4, 0.5, mesoscopic=True) as (_, _, record):
+        assert record.crossings.sum() > 0
 
 
 @pytest.mark.parametrize("key, value", [("signals", "max-pressure"), ("measurement", "estimate")])
@@ -225,16 +200,7 @@ def test_options_and_includes_of_the_user_count(config, tmp_path):
     case = read_sumo_input(tmp_path / "city.sumocfg")
     assert case.reading == {"scale": "2.5"} and case.mesoscopic and case.left_out == ()
     assert case.options["max-depart-delay"] == "60" and case.options["meso-junction-control"] == "false"
-    text = good(
-        cosim(
-            "import",
-            tmp_path / "city.sumocfg",
-            "--regions",
-            2,
-            "--out",
-            tmp_path / "networks" / "x",
-        )
-    )
+    text = good(cosim("import", tmp_path / "city.sumocfg", "--regions", 2, "--out", tmp_path / "networks" / "x"))
     assert "150 vehicles in" in text
     scenario = load_scenario(tmp_path / "scenarios" / "x")
     assert scenario.demand_factor == 1.0 and scenario.demand.sum() * scenario.step == pytest.approx(150.0)
@@ -271,14 +237,8 @@ def test_signal_plans_know_the_city_s_own_vehicles(imported):
     assert 2.0 * 75 / 900 <= flows["B1C1", "C1D1"] < 2.0 * 120 / 900  # the flow straight on, of trips
     assert all(b in city.successors[a] for a, b in flows)
     for plan in ("max-pressure", "webster", "actuated"):
-        plant = SumoPlant(scenario, settings=settings(scenario).changed(signals=plan))
-        try:
-            plant.reset(0)
-            for _ in range(2):
-                plant.step(Controls(perimeter=np.where(scenario.network.adjacency, 0.9, 0.0), splits=None))
-            assert SimpleNamespace(**plant.record()).departures.sum() > 0
-        finally:
-            plant.close()
+        with tiny_city.played(scenario, 2, 0.9, signals=plan) as (_, _, record):
+            assert record.departures.sum() > 0
 
 
 @pytest.mark.parametrize(
@@ -330,26 +290,10 @@ def test_guidance_leaves_roads_that_are_closed_to_cars_alone(config, tmp_path):
     (tmp_path / "city.sumocfg").write_text(
         '<configuration><net-file value="city.net.xml"/><route-files value="cars.rou.xml"/></configuration>'
     )
-    good(
-        cosim(
-            "import",
-            tmp_path / "city.sumocfg",
-            "--regions",
-            2,
-            "--out",
-            tmp_path / "networks" / "taxis",
-        )
-    )
-    scenario = replace(load_scenario(tmp_path / "scenarios" / "taxis"), steps=6)
-    network = scenario.network
-    plant = SumoPlant(scenario)
-    try:
-        plant.reset(0)
-        for _ in range(scenario.steps):
-            plant.step(Controls(perimeter=np.where(network.adjacency, 0.9, 0.0), splits=network.nominal_splits))
-        assert SimpleNamespace(**plant.record()).guided.sum() > 10
-    finally:
-        plant.close()
+    good(cosim("import", tmp_path / "city.sumocfg", "--regions", 2, "--out", tmp_path / "networks" / "taxis"))
+    scenario = load_scenario(tmp_path / "scenarios" / "taxis")
+    with tiny_city.played(scenario, 6, 0.9, scenario.network.nominal_splits) as (_, _, record):
+        assert record.guided.sum() > 10
 
 
 @pytest.mark.slow

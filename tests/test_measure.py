@@ -8,6 +8,7 @@ import streets
 
 from cosim.plant.meter import Event, Meter
 from cosim.sumo.outputs import End
+from cosim.sumo.session import REFUSALS
 from nmfd.ledger import LedgerError
 
 # a0 -> b0 -> b1 -> c0 in a row, regions 0, 1, 1, 2, and a way back c0 -> a0. Entries: b0, c0 and a0.
@@ -150,6 +151,16 @@ def test_who_waits_to_enter_is_backlog(play):
     assert (play.meter.backlog() == x((0, 2), (1, 1))).all() and (play.meter.accumulation() == 0).all()
     play.step(new=["v"], waiting=["w"])
     assert (play.meter.backlog() == x((1, 1))).all() and (play.meter.accumulation() == x((0, 2))).all()
+
+
+def test_a_vehicle_that_sumo_gives_up_at_once(play):
+    """It is loaded and gone in the same step: nothing to follow, and nothing breaks."""
+
+    def gone(vehicle):
+        raise REFUSALS(f"Vehicle '{vehicle}' is not known.")
+
+    play.session.route = gone
+    assert play.step(loads=("ghost",)) == [] and play.meter.given_up.sum() == 1
 
 
 def test_a_vehicle_that_gives_up_before_it_departs_was_never_there(play):

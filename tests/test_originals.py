@@ -128,12 +128,6 @@ def test_demand_file(tmp_path):
     assert scenario.demand[0, 0, 1] == 2.5 and scenario.demand[3, 1, 0] == 1.5 and scenario.demand.sum() == 4.0
 
 
-@pytest.mark.parametrize("row", ["0,0,2,1.0", "0,0,1,-1", "0,0,1,nan"])
-def test_demand_file_errors_name_the_line(tmp_path, row):
-    with pytest.raises(InputError, match="demand.csv: line 2: expected an interval"):
-        load_scenario(with_demand_file(tmp_path, row + "\n"))
-
-
 def test_scenario_on_a_base_finds_its_files(tmp_path):
     folder = with_demand_file(tmp_path, "0,0,1,2.5\n")
     (tmp_path / "more").mkdir()

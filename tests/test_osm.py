@@ -101,20 +101,7 @@ def test_import_makes_a_scenario_and_names_the_licence(tmp_path):
     with gzip.open(tmp_path / "city.osm.gz", "wb") as stream:
         stream.write(street_map())
     net, scenario = tmp_path / "networks" / "mycity", tmp_path / "scenarios" / "mycity"
-    good(
-        cosim(
-            "import",
-            tmp_path / "city.osm.gz",
-            "--regions",
-            2,
-            "--demand",
-            "peak",
-            "--level",
-            0.1,
-            "--out",
-            net,
-        )
-    )
+    good(cosim("import", tmp_path / "city.osm.gz", "--regions", 2, "--demand", "peak", "--level", 0.1, "--out", net))
     assert "OpenStreetMap contributors" in (net / "NOTICE.txt").read_text()
     assert "right-hand traffic; 4 signals" in (net / "import.txt").read_text()
     good(cosim("run", scenario, "--controller", "pi-gating", "--steps", 3, "--out", tmp_path / "run"))
@@ -136,11 +123,7 @@ def test_import_makes_a_scenario_and_names_the_licence(tmp_path):
 def test_one_line(tmp_path, monkeypatch, arguments, expected):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(case, "SERVERS", "http://127.0.0.1:1/")
-    for name, content in (
-        ("empty.osm", "<osm/>"),
-        ("city.osm.pbf", ""),
-        ("other.xml", "<html/>"),
-    ):
+    for name, content in (("empty.osm", "<osm/>"), ("city.osm.pbf", ""), ("other.xml", "<html/>")):
         (tmp_path / name).write_text(content)
     assert expected in error_line(cosim("import", *arguments, "--regions", 2, "--out", "networks/x"))
     assert not (tmp_path / "networks" / "x").exists() and not (tmp_path / "scenarios").exists()

@@ -14,11 +14,8 @@ from cosim.importing.demand import read_traffic
 from cosim.importing.importer import import_city
 from cosim.importing.quality import left_alone
 from cosim.importing.streets import read_streets
-from cosim.plant.meter import Meter
-from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
 from cosim.sumo.recorded_trips import draw, read_recorded_trips
-from cosim.sumo.session import REFUSALS
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
 
@@ -140,7 +137,7 @@ def test_cars_for_streets_that_are_closed_to_them(net, city, tmp_path):
             '<vehicle id="over" depart="10"><route edges="B1C1 C1D1 D1D2"/></vehicle>'
             '<trip id="car" depart="12" from="A1B1" to="D1D2"/>',
             net_file="closed.net.xml",
-        ),
+        )
     )
     assert "2 vehicles in" in said and "without a route that SUMO could drive, left out: 61" in said
     due, departed, *_, backlog = driven(scenario, 2, 0.4)
@@ -195,12 +192,8 @@ def test_phases_that_do_not_follow_in_order(net, city):
     said, scenario = imported(city(net_file=branching))
     assert "no gateway has a signal that perimeter control can use" in said
     assert "branching signal" in (scenario.network.folder / "gateways.csv").read_text()
-    plant = SumoPlant(scenario)
-    try:
-        plant.reset(0)
+    with tiny_city.played(scenario, 0, 0.4) as (plant, _, _):
         assert len(plant.leaks()) == len(plant.city.gateways) > 0
-    finally:
-        plant.close()
 
 
 def test_cycles_shorter_than_half_a_second(net, tmp_path):
@@ -257,30 +250,6 @@ def test_sumos_own_words_in_one_line(city, capfd):
     assert capfd.readouterr().err == ""
 
 
-def test_a_vehicle_that_sumo_gives_up_at_once(net, city):
-    """It is loaded and gone in the same step: nothing to follow, and nothing breaks."""
-    _, scenario = imported(city())
-    plant = SumoPlant(scenario)
-    try:
-        plant.reset(0)
-
-        class Session:
-            step_length = 1.0
-
-            def loaded(self):
-                return ("ghost",)
-
-            def route(self, vehicle):
-                raise REFUSALS(f"Vehicle '{vehicle}' is not known.")
-
-            def __getattr__(self, name):
-                return lambda *_: ()
-
-        assert Meter(Session(), plant.city).observe() == []
-    finally:
-        plant.close()
-
-
 def test_speeds_and_coordinates(city):
     """A fixed speed is deadly before a signal under control; trips between coordinates are driven."""
     traffic = traffic_of(
@@ -290,9 +259,7 @@ def test_speeds_and_coordinates(city):
         )
     )
     assert [vehicle.get("departSpeed") for vehicle in traffic.vehicles] == ["max", None, "random"]
-    assert traffic.notes == {
-        "fixed speeds at the departure, made the highest safe ones": 1,
-    }
+    assert traffic.notes == {"fixed speeds at the departure, made the highest safe ones": 1}
 
 
 def test_a_generated_peak_beside_types_of_the_city(net, city):

@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 
 from cosim.plant.guidance import Guide
-from cosim.plant.plant import SumoPlant
 from cosim.plant.sampling import StreetSampler
-from cosim.plant.settings import Settings
 from cosim.sumo.session import Session
 from nmfd.api import load_scenario
 from nmfd.types import Controls
@@ -34,20 +32,6 @@ def random_controls(scenario, random, *, guidance=False):
     splits = random.random(network.split_mask.shape) * network.split_mask
     splits /= np.where(splits.sum(axis=1, keepdims=True) > 0, splits.sum(axis=1, keepdims=True), 1.0)
     return Controls(perimeter=perimeter, splits=splits if guidance else None)
-
-
-@pytest.fixture
-def plant_of(scenario):
-    """Plants that are closed in any case: SUMO allows one session per process."""
-    plants = []
-
-    def make(**overrides):
-        plants.append(SumoPlant(scenario, settings=Settings(**overrides)))
-        return plants[-1]
-
-    yield make
-    for plant in plants:
-        plant.close()
 
 
 def drive(plant, scenario, *, seed=1, guidance=False):

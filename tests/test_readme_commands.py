@@ -19,10 +19,7 @@ REDUCED = {  # what is added; of an option that is there already the last counts
     "cosim compare": [],
     "cosim report": [],
     "cosim evaluate": [*STEPS, "--seeds", 1, "--demand", 1],
-    "cosim import": [
-        "--regions",
-        3,
-    ],
+    "cosim import": ["--regions", 3],
     "cosim identify": ["--levels", 6, "--seeds", 1, "--own", "--iterations", 10],
     "cosim list": [],
     "nmfd list": [],
@@ -82,9 +79,7 @@ def test_the_commands_run(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for folder in ("networks", "scenarios"):
         shutil.copytree(
-            ROOT / folder,
-            tmp_path / folder,
-            ignore=shutil.ignore_patterns("reference", "tutorials", "*.md", "ppo.*"),
+            ROOT / folder, tmp_path / folder, ignore=shutil.ignore_patterns("reference", "tutorials", "*.md", "ppo.*")
         )
     tiny_city.city(tmp_path)  # city.sumocfg
     done, ran = set(), 0

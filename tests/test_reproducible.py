@@ -60,15 +60,7 @@ def test_trainings(tmp_path):
 @pytest.fixture(scope="module")
 def city(tmp_path_factory):
     folder = tmp_path_factory.mktemp("city")
-    here(
-        "cosim",
-        "import",
-        tiny_city.city(folder),
-        "--regions",
-        3,
-        "--out",
-        folder / "networks" / "tiny",
-    )
+    here("cosim", "import", tiny_city.city(folder), "--regions", 3, "--out", folder / "networks" / "tiny")
     return folder / "scenarios" / "tiny"
 
 

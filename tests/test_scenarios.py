@@ -99,14 +99,9 @@ def test_a_network_is_written_as_it_is_read(tmp_path):
         ('name = "x"\nbase = "."\n', "base: the scenarios are each other's base"),
         ('name = "x"\nbase = "../scenario"\ndemand_factor = -1.0\n', "scenario.toml: demand_factor"),
         ('name = "x"\nbase = "../scenario"\nprotected = [2]\n', "scenario.toml: protected"),
-        ('name = "x"\nbase = "../scenario"\nstep = 300.0\n', "scenario.toml: step: .* at most 238 s"),
         ('name = "x"\nbase = "../scenario"\nnetwork = "../none"\n', "network.toml: no such file"),
-        ('name = "x"\nbase = "../scenario"\nstepz = 3\n', "scenario.toml: stepz"),
-        ('name = "x"\nbase = "../scenario"\nsteps = "20"\n', "scenario.toml: steps"),
         ('name = "x"\nnetwork = "../network"\nstep = 30.0\nsteps = 5\n', "scenario.toml: demand: missing"),
-        ("name = tiny", "scenario.toml: is not valid TOML"),
         (tiny.SCENARIO.replace("to = 1", "to = 7"), r"scenario.toml: demand\[0\].to: region 7 is unknown"),
-        (tiny.SCENARIO.replace("peak = 2.0", "peak = -2.0"), r"scenario.toml: demand\[0\].peak"),
     ],
 )
 def test_wrong_scenarios(base, text, message):
@@ -118,16 +113,12 @@ def test_wrong_scenarios(base, text, message):
 @pytest.mark.parametrize(
     "old, new, message",
     [
-        ("[0]", "[0, 1]", r"regions\[1\].adjacent: expected .* without 1"),
         ("[0]", "[5]", r"regions\[1\].adjacent: .*\[5\]"),
         ("adjacent = [1]", "adjacent = []", "regions: region 1 cannot be reached from region 0"),
         ("adjacent = [1]", "adjacent = [1]\ncapacity = [1.0]", r"regions\[0\].capacity: capacity and storage belong"),
         ("adjacent = [1]", "adjacent = [1]\nexit_rates = [1.0]", r"regions\[0\].exit_rates: .* 2 numbers"),
         ("adjacent = [0]", "adjacent = [0]\nexit_rates = [1.0, 1.0]", r"regions\[0\].exit_rates: missing"),
         ("adjacent = [1]", "adjacent = [1]\nobserved_split_ratios.1 = { 1 = 0.5 }", "with sum 1"),
-        ("max =", "mx = 1\nmax =", "perimeter.mx"),
-        ("jam = 1000.0", "jam = true", "mfd.jam"),
-        ("c = 0.0042", "c = -1", "mfd.c: "),
         ("max = 0.9", "max = 0.1", "perimeter: min must be less"),
     ],
 )

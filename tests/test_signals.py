@@ -35,19 +35,6 @@ def city(scenario):
     return city_of(scenario.network)
 
 
-@pytest.fixture
-def plant_of(scenario):
-    plants = []
-
-    def make(**overrides):
-        plants.append(SumoPlant(scenario, settings=Settings(**overrides)))
-        return plants[-1]
-
-    yield make
-    for plant in plants:
-        plant.close()
-
-
 @pytest.fixture(scope="module")
 def driven(scenario):
     """The first four intervals at u with these overrides, for all tests that ask for the same: `drive`, and leaks."""

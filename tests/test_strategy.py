@@ -94,6 +94,9 @@ def test_tables_that_fit_equally_well_are_an_error(scenario):
     "name, expected",
     [
         ("nobody", "controller 'nobody' is unknown; choose from no-control, route-guidance, pi-gating"),
+        ("pi_gating", "unknown; did you mean pi-gating?"),
+        ("dpc-pcrg+max-presure", "'max-presure' is unknown; did you mean max-pressure?"),
+        ("dpc-pcrg+complience-50", "did you mean compliance-N?"),
         ("", "controller '' is unknown"),
         ("dpc-pc+", "strategy 'dpc-pc+': '' is unknown; choose from webster, actuated, max-pressure"),
         ("dpc-pc+pi-gating", "'pi-gating' is unknown"),

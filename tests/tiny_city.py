@@ -2,6 +2,8 @@
 
 import gzip
 import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -108,26 +110,22 @@ def imported(folder: Path, regions: int = 3, source: Path | None = None, **optio
     return scenario
 
 
-def driven(scenario: Scenario, intervals: int, gates: float, **overrides) -> tuple:
-    """(trips due, departures, arrivals, accumulation, backlog) of a run with all u at `gates`; in every interval the
-    ledger is checked."""
+@contextmanager
+def played(scenario: Scenario, intervals: int, gates: float, splits: np.ndarray | None = None, **overrides) -> Iterator:
+    """A plant after so many intervals with all u at `gates`, its state and its record; the ledger is checked in every
+    interval."""
     scenario = replace(scenario, steps=intervals)
     plant = SumoPlant(scenario, settings=settings(scenario).changed(**overrides))
+    controls = Controls(perimeter=np.where(scenario.network.adjacency, gates, 0.0), splits=splits)
     try:
-        plant.reset(0)
-        for _ in range(intervals):
-            measured = plant.step(
-                Controls(
-                    perimeter=np.where(scenario.network.adjacency, gates, 0.0), splits=scenario.network.nominal_splits
-                )
-            )
-        record = SimpleNamespace(**plant.record())
-        return (
-            len(plant.trips()),
-            record.departures.sum(),
-            record.arrivals.sum(),
-            measured.accumulation.sum(),
-            measured.backlog.sum(),
-        )
+        states = [plant.reset(0), *(plant.step(controls) for _ in range(intervals))]
+        yield plant, states[-1], SimpleNamespace(**plant.record()) if intervals else None
     finally:
         plant.close()
+
+
+def driven(scenario: Scenario, intervals: int, gates: float, **overrides) -> tuple:
+    """(trips due, departures, arrivals, accumulation, backlog) of `played` with nominal split ratios."""
+    with played(scenario, intervals, gates, scenario.network.nominal_splits, **overrides) as (plant, state, record):
+        due, inside = len(plant.trips()), state.accumulation.sum()
+        return due, record.departures.sum(), record.arrivals.sum(), inside, state.backlog.sum()

@@ -14,7 +14,7 @@ from urllib.parse import unquote
 import numpy as np
 
 from cosim.sumo.programs import HOME, run_sumo, run_tool
-from cosim.sumo.xml_files import BROKEN, attribute, file_list, opened, read_xml
+from cosim.sumo.xml_files import attribute, file_list, read_xml, stream_of
 from nmfd.errors import InputError
 from nmfd.runs.files import temporary_folder
 
@@ -220,11 +220,6 @@ def fetch_osm(box: Box, folder: Path) -> Path:
 
 def _root(path: Path, tag: str | None = None) -> ElementTree.Element:
     """Read the root of an XML file, or its first element `tag`, with its attributes only. Raises InputError."""
-    try:
-        with opened(path) as stream:
-            elements = (element for _, element in ElementTree.iterparse(stream, events=("start",)))
-            return next(element for element in elements if tag in (None, element.tag))
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; give the path of an existing one") from None
-    except BROKEN as error:
-        raise InputError(f"{path}: is not an XML file that SUMO could read ({error}); correct or replace it") from None
+    with stream_of(path) as stream:
+        elements = (element for _, element in ElementTree.iterparse(stream, events=("start",)))
+        return next(element for element in elements if tag in (None, element.tag))

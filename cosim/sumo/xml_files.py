@@ -44,13 +44,8 @@ def child(element: ElementTree.Element, tag: str) -> ElementTree.Element:
 
 def read_xml(path: Path, depth: int = 0) -> ElementTree.Element:
     """Return the root of an XML file with the files that it includes (<include href="..."/>). Raises InputError."""
-    try:
-        with opened(path) as stream:
-            root = ElementTree.parse(stream).getroot()
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; give the path of an existing one") from None
-    except BROKEN as error:
-        raise InputError(f"{path}: is not an XML file that SUMO could read ({error}); correct or replace it") from None
+    with stream_of(path) as stream:
+        root = ElementTree.parse(stream).getroot()
     if depth > MAX_INCLUDE_DEPTH:
         raise InputError(f"{path}: include: files include each other without end; remove one of the includes")
     parts: list[ElementTree.Element] = []
@@ -61,18 +56,27 @@ def read_xml(path: Path, depth: int = 0) -> ElementTree.Element:
 
 
 @contextmanager
+def stream_of(
+    path: Path, kind: str = "an XML file that SUMO could read", remedy: str = "correct or replace it"
+) -> Iterator[io.BufferedIOBase]:
+    """Yield a stream of a file, unzipped. Raises InputError if it is missing, or for one of BROKEN in the block."""
+    try:
+        with opened(path) as stream:
+            yield stream
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; give the path of an existing one") from None
+    except BROKEN as error:
+        raise InputError(f"{path}: is not {kind} ({error}); {remedy}") from None
+
+
+@contextmanager
 def network_root(net: Path) -> Iterator[ElementTree.Element]:
     """Yield the root of a SUMO network. Raises InputError if it is none, or if the block misses a part of it."""
-    try:
-        with opened(net) as stream:
-            root = ElementTree.parse(stream).getroot()
+    with stream_of(net, "a SUMO network", "build it with netconvert") as stream:
+        root = ElementTree.parse(stream).getroot()
         if root.tag != "net":
             raise ValueError(f"expected <net>, got a file of <{root.tag}> instead")
         yield root
-    except FileNotFoundError:
-        raise InputError(f"{net}: no such file; give the path of an existing SUMO network") from None
-    except BROKEN as error:
-        raise InputError(f"{net}: is not a SUMO network ({error}); build it with netconvert") from None
 
 
 def file_list(files: Sequence[Path]) -> str:
