@@ -20,7 +20,6 @@ from cosim.evaluation.simulate import Simulation, simulate
 from cosim.importing import get as cities
 from cosim.importing.importer import import_city as import_city
 from cosim.report import figures
-from cosim.sumo.outputs import check
 from nmfd.api import check_policies, load_scenario
 from nmfd.controllers.strategy import parse, parse_many
 from nmfd.errors import InputError, RunFailed
@@ -44,7 +43,7 @@ def run(
     demand: float = 1.0,
     policy: Path | str | None = None,
     city: str = "",
-    sumo_output: Mapping[str, Path | str] | None = None,
+    tripinfo: Path | str | None = None,
     progress: Progress = None,
 ) -> Result:
     """Run one closed loop in SUMO, in this process and without a run folder.
@@ -56,7 +55,7 @@ def run(
     demand: multiple of the scenario's demand
     policy: policy file, if not SCENARIO/NAME.pt
     city: words of the strategy for a controller object, such as "max-pressure+rerouting-30"
-    sumo_output: files of SUMO's own outputs: {"tripinfo": "trips.xml"}, also summary, edgedata, emission
+    tripinfo: file for SUMO's own output of trips; all others are options of SUMO in [sumo.options]
     progress: None for a bar, False for none, or a function of done and total control intervals
 
     The result has the arrays of cosim.plant.record.RECORD, and the facts of cosim.evaluation.simulate as attributes.
@@ -70,13 +69,10 @@ def run(
     scenario = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
     if not 0.0 < demand <= 10.0:
         raise InputError(f"demand: expected a number above 0 up to 10, got {demand:g} instead")
-    outputs = {kind: Path(file) for kind, file in (sumo_output or {}).items()}
-    check(outputs)
-    policy = None if policy is None else Path(policy)
+    policy, tripinfo = (None if file is None else Path(file) for file in (policy, tripinfo))
     with watched(strategy.name, progress) as show:
-        return simulate(
-            Simulation(with_demand(scenario, steps=steps), strategy, seed, demand, policy, outputs), progress=show
-        )
+        job = Simulation(with_demand(scenario, steps=steps), strategy, seed, demand, policy, tripinfo)
+        return simulate(job, progress=show)
 
 
 def run_controllers(
@@ -88,14 +84,12 @@ def run_controllers(
     steps: int | None = None,
     demand: float = 1.0,
     policy: Path | None = None,
-    sumo_output: Sequence[str] | None = None,
     out: Path | None = None,
 ) -> str:
     """Run strategies on the same trips with a run folder, two at a time; return a report.
 
     settings: see nmfd.load_scenario; other arguments as in `run`
     policy: policy file of the first controller, if not SCENARIO/NAME.pt
-    sumo_output: kinds of SUMO's own outputs to write (cosim.sumo.outputs)
     out: run folder, runs/SCENARIO-TIME if None
     Raises: InputError, and RunFailed if a run failed
     """
@@ -105,8 +99,7 @@ def run_controllers(
     if all(strategy.name != "no-control" for strategy in strategies):
         strategies.reverse()  # the other controllers are compared with the first one
     out = default_folder(loaded.name) if out is None else out
-    sumo_files = tuple(sumo_output or ())
-    runs = runs_of(loaded, strategies, [seed], demand=demand, policies=policies, sumo_output=sumo_files, out=out)
+    runs = runs_of(loaded, strategies, [seed], demand=demand, policies=policies)
     with locked(out):
         raise_failures(run_many(runs, out, workers=2))
         finished = results.read(out)

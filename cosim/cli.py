@@ -86,12 +86,6 @@ def demo(out: Path) -> None:
 @STEPS
 @DEMAND
 @click.option("--policy", type=FILE, metavar="FILE", help="Policy file of --controller. [default: SCENARIO/NAME.pt]")
-@click.option(
-    "--sumo-output",
-    type=listed(click.Choice(["tripinfo", "summary", "edgedata", "emission"])),
-    metavar="A,B,...",
-    help="SUMO's own outputs: tripinfo, summary, edgedata, emission (large).",
-)
 @out_option("runs/SCENARIO-TIME")
 def run(scenario: Path, controller: str, against: str | None, **options: Any) -> None:
     """Run one controller, or two on the same trips.

@@ -88,7 +88,7 @@ def test_measures_of_a_city_are_those_of_tripinfo(tmp_path, steps):
     crowds = crowd.format("cars", "", "A1B1", "C1D1") + crowd.format("line9", 'type="citybus"', "A2B2", "C2D2")
     (tmp_path / "buses.rou.xml").write_text(tiny_city.BUSES.replace("<vehicle", crowds + "<vehicle"))
     scenario = tiny_city.imported(tmp_path, source=config)
-    result = cosim.run(scenario, "no-control", steps=steps, seed=1, sumo_output={"tripinfo": info})
+    result = cosim.run(scenario, "no-control", steps=steps, seed=1, tripinfo=info)
     row = metrics.summary(result)
     root = ElementTree.parse(info)
     trips = pd.DataFrame([trip.attrib for trip in root.iter("tripinfo")])
@@ -119,8 +119,8 @@ def test_measures_of_a_city_are_those_of_tripinfo(tmp_path, steps):
 
 def test_outputs_do_not_change_who_reroutes(tmp_path):
     scenario = load_scenario(tiny_city.imported(tmp_path), {"sumo.rerouting": 0.5, "steps": 4})
-    files = ({}, {"tripinfo": tmp_path / "a.xml"})
-    plain, written = (cosim.run(scenario, "no-control", seed=1, sumo_output=each) for each in files)
+    files = None, tmp_path / "a.xml"
+    plain, written = (cosim.run(scenario, "no-control", seed=1, tripinfo=each) for each in files)
     assert (plain.edge_vehicles == written.edge_vehicles).all() and plain.co2_kg == written.co2_kg > 0
 
 

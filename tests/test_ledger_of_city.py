@@ -234,7 +234,7 @@ def run(folder: Path, city, case: Case, *, mesoscopic: bool, seed: int):
         seed=seed,
         **case.session,
         options=(
-            *(*options(out, {}), "--additional-files", str(folder / "more.add.xml")),
+            *(*options(out, detailed=False), "--additional-files", str(folder / "more.add.xml")),
             *("--ignore-junction-blocker", "20", *case.options),
             *(f"--{key}={value}" for key, value in MESOSCOPIC.items() if mesoscopic),
         ),
@@ -356,7 +356,7 @@ def test_a_run_says_who_was_removed_and_counts_them_until_then(tmp_path):
     (scenario / "scenario.toml").write_text(text.replace("[sumo]", '[sumo]\nadditional = ["more.add.xml"]'))
     (tmp_path / "mine.py").write_text(MEDDLER)
     trips = tmp_path / "trips.xml"
-    run = cosim.run(scenario, f"{tmp_path / 'mine.py'}:Meddler", steps=8, seed=1, sumo_output={"tripinfo": trips})
+    run = cosim.run(scenario, f"{tmp_path / 'mine.py'}:Meddler", steps=8, seed=1, tripinfo=trips)
     ended = [trip.get("vaporized") for trip in ElementTree.parse(trips).getroot() if float(trip.get("arrival")) >= 0]
     spent = time_spent(ElementTree.parse(trips).getroot())
     assert metrics.total_time_spent(run) == run.time_spent.sum() == pytest.approx(spent, rel=1e-9)

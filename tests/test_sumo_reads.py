@@ -179,7 +179,7 @@ def drive_and_compare(config, ended):
     imported(config)
     tmp_path = config.parent
     out = tmp_path / "t.xml"
-    run(tmp_path / "scenarios" / "x", "no-control", seed=0, sumo_output={"tripinfo": out}, progress=False)
+    run(tmp_path / "scenarios" / "x", "no-control", seed=0, tripinfo=out, progress=False)
     keys = ("depart", "arrival", "routeLength", "departLane", "arrivalLane", "timeLoss")
     mine, alone = ({name: [trip[key] for key in keys] for name, trip in t.items()} for t in (trips(out), plain(config)))
     done = {name: trip for name, trip in alone.items() if trip[1] != "-1.00"}  # the import simulates longer
@@ -207,7 +207,7 @@ def test_what_is_left_out_is_said_first_and_last(tmp_path):
     config = city(tmp_path, ["count", "reroute"])
     route = '<vehicle id="gap" depart="9"><route edges="A1B1 C1D1"/></vehicle></routes>'
     (tmp_path / "c.rou.xml").write_text((tmp_path / "c.rou.xml").read_text().replace("</routes>", route))
-    first, *_, last = imported(config).splitlines()
+    first, *_, last, _ = imported(config).splitlines()
     share = "10.0% of the vehicles and 6.9% of the distance left out"
     assert share in first and last == f"WARNING: {share}: this is not the traffic of c.sumocfg"
     assert last in (tmp_path / "networks" / "x" / "verdict.txt").read_text()

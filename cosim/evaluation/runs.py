@@ -12,7 +12,6 @@ from cosim.plant import incidents
 from cosim.plant.launch import own_vehicles
 from cosim.plant.programmes import check_strategy
 from cosim.plant.settings import FILES, PRESSURES, own_files, settings
-from cosim.sumo import outputs
 from cosim.sumo.net import check_adjacency, city_files, load_city
 from cosim.sumo.signals import HELD, read_signals
 from cosim.sumo.xml_files import read_xml
@@ -31,15 +30,12 @@ def runs_of(
     demand: float = 1.0,
     policies: Mapping[str, Path] | None = None,
     folder: str = "",
-    sumo_output: Sequence[str] = (),
-    out: Path = Path(),
 ) -> list[Run]:
     """Return the runs of strategies x seeds at one demand level, seed by seed.
 
     city: result of `city_key`, computed if None
     policies: strategy name -> file instead of the scenario's
-    folder: below that of all runs, `out`
-    sumo_output: kinds of SUMO's own outputs to write to `out` (cosim.sumo.outputs)
+    folder: below that of all runs
     Raises: InputError if a strategy cannot run in this city
     """
     flows = np.ascontiguousarray(with_demand(scenario, factor=demand).demand)
@@ -52,15 +48,12 @@ def runs_of(
     policies = policies or {}
     for strategy in strategies:
         strategy.make(scenario, policies.get(strategy.name))  # reports mistakes before the first run
-    if sumo_output:
-        shared["sumo_output"] = list(sumo_output)
     keys = {s.name: {**shared, "controller": s.fingerprint(scenario, policies.get(s.name))} for s in strategies}
     runs = []
     for seed in seeds:
         for strategy in strategies:
-            name, files = strategy.name, dict(outputs.paths(tuple(sumo_output), out, strategy.name, seed))
-            job = Simulation(scenario, strategy, seed, demand, policies.get(name), files)
-            runs.append(Run(run_name(name, seed), keys[name], job, folder))
+            job = Simulation(scenario, strategy, seed, demand, policies.get(strategy.name))
+            runs.append(Run(run_name(strategy.name, seed), keys[strategy.name], job, folder))
     return runs
 
 

@@ -5,7 +5,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,6 @@ from cosim.plant.record import RECORD, TOTALS, settled
 from cosim.plant.settings import own_files, settings
 from cosim.sumo.arrays import RegionCounts
 from cosim.sumo.net import City, Gateway, gateway_room_taken
-from cosim.sumo.outputs import check_whole
 from nmfd import closed_loop, metrics
 from nmfd.arrays import PerRegion
 from nmfd.controllers.strategy import Strategy
@@ -41,7 +40,7 @@ class Simulation:
     seed: of trips, drivers and guidance
     demand: multiple of the scenario's demand
     policy: policy file instead of the scenario's
-    outputs: kind of SUMO's own output (cosim.sumo.outputs) -> file
+    trip_file: for SUMO's own tripinfo output
     """
 
     scenario: Scenario
@@ -49,7 +48,7 @@ class Simulation:
     seed: int
     demand: float = 1.0
     policy: Path | None = None
-    outputs: Mapping[str, Path] = field(default_factory=dict)
+    trip_file: Path | None = None
 
     def __call__(self) -> Result:
         """Return `simulate` of it."""
@@ -74,10 +73,10 @@ def simulate(
     strategy, scenario = job.strategy, with_demand(job.scenario, factor=job.demand)
     controller = strategy.make(scenario, job.policy)
     with ExitStack() as stack:
-        files = {kind: stack.enter_context(atomic(path)) for kind, path in job.outputs.items()}
+        file = stack.enter_context(atomic(job.trip_file)) if job.trip_file else None
         chosen = settings(scenario).changed(**strategy.city)
         plant = SumoPlant(
-            scenario, settings=chosen, outputs=files, planning=strategy.planning(scenario), observer=observer, gui=gui
+            scenario, settings=chosen, trip_file=file, planning=strategy.planning(scenario), observer=observer, gui=gui
         )
         stack.callback(plant.close)
         result = closed_loop.run(plant, controller, scenario, seed=job.seed, progress=progress)
@@ -109,7 +108,6 @@ def simulate(
             "setup_time_s": time.perf_counter() - begin - result.wall_time,
             "jumps": int(result.jumps.sum()),
         }
-        check_whole(files)
     return result.add(facts)
 
 

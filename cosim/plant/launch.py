@@ -51,17 +51,17 @@ class Launch:
         signals: tuple[list[Signal], list[str]],
         layout: Layout,
         *,
-        outputs: Mapping[str, Path],
+        trip_file: Path | None,
         gui: bool,
     ):
-        """outputs: kind (cosim.sumo.outputs) -> file; layout: of the loop detectors; gui: in the window of sumo-gui"""
+        """layout: of the loop detectors; trip_file: of SUMO's tripinfo, to be kept; gui: in the window of sumo-gui"""
         self._scenario, self._settings, self._city, self._signals = scenario, settings, city, signals
-        self._layout, self._outputs, self._gui = layout, outputs, gui
+        self._layout, self._kept, self._gui = layout, trip_file is not None, gui
         self._temporary = tempfile.TemporaryDirectory(prefix="cosim-", ignore_cleanup_errors=True)
         self._folder = Path(self._temporary.name)
         self.vehicles: list[str] = []
         self.held: HeldTrips | None = None
-        self.trip_file = outputs.get("tripinfo", self._folder / "tripinfo.xml")
+        self.trip_file = trip_file or self._folder / "tripinfo.xml"
         self.emission_file = self._folder / "emissions.xml"
 
     def start(self, seed: int) -> Session:
@@ -96,7 +96,7 @@ class Launch:
 
     def _options(self) -> list[str]:
         settings = self._settings
-        options = [*outputs.options(self.trip_file, self._outputs), "--begin", str(settings.begin)]
+        options = [*outputs.options(self.trip_file, detailed=self._kept), "--begin", str(settings.begin)]
         options += ["--ignore-route-errors", str(bool(settings.routes)).lower()]
         if settings.rerouting > 0:
             options += [*REROUTING, "--device.rerouting.probability", str(settings.rerouting)]
@@ -119,11 +119,8 @@ class Launch:
         if settings.measurement == ESTIMATE:
             additional.append(folder / "loops.add.xml")
             write_loops(self._city, self._layout, scenario.step, additional[-1])
-        if "edgedata" in self._outputs:
-            additional.append(folder / "edgedata.add.xml")
-            outputs.write_edge_data(additional[-1], self._outputs["edgedata"], "edgedata", freq=f"{scenario.step:g}")
         additional.append(folder / "emissions.add.xml")
-        outputs.write_edge_data(additional[-1], self.emission_file, "cosim-emissions", **outputs.EMISSION_DATA)
+        outputs.write_emission_data(additional[-1], self.emission_file.resolve())
         return additional
 
     def _write_vehicles(self, path: Path, seed: int) -> list[str]:

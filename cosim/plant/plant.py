@@ -54,14 +54,14 @@ class SumoPlant:
         scenario: Scenario,
         *,
         settings: Settings | None = None,
-        outputs: Mapping[str, Path] | None = None,
+        trip_file: Path | None = None,
         gui: bool = False,
         planning: PlanningModel | None = None,
         observer: Observer | None = None,
     ):
         """Build the network if need be.
 
-        settings: instead of the table [sumo]; outputs: kind (cosim.sumo.outputs) -> file, complete after `trip_facts`
+        settings: instead of the table [sumo]; trip_file: for SUMO's tripinfo, complete after `trip_facts`
         gui: show the run in sumo-gui; planning: model of the estimator, that of the scenario if None
         Raises InputError for a city that does not fit the scenario's network or the settings.
         """
@@ -74,9 +74,7 @@ class SumoPlant:
         self._layout = lay_out(self.city, settings.detector_share)
         self._instruments = instruments(self.city, self._layout, settings.probe_share)
         self.steered, self.other_signals = signals = city_signals(self.city, scenario, settings)
-        self._launch = Launch(
-            scenario, settings, self.city, signals, self._layout, outputs=dict(outputs or {}), gui=gui
-        )
+        self._launch = Launch(scenario, settings, self.city, signals, self._layout, trip_file=trip_file, gui=gui)
         self._session: Session | None = None
 
     def reset(self, seed: int) -> State:

@@ -1,28 +1,17 @@
-"""SUMO's output files: tripinfo, read while SUMO writes it, and others on request."""
+"""SUMO's output files: tripinfo, read while SUMO writes it, and emissions by edge."""
 
 import math
-import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Container, Iterable, Mapping
+from collections.abc import Callable, Container
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree.ElementTree import Element
 from xml.sax.saxutils import quoteattr
 
-from cosim.sumo.xml_files import BROKEN, attribute, opened
-from nmfd.errors import InputError, RunFailed, did_you_mean
-from nmfd.runs.files import run_name
+from cosim.sumo.xml_files import BROKEN, attribute
+from nmfd.errors import RunFailed
 
-# Kind -> ending of its file. Emissions in every step are gigabytes, unless compressed.
-KINDS = {
-    "tripinfo": "tripinfo.xml",
-    "summary": "summary.xml",
-    "edgedata": "edgedata.xml",
-    "emission": "emission.xml.gz",
-}
 KG_PER_MG = 1e-6
-EMISSION_DATA = {"type": "emissions", "withInternal": "true"}  # attributes of SUMO's edge data over the whole run
-END_TAG_BYTES = 200  # these last bytes of a file hold the end tag of its root
 
 
 class End(NamedTuple):
@@ -94,42 +83,24 @@ class TripReader:
         return None
 
 
-def check(kinds: Iterable[str]) -> None:
-    """Raise InputError for an unknown kind of output."""
-    for kind in kinds:
-        if kind not in KINDS:
-            raise InputError(
-                f"--sumo-output: {kind!r} is unknown{did_you_mean(kind, KINDS)}; choose from "
-                f"{', '.join(KINDS)}, separated by commas"
-            )
-
-
-def paths(kinds: tuple[str, ...], folder: Path, controller: str, seed: int) -> tuple[tuple[str, Path], ...]:
-    """Return kind and file of the outputs in a run folder."""
-    return tuple((kind, folder / f"{run_name(controller, seed)}.{KINDS[kind]}") for kind in kinds)
-
-
-def options(trip_file: Path, outputs: Mapping[str, Path]) -> list[str]:
-    """Return the options with which SUMO writes `trip_file`, for `TripReader`, and `outputs`, kind -> file."""
-    files = {"tripinfo": trip_file, **{kind: outputs[kind] for kind in ("summary", "emission") if kind in outputs}}
-    others = "--tripinfo-output.write-unfinished true --tripinfo-output.write-undeparted true"
-    written = [word for kind, file in files.items() for word in (f"--{kind}-output", str(file))]
+def options(trip_file: Path, *, detailed: bool) -> list[str]:
+    """Return SUMO's options for a `trip_file` that `TripReader` can read; detailed: with emissions of every trip."""
+    others = "--tripinfo-output.write-unfinished true --tripinfo-output.write-undeparted true".split()
     # Not 0: SUMO draws a random number for every vehicle unless it is 0, and others decide who has a rerouting device.
-    emitting = "1" if "tripinfo" in outputs or "emission" in outputs else "1e-12"
-    return [*written, *others.split(), "--device.emissions.probability", emitting]
+    emitting = "--device.emissions.probability", "1" if detailed else "1e-12"
+    return ["--tripinfo-output", str(trip_file), *others, *emitting]
 
 
-def write_edge_data(path: Path, target: Path, name: str, **attributes: str) -> None:
-    """Write an additional file that makes SUMO write data `name` per edge with `attributes` to `target`."""
-    given = {"id": name, "excludeEmpty": "true", "file": str(target.resolve()), **attributes}
-    words = " ".join(f"{key}={quoteattr(value)}" for key, value in given.items())
-    path.write_text(f"<additional><edgeData {words}/></additional>\n", encoding="utf-8")
+def write_emission_data(path: Path, target: Path) -> None:
+    """Write an additional file that makes SUMO write emissions by edge over the whole run to `target`."""
+    data = f'id="cosim" type="emissions" withInternal="true" excludeEmpty="true" file={quoteattr(str(target))}'
+    path.write_text(f"<additional><edgeData {data}/></additional>\n", encoding="utf-8")
 
 
 def edge_emissions(path: Path) -> dict[str, tuple[float, float]]:
     """Return edge, normal or on a junction -> CO2 and fuel [kg] of all vehicles.
 
-    path: file of EMISSION_DATA, complete at the end of the simulation
+    path: file of `write_emission_data`, complete at the end of the simulation
     Raises: RunFailed for a file that is not whole
     """
     try:
@@ -137,20 +108,6 @@ def edge_emissions(path: Path) -> dict[str, tuple[float, float]]:
         return {edge["id"]: (KG_PER_MG * float(edge["CO2_abs"]), KG_PER_MG * float(edge["fuel_abs"])) for edge in edges}
     except BROKEN as error:
         raise unfinished(path, error) from None
-
-
-def check_whole(outputs: Mapping[str, Path]) -> None:
-    """Raise RunFailed for a file that SUMO could not finish, of which it says nothing."""
-    for path in outputs.values():
-        end = b""
-        try:
-            with opened(path) as stream:
-                while part := stream.read(1 << 20):
-                    end = (end + part)[-END_TAG_BYTES:]
-        except BROKEN as error:
-            raise unfinished(path, error) from None
-        if not re.search(rb"</[\w-]+>\s*$", end):
-            raise unfinished(path)
 
 
 def unfinished(path: Path, error: Exception | None = None) -> RunFailed:
