@@ -266,7 +266,7 @@ def train(
     for region, doubts in zip(believed.region_names, believed.doubts, strict=False):
         if doubts:
             print(f"nmfd: the model of region {region} is doubtful: {'; '.join(doubts)}", file=sys.stderr)
-    worth = chosen.descend and chosen.steps >= training.WORTH_COMPILING
+    worth = chosen.steps >= training.WORTH_COMPILING
     options |= {"anyway": anyway, "compiled": worth and rollout.can_compile(options["device"])}
     try:
         with watched(controller, progress) as show:

@@ -11,10 +11,13 @@ from commands import good, nmfd
 
 from nmfd import closed_loop
 from nmfd.api import load_scenario
+from nmfd.controllers import training
 from nmfd.controllers.dpc.compact import FILL_TIME_S, CompactPolicy, Numbers
 from nmfd.controllers.dpc.policy import Architecture, DpcController
 from nmfd.controllers.dpc.policy_file import checkpoint, load_policy
+from nmfd.controllers.dpc.rollout import Rollout
 from nmfd.controllers.rules import PiGating
+from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
 from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
@@ -27,10 +30,12 @@ CENTRE = 3
 TABLE = """
 [controllers.dpc-pcrg]
 compact = true
-numbers = [1.0, 2.0, 0.0, {price}, 0.6, 0.0, 0.6, 1.5]
-descend = {descend}
+numbers = [1.0, 2.0, 0.0, 0.0, 0.6, 0.0, 0.6, 1.5]
 steps = 5
 learning_rate = 0.05
+
+[controllers.gating-rule]
+numbers = [1.0, 2.0, 0.0, 0.0, 0.6, 0.0, 0.6, 1.5]
 """
 
 
@@ -169,19 +174,29 @@ def test_every_number_has_a_gradient_and_perimeter_control_alone_has_no_prices(n
 
 def test_it_is_trained_and_kept_in_a_file(tmp_path):
     scenario = tiny.write(tmp_path)
-    text = (scenario / "scenario.toml").read_text()
-    files = {}
-    for descend in ("false", "true"):
-        (scenario / "scenario.toml").write_text(text + TABLE.format(price=0.0, descend=descend))
-        files[descend] = scenario / "dpc-pcrg.pt" if descend == "true" else tmp_path / "first.pt"
-        good(nmfd("train", scenario, "--controller", "dpc-pcrg", "--out", files[descend]))
+    (scenario / "scenario.toml").write_text((scenario / "scenario.toml").read_text() + TABLE)
+    good(nmfd("train", scenario, "--controller", "dpc-pcrg"))
     loaded = load_scenario(scenario)
-    first, trained = (load_policy(file, loaded.network) for file in files.values())
-    assert first[0].numbers.tolist() == pytest.approx([1.0, 2.0, 0.0, 0.0, 0.6, 0.0, 0.6, 1.5, 0.0, 0.0, 1.0])
-    assert isinstance(trained[0], CompactPolicy) and (trained[0].numbers != first[0].numbers).any()
-    assert first[1]["configuration"]["steps"] == 0 and trained[1]["configuration"]["steps"] == 5
-    assert trained[1]["configuration"]["validation_veh_s"] < first[1]["configuration"]["validation_veh_s"]
-    good(nmfd("benchmark", scenario, "--controllers", "dpc-pcrg", "--out", tmp_path / "out"))
+    trained, content = load_policy(scenario / "dpc-pcrg.pt", loaded.network)
+    rule = parse("gating-rule").make(loaded)
+    assert rule.policy.numbers.tolist() == pytest.approx([1.0, 2.0, 0.0, 0.0, 0.6, 0.0, 0.6, 1.5, 0.0, 0.0, 1.0])
+    assert isinstance(trained, CompactPolicy) and (trained.numbers != rule.policy.numbers).any()
+    setup = training.settings(loaded, parse("dpc-pcrg"))
+    untrained = training.validate(rule.policy, Rollout(planning_model(loaded, "dpc-pcrg")), 0, setup)
+    assert content["configuration"]["validation_veh_s"] < untrained
+    good(nmfd("benchmark", scenario, "--controllers", "dpc-pcrg,gating-rule", "--out", tmp_path / "out"))
+
+
+@pytest.mark.parametrize(
+    "numbers, protected, problem",
+    [([-1.0] * 8, (3,), "numbers: expected 8 to 11 numbers >= 0"), ([1.0] * 7, (3,), "numbers: should have at least 8"),
+     ([1.0] * 8, (), "numbers: expected a scenario with protected regions")],
+)  # fmt: skip
+def test_wrong_numbers_of_a_rule(numbers, protected, problem):
+    options = {"pricing-rule": {"numbers": numbers}}
+    scenario = replace(load_scenario("economic_mpc"), protected=protected, controller_options=options)
+    with pytest.raises(InputError, match=f"controllers.pricing-rule.{problem}"):
+        parse("pricing-rule").make(scenario)
 
 
 def test_prices_are_in_the_run(network):

@@ -192,7 +192,6 @@ def test_the_device_is_the_gpu_where_there_is_one(monkeypatch):
         ("dpc-pc", {"compact": True, "numbers": [-1.0] * 8}, "numbers: expected 8 to 11 numbers >= 0"),
         ("dpc-pc", {"compact": True, "local": True}, "compact: begins with its numbers"),
         ("dpc-pc", {"metering": True}, "metering: only for compact policies"),
-        ("dpc-pc", {"descend": False}, "descend: only for compact policies"),
     ],
 )
 def test_wrong_training_settings(scenario, controller, options, problem):

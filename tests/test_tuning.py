@@ -77,7 +77,7 @@ def test_the_best_options_are_found_and_written(city, tmp_path, runs):
 def test_numbers_of_a_list_without_a_range_stay_as_they_are(city, tmp_path):
     tuned = tuning.Tuning(
         scenario=city,
-        strategy=parse("dpc-pcrg+max-pressure+guidance-period-60"),
+        strategy=parse("pricing-rule+max-pressure+guidance-period-60"),
         options={"numbers[3]": (2.0, 12.0), "numbers[6]": (1.0, 2.0)},
         out=tmp_path,
     )

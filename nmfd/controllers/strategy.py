@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from nmfd.controllers import custom, open_loop
-from nmfd.controllers.dpc import policy_file
+from nmfd.controllers.dpc import compact, policy_file
 from nmfd.controllers.dpc.options import Training
 from nmfd.controllers.mpc import controller as mpc
 from nmfd.controllers.rules import Gating, Greedy, NoControl, PiGating, Probing, RouteGuidance, SetPoint
@@ -76,6 +76,19 @@ CONTROLLERS: Mapping[str, ControllerType] = {
         *_pair("mpc-{}", "economic MPC", mpc.EconomicMpc, options=mpc.Mpc),
         *_pair("mpc-{}-terminal", "economic MPC with terminal cost", mpc.load, reads=VALUE, options=mpc.Mpc),
         *_pair("probing-{}", "random excitation for cosim identify", Probing, options=SetPoint),
+        ControllerType(
+            name="gating-rule",
+            text="gates by numbers tuned in SUMO",
+            make=partial(compact.rule, guidance=False),
+            options=compact.Rule,
+        ),
+        ControllerType(
+            name="pricing-rule",
+            text="prices of ways through regions, and gates, by numbers tuned in SUMO",
+            make=partial(compact.rule, guidance=True),
+            guides=True,
+            options=compact.Rule,
+        ),
         *_pair("dpc-{}", "trained policy", policy_file.load, reads=POLICY, options=Training),
         *_pair("bound-{}", "best plan with all demand known (nmfd bound)", open_loop.read, reads=PLAN),
     )

@@ -109,7 +109,7 @@ def train(
     if not anyway:
         check(scenario, strategy)
     planning = planning_model(scenario, strategy.controller.name, strategy.table(scenario))
-    steps = setup.steps if setup.descend else 0
+    steps = setup.steps
     configuration = {"controller": strategy.name, "scenario": planning.name, "seed": seed, "compiled": compiled}
     configuration |= {**vars(setup), "steps": steps}
     torch.manual_seed(seed)
@@ -153,8 +153,6 @@ def train(
             write(state | {"generator": generator.get_state()}, state_file)
         if progress:
             progress(step + 1, steps, f"best {best:.4g} veh s")
-    if not steps:  # the initial policy
-        best = keep_the_better(best)
     if not math.isfinite(best):
         raise RunFailed(f"{strategy.name}: every validation of {steps} steps diverged; lower the learning rate")
     state_file.unlink(missing_ok=True)

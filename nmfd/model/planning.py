@@ -19,7 +19,7 @@ from nmfd.runs import config
 from nmfd.runs.config import Problem, Settings, Text, setting
 
 GUIDED = "guided"  # subfolder of a network with the model of the same city with guided drivers
-GUIDING = ("mpc-pcrg", "dpc-pcrg")  # prefixes of the controllers that plan with it
+GUIDING = ("mpc-pcrg", "dpc-pcrg", "pricing-rule")  # prefixes of the controllers that plan with it
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,8 @@
-"""Compact policies: gates, prices and metering by a few readable numbers.
+"""Gates, prices and metering by a few readable numbers: compact DPC policies, and rules.
+
+A compact policy is trained through the regional model (dpc-pc, dpc-pcrg with `compact`). A rule, gating-rule or, with
+prices, pricing-rule, has numbers that were tuned in SUMO (`cosim tune`) or chosen by hand; it reads them from
+scenario.toml.
 
 With z_i = n_i / n_cr,i, the entries h -> p of every protected region p, and the prices of all ways through p, are
 
@@ -30,15 +34,19 @@ t_hj the mean time to leave h on the way to j, so that e_hj is what the prices a
 differentiable and is trained like a network.
 """
 
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
+from pydantic import Field
 from torch import nn
 
-from nmfd.controllers.dpc.policy import Memory, Policy
+from nmfd.controllers.dpc.policy import Architecture, DpcController, Memory, Policy
 from nmfd.model import dynamics
+from nmfd.model.planning import Options, PlanningModel, options
 from nmfd.model.regional_model import RegionalModel
+from nmfd.runs import config
+from nmfd.runs.config import Problem, setting
 from nmfd.tensors import PerPair, PerRegion, PerTurn
 
 DISPERSION_S = 60.0  # of the travel times that drivers perceive; assumed
@@ -61,6 +69,13 @@ class Numbers(NamedTuple):
     integral: float = 0.0
     metering_protected: float = 0.0
     metering_gain: float = 1.0
+
+
+NumbersOption = Annotated[config.Numbers, Field(min_length=MIN_NUMBERS, max_length=11)]
+MEANING = (
+    "set_point, gain, relief, price, price_from, elsewhere, elsewhere_from, metering, integral (0), "
+    "metering_protected (0), metering_gain (1); see nmfd/controllers/dpc/compact.py"
+)
 
 
 class CompactPolicy(Policy):
@@ -148,3 +163,30 @@ class CompactPolicy(Policy):
         more = (costs - torch.where(least.isfinite(), least, 0.0)).clamp(min=0.0)
         weight = self.own * torch.exp(-more / DISPERSION_S)
         return weight / weight.sum(-2, keepdim=True).clamp(min=1e-9)
+
+
+class Rule(Options):
+    """Options of a rule."""
+
+    numbers: NumbersOption = setting(MEANING, Numbers(), unit="-")
+    metering: bool = setting("trips wait while regions are full; for +metering", False)
+
+    def misfit(self, planning: PlanningModel) -> Problem | None:
+        """Return negative numbers, or no protected region, as a problem."""
+        if min(self.numbers) < 0.0:
+            return Problem("numbers", config.got("8 to 11 numbers >= 0", list(self.numbers)))
+        if not planning.protected:
+            return Problem("numbers", "expected a scenario with protected regions; name them")
+        return None
+
+
+def rule(planning: PlanningModel, *, guidance: bool) -> DpcController:
+    """Return the pricing rule or, without guidance, the gating rule. Raise InputError."""
+    name = "pricing-rule" if guidance else "gating-rule"
+    setup = options(Rule, planning, name)
+    architecture = Architecture(guidance=guidance, compact=planning.protected, metering=setup.metering)
+    policy = CompactPolicy(planning.network, architecture)
+    policy.numbers.data.copy_(torch.tensor(Numbers(*setup.numbers)))
+    controller = DpcController(policy)
+    controller.name = name
+    return controller

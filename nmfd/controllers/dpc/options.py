@@ -2,12 +2,13 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from typing import Literal
 
-from pydantic import Field, model_validator
+from pydantic import model_validator
 
+from nmfd.controllers.dpc.compact import MEANING, NumbersOption
 from nmfd.model.planning import Options, PlanningModel
-from nmfd.runs.config import Flow, Numbers, Problem, Share, Texts, got, setting, whole
+from nmfd.runs.config import Flow, Problem, Share, Texts, got, setting, whole
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,14 +64,8 @@ class Training(Options):
 
     local: bool = setting("one small network for every boundary, which fits other cities; perimeter control", False)
     compact: bool = setting("gates and prices of a few readable numbers instead of a network; on the CPU", False)
-    numbers: Annotated[Numbers, Field(min_length=8, max_length=11)] | None = setting(
-        "initial numbers of a compact policy: set_point, gain, relief, price, price_from, elsewhere, elsewhere_from, "
-        "metering, integral (0), metering_protected (0), metering_gain (1); see nmfd/controllers/dpc/compact.py",
-        None,
-        unit="-",
-    )
+    numbers: NumbersOption | None = setting(f"initial numbers of a compact policy: {MEANING}", None, unit="-")
     metering: bool = setting("a compact policy makes trips wait while regions are full; for +metering", False)
-    descend: bool = setting("false leaves a compact policy at its initial numbers, such as those of cosim tune", True)
     steps: int = whole("Adam steps", 400, low=1, high=10**7)
     learning_rate: float = setting("of Adam; falls to a tenth along a cosine", 1e-3, unit="-", gt=0.0, le=1.0)
     demand_low: float = setting("least factor of all demand, drawn per rollout", 1.0, unit="-", gt=0.0, le=1.0)
@@ -98,8 +93,8 @@ class Training(Options):
             raise Problem("compact", "begins with its numbers; omit local, from_gating, from_no_control")
         if self.numbers and not (self.compact and min(self.numbers) >= 0.0):
             raise Problem("numbers", "expected 8 to 11 numbers >= 0 of a compact policy; add compact = true")
-        if (self.metering or not self.descend) and not self.compact:
-            raise Problem("metering" if self.metering else "descend", "only for compact policies; add compact = true")
+        if self.metering and not self.compact:
+            raise Problem("metering", "only for compact policies; add compact = true")
         if self.preset != "ours" and (self.compact or self.local or self.from_gating or self.from_no_control):
             raise Problem("preset", "begins with a random network; omit compact, local, from_gating, from_no_control")
         parts = vars(PRESETS[self.preset])
