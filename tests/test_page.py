@@ -10,7 +10,7 @@ import pytest
 from commands import cosim, error_line
 
 from cosim.evaluation import results, statistics
-from cosim.report import card, figures, html
+from cosim.report import figures, html
 
 EVIL = "<script>alert(1)</script>"
 VOID = {"meta", "link", "img", "br"}
@@ -85,7 +85,7 @@ def test_the_card_has_the_figures_of_the_best_strategy(evaluation):
     rows = results.read(evaluation).level(1.0).rows.assign(mean_trip_time_s=0.0, co2_kg=float("nan"))
     rows.loc[rows["controller"] == "no-control", "mean_trip_time_s"] = 600.0
     rows.loc[rows["controller"] == "dpc-pcrg", "mean_trip_time_s"] = [299.0, 301.0]
-    heading, shown, name = card.card(rows)
+    heading, shown, name = html.card(rows)
     assert heading == "dpc-pcrg compared with no control" and name == "dpc-pcrg"
     trip, served, spent = shown  # CO2 was not recorded
     assert (trip.value, trip.before, trip.better) == ("5.0 min", "10.0 min without control", True)
@@ -93,9 +93,9 @@ def test_the_card_has_the_figures_of_the_best_strategy(evaluation):
     assert served.value == "500" and served.better is None
     times = rows.groupby("controller")["total_time_spent_veh_s"].mean() / 3600
     assert spent.value == f"{times['dpc-pcrg']:,.0f} veh h" and spent.better
-    alone = card.card(rows[rows["controller"] == "no-control"])
+    alone = html.card(rows[rows["controller"] == "no-control"])
     assert alone[0] == "no-control" and all(figure.change == "" for figure in alone[1])
-    single = card.card(rows[rows["seed"] == 2000])[1]
+    single = html.card(rows[rows["seed"] == 2000])[1]
     assert all(figure.better is None and figure.change.endswith("on one seed") for figure in single)
 
 

@@ -2,11 +2,14 @@
 
 import base64
 import json
+import math
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from statistics import mean
+from typing import NamedTuple
 
 import pandas as pd
 from bokeh.embed import components
@@ -15,11 +18,12 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from cosim.evaluation import by_region, explain, statistics
 from cosim.evaluation.results import Finished, Level
-from cosim.report import card, figures
+from cosim.report import figures
 from cosim.view.page import with_slider
 from cosim.view.picture import CityPicture, frames, totals
 from nmfd.errors import InputError
 from nmfd.runs import files
+from nmfd.studies.benchmark import REFERENCE
 
 PICTURES = {  # file -> caption
     "total_accumulation": "Vehicles in the network, with those that wait to enter, over time.",
@@ -32,6 +36,25 @@ LEVEL_PICTURES = {
     "frontier": "Trips served, as a share of those that are due, over the demand.",
     "demand": "Total time spent relative to the reference, over the demand, with 95 % intervals.",
 }
+
+MINUTE, HOUR = 60.0, 3600.0  # s
+QUANTITIES = {  # label -> column, its unit on the card, format of a value, sign of an improvement, meaning
+    "Time per trip": ("mean_trip_time_s", MINUTE, "{:.1f} min", -1, "from wanted departure to end of trip or run"),
+    "Trips served": ("completed_veh", 1.0, "{:,.0f}", 1, "completed trips, mean over seeds"),
+    "CO2": ("co2_kg", 1000.0, "{:.2f} t", -1, "of all vehicles while the run lasted, by SUMO's HBEFA4 petrol car"),
+    "Total time spent": (statistics.TTS, HOUR, "{:,.0f} veh h", -1, "private vehicles on the road or waiting to enter"),
+}
+
+
+class Figure(NamedTuple):
+    """Figure of the card: of the best strategy, before of the reference; better: None if the interval holds zero."""
+
+    label: str
+    value: str
+    meaning: str
+    before: str = ""
+    change: str = ""
+    better: bool | None = None
 
 
 def write_page(path: Path, runs: Sequence[Finished], *, seed: int | None = None) -> Path:
@@ -85,7 +108,7 @@ def _run(run: Finished) -> dict:
     """Return what the page shows of a folder."""
     level, rows = run.level(), run.rows
     seeds = ", ".join(map(str, sorted(set(rows["seed"]))))
-    heading, shown, name = card.card(level.rows)
+    heading, shown, name = card(level.rows)
     manifest = {"runs": level.key, "controllers": level.controllers, "sessions": run.sessions}
     minutes = level.key["steps"] * level.key["step_s"] / 60
     pictures = _pictures(partial(figures.draw_levels, rows=rows), LEVEL_PICTURES) if len(run.levels) > 1 else []
@@ -100,6 +123,33 @@ def _run(run: Finished) -> dict:
         "levels": [_level(run, level) for level in run.levels],
         "manifest": json.dumps(manifest, indent=1),
     }
+
+
+def card(rows: pd.DataFrame) -> tuple[str, list[Figure], str]:
+    """Return a heading, the figures that were recorded, and the name of the best strategy of one demand level.
+
+    It is compared with the reference on the seeds that both have.
+    """
+    against, level = statistics.compared_with(rows), rows["demand"].iloc[0]
+    name = next((name for name in figures.ranked(rows) if name != against), against)
+    heading = name if name == against else f"{name} compared with {against.replace('-', ' ')}"
+    than = "without control" if against == REFERENCE else f"under {against}"
+    shown = []
+    for label, (column, unit, form, good, meaning) in QUANTITIES.items():
+        now, before = (statistics.by_seed(rows, level, one, column) for one in (name, against))
+        common, pair = [seed for seed in now if seed in before], statistics.paired(now, before)
+        value = mean(now[seed] for seed in common or now) / unit
+        figure = Figure(label, form.format(value), meaning)
+        if name != against and not math.isnan(pair.percent):
+            single = math.isnan(pair.percent_half)
+            spread = " on one seed" if single else f" ± {pair.percent_half:.0f} (95 %, {pair.seeds} seeds)"
+            figure = figure._replace(
+                before=f"{form.format(mean(before[seed] for seed in common) / unit)} {than}",
+                change=f"{pair.percent:+.0f} %{spread}",
+                better=pair.percent * good > 0 if pair.excludes_zero else None,
+            )
+        shown += [] if math.isnan(value) else [figure]
+    return heading, shown, name
 
 
 def _level(run: Finished, level: Level) -> dict:
