@@ -8,8 +8,7 @@ import tiny_city
 from tiny_city import pieces
 
 from cosim.importing.baseline import INTERVAL_S, Baseline
-from cosim.importing.partition import make_blocks, partition, read_regions
-from cosim.importing.regions import finish
+from cosim.importing.partition import finish, make_blocks, own_regions, partition
 from cosim.importing.streets import read_streets
 from nmfd.errors import InputError
 
@@ -107,14 +106,14 @@ def test_a_region_without_return_goes_to_its_neighbour(tmp_path):
 @pytest.mark.parametrize(
     "text, expected",
     [
-        ("edge,part\nA0A1,0\n", "expected a csv with the columns edge,region"),
-        ("edge,region\nA0A1,x\n", "expected a csv with the columns edge,region"),
+        ("edge,part\nA0A1,0\n", "line 1: expected edge,region"),
+        ("edge,region\nA0A1,x\n", "line 2: expected an edge and a region"),
         ("edge,region\nnone,0\n", "edge none is not in"),
-        ("edge,region\nA0A1,0\nA0A1,1\n", "edge A0A1 has several rows"),
+        ("edge,region\nA0A1,0\nA0A1,1\n", "edge A0A1 appears twice"),
         ("edge,region\nA0A1,0\nA1A2,2\n", "expected two or more regions 0, 1, ..., each with an edge"),
     ],
 )
 def test_mistakes_in_a_table_of_regions(streets, tmp_path, text, expected):
     (tmp_path / "own.csv").write_text(text)
     with pytest.raises(InputError, match=expected):
-        read_regions(streets, tmp_path / "own.csv")
+        own_regions(streets, tmp_path / "own.csv")

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cosim.evaluation import by_region, statistics
+from cosim.evaluation import statistics
 from cosim.evaluation.results import Finished, Level
 from nmfd.arrays import PerRegion
 from nmfd.controllers.rules import Gating, PiGating
@@ -124,7 +124,7 @@ def _reasons(level: Level, scenario: Scenario, name: str, against: str, *, gains
 
 def _losers(level: Level, region_names: Sequence[str], name: str, against: str) -> str:
     """Return a sentence about the regions from which trips take much longer, "" if there are none."""
-    longer = by_region.longer_trips(level, name, against)
+    longer = statistics.longer_trips(level, name, against)
     worst = [f"{region_names[r]} ({longer[r]:+.0f} %)" for r in np.argsort(-longer) if longer[r] > LONGER_PERCENT]
     return f" Some lose: trips from {', '.join(worst)} take longer." if worst else ""
 

@@ -18,8 +18,7 @@ from cosim.importing.baseline import Baseline, averaged_runs
 from cosim.importing.case import Progress, SumoInput, parse_box, seconds, sumo_input
 from cosim.importing.demand import Traffic, read_traffic, wrapped
 from cosim.importing.generated import morning_peak
-from cosim.importing.partition import partition, read_regions
-from cosim.importing.regions import finish
+from cosim.importing.partition import finish, own_regions, partition
 from cosim.importing.streets import Streets, read_streets
 from cosim.sumo.net import load_city
 from nmfd.errors import InputError
@@ -98,7 +97,7 @@ def import_city(
             window = f"begin {case.begin:g} s, end {case.end} s"
             raise InputError(f"{case.source}: expected 0 s <= begin < end, got {window}")
         streets = read_streets(case.net, case.additional)
-        own = read_regions(streets, Path(str(regions))) if count is None else None
+        own = own_regions(streets, Path(str(regions))) if count is None else None
         traffic = read_traffic(case, streets, seed)
         mesoscopic = mesoscopic or case.mesoscopic
         meso = mesoscopic or streets.drivable.sum() > LARGE_CITY_EDGES

@@ -10,7 +10,7 @@ import numpy as np
 from cosim.importing.baseline import Baseline
 from cosim.importing.case import SumoInput
 from cosim.importing.demand import Traffic, departure
-from cosim.importing.regions import digraph, names, positions
+from cosim.importing.partition import digraph, names, positions
 from cosim.importing.streets import Streets
 from cosim.sumo.arrays import EdgeNumbers
 from nmfd.arrays import PairsOverTime

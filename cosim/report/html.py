@@ -16,7 +16,7 @@ from bokeh.embed import components
 from bokeh.resources import Resources
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from cosim.evaluation import by_region, explain, statistics
+from cosim.evaluation import explain, statistics
 from cosim.evaluation.results import Finished, Level
 from cosim.report import figures
 from cosim.view.page import with_slider
@@ -156,7 +156,7 @@ def _level(run: Finished, level: Level) -> dict:
     """Return what the page shows of a demand level."""
     rows = level.rows
     draw = partial(figures.draw_level, finished=run, level=level)
-    regions = by_region.table(level, run.map(), run.scenario.network.region_names, _pair(rows))
+    regions = statistics.by_region(level, run.map(), run.scenario.network.region_names, _pair(rows))
     return {
         "title": f"Demand times {level.demand:g}",
         "tables": [_html(table) for table in statistics.shown(statistics.statistics(rows))],

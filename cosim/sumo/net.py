@@ -133,7 +133,7 @@ def load_city(net_file: Path, regions_csv: Path, regions: int) -> City:
     Raises InputError for a broken file, an unknown edge, an edge without a region and a region without edges.
     """
     lanes_of, internal, connections = _read_net(Path(net_file))
-    given = _read_regions(Path(regions_csv), regions)
+    given = read_regions(Path(regions_csv), regions)
     for edge in given:
         if edge not in lanes_of and edge not in internal:
             raise InputError(f"{regions_csv}: edge {edge} is not in {net_file}; remove it or give the network it is of")
@@ -246,11 +246,12 @@ def for_cars(lane: ElementTree.Element) -> bool:
     return not {"all", "passenger"} & set(lane.get("disallow", "").split())
 
 
-def _read_regions(path: Path, regions: int) -> dict[str, int]:
+def read_regions(path: Path, regions: int = 10**6) -> dict[str, int]:
+    """Return edge -> region, less than `regions`, of a csv file edge,region. Raises InputError."""
     check_file(path, "give a table with the columns edge,region")
     try:
-        with path.open(encoding="utf-8", newline="") as stream:
-            header, *rows = list(csv.reader(stream)) or [[]]
+        with path.open(encoding="utf-8-sig", newline="") as stream:
+            header, *rows = list(csv.reader(stream, skipinitialspace=True)) or [[]]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: cannot be read ({error}); give a table with the columns edge,region") from None
     if header != ["edge", "region"]:
