@@ -275,15 +275,3 @@ def test_command_lines(tmp_path, words):
     before = sorted(tmp_path.rglob("*"))
     error_line(call("nmfd", *filled), "nmfd")
     assert sorted(tmp_path.rglob("*")) == before
-
-
-@pytest.mark.parametrize(
-    "content", [{"notes.txt": "mine"}, {"manifest.json": "{"}, {"manifest.json": "[]"}], ids=["a file", "cut", "a list"]
-)
-def test_a_folder_with_something_else_is_left_alone(tmp_path, content):
-    scenario, out = tiny.write(tmp_path), tmp_path / "out"
-    out.mkdir()
-    for name, text in content.items():
-        (out / name).write_text(text)
-    error_line(nmfd("benchmark", scenario, "--controllers", "no-control", "--out", out), "nmfd")
-    assert {path.name: path.read_text() for path in out.iterdir() if path.name[0] != "."} == content

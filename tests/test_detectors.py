@@ -139,7 +139,3 @@ def test_states_are_estimated_with_the_model_of_those_who_drive():
         again = drive(scenario, make_controller("route-guidance", scenario), planning, changed)
         assert (again.accumulation == found.accumulation).all()
         assert (again.observed == found.observed).all() == same
-
-
-def test_same_seed_same_result(scenario, run):
-    assert drive(scenario, measurement="estimate").without_times().identical(run.without_times())

@@ -99,16 +99,3 @@ def test_the_map_is_drawn_into_the_axes_it_is_given(city):
     assert city.plot(ax) is ax
     assert len(ax.collections[0].get_paths()) == city.regions["edges"].sum()
     assert cosim.City("networks/grid7").plot().collections
-
-
-@pytest.mark.parametrize(
-    "folder, expected",
-    [
-        ("networks/hexagon7", "networks/hexagon7/network.toml: sumo: missing"),
-        ("networks/grid", "networks/grid/network.toml: no such file; did you mean grid7?"),
-        ("scenarios/grid7_peek", "scenarios/grid7_peek/scenario.toml: no such file; did you mean grid7_peak?"),
-    ],
-)
-def test_no_city(folder, expected):
-    with pytest.raises(nmfd.InputError, match=re.escape(expected)):
-        cosim.City(folder)

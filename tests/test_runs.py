@@ -76,12 +76,6 @@ def test_half_precision_is_kept_in_a_file(tmp_path):
     np.testing.assert_array_equal(Result.read(tmp_path / "a.nc").edge_vehicles, record["edge_vehicles"])
 
 
-def test_removed_and_prices_are_zero_by_default():
-    run = trajectory()
-    assert (run.removed == 0).all() and run.removed.shape == (5, 2, 2)
-    assert (run.prices == 0).all() and run.prices.shape == (4, 2)
-
-
 def test_a_row_holds_the_figures_and_the_facts_of_a_run():
     row = metrics.summary(trajectories.recorded(trajectory(), {}, {"trips": 12}))
     assert list(row)[:4] == ["controller", "seed", "plant", "total_time_spent_veh_s"] and list(row)[-1] == "trips"
