@@ -217,61 +217,38 @@ def train(
 ) -> Any:
     """Train a DPC policy and return its file; or a module of your own, which is returned.
 
-        >>> import torch
-        >>> scenario = nmfd.load_scenario("economic_mpc")
-        >>> gates = torch.nn.Sequential(  # numbers (..., R, R) of any network, and the box of u
-        ...     torch.nn.Flatten(-2), torch.nn.Linear(49, 49), torch.nn.Unflatten(-1, (7, 7)),
-        ...     nmfd.PerimeterLayer(scenario.network))
-        >>> mine = nmfd.train(scenario, "dpc-pc", policy=gates, steps=1, progress=False)
-        >>> nmfd.run(scenario, nmfd.ModuleController(mine, scenario), steps=2).perimeter.shape
-        (2, 7, 7)
-
     controller: its name; with `policy` the one whose settings and planning model are used
-    policy: module, states (veh, (B, R, R)) -> perimeter, (perimeter, splits) or (perimeter, splits, metering), which
-        nmfd.PerimeterLayer and nmfd.SplitsLayer make admissible by construction; trained in place
-
-    With `policy`, the loss is the mean over the rollouts of cost plus weighted constraints, which are differentiable:
-
-    cost: nmfd.Trajectories -> (B,); by default the total time spent
-    constraints: pairs of a function, nmfd.Trajectories -> penalty (B,) or (), not negative, and its weight
-    sample: (torch.Generator, B) -> initial states (veh, (B, R, R)) and demand (veh/s, (T, B, R, R)); by default those
-        of the settings
-
-    For named controllers:
-
+    policy: module as in nmfd.ModuleController, admissible by nmfd.PerimeterLayer and nmfd.SplitsLayer; trained in place
+    cost: differentiable function, nmfd.Trajectories -> (B,); by default the total time spent
+    sample: (torch.Generator, B) -> initial states (veh, (B, R, R)) and demand (veh/s, (T, B, R, R)); by default random
+    constraints: pairs of a function, nmfd.Trajectories -> penalty >= 0 (B,), and its weight; their means are added
     out: policy file, SCENARIO/NAME.pt if None
-    resume: continue an interrupted training
-    anyway: train even on placeholder MFDs or if no gateway can be controlled
-
-    For both:
-
     steps: Adam steps; those of scenario.toml, else 400, if None
     device: "cpu", which gives the same weights every time, "cuda" or "auto"
+    resume: continue an interrupted training
+    anyway: train even on placeholder MFDs or if no gateway can be controlled
     progress: see `benchmark`
     """
     scenario, strategy = _loaded(scenario), parse(controller)
-    own: dict[str, Any] = {"cost": cost, "sample": sample, "constraints": constraints}
-    if policy is not None:
-        if out or resume:
-            raise InputError("policy: a module is returned, not written; omit out and resume, keep its state_dict()")
-        with watched(type(policy).__name__, progress) as show:
-            own |= {"seed": seed, "steps": steps, "device": training.available(device), "progress": show}
-            return training.train_module(scenario, strategy, policy, **own)
-    if any(own.values()):
-        raise InputError("cost, sample and constraints: train a module of your own; add policy=module")
+    if policy is not None and (out or resume):
+        raise InputError("policy: a module is returned, not written; omit out and resume, keep its state_dict()")
+    task = training.Task(cost=cost, sample=sample, constraints=constraints)
     options: dict[str, Any] = {"seed": seed, "steps": steps, "device": training.available(device), "resume": resume}
     chosen = training.settings(scenario, strategy, steps)
-    file = _file(scenario, f"{controller}.pt", out)
+    file = _file(scenario, f"{controller}.pt", out) if policy is None else None
     believed = strategy.planning(scenario).network
     for region, doubts in zip(believed.region_names, believed.doubts, strict=False):
         if doubts:
             print(f"nmfd: the model of region {region} is doubtful: {'; '.join(doubts)}", file=sys.stderr)
-    worth = chosen.steps >= training.WORTH_COMPILING
-    options |= {"anyway": anyway, "compiled": worth and rollout.can_compile(options["device"])}
+    worth = policy is None and chosen.steps >= training.WORTH_COMPILING
+    options |= {"compiled": worth and rollout.can_compile(options["device"])}
+    options |= {"module": policy, "task": task, "anyway": anyway}
     try:
         with watched(controller, progress) as show:
             return training.train(scenario, strategy, out=file, progress=show, **options)
     except KeyboardInterrupt:
+        if file is None:
+            raise
         raise KeyboardInterrupt(f"the best policy so far, if any, is {file}; add --resume to continue") from None
 
 

@@ -322,7 +322,7 @@ def test_a_rollout_with_metering_and_detours_is_the_plant():
     rollout = training.Rollout(planning_model(PEAK), dtype=torch.float64, detour_cost=40.0)
     start, demand = rollout.start.expand(2, 7, 7), rollout.demand[:, None] * torch.tensor([1.0, 0.5]).reshape(2, 1, 1)
     exact, seen, waiting = rollout.states(made, start, demand, torch.Generator())
-    state, spent = plant.reset(0), 0.0
+    waiting, state, spent = waiting.sum((-2, -1)), plant.reset(0), 0.0
     assert torch.equal(exact, seen) and waiting[-1, 0] > 2.0 * waiting[-1, 1] > 10.0
     for k in range(PEAK.steps):
         x = state.accumulation

@@ -9,7 +9,7 @@ import torch
 
 import nmfd
 from nmfd.controllers import training
-from nmfd.controllers.dpc.options import PRESETS
+from nmfd.controllers.dpc.options import PUBLISHED
 from nmfd.controllers.dpc.policy import SoftExponential
 from nmfd.controllers.strategy import parse
 
@@ -46,7 +46,7 @@ def test_the_published_preset_trains_loads_and_drives(tmp_path, monkeypatch):
 def test_one_part_at_a_time_and_what_does_not_fit(tmp_path):
     setup = training.settings(published(tmp_path, "batch", "clip"), parse("dpc-pcrg"))
     assert (setup.recipe.batch, setup.recipe.clip, setup.recipe.weight_decay) == (16, 1.0, 1e-6)
-    assert math.isinf(PRESETS["published"].clip)
+    assert math.isinf(PUBLISHED.clip)
     with pytest.raises(
         nmfd.InputError, match=r"preset_without: expected parts of the preset published, of learning_rat"
     ):

@@ -7,7 +7,8 @@ import copy
 import io
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +21,12 @@ from nmfd.controllers.dpc.compact import CompactPolicy, Numbers
 from nmfd.controllers.dpc.options import Training
 from nmfd.controllers.dpc.policy import Architecture, ModuleController, Policy
 from nmfd.controllers.dpc.policy_file import checkpoint, new_policy, read_file
-from nmfd.controllers.dpc.rollout import Demands, Rollout, States, Trajectories, compiled_step
+from nmfd.controllers.dpc.rollout import Rollout, Trajectories, compiled_step
 from nmfd.controllers.rules import PiGating
 from nmfd.controllers.strategy import Strategy
 from nmfd.errors import InputError, RunFailed
 from nmfd.model.authority import NO_GATEWAY
-from nmfd.model.planning import options, planning_model
+from nmfd.model.planning import PlanningModel, options, planning_model
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs.config import error
@@ -84,136 +85,118 @@ def available(device: str) -> str:
     return "cuda" if device == "auto" and torch.cuda.is_available() else device.replace("auto", "cpu")
 
 
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """Cost, sample and constraints of the user's own, as of nmfd.train; by default the total time spent."""
+
+    cost: Callable[[Trajectories], torch.Tensor] | None = None
+    sample: Callable[[Generator, int], tuple] | None = None
+    constraints: Sequence[tuple[Callable[[Trajectories], torch.Tensor], float]] = ()
+
+    @property
+    def own(self) -> str:
+        """Names of its parts, "" for the default."""
+        parts = [self.cost, self.sample, *(part for part, _ in self.constraints)]
+        return ", ".join(getattr(part, "__qualname__", repr(part)) for part in parts if part)
+
+
 @one_thread()
 def train(
     scenario: Scenario,
     strategy: Strategy,
     *,
     seed: int,
-    out: Path,
+    out: Path | None,
+    module: nn.Module | None = None,
+    task: Task = Task(),
     steps: int | None = None,
     resume: bool = False,
     device: str = "cpu",
     compiled: bool = False,
     anyway: bool = False,
     progress: Callable[[int, int, str], None] | None = None,
-) -> Path:
+) -> Any:
     """Train the policy of `strategy` and write the best in validation to `out`; the same seed gives the same weights.
 
+    module: instead of the policy, trained in place and returned with its best weights, without a file
     resume: continue from the state in `out`.resume
     compiled: compile the step, about twice as fast after a minute or two; the weights differ by rounding
     anyway: train even if `check` raises
     progress: called with (done, steps, note) after every step
     """
     setup = settings(scenario, strategy, steps)
-    if not anyway:
+    if module is not None:
+        empty = np.zeros(scenario.network.adjacency.shape)
+        ModuleController(module, scenario).act(Observation(step=0, time=0.0, accumulation=empty, backlog=empty))
+    elif not anyway:
         check(scenario, strategy)
     planning = planning_model(scenario, strategy.controller.name, strategy.table(scenario))
     steps = setup.steps
     configuration = {"controller": strategy.name, "scenario": planning.name, "seed": seed, "compiled": compiled}
-    configuration |= {**vars(setup), "steps": steps}
+    configuration |= {**vars(setup), "steps": steps} | ({"task": task.own} if task.own else {})
     torch.manual_seed(seed)
     generator = Generator().manual_seed(seed)
-    guidance, compact = strategy.controller.guides, planning.protected if setup.compact else ()
-    architecture = Architecture(guidance=guidance, local=setup.local, compact=compact, metering=setup.metering)
+    recipe, policy = setup.recipe, module or _first_policy(setup, planning, guidance=strategy.controller.guides)
+    device = "cpu" if isinstance(policy, CompactPolicy) else device
+    policy = policy.to(device).train()
+    rollout = Rollout(planning, device=device, detour_cost=setup.detour_cost, process_std=recipe.process_std)
+    if setup.from_gating and not resume and isinstance(policy, Policy):
+        begin_as_gate(policy, rollout, generator)
+    advance = compiled_step(rollout.step) if compiled else rollout.step
+    optimizer = Adam(policy.parameters(), lr=setup.learning_rate, weight_decay=recipe.weight_decay)
+    first, best, kept = 0, float("inf"), copy.deepcopy(policy.state_dict())
+    state_file = None if out is None else out.with_name(out.name + ".resume")
+    objective = partial(_loss, policy, rollout, setup, task)
+
+    def keep_the_better(best: float) -> float:
+        with torch.no_grad():
+            own = objective(Generator().manual_seed(seed), VALIDATION_ROLLOUTS).item() if task.own else None
+        score = validate(policy, rollout, seed, setup) if own is None else own
+        if score < best and out is not None:
+            write(checkpoint(policy, planning.network, {**configuration, "validation_veh_s": score}), out)
+        elif score < best:
+            kept.update(copy.deepcopy(policy.state_dict()))
+        return min(best, score)
+
+    if resume and state_file is not None:
+        first, best = _restore(state_file, configuration, policy, optimizer, generator)
+    for step in range(first, steps):
+        _set_rate(optimizer, setup, step / steps)
+        _descend(policy, objective(generator, recipe.batch, advance), optimizer, setup, step)
+        if (step + 1) % VALIDATION_PERIOD == 0 or step + 1 == steps:
+            best = keep_the_better(best)
+            state = {"configuration": configuration, "step": step + 1, "best": best}
+            state |= {"policy": policy.state_dict(), "optimizer": optimizer.state_dict()}
+            if state_file is not None:
+                write(state | {"generator": generator.get_state()}, state_file)
+        if progress:
+            progress(step + 1, steps, f"best {best:.4g}" + ("" if task.own else " veh s"))
+    if not math.isfinite(best):
+        raise RunFailed(f"{strategy.name}: every validation of {steps} steps diverged; lower the learning rate")
+    if state_file is not None:
+        state_file.unlink(missing_ok=True)
+        return out
+    policy.load_state_dict(kept)
+    return policy.cpu().eval()
+
+
+def _first_policy(setup: Training, planning: PlanningModel, *, guidance: bool) -> Policy:
+    """Return the untrained policy that the settings describe."""
     recipe = setup.recipe
-    architecture = replace(
-        architecture, soft_exponential=recipe.activation != "gelu", decoder_layers=recipe.decoder_layers
+    architecture = Architecture(
+        guidance=guidance,
+        local=setup.local,
+        compact=planning.protected if setup.compact else (),
+        metering=setup.metering,
+        soft_exponential=recipe.activation != "gelu",
+        decoder_layers=recipe.decoder_layers,
     )
     policy = new_policy(planning.network, architecture)
     if setup.numbers and isinstance(policy, CompactPolicy):
         policy.numbers.data.copy_(torch.tensor(Numbers(*setup.numbers)))
     if setup.from_no_control:
         begin_as_no_control(policy, planning.network)
-    device = "cpu" if setup.compact else device
-    policy = policy.to(device)
-    rollout = Rollout(planning, device=device, detour_cost=setup.detour_cost, process_std=recipe.process_std)
-    if setup.from_gating and not resume:
-        begin_as_gate(policy, rollout, generator)
-    advance = compiled_step(rollout.step) if compiled else rollout.step
-    optimizer = Adam(policy.parameters(), lr=setup.learning_rate, weight_decay=recipe.weight_decay)
-    first, best = 0, float("inf")
-    state_file = out.with_name(out.name + ".resume")
-
-    def keep_the_better(best: float) -> float:
-        score = validate(policy, rollout, seed, setup)
-        if score < best:
-            write(checkpoint(policy, planning.network, {**configuration, "validation_veh_s": score}), out)
-        return min(best, score)
-
-    if resume:
-        first, best = _restore(state_file, configuration, policy, optimizer, generator)
-    for step in range(first, steps):
-        _set_rate(optimizer, setup, step / steps)
-        _descend(policy, rollout, setup, generator, advance, optimizer, step)
-        if (step + 1) % VALIDATION_PERIOD == 0 or step + 1 == steps:
-            best = keep_the_better(best)
-            state = {"configuration": configuration, "step": step + 1, "best": best}
-            state |= {"policy": policy.state_dict(), "optimizer": optimizer.state_dict()}
-            write(state | {"generator": generator.get_state()}, state_file)
-        if progress:
-            progress(step + 1, steps, f"best {best:.4g} veh s")
-    if not math.isfinite(best):
-        raise RunFailed(f"{strategy.name}: every validation of {steps} steps diverged; lower the learning rate")
-    state_file.unlink(missing_ok=True)
-    return out
-
-
-@one_thread()
-def train_module(
-    scenario: Scenario,
-    strategy: Strategy,
-    module: nn.Module,
-    *,
-    cost: Callable[[Trajectories], torch.Tensor] | None = None,
-    sample: Callable[[Generator, int], tuple] | None = None,
-    constraints: Sequence[tuple[Callable[[Trajectories], torch.Tensor], float]] = (),
-    seed: int = 0,
-    steps: int | None = None,
-    device: str = "cpu",
-    progress: Callable[[int, int, str], None] | None = None,
-) -> nn.Module:
-    """Train a module of the user's own in place and return it with its best weights; arguments as of nmfd.train."""
-    setup = settings(scenario, strategy, steps)
-    empty = np.zeros(scenario.network.adjacency.shape)
-    ModuleController(module, scenario).act(Observation(step=0, time=0.0, accumulation=empty, backlog=empty))
-    recipe, planning = setup.recipe, planning_model(scenario, strategy.controller.name, strategy.table(scenario))
-    rollout, generator = Rollout(planning, device=device, process_std=recipe.process_std), Generator().manual_seed(seed)
-    module = module.to(device).train()
-    optimizer = Adam(module.parameters(), lr=setup.learning_rate, weight_decay=recipe.weight_decay)
-
-    def loss(generator: Generator, batch: int) -> torch.Tensor:
-        rollout.draw_model(batch, setup.mfd_spread, generator, setup.mfd_scale)
-        given = sample(generator, batch) if sample else _draw(rollout, setup, generator, batch)
-        x, demand = (torch.as_tensor(part, dtype=rollout.dtype, device=rollout.device) for part in given)
-        if x.shape != (batch, *rollout.start.shape) or demand.shape[1:] != x.shape or len(demand) < 2:
-            wanted = f"start ({batch}, R, R) and demand (T, {batch}, R, R) with R = {len(rollout.start)} and T > 1"
-            raise InputError(f"sample: expected {wanted}, got {tuple(x.shape)} and {tuple(demand.shape)}; return these")
-        run = rollout.trajectories(module, x, demand, generator)
-        total = (cost(run) if cost else run.total_time_spent).mean()
-        return total + sum(weight * penalty(run).mean() for penalty, weight in constraints)
-
-    best, kept = math.inf, copy.deepcopy(module.state_dict())
-    for step in range(setup.steps):
-        _set_rate(optimizer, setup, step / setup.steps)
-        value = loss(generator, recipe.batch)
-        if not value.requires_grad:
-            raise InputError("cost: has no gradient by the weights of the policy; compute it from the run with torch")
-        optimizer.zero_grad()
-        value.backward()
-        torch.nn.utils.clip_grad_norm_(module.parameters(), recipe.clip)
-        optimizer.step()
-        if (step + 1) % VALIDATION_PERIOD == 0 or step + 1 == setup.steps:
-            with torch.no_grad():
-                score = loss(Generator().manual_seed(seed), VALIDATION_ROLLOUTS).item()
-            if score < best:
-                best, kept = score, copy.deepcopy(module.state_dict())
-        if progress:
-            progress(step + 1, setup.steps, f"best {best:.4g}")
-    if not math.isfinite(best):
-        raise RunFailed(f"{type(module).__name__}: every validation diverged; lower the learning rate")
-    module.load_state_dict(kept)
-    return module.cpu().eval()
+    return policy
 
 
 def _set_rate(optimizer: Adam, setup: Training, done: float) -> None:
@@ -223,41 +206,50 @@ def _set_rate(optimizer: Adam, setup: Training, done: float) -> None:
         group["lr"] = setup.recipe.learning_rate or setup.learning_rate * (0.1 + 0.9 * cosine)
 
 
-def _draw(rollout: Rollout, setup: Training, generator: Generator, batch: int) -> tuple[States, Demands]:
-    """Return initial states and demands of the rollouts of one step."""
-    most, levels = setup.recipe.largest_start, (setup.demand_low, setup.demand_high)
-    spread, share = (0.0, 0.0) if most else (DEMAND_SPREAD, RANDOM_START_SHARE)
-    x, demand = rollout.random_start(batch, spread, share, generator, levels)
-    if most:
-        x = x + most * torch.rand(x.shape, generator=generator).to(x)
-    return x, rollout.perturb(demand, torch.rand(batch, generator=generator), setup.noise, generator)
-
-
-def _descend(
-    policy: Policy,
+def _loss(
+    policy: nn.Module,
     rollout: Rollout,
     setup: Training,
+    task: Task,
     generator: Generator,
-    advance: Callable,
-    optimizer: Adam,
-    step: int,
-) -> None:
+    batch: int,
+    advance: Callable | None = None,
+) -> torch.Tensor:
+    """Return the loss of `batch` rollouts under random models, from random states and demands or those of the task."""
+    most, levels = setup.recipe.largest_start, (setup.demand_low, setup.demand_high)
+    rollout.draw_model(batch, setup.mfd_spread, generator, setup.mfd_scale)
+    if task.sample:
+        given = task.sample(generator, batch)
+        x, demand = (torch.as_tensor(part, dtype=rollout.dtype, device=rollout.device) for part in given)
+        if x.shape != (batch, *rollout.start.shape) or demand.shape[1:] != x.shape or len(demand) < 2:
+            wanted = f"start ({batch}, R, R) and demand (T, {batch}, R, R) with R = {len(rollout.start)} and T > 1"
+            raise InputError(f"sample: expected {wanted}, got {tuple(x.shape)} and {tuple(demand.shape)}; return these")
+    else:
+        spread, share = (0.0, 0.0) if most else (DEMAND_SPREAD, RANDOM_START_SHARE)
+        x, demand = rollout.random_start(batch, spread, share, generator, levels)
+        x = x + most * torch.rand(x.shape, generator=generator).to(x) if most else x
+        demand = rollout.perturb(demand, torch.rand(batch, generator=generator), setup.noise, generator)
+    if not (task.cost or task.constraints):
+        total = rollout.total_time_spent(policy, x, demand, generator, advance)
+        # The logarithm, because a rollout that is heavily loaded must not count for more than the others.
+        return torch.log(total.clamp(min=1.0)).mean() if setup.recipe.loss == "log" else total.mean()
+    run = rollout.trajectories(policy, x, demand, generator, advance)
+    loss = (task.cost(run) if task.cost else run.total_time_spent).mean()
+    return loss + sum(weight * penalty(run).mean() for penalty, weight in task.constraints)
+
+
+def _descend(policy: nn.Module, loss: torch.Tensor, optimizer: Adam, setup: Training, step: int) -> None:
     """Do one Adam step."""
-    recipe = setup.recipe
-    rollout.draw_model(recipe.batch, setup.mfd_spread, generator, setup.mfd_scale)
-    x, demand = _draw(rollout, setup, generator, recipe.batch)
-    total = rollout.total_time_spent(policy, x, demand, generator, advance)
-    # The logarithm, because a rollout that is heavily loaded must not count for more than the others.
-    loss = torch.log(total.clamp(min=1.0)).mean() if recipe.loss == "log" else total.mean()
+    if not loss.requires_grad:
+        raise InputError("cost: has no gradient by the weights of the policy; compute it from the run with torch")
     optimizer.zero_grad()
     loss.backward()
-    if policy.architecture.guidance and not setup.compact:
+    if isinstance(policy, Policy) and policy.architecture.guidance and not setup.compact:
         # The decoders are trained in turn. Not by requires_grad, which would compile the step once for each.
-        for weights in (
-            policy.splits_decoder if step // recipe.epoch % 2 == 0 else policy.perimeter_decoder
-        ).parameters():
+        frozen = policy.splits_decoder if step // setup.recipe.epoch % 2 == 0 else policy.perimeter_decoder
+        for weights in frozen.parameters():
             weights.grad = None
-    torch.nn.utils.clip_grad_norm_(policy.parameters(), recipe.clip)
+    torch.nn.utils.clip_grad_norm_(policy.parameters(), setup.recipe.clip)
     optimizer.step()
     if isinstance(policy, CompactPolicy):
         policy.bound()

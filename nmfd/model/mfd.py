@@ -158,12 +158,6 @@ class PiecewiseLinear(Mfd):
             q = q + change * (1.0 - kink / xp.maximum(accumulation, kink))
         return q
 
-    def slope_up_to_jam(self, accumulation: Any) -> Any:
-        return sum(
-            np.where(accumulation > kink, change * kink / np.maximum(accumulation, 1e-9) ** 2, 0.0)
-            for kink, change in self._kinks()
-        )
-
     def _kinks(self) -> Iterator[tuple[Any, Any]]:
         """Yield the accumulations at which the slope of the outflow changes, from 0, and these changes [1/s]."""
         left, low, before = 0.0, 0.0, 0.0
@@ -202,9 +196,6 @@ class _Several(Mfd):
 
     def rate_up_to_jam(self, accumulation: Any, xp: Any = np) -> Any:
         return sum(w * curve.rate_up_to_jam(xp.minimum(accumulation, curve.jam), xp) for w, curve in self.kinds)
-
-    def slope_up_to_jam(self, accumulation: Any) -> Any:
-        return sum(w * curve.slope_up_to_jam(np.minimum(accumulation, curve.jam)) for w, curve in self.kinds)
 
 
 def stacked(mfds: Sequence[Mfd], array: Callable[[Sequence[float]], Any]) -> Mfd:

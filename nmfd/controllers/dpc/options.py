@@ -37,26 +37,23 @@ class Recipe:
     largest_start: float = 0.0
 
 
-PRESETS = {
-    "ours": Recipe(),
-    # Tumu et al., by section. Training: learning rate (no schedule is named), weight decay, batch, sizes of 128,
-    # alternation by epoch; no clipping is named. Policy Network: SoftExponential, decoders that are networks of hidden
-    # layers. Problem Formulation: plain sum of the accumulations, noise on the state. Conclusion: one scenario.
-    # Not stated: the number of steps, the length of an epoch (here ten batches), hidden layers (here two, one in each
-    # decoder), and initial states (here those of Region Scaling Results, the only ones that are named).
-    "published": Recipe(
-        learning_rate=1e-4,
-        weight_decay=1e-6,
-        batch=256,
-        clip=math.inf,
-        activation="soft-exponential",
-        decoder_layers=1,
-        loss="sum",
-        epoch=10,
-        process_std=0.25,
-        largest_start=100.0,
-    ),
-}
+# Tumu et al., by section. Training: learning rate (no schedule is named), weight decay, batch, sizes of 128,
+# alternation by epoch; no clipping is named. Policy Network: SoftExponential, decoders that are networks of hidden
+# layers. Problem Formulation: plain sum of the accumulations, noise on the state. Conclusion: one scenario.
+# Not stated: the number of steps, the length of an epoch (here ten batches), hidden layers (here two, one in each
+# decoder), and initial states (here those of Region Scaling Results, the only ones that are named).
+PUBLISHED = Recipe(
+    learning_rate=1e-4,
+    weight_decay=1e-6,
+    batch=256,
+    clip=math.inf,
+    activation="soft-exponential",
+    decoder_layers=1,
+    loss="sum",
+    epoch=10,
+    process_std=0.25,
+    largest_start=100.0,
+)
 
 
 class Training(Options):
@@ -97,16 +94,17 @@ class Training(Options):
             raise Problem("metering", "only for compact policies; add compact = true")
         if self.preset != "ours" and (self.compact or self.local or self.from_gating or self.from_no_control):
             raise Problem("preset", "begins with a random network; omit compact, local, from_gating, from_no_control")
-        parts = vars(PRESETS[self.preset])
-        if self.preset_without and (self.preset == "ours" or not set(self.preset_without) <= set(parts)):
-            problem = got(f"parts of the preset published, of {', '.join(parts)}", list(self.preset_without))
+        if self.preset_without and (self.preset == "ours" or not set(self.preset_without) <= set(vars(PUBLISHED))):
+            problem = got(f"parts of the preset published, of {', '.join(vars(PUBLISHED))}", list(self.preset_without))
             raise Problem("preset_without", f"{problem}; correct them or add preset")
         return self
 
     @property
     def recipe(self) -> Recipe:
         """The preset with its exceptions."""
-        return replace(PRESETS[self.preset], **{name: getattr(PRESETS["ours"], name) for name in self.preset_without})
+        ours = Recipe()
+        parts = {name: getattr(ours, name) for name in self.preset_without}
+        return ours if self.preset == "ours" else replace(PUBLISHED, **parts)
 
     def misfit(self, planning: PlanningModel) -> Problem | None:
         """Return a gate without a protected region as a problem."""

@@ -5,6 +5,7 @@ As in Tumu et al.: an MLP backbone with one decoder for the perimeter (scaled si
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -215,23 +216,19 @@ class DpcController:
         return Controls(perimeter=perimeter, splits=splits, prices=prices, metering=metering)
 
 
-def commanded(policy: nn.Module, x: PerPair) -> tuple[PerPair, PerTurn | None, PerRegion | None]:
-    """Return perimeter, splits or None, and metering (veh/s, (..., R)) or None of any policy in the states x."""
-    if isinstance(policy, Policy):
-        return *policy(x), policy.metering(x)
+def commanded(policy: nn.Module, x: PerPair) -> tuple[PerPair, PerTurn | None]:
+    """Return perimeter, and splits or None, of any module in the states x."""
     values = policy(x)
-    perimeter, splits, metering = (*(values if isinstance(values, tuple) else (values,)), None, None)[:3]
-    return perimeter, splits, metering
+    return values if isinstance(values, tuple) else (values, None)
 
 
 class ModuleController:
-    """Module of your own as a controller: states (veh, (..., R, R)) -> admissible controls.
+    """Module of your own as a controller: states (veh, (..., R, R)) -> perimeter or (perimeter, splits).
 
-    It returns perimeter, (perimeter, splits) or (perimeter, splits, metering). They are checked at every step, as those
-    of a class of your own.
+    Methods `prices` and `metering` of the states, if it has them, return those of nmfd.Controls. All are checked.
 
         >>> scenario = nmfd.load_scenario("economic_mpc")
-        >>> gates = nmfd.PerimeterLayer(scenario.network)  # without weights: opens the more, the more vehicles there are
+        >>> gates = nmfd.PerimeterLayer(scenario.network)  # opens with every vehicle more
         >>> nmfd.run(scenario, nmfd.ModuleController(gates, scenario), steps=1).controller
         'PerimeterLayer'
     """
@@ -245,7 +242,12 @@ class ModuleController:
     def act(self, observation: Observation) -> Controls:
         with torch.inference_mode():
             like = next(self.module.parameters(), torch.zeros(1))
-            values = commanded(self.module, torch.from_numpy(observation.accumulation).to(like))
-        perimeter, splits, metering = (None if v is None else v.cpu().numpy().astype(float) for v in values)
-        controls = Controls(perimeter=perimeter, splits=splits, metering=metering)
-        return checked(controls, self._network, f"{self.name}: interval {observation.step}")
+            x = torch.from_numpy(observation.accumulation).to(like)
+            parts = dict(zip(("perimeter", "splits"), commanded(self.module, x), strict=True))
+            parts |= {
+                name: getattr(self.module, name)(x) for name in ("prices", "metering") if hasattr(self.module, name)
+            }
+        controls: dict[str, Any] = {name: v.cpu().numpy() for name, v in parts.items() if v is not None}
+        return checked(
+            Controls(**{"splits": None, **controls}), self._network, f"{self.name}: interval {observation.step}"
+        )

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Generator, nn
 
-from nmfd.controllers.dpc.policy import Policy, commanded
+from nmfd.controllers.dpc.policy import commanded
 from nmfd.model import dynamics
 from nmfd.model.planning import PlanningModel
 from nmfd.model.scenario import pairs_with_demand
@@ -24,13 +24,11 @@ Levels = Float[torch.Tensor, " B"]
 
 @dataclass(frozen=True, kw_only=True)
 class Trajectories:
-    """B rollouts of T control intervals, of which costs and constraints are functions.
+    """B rollouts of T control intervals of `step` (s), of which costs and constraints are functions.
 
-    step: control interval (s)
-    states, backlog: inside region i, and waiting to enter it, at the beginning of each interval (veh, (T, B, R, R))
-    demand: (veh/s, (T, B, R, R))
-    rate: outflow per vehicle q_i (1/s, (T, B, R)), in proportion to the mean speed of the region
-    perimeter, splits: commands (-, (T-1, B, R, R)) and (-, (T-1, B, R, R, R)); none follows the last state
+    states, backlog: in region i, and waiting to enter it, at the beginning of each interval (veh, (T, B, R, R))
+    demand: (veh/s, (T, B, R, R)); rate: outflow per vehicle q_i (1/s, (T, B, R)), in proportion to the mean speed
+    perimeter, splits: (-, (T, B, R, R)), (-, (T, B, R, R, R)) in these states
     """
 
     step: float
@@ -38,8 +36,8 @@ class Trajectories:
     backlog: Demands
     demand: Demands
     rate: Float[torch.Tensor, "T B R"]
-    perimeter: Float[torch.Tensor, "K B R R"]
-    splits: Float[torch.Tensor, "K B R R R"]
+    perimeter: Float[torch.Tensor, "T B R R"]
+    splits: Float[torch.Tensor, "T B R R R"]
 
     @property
     def total_time_spent(self) -> Levels:
@@ -142,72 +140,56 @@ class Rollout:
         normal = torch.randn(demand.shape, generator=generator, dtype=self.dtype)
         return (demand + (normal * sigma).to(self.device)).clamp(min=0.0)
 
-    def step(self, policy: Policy, x: States, demand: States, noise: States) -> States:
+    def step(self, policy: nn.Module, x: States, demand: States, noise: States) -> States:
         """Return the state one control interval after x (veh, (B, R, R)), which `policy` observes with `noise`."""
-        perimeter, splits = policy(x + noise)
+        perimeter, splits = commanded(policy, x + noise)
         splits = self.nominal_splits if splits is None else splits
         return dynamics.advance(self.parameters, x, demand, perimeter, splits, **self.planning.scheme)
 
     def states(
-        self, policy: Policy, x: States, demand: Demands, generator: Generator, step: Callable | None = None
-    ) -> tuple[Demands, Demands, Float[torch.Tensor, "T B"]]:
-        """Return the states under `policy`, the observed ones (veh, (T, B, R, R)), and the backlog (veh, (T, B)).
+        self, policy: nn.Module, x: States, demand: Demands, generator: Generator, step: Callable | None = None
+    ) -> tuple[Demands, Demands, Demands]:
+        """Return the states under `policy`, the observed ones, and the backlog (veh, (T, B, R, R)).
 
+        policy: a Policy or any module: states -> perimeter or (perimeter, splits); it may have a method `metering`
         step: replaces `self.step`, such as its compiled form
         """
         noise = torch.randn(demand.shape, generator=generator, dtype=self.dtype).to(self.device)
         noise *= self.planning.measurement_std
-        shocks = self._shocks(demand, generator)
-        states, waiting, backlog = [x], [x.new_zeros(len(x))], torch.zeros_like(x)
+        states, waiting, metering = [x], [torch.zeros_like(x)], getattr(policy, "metering", lambda x: None)
         for k in range(demand.shape[0] - 1):
-            entering = demand[k]
-            if policy.architecture.metering:
-                rates = policy.metering(states[-1] + noise[k])
+            entering, backlog = demand[k], waiting[-1]
+            if (rates := metering(states[-1] + noise[k])) is not None:
                 entering, backlog = dynamics.admitted(backlog, entering, rates, self.planning.step)
-            states.append(shaken((step or self.step)(policy, states[-1], entering, noise[k]), shocks, k))
-            waiting.append(backlog.sum((-2, -1)))
+            x = (step or self.step)(policy, states[-1], entering, noise[k])
+            if self.process_std:
+                shock = torch.randn(x.shape, generator=generator, dtype=self.dtype).to(self.device)
+                x = torch.where(x > 0, (x + self.process_std * shock).clamp(min=0.0), x)
+            states.append(x)
+            waiting.append(backlog)
         exact = torch.stack(states)
         return exact, exact + noise, torch.stack(waiting)
 
-    def trajectories(self, policy: nn.Module, x: States, demand: Demands, generator: Generator) -> "Trajectories":
-        """Return the rollouts of any module from x; arguments as `states`."""
-        noise = torch.randn(demand.shape, generator=generator, dtype=self.dtype).to(self.device)
-        shocks = self._shocks(demand, generator)
-        states, waiting, commands = [x], [torch.zeros_like(x)], []
-        for k in range(len(demand) - 1):
-            perimeter, splits, rates = commanded(policy, states[-1] + self.planning.measurement_std * noise[k])
-            splits = (self.nominal_splits if splits is None else splits).expand(len(x), -1, -1, -1)
-            entering, backlog = dynamics.admitted(waiting[-1], demand[k], rates, self.planning.step)
-            waiting.append(backlog)
-            commands.append((perimeter, splits))
-            after = dynamics.advance(self.parameters, states[-1], entering, perimeter, splits, **self.planning.scheme)
-            states.append(shaken(after, shocks, k))
-        exact, (perimeters, turns) = torch.stack(states), map(torch.stack, zip(*commands, strict=True))
-        return Trajectories(
-            step=self.planning.step,
-            states=exact,
-            backlog=torch.stack(waiting),
-            demand=demand,
-            rate=dynamics.rate(self.parameters, exact.sum(-1)),
-            perimeter=perimeters,
-            splits=turns,
-        )
+    def trajectories(
+        self, policy: nn.Module, x: States, demand: Demands, generator: Generator, step: Callable | None = None
+    ) -> "Trajectories":
+        """Return the rollouts from x with their controls; arguments as `states`."""
+        exact, seen, backlog = self.states(policy, x, demand, generator, step)
+        perimeter, splits = commanded(policy, seen)
+        rate, given = dynamics.rate(self.parameters, exact.sum(-1)), {"states": exact, "backlog": backlog}
+        splits = (self.nominal_splits if splits is None else splits).expand(*exact.shape, -1)
+        step_s = self.planning.step
+        return Trajectories(step=step_s, demand=demand, rate=rate, perimeter=perimeter, splits=splits, **given)
 
     def total_time_spent(
-        self, policy: Policy, x: States, demand: Demands, generator: Generator, step: Callable | None = None
+        self, policy: nn.Module, x: States, demand: Demands, generator: Generator, step: Callable | None = None
     ) -> Levels:
         """Return the TTS (veh s, (B,)) of rollouts from x under `policy`, with detours; arguments as `states`."""
         exact, seen, waiting = self.states(policy, x, demand, generator, step)
-        vehicles = exact.sum((0, -2, -1)) + waiting.sum(0)
-        if self.detour_cost and policy.architecture.guidance:
-            vehicles = vehicles + self.detour_cost * self._diverted(exact, policy(seen)[1]).sum((0, -2, -1))
+        vehicles = exact.sum((0, -2, -1)) + waiting.sum((-2, -1)).sum(0)
+        if self.detour_cost and (splits := commanded(policy, seen)[1]) is not None:
+            vehicles = vehicles + self.detour_cost * self._diverted(exact, splits).sum((0, -2, -1))
         return self.planning.step * vehicles
-
-    def _shocks(self, demand: Demands, generator: Generator) -> Demands | None:
-        """Draw the process noise of all intervals (veh, (T, B, R, R)), None without."""
-        if not self.process_std:
-            return None
-        return self.process_std * torch.randn(demand.shape, generator=generator, dtype=self.dtype).to(self.device)
 
     def _diverted(self, x: PerPair, splits: PerTurn) -> PerPair:
         """Return the flow that leaves a region off the nominal split ratios (veh/s, (..., R, R))."""
@@ -216,11 +198,6 @@ class Rollout:
         if p.exit_rates is not None:
             leaving = leaving * p.exit_rates
         return 0.5 * (splits - self.nominal_splits).abs().sum(-2) * leaving
-
-
-def shaken(x: States, shocks: Demands | None, k: int) -> States:
-    """Return x after the process noise of interval k on each x_ij that is not empty; none becomes negative."""
-    return x if shocks is None else torch.where(x > 0, (x + shocks[k]).clamp(min=0.0), x)
 
 
 def can_compile(device: str = "cpu") -> bool:
