@@ -148,6 +148,7 @@ def test_a_named_policy_takes_a_cost_too(tmp_path):
         ({"out": "mine.pt"}, "policy: a module is returned, not written"),
         ({"sample": lambda generator, batch: (torch.zeros(batch, 4, 4),) * 2}, r"sample: expected start \(16, R, R\)"),
         ({"cost": lambda run: run.states.detach().sum()}, "cost: has no gradient"),
+        ({"constraints": [crowded]}, r"constraints: expected pairs \(function, weight\), got <function crowded"),
     ],
 )
 def test_wrong_parts_are_one_line(given, message):

@@ -93,6 +93,11 @@ class Task:
     sample: Callable[[Generator, int], tuple] | None = None
     constraints: Sequence[tuple[Callable[[Trajectories], torch.Tensor], float]] = ()
 
+    def __post_init__(self) -> None:
+        for pair in self.constraints:
+            if not (isinstance(pair, tuple) and len(pair) == 2 and callable(pair[0])):
+                raise InputError(f"constraints: expected pairs (function, weight), got {pair!r}; add the weight")
+
     @property
     def own(self) -> str:
         """Names of its parts, "" for the default."""
@@ -131,16 +136,16 @@ def train(
     elif not anyway:
         check(scenario, strategy)
     planning = planning_model(scenario, strategy.controller.name, strategy.table(scenario))
-    steps = setup.steps
     configuration = {"controller": strategy.name, "scenario": planning.name, "seed": seed, "compiled": compiled}
-    configuration |= {**vars(setup), "steps": steps} | ({"task": task.own} if task.own else {})
+    configuration |= vars(setup) | ({"task": task.own} if task.own else {})
     torch.manual_seed(seed)
     generator = Generator().manual_seed(seed)
-    recipe, policy = setup.recipe, module or _first_policy(setup, planning, guidance=strategy.controller.guides)
+    recipe, steps, guidance = setup.recipe, setup.steps, strategy.controller.guides
+    policy = _first_policy(setup, planning, guidance=guidance) if module is None else module
     device = "cpu" if isinstance(policy, CompactPolicy) else device
     policy = policy.to(device).train()
     rollout = Rollout(planning, device=device, detour_cost=setup.detour_cost, process_std=recipe.process_std)
-    if setup.from_gating and not resume and isinstance(policy, Policy):
+    if setup.from_gating and not resume and module is None:
         begin_as_gate(policy, rollout, generator)
     advance = compiled_step(rollout.step) if compiled else rollout.step
     optimizer = Adam(policy.parameters(), lr=setup.learning_rate, weight_decay=recipe.weight_decay)
@@ -150,10 +155,12 @@ def train(
 
     def keep_the_better(best: float) -> float:
         with torch.no_grad():
-            own = objective(Generator().manual_seed(seed), VALIDATION_ROLLOUTS).item() if task.own else None
+            fixed = Generator().manual_seed(seed)
+            own = objective(fixed, VALIDATION_ROLLOUTS).item() if task.own else None
         score = validate(policy, rollout, seed, setup) if own is None else own
         if score < best and out is not None:
-            write(checkpoint(policy, planning.network, {**configuration, "validation_veh_s": score}), out)
+            key = "validation" if task.own else "validation_veh_s"
+            write(checkpoint(policy, planning.network, {**configuration, key: score}), out)
         elif score < best:
             kept.update(copy.deepcopy(policy.state_dict()))
         return min(best, score)
@@ -234,7 +241,7 @@ def _loss(
         # The logarithm, because a rollout that is heavily loaded must not count for more than the others.
         return torch.log(total.clamp(min=1.0)).mean() if setup.recipe.loss == "log" else total.mean()
     run = rollout.trajectories(policy, x, demand, generator, advance)
-    loss = (task.cost(run) if task.cost else run.total_time_spent).mean()
+    loss = torch.as_tensor(task.cost(run) if task.cost else run.total_time_spent).mean()
     return loss + sum(weight * penalty(run).mean() for penalty, weight in task.constraints)
 
 
@@ -244,7 +251,7 @@ def _descend(policy: nn.Module, loss: torch.Tensor, optimizer: Adam, setup: Trai
         raise InputError("cost: has no gradient by the weights of the policy; compute it from the run with torch")
     optimizer.zero_grad()
     loss.backward()
-    if isinstance(policy, Policy) and policy.architecture.guidance and not setup.compact:
+    if isinstance(policy, Policy) and hasattr(policy, "splits_decoder"):
         # The decoders are trained in turn. Not by requires_grad, which would compile the step once for each.
         frozen = policy.splits_decoder if step // setup.recipe.epoch % 2 == 0 else policy.perimeter_decoder
         for weights in frozen.parameters():

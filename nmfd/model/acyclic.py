@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float, Int
 from nmfd.arrays import PerPair, PerRegion, PerTurn
 from nmfd.model.dynamics import counted
 from nmfd.model.mfd import Mfd, stacked
-from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, RegionalModel
+from nmfd.model.regional_model import LEAST_ROOM, RegionalModel, passing_share
 
 LEAST_SHARE = 1e-6  # of theta left without h = g and h = o: less is the rounding of an optimiser, not a route
 
@@ -148,8 +148,7 @@ def transfers(model: Acyclic, x: PerCell, leaving: PerCell, perimeter: PerPair, 
     regions = len(model.start)
     wish_of_pair = np.bincount(here * regions + model.move_next, wish, minlength=regions**2).reshape(regions, regions)
     room = np.maximum(1.0 - np.bincount(model.region, x, minlength=regions) / model.storage, LEAST_ROOM)
-    limit = perimeter * model.capacity * room + LEAST_LIMIT
-    return (1.0 + (wish_of_pair / limit) ** SHARPNESS)[here, model.move_next] ** (-1.0 / SHARPNESS) * wish
+    return passing_share(wish_of_pair, perimeter * model.capacity * room)[here, model.move_next] * wish
 
 
 def advance_counted(

@@ -24,7 +24,7 @@ from typing import Any
 import torch
 
 from nmfd.model.mfd import Mfd, stacked
-from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, RegionalModel
+from nmfd.model.regional_model import LEAST_ROOM, RegionalModel, passing_share
 from nmfd.tensors import PerPair, PerRegion, PerRollout, PerTurn
 
 
@@ -91,8 +91,7 @@ def passing(p: Parameters, wish: PerPair, perimeter: PerPair, accumulation: PerR
     2013), accumulation (..., R) [veh].
     """
     room = (1.0 - accumulation / p.storage).clamp(min=LEAST_ROOM)
-    limit = perimeter * p.capacity * room.unsqueeze(-2)
-    return (1.0 + (wish / (limit + LEAST_LIMIT)) ** SHARPNESS) ** (-1.0 / SHARPNESS)
+    return passing_share(wish, perimeter * p.capacity * room.unsqueeze(-2))
 
 
 def admitted(backlog: PerPair, demand: PerPair, metering: PerRegion | None, step: float) -> tuple[PerPair, PerPair]:

@@ -28,6 +28,11 @@ MOST_VEHICLES = 1e9  # in a region
 FOR_ALL = ("exit_rates", "capacity", "storage", "controllable")  # given for every region or for none
 
 
+def passing_share(wish: Any, limit: Any) -> Any:
+    """Return the share [-] of a desired flow that passes a boundary of this limit [veh/s]; any library's arrays."""
+    return (1.0 + (wish / (limit + LEAST_LIMIT)) ** SHARPNESS) ** (-1.0 / SHARPNESS)
+
+
 @dataclass(frozen=True, kw_only=True)
 class RegionalModel:
     """R regions, numbered from 0.

@@ -18,7 +18,7 @@ from nmfd.arrays import PairsOverTime, PerPair, TurnsOverTime
 from nmfd.model import dynamics
 from nmfd.model.mfd import stacked
 from nmfd.model.planning import PlanningModel
-from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, RegionalModel
+from nmfd.model.regional_model import LEAST_ROOM, RegionalModel, passing_share
 
 XP = SimpleNamespace(**vars(ca) | {"minimum": ca.fmin, "maximum": ca.fmax, "where": ca.if_else})  # NumPy's names
 UNIT = 1000.0  # veh, unit of the accumulations in the solver
@@ -121,8 +121,7 @@ def flows(p: Parameters, x: Matrix, perimeter: Matrix, splits: Turns) -> tuple[M
 def passing(p: Parameters, wish: Matrix, perimeter: Matrix, accumulation: Matrix) -> Matrix:
     """Return the share (R, R) [-] of the desired flow `wish` (R, R) [veh/s] that passes each boundary."""
     room = ca.fmax(1.0 - accumulation.T / p.storage, LEAST_ROOM)
-    limit = perimeter * p.capacity * ca.repmat(room, wish.shape[0], 1)
-    return (1.0 + (wish / (limit + LEAST_LIMIT)) ** SHARPNESS) ** (-1.0 / SHARPNESS)
+    return passing_share(wish, perimeter * p.capacity * ca.repmat(room, wish.shape[0], 1))
 
 
 def derivative(p: Parameters, x: Matrix, demand: Matrix, perimeter: Matrix, splits: Turns) -> Matrix:
