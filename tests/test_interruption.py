@@ -49,7 +49,8 @@ def test_ctrl_c_at_any_moment_is_one_line(tmp_path, after, wait):
     assert returned == 130 and said.startswith("nmfd: interrupted") and said.count("\n") == 1, said
 
 
-@pytest.mark.parametrize("streams", ["<&- >&- 2>&-", pytest.param("2>&1 | true", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("streams", ["<&- >&- 2>&-", "2>&1 | true"])
 def test_runs_are_kept_without_standard_streams(tmp_path, streams):
     command = [sys.executable, "-m", "nmfd", "benchmark", str(tiny.write(tmp_path)), "--controllers", "no-control"]
     subprocess.run([f"{shlex.join(command)} --workers 2 --seeds 2 --out {tmp_path}/out {streams}"], shell=True)
@@ -61,7 +62,7 @@ def test_runs_are_kept_without_standard_streams(tmp_path, streams):
     [
         pytest.param(signal.SIGINT, 130, id="Ctrl-C"),
         pytest.param(signal.SIGTERM, 130, id="SIGTERM", marks=pytest.mark.slow),
-        pytest.param(signal.SIGKILL, -9, id="kill -9"),
+        pytest.param(signal.SIGKILL, -9, id="kill -9", marks=pytest.mark.slow),
     ],
 )
 def test_a_stopped_benchmark_continues(tmp_path, by, status):

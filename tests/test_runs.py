@@ -214,6 +214,7 @@ def test_failures_are_rows_and_the_others_go_on(tmp_path):
         raise_failures(run_many(runs, tmp_path / "out", workers=0))
 
 
+@pytest.mark.slow
 def test_processes_that_die_or_hang_are_rows_and_give_the_same_numbers(tmp_path):
     works = {"a": die, "b": partial(die, 0), "c": crash, "d": hang, "e": None}
     runs = [run_of(name, work=work) for name, work in works.items()]

@@ -161,6 +161,7 @@ def test_webster_in_sumo(scenario, plant_of):
         assert states == [cycle[(begin + n) % len(cycle)] for n in range(len(states))], name
 
 
+@pytest.mark.slow
 def test_the_same_drivers_reroute(scenario, plant_of):
     """Equipment follows from the seed, whatever the signals do; more drivers include the fewer."""
     equipped = {}

@@ -95,6 +95,7 @@ def test_the_committed_ones_come_within_five_percent_of_the_bound(scenario, name
     assert most < 30.0 * run.accumulation[:-1].sum() < 1.05 * most
 
 
+@pytest.mark.slow
 def test_the_same_seed_learns_the_same_and_the_file_keeps_it(scenario, learned, tmp_path):
     again = learn(scenario, NAME, seed=0, samples=256, rounds=1, steps=150)
     other = learn(scenario, NAME, seed=1, samples=256, rounds=1, steps=150)

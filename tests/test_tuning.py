@@ -60,6 +60,7 @@ def tune(chosen):
     return tuning.tune(chosen, progress=False)
 
 
+@pytest.mark.slow
 def test_the_best_options_are_found_and_written(city, tmp_path, runs):
     done, _ = runs
     table = tune(order(city, tmp_path / "out"))
