@@ -195,7 +195,7 @@ def junctions():
         if name == "s":
             shown.append((session.time, name, state))
 
-    control = MaxPressure(session, TOWN, [CROSSING, END], FLOWS, show=show)
+    control = MaxPressure(session, TOWN, [CROSSING, END], FLOWS, show=show, lookahead=1.0)
 
     def play(until):
         while session.time <= until:
@@ -213,7 +213,7 @@ def shown_by(crossing, vehicles, seconds, *, town=TOWN, **options):
     def show(name, state):
         shown.append((session.time, state))
 
-    control = MaxPressure(session, town, [crossing], FLOWS, show=show, **options)
+    control = MaxPressure(session, town, [crossing], FLOWS, show=show, lookahead=1.0, **options)
     for _ in range(seconds):
         control.play(session.time)
         session.time += 1.0
@@ -313,7 +313,7 @@ def test_a_spent_ration_exerts_no_pressure():
         **{**vars(TOWN), "gateways": (Gateway(source=0, target=1, from_edge="a", to_edge="b", signal="s", links=(0,)),)}
     )
     shown, session = [], SimpleNamespace(time=0.0, lane_vehicles=lambda lane: {"a": 50.0, "c": 1.0}.get(lane[0], 0.0))
-    control = MaxPressure(session, town, [CROSSING], FLOWS, show=lambda name, state: shown.append(state))
+    control = MaxPressure(session, town, [CROSSING], FLOWS, show=lambda name, state: shown.append(state), lookahead=1.0)
     control.command(np.full(1, 5.0 / 61.0))  # 5 s, and so much of the other 61 s
     assert control.green_time() == {"s": {0: 0.0}}
     for second in range(66):
@@ -327,7 +327,7 @@ def test_what_is_known_of_a_run():
     """Of five lanes one is served in part by a stage of t; CROSS is 6 s of 66 s between its stages, and so is t."""
     vehicles = {"a": 9.0, "c": 9.0}
     session = SimpleNamespace(time=0.0, lane_vehicles=lambda lane: vehicles.get(lane[0], 0.0))
-    control = MaxPressure(session, TOWN, [CROSSING, END], FLOWS, show=lambda *_: None)
+    control = MaxPressure(session, TOWN, [CROSSING, END], FLOWS, show=lambda *_: None, lookahead=1.0)
     for _ in range(100):
         control.play(session.time)
         session.time += 1.0

@@ -47,8 +47,8 @@ class Actuation:
         self._pressure, show = None, incidents.show
         self._controls: list[MaxPressure | GatewaySignal | ResponsiveSignal] = []
         if flows is not None:
-            cyclic = settings.signals == CYCLIC
-            self._pressure = MaxPressure(session, city, steered, flows, show=show, cyclic=cyclic)
+            cyclic, lookahead = settings.signals == CYCLIC, settings.lookahead
+            self._pressure = MaxPressure(session, city, steered, flows, show=show, lookahead=lookahead, cyclic=cyclic)
             self._controls.append(self._pressure)
             phases = {signal.id: signal.phases for signal in steered if signal.id in movements}
         left = {*phases, *settings.leave_signals}

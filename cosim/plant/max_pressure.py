@@ -14,7 +14,7 @@ Acyclic (Varaiya): the next stage is the one with the highest pressure; a link t
 vehicle waited there comes first. Cyclic (Levin, Hu and Odell, "Max-pressure signal control with cyclical phase
 structure", 2020): stages keep their order, stay while none has a higher pressure, and are left out without a vehicle.
 In both no green outlasts MAX_GREEN_S while others wait. A change costs yellow and red: the pressure of another stage
-counts for the share of green in these and the LOOKAHEAD_S that follow.
+counts for the share of green in these and the `lookahead` that follows: the shorter, the fewer the changes.
 """
 
 from collections import defaultdict
@@ -40,7 +40,6 @@ FACTS = {  # columns of the table of runs
     "programmed_intergreen_share": "the same in the original programmes",
 }
 DECISION_PERIOD_S = 5.0  # about two vehicles per lane
-LOOKAHEAD_S = 1.0  # the best of 10, 4, 2, 1 and 0.3 in Bologna; good in Ingolstadt and Cologne (seeds 1100 to 1102)
 MAX_GREEN_S = 50.0  # netconvert's for actuated signals
 MAX_RED_S = 120.0  # about the longest usual cycle (Signal Timing Manual, 2nd edition, 2015)
 SHORT_ROAD_M = 15.0  # two vehicles
@@ -61,10 +60,11 @@ class MaxPressure:
         flows: Mapping[tuple[str, str], float],
         *,
         show: Show,
+        lookahead: float,
         cyclic: bool = False,
     ):
-        """flows: (edge, next edge) -> flow, any unit"""
-        self._session, self._show, self._cyclic = session, show, cyclic
+        """flows: (edge, next edge) -> flow, any unit; lookahead: green that follows a change [s]"""
+        self._session, self._show, self._cyclic, self._lookahead = session, show, cyclic, lookahead
         roads = Roads(city, signals, flows)
         self._roads, self._start = roads, session.time
         movements = gateway_movements(city)
@@ -125,7 +125,7 @@ class MaxPressure:
             overdue = approaches.serves @ (waiting * approaches.overdue(now))
             if overdue.any():
                 return int(np.argmax(overdue))
-        worth = {n: pressure[n] * LOOKAHEAD_S / (LOOKAHEAD_S + junction.loss(n)) for n in in_turn}
+        worth = {n: pressure[n] * self._lookahead / (self._lookahead + junction.loss(n)) for n in in_turn}
         best = max(in_turn, key=worth.__getitem__)
         too_long = now + DECISION_PERIOD_S > junction.stage_since + MAX_GREEN_S + 1e-6
         if worth[best] > pressure[own] or too_long:
@@ -279,7 +279,7 @@ def transition(phases: tuple[Phase, ...], source: int, target: int) -> list[Phas
     walking = losing & ends_bare(phases)  # their red begins while cars beside them are still green
     yellow = max(yellow_time(phases, link) for link in losing)
     red = sum(phase.duration for phase in between if "y" not in phase.state)
-    red = max(red, *(clear[k] - yellow for k in losing - walking))
+    red = max([red, *(clear[k] - yellow for k in losing - walking)])
     alone = max((clear[k] - yellow - red for k in walking), default=0.0)
     return [
         Phase(duration=seconds, state="".join(light if k in ends else a for k, a in enumerate(before)))

@@ -34,6 +34,12 @@ class Settings(config.Settings):
         {},
     )
     signals: Signals = setting("control of the signals", FIXED)
+    lookahead: float = setting(
+        "green after a change of stage for which max-pressure compares pressures; less: fewer changes",
+        1.0,
+        unit="s",
+        gt=0.0,
+    )
     leave_signals: Texts = setting("signals that perimeter control does not change", ())
     chain_limit: Share = setting(
         "share of the room before a gateway beyond which no command holds vehicles there; 0: no limit, and the same "
