@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nmfd.errors import InputError
-from nmfd.model.mfd import Cubic, fit
+from nmfd.model.mfd import Cubic, fit, trapezoid
 
 # The published curve with a tenth of its jam accumulation: the coefficients span nine orders of magnitude.
 TRUTH = Cubic(a=4.133e-9, b=-8.282e-6, c=0.0042, jam=1000.0)
@@ -28,6 +28,16 @@ def test_a_parabola_in_closed_form():
     assert curve.reaching(0.75) == pytest.approx(250.0, abs=0.1) and curve.reaching(1.0) == curve.critical
     np.testing.assert_allclose(curve.outflow(np.array([0.0, 250.0, 1000.0])), [0.0, 0.75, 0.0], atol=1e-12)
     np.testing.assert_allclose(curve.rate(np.array([0.0, 250.0])), [0.004, 0.003])
+
+
+def test_a_trapezoid_in_closed_form():
+    """The least of three lines, constant from where a twentieth of the capacity is left; and what is no curve."""
+    curve = trapezoid(free=0.004, capacity=6.0, wave=0.001, jam=8000.0)
+    n = np.array([0.0, 1000.0, 1500.0, 1900.0, 2000.0, 5000.0, 7700.0])
+    np.testing.assert_allclose(curve.outflow(n), np.minimum(np.minimum(0.004 * n, 6.0), 8.0 - 0.001 * n), atol=1e-12)
+    assert curve.outflow(9000.0) == pytest.approx(0.3) and curve.critical == pytest.approx(1500.0, abs=0.4)
+    with pytest.raises(InputError, match="^PiecewiseLinear: expected as many finite outflows as accumulations"):
+        replace(curve, accumulations=(1500.0, 1500.0, 7700.0))
 
 
 def test_beyond_the_jam_the_outflow_is_constant():
