@@ -137,12 +137,8 @@ class PiecewiseLinear(Mfd):
 
     def __post_init__(self) -> None:
         n, count = np.array([0.0, *self.accumulations]), len(self.outflows)
-        if (
-            not count
-            or len(n) != count + 1
-            or not (np.diff(n) > 0).all()
-            or not np.isfinite([*n, *self.outflows]).all()
-        ):
+        rising = len(n) == count + 1 > 1 and (np.diff(n) > 0).all()
+        if not (rising and np.isfinite([*n, *self.outflows]).all()):
             wanted = "as many finite outflows as accumulations, which rise from above 0"
             raise InputError(f"PiecewiseLinear: expected {wanted}, got {self.accumulations} and {self.outflows}")
 
