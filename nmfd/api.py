@@ -133,7 +133,8 @@ def benchmark(
     workers: runs at a time
     progress: as in `nmfd.run`; your own is called as progress(done, runs, name)
 
-    The column `failure` is "" of a finished run, else its reason. Raises InputError.
+    The column `failure` is "" of a finished run, else its reason; `lower_bound_veh_s` is that of the total time spent
+    with the same controls, where `nmfd bound` has found one. Raises InputError.
     """
     scenario, files = _loaded(scenario), {name: Path(file) for name, file in (policies or {}).items()}
     _check_plant(plant)
@@ -150,8 +151,10 @@ def benchmark(
         for seed in (range(seeds) if isinstance(seeds, int) else seeds)
     ]
     out = default_folder(scenario.name) if out is None else Path(out)
+    lower = {strategy.name: benchmark_study.lower_bound(scenario, strategy, plant) for strategy in strategies}
     with locked(out):
         rows = run_many(runs, out, workers=workers_for(strategies, workers), progress=progress)
+        rows["lower_bound_veh_s"] = rows["controller"].map(lower)
         done = rows[rows["failure"] == ""]
         names = [run_name(name, seed) for name, seed in zip(done["controller"], done["seed"], strict=True)]
         if names:
@@ -260,7 +263,7 @@ def bound(
     iterations: int = bound_study.ITERATIONS,
     progress: Progress = None,
 ) -> str:
-    """Optimise the controls of "bound-pc" or "bound-pcrg" for known demand; return a report.
+    """Find the best plan "bound-pc" or "bound-pcrg" for known demand, and a lower bound; return a report.
 
     out: plan file, SCENARIO/NAME.npz if None
     iterations: Adam steps
@@ -272,6 +275,8 @@ def bound(
     open_loop.write(plan, scenario, file)
     totals = sorted(plan.totals.items(), key=lambda item: item[1])
     lines = [f"from {name}: {total:.5g} veh s" + (" (kept)" if name == plan.start else "") for name, total in totals]
+    above = benchmark_study.percent_change(totals[0][1], plan.lower)
+    lines += [f"lower bound: {plan.lower:.5g} veh s; the best plan is at most {above:.1f} % above the optimum"]
     return "\n".join([*lines, f"Written to {file}"])
 
 

@@ -292,9 +292,10 @@ def train(scenario: Path, settings: dict, controller: str, **options: Any) -> No
 @click.option("--controller", required=True, metavar="NAME", help="bound-pc or bound-pcrg.")
 @click.option("--out", type=FILE, metavar="FILE", help="Plan file. [default: SCENARIO/NAME.npz]")
 def bound(scenario: Path, settings: dict, controller: str, **options: Any) -> None:
-    """Optimise the controls for known demand, as a bound.
+    """Find the best plan for known demand, and a lower bound of the total time spent.
 
-    `nmfd benchmark --controllers bound-pc,bound-pcrg` replays the plan.
+    `nmfd benchmark --controllers bound-pc,bound-pcrg` replays the plan; its table says how far controllers are at most
+    above the optimum.
 
     \b
     Example:

@@ -1,4 +1,4 @@
-"""The bound: admissible plans below every closed loop and an exact optimum, plan files, and the command."""
+"""Best plans: admissible, below closed loops. Lower bounds: relaxations that all trajectories meet. The command."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tiny
+import torch
 from commands import good, nmfd
 
 from nmfd import api, closed_loop
@@ -14,6 +15,7 @@ from nmfd.controllers import open_loop
 from nmfd.controllers.rules import NoControl, PiGating
 from nmfd.errors import InputError
 from nmfd.metrics import total_time_spent
+from nmfd.model import dynamics
 from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
 from nmfd.model.scenario import with_demand
@@ -79,9 +81,13 @@ def test_an_interrupted_descent_keeps_the_best_so_far(scenario):
 
 def test_a_plan_that_benchmark_replays(folder, tmp_path):
     text = api.bound(folder, "bound-pcrg", iterations=20)
-    assert "(kept)" in text and "from pi-gating:" in text
+    assert "(kept)" in text and "from pi-gating:" in text and "the best plan is at most" in text
     text = good(nmfd("benchmark", folder, "--controllers", "no-control,bound-pcrg", "--out", tmp_path / "out"))
-    assert "above bound" in text and any(line.startswith("bound-pcrg ") for line in text.splitlines())
+    assert (
+        "above the optimum" in text
+        and "≤ " in text
+        and any(line.startswith("bound-pcrg ") for line in text.splitlines())
+    )
 
 
 def test_wrong_names(scenario):
@@ -100,3 +106,72 @@ def test_files_that_do_not_fit(scenario, tmp_path):
     path.write_bytes(b"nothing")
     with pytest.raises(InputError, match="is no plan"):
         open_loop.read(path, scenario, guidance=False)
+
+
+def unit_vector(lp, scenario, controls):
+    """The variables of `lp` along the plant's trajectory under controls (T, R, R), (T, R, R, R), and its TTS."""
+    p, x = dynamics.parameters(scenario.network), torch.from_numpy(scenario.start)
+    weights, places = dynamics.SCHEMES[scenario.integrator]
+    here, onward, to = lp.turns.T
+    states, outflows, transfers, spent = [], [], [], 0.0
+    for k, (u, theta) in enumerate(zip(*map(torch.from_numpy, controls), strict=True)):
+        spent += scenario.step * float(x.sum())
+        for _ in range(scenario.substeps if k + 1 < scenario.steps else 1):
+            total, slope = 0.0 * x, 0.0 * x
+            for weight, place in zip(weights, places, strict=True):
+                at = x + place * lp.step * slope
+                slope = dynamics.derivative(p, at, torch.from_numpy(scenario.demand[k]), u, theta)[0]
+                total = total + weight * slope
+                leaving = dynamics.rate(p, at.sum(-1)).unsqueeze(-1) * at
+                states.append(at.numpy()[*lp.pairs.T])
+                outflows.append((leaving if p.exit_rates is None else leaving * p.exit_rates).numpy()[*lp.pairs.T])
+                transfers.append(dynamics.flows(p, at, u, theta)[1].numpy()[here, onward, to])
+                if k + 1 == scenario.steps:
+                    break
+            x = x + lp.step * total
+    z = [np.ravel(states), lp.step * np.ravel(outflows), lp.step * np.ravel(transfers)]
+    return np.concatenate(z) / lp.vehicles, spent
+
+
+def random_controls(network, steps, random, *, guidance):
+    shape = (steps, *network.adjacency.shape)
+    u = np.where(network.adjacency, random.uniform(network.u_min, network.u_max, shape), 0.0)
+    u = np.where(random.random(shape) < 0.3, np.where(network.adjacency, network.u_min, 0.0), u)
+    if not guidance:
+        return u, np.broadcast_to(network.nominal_splits, (steps, *network.split_mask.shape))
+    theta = network.split_mask * random.exponential(size=(steps, *network.split_mask.shape)) ** 3
+    return u, theta / np.maximum(theta.sum(axis=2, keepdims=True), 1e-300)
+
+
+@pytest.mark.parametrize("guidance", [False, True])
+@pytest.mark.parametrize("variant", ["euler", "substeps", "rk4", "exit rates", "capacity"])
+def test_every_trajectory_meets_the_relaxation(variant, guidance):
+    """Random, neutral and greedy controls, into gridlock; and the optimum is below what they spend."""
+    scenario = replace(with_demand(load_scenario(ECONOMIC), steps=12), initial=np.zeros((7, 7)))
+    scenario.initial[3], scenario.initial[0] = 2500.0, 200.0
+    network, random = scenario.network, np.random.default_rng(5)
+    if variant == "exit rates":
+        network = replace(network, exit_rates=random.uniform(0.5, 1.5, (7, 7)))
+    if variant == "capacity":
+        network = replace(network, capacity=1.5 * network.adjacency, storage=np.full(7, 9000.0))
+    changes = {"substeps": {"substeps": 3}, "rk4": {"integrator": "rk4"}}.get(variant, {})
+    scenario = replace(scenario, network=network, **changes)
+    lp, bounded = bound.relaxation(scenario, guidance=guidance), bound.lower_bound(scenario, guidance=guidance)
+    runs = list(bound.neutral_starts(network, 12, guidance=guidance).values())
+    runs += [random_controls(network, 12, random, guidance=guidance) for _ in range(5)]
+    for controls in runs:
+        z, spent = unit_vector(lp, scenario, tuple(map(np.array, controls)))
+        assert z.min() >= 0.0 and z.max() <= 1.0
+        np.testing.assert_allclose(lp.equal @ z, lp.given, rtol=0.0, atol=1e-12)
+        assert (lp.upper @ z - lp.most).max() <= 1e-12
+        assert scenario.step * lp.vehicles * (lp.cost @ z) == pytest.approx(spent, rel=1e-12) and bounded <= spent
+    z[lp.cost > 0] *= 0.99  # vehicles that vanish
+    assert abs(lp.equal @ z - lp.given).max() > 1e-6
+
+
+def test_without_congestion_the_lower_bound_is_nearly_reached(scenario):
+    free = replace(scenario, demand=0.01 * scenario.demand, protected=())
+    plan = bound.compute(free, "bound-pc", iterations=100)
+    assert 0.97 * plan.totals[plan.start] < plan.lower <= plan.totals[plan.start]
+    with pytest.raises(InputError, match="process_std: expected 0 for a lower bound, got 0.25"):
+        bound.lower_bound(replace(free, process_std=0.25), guidance=False)

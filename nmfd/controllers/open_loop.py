@@ -1,5 +1,6 @@
 """Open-loop plans as controllers, and their files, which `nmfd bound` writes."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,12 +22,14 @@ class Plan:
 
     perimeter: (-, (T, R, R)); splits: (-, (T, R, R, R)), None without route guidance
     start: initial plan of the best descent; totals: initial plan -> total time spent after its descent (veh s)
+    lower: bound that the total time spent of no plan falls below (veh s); NaN if unknown
     """
 
     perimeter: PairsOverTime
     splits: TurnsOverTime | None
     start: str
     totals: Mapping[str, float]
+    lower: float = math.nan
 
     @property
     def name(self) -> str:
@@ -50,7 +53,7 @@ def write(plan: Plan, scenario: Scenario, path: Path) -> None:
     """Write `plan` and the hash of its scenario to an .npz file."""
     content = {"perimeter": plan.perimeter, "start": plan.start}
     content |= {"scenario": scenario.name, "model": model_hash(scenario)}
-    content |= {"names": list(plan.totals), "totals": list(plan.totals.values())}
+    content |= {"names": list(plan.totals), "totals": list(plan.totals.values()), "lower": plan.lower}
     content |= {} if plan.splits is None else {"splits": plan.splits}
     with atomic(path) as temporary:
         np.savez_compressed(temporary, **content)
@@ -65,6 +68,7 @@ def read(path: Path, scenario: Scenario, *, guidance: bool) -> Plan:
                 splits=file["splits"] if "splits" in file else None,
                 start=str(file["start"]),
                 totals=dict(zip(file["names"].tolist(), file["totals"].tolist(), strict=True)),
+                lower=float(file["lower"]) if "lower" in file else math.nan,
             )
             model = str(file["model"])
     except Exception:
