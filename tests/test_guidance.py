@@ -77,6 +77,12 @@ def least(city, allowed):
     return cost
 
 
+def takes(way, city):
+    """The time [s] from the end of the first edge of a way to that of its last."""
+    turns = {(int(a), int(b)): extra for a, b, extra in zip(*city[:3], strict=True)}
+    return sum(turns[move] + city[3][move[1]] for move in zip(way[:-1], way[1:], strict=True))
+
+
 def back_to(gate, entry, city):
     """(G,) [s] from behind the nearest gateway back to each."""
     return 0.8 * least(city, np.full(EDGES, True))[np.ix_(entry, gate)].min(axis=0)
@@ -85,13 +91,11 @@ def back_to(gate, entry, city):
 def test_the_searches_find_the_least_times_up_to_a_limit(city, ways):
     found, gate, entry = ways
     inside, outside = least(city, REGION == 0), least(city, REGION != 0)
-    turns = {pair: extra for *pair, extra in zip(*city[:3], strict=True) for pair in [tuple(map(int, pair))]}
-    cut = 0
+    over, cut = [takes(move, city) for move in zip(gate.tolist(), entry.tolist(), strict=True)], 0
     for most in (60.0, np.inf, 150.0):  # a wider search may come later, a narrower one may use it
         for here in range(10):
             for target in range(10, EDGES):
-                over = [turns[move] for move in zip(gate.tolist(), entry.tolist(), strict=True)]
-                exact = inside[here, gate] + over + city[3][entry] + outside[entry, target]
+                exact = inside[here, gate] + over + outside[entry, target]
                 cost, reached = found.cost(here, target, most)
                 np.testing.assert_array_equal(reached, np.isfinite(exact))
                 np.testing.assert_allclose(cost[exact <= most], exact[exact <= most])
@@ -102,29 +106,24 @@ def test_the_searches_find_the_least_times_up_to_a_limit(city, ways):
                     assert way[0] == here and way[-1] == target
                     crossing = way.index(int(entry[g]))
                     assert way[crossing - 1] == gate[g] and (REGION[way[crossing:]] != 0).all()
-                    takes = city[3][way[1:]].sum() + sum(turns[move] for move in zip(way[:-1], way[1:], strict=True))
-                    assert takes == pytest.approx(exact[g])
+                    assert takes(way, city) == pytest.approx(exact[g])
     assert cut > 100
 
 
 def test_ways_that_come_back_are_found_where_they_are_the_fastest_of_all(city, ways):
     found, gate, entry = ways
     exact, back = least(city, np.full(EDGES, True)), 0
-    turns = {(int(a), int(b)): extra for a, b, extra in zip(*city[:3], strict=True)}
     for most in (60.0, np.inf, 150.0):
         for here in range(10):
             for target in range(10, EDGES):
                 cost, _ = found.cost(here, target, most)
-                takes, gateway = found.returning(here, target, most)
+                returning, gateway = found.returning(here, target, most)
                 if exact[here, target] < most:
-                    assert min(takes, cost.min()) == pytest.approx(exact[here, target])
-                if takes >= min(most, cost.min() - 1e-9):
+                    assert min(returning, cost.min()) == pytest.approx(exact[here, target])
+                if returning >= min(most, cost.min() - 1e-9):
                     continue
                 way = found.returning_route(here, gateway, target)
-                assert (way[0], way[-1]) == (here, target)
-                assert sum(turns[move] + city[3][move[1]] for move in zip(way[:-1], way[1:], strict=True)) == (
-                    pytest.approx(takes)
-                )
+                assert (way[0], way[-1]) == (here, target) and takes(way, city) == pytest.approx(returning)
                 crossing = max(n for n, edge in enumerate(way) if REGION[edge] == 0)
                 assert (way[crossing], way[crossing + 1]) == (gate[gateway], entry[gateway])
                 assert (REGION[way[:crossing]] != 0).any()
@@ -137,7 +136,6 @@ def test_ways_home_are_the_fastest_up_to_a_limit(city, kept):
     first, second, turn, time = city
     exact = least(city, np.full(EDGES, True))
     home = Trees(Moves(first, second, allowed=np.full(EDGES, True), reverse=True), time, turn, Searches(kept))
-    turns = {(int(a), int(b)): extra for a, b, extra in zip(first, second, turn, strict=True)}
     for most in (60.0, np.inf, 100.0):
         for here in range(EDGES):
             for target in range(EDGES):
@@ -147,8 +145,7 @@ def test_ways_home_are_the_fastest_up_to_a_limit(city, kept):
                 elif np.isfinite(exact[here, target]):
                     way = home.back(target, here)
                     assert (way[0], way[-1]) == (here, target)
-                    takes = sum(turns[move] + time[move[1]] for move in zip(way[:-1], way[1:], strict=True))
-                    assert cost == pytest.approx(exact[here, target]) == takes
+                    assert cost == pytest.approx(exact[here, target]) == takes(way, city)
 
 
 # A main road a m b t of 10 s each, of which m is in another region, and the side street s of `side` s from a to t.

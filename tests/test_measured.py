@@ -183,26 +183,24 @@ def test_the_command(tmp_path, made):
     assert "R2" in text and "trip length assumed" in text and f"Written to {out}" in text
 
 
-@pytest.mark.parametrize(
-    "name, text, expected",
-    [
-        ("about", "region,lane_km\nnorth,2\n", "lane_km: 2 is less than the 10 km of its detectors"),
-        ("about", "region,lane_km\nnorht,20\n", "region 'norht' has no detector; did you mean north?"),
-        ("about", "region,trip_length\nnorth,1.5\n", "line 2: trip_length: expected m, from 10"),
-        ("adjacency", "region,neighbour\nnorth,north\n", "region south cannot be reached from north"),
-        ("adjacency", "region,neighbour\nnorth,west\n", "line 2: region 'west' has no detector"),
-        ("adjacency", "region,neighbour\n", "region south cannot be reached from north"),
-        ("adjacency", "a,b\n", "column region is missing"),
-        ("about", "", "cannot be read as a csv file"),
-    ],
-    ids=str,
-)
-def test_other_tables_end_in_one_line(tmp_path, made, name, text, expected):
-    files = {**written(tmp_path, *made), name: tmp_path / f"{name}.csv"}
-    files[name].write_text(text)
-    with pytest.raises(nmfd.InputError, match="^[^\n]*$") as caught:
-        nmfd.identify(**files, trip_length=TRIP, out=tmp_path / "city")
-    assert expected in str(caught.value) and not (tmp_path / "city").exists()
+TABLES = {  # expected in the error -> name and text of a table
+    "lane_km: 2 is less than the 10 km of its detectors": ("about", "region,lane_km\nnorth,2\n"),
+    "region 'norht' has no detector; did you mean north?": ("about", "region,lane_km\nnorht,20\n"),
+    "line 2: trip_length: expected m, from 10": ("about", "region,trip_length\nnorth,1.5\n"),
+    "region south cannot be reached from north": ("adjacency", "region,neighbour\nnorth,north\n"),
+    "line 2: region 'west' has no detector": ("adjacency", "region,neighbour\nnorth,west\n"),
+    "column region is missing": ("adjacency", "a,b\n"),
+    "cannot be read as a csv file": ("about", ""),
+}
+
+
+@pytest.mark.parametrize("expected", TABLES)
+def test_other_tables_end_in_one_line(tmp_path, made, expected):
+    name, text = TABLES[expected]
+    (tmp_path / "other.csv").write_text(text)
+    test_malformed_tables_end_in_one_line(
+        tmp_path, made, lambda *given: given, {name: tmp_path / "other.csv", "trip_length": TRIP}, expected
+    )
 
 
 @pytest.mark.usefixtures("without_pictures")

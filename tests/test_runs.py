@@ -175,6 +175,7 @@ def test_runs_are_done_once_and_come_in_the_order_asked_for(tmp_path):
         "controllers": {name: {"policy_hash": "p"} for name in "bac"},
     }
     assert {"command", "commit", "versions", "date"} <= set(manifest["sessions"][0])
+    assert re.fullmatch(r"None|[0-9a-f]{40}", str(manifest["sessions"][0]["commit"]))
 
 
 def test_another_key_does_a_run_again(tmp_path, capsys):
@@ -300,11 +301,6 @@ def test_a_scheduler_that_does_not_answer_is_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "DASK_PATIENCE_S", 0.2)
     with pytest.raises(InputError, match="no Dask scheduler answers at 'tcp://127.0.0.1:1'"):
         run_many([run_of()], tmp_path / "out", scheduler="tcp://127.0.0.1:1")
-
-
-def test_the_commit_is_that_of_the_checkout():
-    commit = module.provenance()["commit"]
-    assert commit is None or re.fullmatch(r"[0-9a-f]{40}", commit)
 
 
 @pytest.mark.slow
