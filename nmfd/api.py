@@ -22,12 +22,10 @@ from nmfd.runs.run_many import Run, locked, run_many
 from nmfd.runs.run_many import raise_failures as raise_failures
 from nmfd.studies import benchmark as benchmark_study
 from nmfd.studies import bound as bound_study
-from nmfd.studies import robustness as robustness_study
-from nmfd.studies.benchmark import PLANTS, REFERENCE, closed_loop_of, key_of, workers_for
+from nmfd.studies.benchmark import PLANTS, REFERENCE, SIGMAS_VEH_S, closed_loop_of, key_of, workers_for
+from nmfd.studies.benchmark import improvement_table as improvement_table
 from nmfd.studies.benchmark import summary_table as summary_table
 from nmfd.studies.measured import identify as identify
-from nmfd.studies.robustness import SIGMAS_VEH_S
-from nmfd.studies.robustness import improvement_table as improvement_table
 from nmfd.types import Controller, Plant, Result
 
 if TYPE_CHECKING:
@@ -182,12 +180,12 @@ def robustness(
     scenario = _loaded(scenario)
     others = [one for one in parse_many(controllers, scenario, regional=True) if one.name != REFERENCE]
     strategies = [parse(REFERENCE), *others]
-    key = key_of(scenario, strategies, robustness_study.PLANT, {})
+    key = key_of(scenario, strategies, benchmark_study.PERTURBED_PLANT, {})
     runs = [
         Run(
             run_name(strategy.name, number),
             {**key(strategy.name), "sigma_veh_per_s": sigma},
-            partial(robustness_study.run_one, strategy, number, scenario=scenario, sigma=sigma),
+            partial(benchmark_study.run_perturbed, strategy, number, scenario=scenario, sigma=sigma),
             folder=f"sigma-{sigma:g}",
         )
         for sigma in sigmas
@@ -198,7 +196,7 @@ def robustness(
     with locked(out):
         rows = run_many(runs, out, workers=workers_for(strategies, workers), progress=progress)
         if (rows["failure"] == "").any():
-            robustness_study.draw(out, rows)
+            benchmark_study.draw_robustness(out, rows)
     return rows
 
 

@@ -9,7 +9,7 @@ import tiny
 
 from nmfd.api import load_scenario, robustness
 from nmfd.model.scenario import pairs_with_demand, perturbed
-from nmfd.studies import robustness as study
+from nmfd.studies import benchmark as study
 
 
 @pytest.fixture

@@ -1,7 +1,7 @@
 """Figures of an evaluation in SUMO: functions that draw into `ax`, and the files of one demand level."""
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +10,8 @@ from matplotlib.axes import Axes
 
 from cosim.evaluation import model_validation, statistics
 from cosim.evaluation.results import Finished, Level
-from nmfd.model.regional_model import RegionalModel
 from nmfd.studies import plots
 from nmfd.studies.benchmark import draw_accumulations, interval
-from nmfd.types import Result
 
 Points = dict[str, dict[float, tuple[float, float]]]  # controller -> level -> mean and half of the interval
 
@@ -60,7 +58,10 @@ def draw_level(out: Path, finished: Finished, level: Level) -> None:
     best_first = {name: best_first[name] for name in ranked(rows) if name in best_first}
     against = statistics.compared_with(rows)
     other = next((name for name in best_first if name != against), None)
-    _draw_mfds(out / "mfd.png", network, [best_first[name] for name in (against, other) if name in best_first])
+    shown = [best_first[name] for name in (against, other) if name in best_first]
+    clouds = [(run.controller, model_validation.outflow_samples(network, [run])) for run in shown]
+    samples = [{name: np.concatenate([*of[n].values()]) for name, of in clouds} for n in range(network.regions)]
+    plots.draw_mfds(out / "mfd.png", network, samples)
 
 
 def draw_levels(out: Path, rows: pd.DataFrame) -> None:
@@ -87,9 +88,3 @@ def draw_levels(out: Path, rows: pd.DataFrame) -> None:
             drawing.suptitle("mean over seeds, 95 % intervals", fontsize="medium")
             plots.legend_below(drawing, [ax])
             plots.save(drawing, out / file)
-
-
-def _draw_mfds(path: Path, network: RegionalModel, results: Sequence[Result]) -> None:
-    clouds = [(run.controller, model_validation.outflow_samples(network, [run])) for run in results]
-    samples = [{name: np.concatenate([*of[n].values()]) for name, of in clouds} for n in range(network.regions)]
-    plots.draw_mfds(path, network, samples)

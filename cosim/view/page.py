@@ -32,7 +32,9 @@ class Page:
     def __init__(self, picture: CityPicture, names: Sequence[str], totals: Mapping[str, Sequence[PerEdge]] = {}):
         """totals: label -> values (E,) of every run, which the maps can show instead of the density"""
         self.picture, self.names = picture, names
-        tops = {label: top_of(values) for label, values in totals.items()}
+        # Above a scale is only TOP_SHARE of the values of all runs; its upper end has two digits.
+        upper = {label: np.quantile(np.concatenate(values), 1.0 - TOP_SHARE) for label, values in totals.items()}
+        tops = {label: float(f"{end:.2g}") or 1.0 for label, end in upper.items()}
         self.maps = [
             CityMap(picture, name, {label: (values[n], tops[label]) for label, values in totals.items()})
             for n, name in enumerate(names)
@@ -90,11 +92,6 @@ class Page:
             _wrapped([*below, curves.gates, curves.trips, curves.spent]),
             sizing_mode="stretch_width",
         )
-
-
-def top_of(values: Sequence[PerEdge]) -> float:
-    """Return the upper end of a scale for the values of all runs: all but TOP_SHARE are below, two digits."""
-    return float(f"{np.quantile(np.concatenate(values), 1.0 - TOP_SHARE):.2g}") or 1.0
 
 
 def with_slider(
