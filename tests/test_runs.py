@@ -213,6 +213,7 @@ def test_failures_are_rows_and_the_others_go_on(tmp_path):
     assert rows["b"] == "policy.pt: no such file" and rows["c"].startswith("SystemExit: 3") and rows["d"] == ""
     with pytest.raises(RunFailed, match=r"^a, seed 0: ZeroDivisionError.*; b, seed 0: policy.pt"):
         raise_failures(run_many(runs, tmp_path / "out", workers=0))
+    assert set(run_many([run_of(name) for name in "abcd"], tmp_path / "out", workers=0)["failure"]) == {""}
 
 
 @pytest.mark.slow
