@@ -58,6 +58,8 @@ def settings(scenario: Scenario, strategy: Strategy, steps: int | None = None) -
     setup = options(Training, planning, kind.name, table)
     if setup.local and kind.guides:
         raise error(planning.where, f"controllers.{table}.local", "a local policy guides no routes; train dpc-pc")
+    if setup.prices and not kind.guides:
+        raise error(planning.where, f"controllers.{table}.prices", "prices guide drivers; train dpc-pcrg")
     return setup if steps is None else setup.changed(steps=steps)
 
 
@@ -195,6 +197,7 @@ def _first_policy(setup: Training, planning: PlanningModel, *, guidance: bool) -
         local=setup.local,
         compact=planning.protected if setup.compact else (),
         metering=setup.metering,
+        prices=setup.prices,
         soft_exponential=recipe.activation != "gelu",
         decoder_layers=recipe.decoder_layers,
     )
@@ -251,10 +254,9 @@ def _descend(policy: nn.Module, loss: torch.Tensor, optimizer: Adam, setup: Trai
         raise InputError("cost: has no gradient by the weights of the policy; compute it from the run with torch")
     optimizer.zero_grad()
     loss.backward()
-    if isinstance(policy, Policy) and hasattr(policy, "splits_decoder"):
-        # The decoders are trained in turn. Not by requires_grad, which would compile the step once for each.
-        frozen = policy.splits_decoder if step // setup.recipe.epoch % 2 == 0 else policy.perimeter_decoder
-        for weights in frozen.parameters():
+    decoders = policy.decoders if isinstance(policy, Policy) else []
+    for n, decoder in enumerate(decoders):  # in turn; not by requires_grad, which would compile the step once for each
+        for weights in decoder.parameters() if n != step // setup.recipe.epoch % len(decoders) else ():
             weights.grad = None
     torch.nn.utils.clip_grad_norm_(policy.parameters(), setup.recipe.clip)
     optimizer.step()
@@ -263,13 +265,13 @@ def _descend(policy: nn.Module, loss: torch.Tensor, optimizer: Adam, setup: Trai
 
 
 def begin_as_no_control(policy: Policy, network: RegionalModel) -> None:
-    """Make `policy` nearly independent of the state, with open gateways and nominal split ratios."""
+    """Make `policy` nearly independent of the state, with open gateways, nominal split ratios or no prices."""
     with torch.no_grad():
-        policy.perimeter_decoder.weight.mul_(NO_CONTROL_WEIGHT)
+        for decoder in policy.decoders:
+            decoder.weight.mul_(NO_CONTROL_WEIGHT)
         policy.perimeter_decoder.bias.fill_(NO_CONTROL_LOGIT)
-        if policy.architecture.guidance:
+        if policy.architecture.guidance and not policy.architecture.prices:
             own = torch.tensor(network.nominal_splits[np.arange(network.regions)[:, None], policy.onward.numpy()])
-            policy.splits_decoder.weight.mul_(NO_CONTROL_WEIGHT)
             policy.splits_decoder.bias.copy_(own.clamp(min=NO_CONTROL_SPLIT).log().flatten())
 
 

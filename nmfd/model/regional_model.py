@@ -25,6 +25,7 @@ LEAST_ROOM = 0.03  # of the capacity, into a region however full: no boundary cl
 LEAST_LIMIT = 1e-6  # veh/s, against a division by zero
 
 MOST_VEHICLES = 1e9  # in a region
+DISPERSION_S = 60.0  # of the travel times that drivers perceive; assumed
 FOR_ALL = ("exit_rates", "capacity", "storage", "controllable")  # given for every region or for none
 
 
@@ -49,6 +50,7 @@ class RegionalModel:
     storage: (R,) [veh], accumulation that leaves no room for vehicles from other regions; with `capacity`
     controllable: (R, R) [-], [i, h]: share of the flow that passes signals under control; None if unknown
     critical_above: {region: largest accumulation [veh]} where data show no falling branch; the MFD is a guess beyond
+    dispersion: of the logit by which guided drivers answer prices (nmfd.model.answer) [s]
     placeholder: the MFDs are guesses that no run has measured
     doubts: warnings about the fit of each region; () if unknown
     folder: of network.toml, or None
@@ -67,6 +69,7 @@ class RegionalModel:
     storage: PerRegion | None = None
     controllable: PerPair | None = None
     critical_above: Mapping[int, float] = field(default_factory=dict)
+    dispersion: float = DISPERSION_S
     placeholder: bool = False
     doubts: tuple[tuple[str, ...], ...] = ()
     folder: Path | None = None
@@ -132,6 +135,7 @@ class RegionalModel:
         content += [self.nominal_splits.round(12).tolist()]
         options = {"exit_rates": self.exit_rates, "capacity": self.capacity, "storage": self.storage}
         content += [[name, option.tolist()] for name, option in options.items() if option is not None]
+        content += [["dispersion", self.dispersion]] if self.dispersion != DISPERSION_S else []
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
 
@@ -223,6 +227,13 @@ class NetworkTable(Settings):
     name: config.Name = setting("name of the model")
     placeholder: bool = setting("MFDs are guesses from lanes and speed limits; no policy is trained on them", False)
     perimeter: PerimeterTable = setting("bounds of the control")
+    dispersion: float = setting(
+        "spread of the travel times by which guided drivers answer prices, a logit",
+        DISPERSION_S,
+        unit="s",
+        ge=1.0,
+        le=1e4,
+    )
     mfd: MfdTable | None = setting("MFD of every region without one of its own", None)
     regions: Rows[RegionTable] = setting("one table per region", min_length=1)
     sumo: dict[str, Any] = setting("simulated city, for cosim", {})
@@ -298,6 +309,7 @@ def load_network(folder: Path | str) -> RegionalModel:
         storage=numbers("storage"),
         controllable=numbers("controllable", by_pair=True),
         critical_above={i: row.critical_above for i, row in enumerate(rows) if row.critical_above is not None},
+        dispersion=table.dispersion,
         placeholder=table.placeholder,
         folder=folder,
         doubts=tuple(row.doubts for row in rows) if any(row.doubts for row in rows) else (),

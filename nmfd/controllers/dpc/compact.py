@@ -25,13 +25,7 @@ With `integral` the gate is PI gating (nmfd.controllers.rules), initially open, 
 It corrects errors of the regional model, so that rollouts of that model do not use it: `integral` is tuned in SUMO
 (`cosim tune`), not trained. The straight line closes earlier than s as the region fills.
 
-A price c_i multiplies the travel time through region i by 1 + c_i for guided drivers bound for elsewhere
-(nmfd.types.Controls). The regional model answers by a logit over the next regions, around the nominal theta0:
-
-    theta_ihj ~ theta0_ihj exp(-e_hj / DISPERSION_S),    e_hj = c_h t_hj + sum_g theta0_hgj e_gj for h != j,
-
-t_hj the mean time to leave h on the way to j, so that e_hj is what the prices add from h on. The policy stays
-differentiable and is trained like a network.
+The regional model answers prices by a logit (nmfd.model.answer); the policy is trained like a network.
 """
 
 from typing import Annotated, Any, NamedTuple
@@ -41,18 +35,14 @@ import torch
 from pydantic import Field
 from torch import nn
 
-from nmfd.controllers.dpc.policy import Architecture, DpcController, Memory, Policy
-from nmfd.model import dynamics
+from nmfd.controllers.dpc.policy import FILL_TIME_S, Architecture, DpcController, Memory, Policy
 from nmfd.model.planning import Options, PlanningModel, options
 from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import config
 from nmfd.runs.config import Problem, setting
-from nmfd.tensors import PerPair, PerRegion, PerTurn
+from nmfd.tensors import PerPair, PerRegion
 
-DISPERSION_S = 60.0  # of the travel times that drivers perceive; assumed
-FILL_TIME_S = 90.0  # a signal cycle
 MIN_NUMBERS = 8  # in a file: up to metering
-MAX_DELAY_FACTOR = 20.0  # largest time to leave a region, relative to free flow
 
 
 class Numbers(NamedTuple):
@@ -85,20 +75,15 @@ class CompactPolicy(Policy):
         self.numbers = nn.Parameter(torch.tensor(Numbers()))
         held = np.isin(np.arange(network.regions), self.architecture.compact)
         self.register_buffer("held", torch.tensor(held), persistent=False)
-        self.register_buffer("own", torch.tensor(network.nominal_splits, dtype=torch.float32), persistent=False)
-        self._model = dynamics.parameters(network, dtype=torch.float32)
-        self._hops = int(network.hops.max())
 
-    def listed(self, x: PerPair, memory: Memory | None = None) -> tuple[PerPair, PerTurn | None]:
-        """Return perimeter and splits of the states x; memory: what `remember` returned for them."""
+    def listed(self, x: PerPair, memory: Memory | None = None) -> tuple[PerPair, None]:
+        """Return the perimeter in the states x, and None; memory: what `remember` returned for them."""
         numbers, full = self._read(), self._full(x)
         gate = numbers.gain * (numbers.set_point - full) if memory is None else memory[..., 0, :]
         want = gate.unsqueeze(-2) + numbers.relief * (full - 1.0).clamp(min=0.0).unsqueeze(-1)
         share = torch.sigmoid(4.0 * want) if memory is None else (0.5 + want).clamp(0.0, 1.0)
         share = torch.where(self.held, share, torch.ones_like(want))
-        perimeter = (self.box.low + (self.box.high - self.box.low) * share) * self.box.allowed
-        prices = self.prices(x)
-        return perimeter, None if prices is None else self._answer(x.to(self.scale.dtype), prices)
+        return (self.box.low + (self.box.high - self.box.low) * share) * self.box.allowed, None
 
     def remember(self, x: PerPair, memory: Memory | None) -> Memory | None:
         """Return v and e after states x, from `memory` before them; None without integral action."""
@@ -143,26 +128,6 @@ class CompactPolicy(Policy):
 
     def _read(self) -> Numbers:
         return Numbers(*self.numbers.clamp(min=0.0))
-
-    def _full(self, x: PerPair) -> PerRegion:
-        """Return the accumulations relative to the critical ones (-, (..., R))."""
-        return x.to(self.scale.dtype).sum(-1) / self.scale.squeeze(-1)
-
-    def _answer(self, x: PerPair, prices: PerRegion) -> PerTurn:
-        """Return the split ratios (-, (..., R, R, R)) of the regional model under prices (-, (..., R))."""
-        p = self._model
-        free = p.mfd.rate_up_to_jam(torch.zeros_like(p.mfd.jam), torch)
-        rate = torch.maximum(dynamics.rate(p, x.sum(-1)), free / MAX_DELAY_FACTOR)
-        leaving = rate.unsqueeze(-1) * (1.0 if p.exit_rates is None else p.exit_rates)
-        here = prices.unsqueeze(-1) / leaving * p.off_diagonal
-        extra = here
-        for _ in range(self._hops):
-            extra = here + torch.einsum("hgj,...gj->...hj", self.own, extra) * p.off_diagonal
-        costs = extra.unsqueeze(-3) + torch.zeros_like(self.own)
-        least = torch.where(self.own > 0, costs, torch.inf).amin(-2, keepdim=True)
-        more = (costs - torch.where(least.isfinite(), least, 0.0)).clamp(min=0.0)
-        weight = self.own * torch.exp(-more / DISPERSION_S)
-        return weight / weight.sum(-2, keepdim=True).clamp(min=1e-9)
 
 
 class Rule(Options):

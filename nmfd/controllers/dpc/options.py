@@ -62,7 +62,8 @@ class Training(Options):
     local: bool = setting("one small network for every boundary, which fits other cities; perimeter control", False)
     compact: bool = setting("gates and prices of a few readable numbers instead of a network; on the CPU", False)
     numbers: NumbersOption | None = setting(f"initial numbers of a compact policy: {MEANING}", None, unit="-")
-    metering: bool = setting("a compact policy makes trips wait while regions are full; for +metering", False)
+    prices: bool = setting("a network chooses prices of the ways through regions instead of split ratios", False)
+    metering: bool = setting("the policy makes trips wait while regions are full; for +metering", False)
     steps: int = whole("Adam steps", 400, low=1, high=10**7)
     learning_rate: float = setting("of Adam; falls to a tenth along a cosine", 1e-3, unit="-", gt=0.0, le=1.0)
     demand_low: float = setting("least factor of all demand, drawn per rollout", 1.0, unit="-", gt=0.0, le=1.0)
@@ -90,8 +91,10 @@ class Training(Options):
             raise Problem("compact", "begins with its numbers; omit local, from_gating, from_no_control")
         if self.numbers and not (self.compact and min(self.numbers) >= 0.0):
             raise Problem("numbers", "expected 8 to 11 numbers >= 0 of a compact policy; add compact = true")
-        if self.metering and not self.compact:
-            raise Problem("metering", "only for compact policies; add compact = true")
+        if self.local and self.metering:
+            raise Problem("metering", "a local policy controls gates only; omit it")
+        if self.compact and self.prices:
+            raise Problem("prices", "a compact policy has prices anyway; omit it")
         if self.preset != "ours" and (self.compact or self.local or self.from_gating or self.from_no_control):
             raise Problem("preset", "begins with a random network; omit compact, local, from_gating, from_no_control")
         if self.preset_without and (self.preset == "ours" or not set(self.preset_without) <= set(vars(PUBLISHED))):

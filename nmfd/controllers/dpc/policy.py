@@ -1,7 +1,13 @@
 """Differentiable predictive control: a neural policy from the measured state to admissible controls.
 
 As in Tumu et al.: an MLP backbone with one decoder for the perimeter (scaled sigmoid) and one for the split ratios
-(masked softmax), so that every output satisfies the constraints by construction.
+(masked softmax), so that every output satisfies the constraints by construction. With `prices` the second decoder gives
+prices, from which the regional model derives the split ratios (nmfd.model.answer); a third one meters departures:
+
+    c_i = MOST_PRICE s(y_i + PRICE_LOGIT)    r_i = n_cr,i / FILL_TIME_S s(y_i + METERING_SLOPE (METERING_FROM - z_i))
+
+y the output of the decoder, z_i = n_i / n_cr,i, s the logistic function. Initially prices are small, and trips wait
+only where a region is far beyond its critical accumulation.
 """
 
 from dataclasses import dataclass
@@ -14,12 +20,16 @@ from torch import nn
 
 from nmfd.arrays import Adjacency
 from nmfd.controllers.custom import checked
+from nmfd.model.answer import Answer
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Horizon
 from nmfd.tensors import PerPair, PerRegion, PerTurn
 from nmfd.types import Controls, Observation
 
 FEATURES = 6  # of a boundary, inputs of a local policy
+FILL_TIME_S = 90.0  # a signal cycle
+MOST_PRICE, PRICE_LOGIT = 10.0, -3.0
+METERING_SLOPE, METERING_FROM = 6.0, 1.25
 Memory = Float[torch.Tensor, "*#B N R"]  # N numbers per region
 
 
@@ -32,7 +42,7 @@ class Architecture:
     sparse: decoders with outputs for adjacent regions only, R^2 instead of R^3, for many regions
     local: one small network for every boundary with FEATURES inputs, perimeter control only; it fits every city
     compact: protected regions of a compact policy (nmfd.controllers.dpc.compact), () for a network
-    metering: the compact policy makes trips wait
+    metering: with largest rates of departures; prices: with prices of regions instead of split ratios, for a network
     soft_exponential: activation SoftExponential instead of GELU; decoder_layers: hidden layers of each decoder
     """
 
@@ -43,6 +53,7 @@ class Architecture:
     local: bool = False
     compact: tuple[int, ...] = ()
     metering: bool = False
+    prices: bool = False
     soft_exponential: bool = False
     decoder_layers: int = 0
 
@@ -119,6 +130,8 @@ class Policy(nn.Module):
         self.box = PerimeterLayer(network, allowed)
         self.register_buffer("onward", torch.tensor(onward), persistent=False)
         self._build(network)
+        if architecture.prices or (architecture.compact and architecture.guidance):
+            self.answer = Answer(network)
 
     def _build(self, network: RegionalModel) -> None:
         """Create the weights."""
@@ -136,30 +149,39 @@ class Policy(nn.Module):
 
         self.backbone = nn.Sequential(*hidden(FEATURES if architecture.local else regions**2, architecture.layers))
         self.perimeter_decoder = decoder(1 if architecture.local else onward.size)
-        if architecture.guidance:
+        if architecture.prices:
+            self.prices_decoder = decoder(regions)
+        elif architecture.guidance:
             self.splits_decoder = decoder(onward.size * regions)
             mask = torch.tensor(network.split_mask[here, onward]) & self.box.allowed.bool().unsqueeze(-1)
             self.simplex = SplitsLayer(network, mask)
+        if architecture.metering:
+            self.metering_decoder = decoder(regions)
+
+    @property
+    def decoders(self) -> list[nn.Module]:
+        """Decoders, which training takes in turn."""
+        return [part for name, part in self.named_children() if name.endswith("_decoder")]
 
     def forward(self, x: PerPair, memory: Memory | None = None) -> tuple[PerPair, PerTurn | None]:
         """Return perimeter and splits of the states x; memory: what `remember` returned for x, None in rollouts."""
         perimeter, splits = self.listed(x, memory)
-        if not self.architecture.listed:
-            return perimeter, splits
-        onward, empty = self.onward, perimeter.new_zeros(*x.shape[:-2], self.regions, self.regions)
-        if splits is not None:
-            turns = empty.unsqueeze(-1).repeat_interleave(self.regions, -1)
-            splits = turns.scatter_add(-2, onward.unsqueeze(-1).expand_as(splits), splits)
-        return empty.scatter_add(-1, onward.expand_as(perimeter), perimeter), splits
+        if self.architecture.listed:
+            onward, empty = self.onward, perimeter.new_zeros(*x.shape[:-2], self.regions, self.regions)
+            perimeter = empty.scatter_add(-1, onward.expand_as(perimeter), perimeter)
+            if splits is not None:
+                turns = empty.unsqueeze(-1).repeat_interleave(self.regions, -1)
+                splits = turns.scatter_add(-2, onward.unsqueeze(-1).expand_as(splits), splits)
+        prices = self.prices(x)
+        return perimeter, splits if prices is None else self.answer(x.to(self.scale.dtype), prices)
 
     def listed(
         self, x: PerPair, memory: Memory | None = None
     ) -> tuple[Float[torch.Tensor, "*#B R D"], Float[torch.Tensor, "*#B R D R"] | None]:
         """Return perimeter (..., R, D) and splits (..., R, D, R) towards the regions `onward`; D = R if dense."""
-        shape = self.onward.shape
-        hidden = self.backbone(self._around(x) if self.architecture.local else (x / self.scale).flatten(-2))
+        shape, hidden = self.onward.shape, self._hidden(x)
         perimeter = self.box(self.perimeter_decoder(hidden).reshape(*x.shape[:-2], *shape))
-        if not self.architecture.guidance:
+        if not self.architecture.guidance or self.architecture.prices:
             return perimeter, None
         return perimeter, self.simplex(self.splits_decoder(hidden).unflatten(-1, (*shape, self.regions)))
 
@@ -169,11 +191,23 @@ class Policy(nn.Module):
 
     def prices(self, x: PerPair) -> PerRegion | None:
         """Return the prices of the ways through each region (-, (..., R)), None for a policy without them."""
-        return None
+        if not self.architecture.prices:
+            return None
+        return MOST_PRICE * torch.sigmoid(self.prices_decoder(self._hidden(x)) + PRICE_LOGIT)
 
     def metering(self, x: PerPair) -> PerRegion | None:
         """Return the largest rates of departures in each region (veh/s, (..., R)), None for a policy without them."""
-        return None
+        if not self.architecture.metering:
+            return None
+        numbers = self.metering_decoder(self._hidden(x)) + METERING_SLOPE * (METERING_FROM - self._full(x))
+        return self.scale.squeeze(-1) / FILL_TIME_S * torch.sigmoid(numbers)
+
+    def _hidden(self, x: PerPair) -> Float[torch.Tensor, "*#B H"]:
+        return self.backbone(self._around(x) if self.architecture.local else (x / self.scale).flatten(-2))
+
+    def _full(self, x: PerPair) -> PerRegion:
+        """Return the accumulations relative to the critical ones (-, (..., R))."""
+        return x.to(self.scale.dtype).sum(-1) / self.scale.squeeze(-1)
 
     def _around(self, x: PerPair) -> Float[torch.Tensor, "*#B R D F"]:
         """Return n, the neighbours' mean n, and the vehicles bound for it, in critical n, for i and h of boundaries."""
