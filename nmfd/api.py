@@ -22,7 +22,7 @@ from nmfd.runs.run_many import Run, locked, run_many
 from nmfd.runs.run_many import raise_failures as raise_failures
 from nmfd.studies import benchmark as benchmark_study
 from nmfd.studies import bound as bound_study
-from nmfd.studies.benchmark import PLANTS, REFERENCE, SIGMAS_VEH_S, closed_loop_of, key_of, workers_for
+from nmfd.studies.benchmark import PLANTS, REFERENCE, SIGMAS_VEH_S, SPREADS, closed_loop_of, key_of, workers_for
 from nmfd.studies.benchmark import improvement_table as improvement_table
 from nmfd.studies.benchmark import summary_table as summary_table
 from nmfd.studies.measured import identify as identify
@@ -165,16 +165,18 @@ def robustness(
     scenario: Scenario | Path | str,
     controllers: str | Sequence[str],
     *,
-    sigmas: Sequence[float] = SIGMAS_VEH_S,
+    kind: str = "demand",
+    sigmas: Sequence[float] | None = None,
     scenarios: int = 20,
     out: Path | str | None = None,
     workers: int = 1,
     progress: Progress = None,
 ) -> "pd.DataFrame":
-    """Run controllers, and no control, against perturbed demand in a folder, draw the improvement; return the runs.
+    """Run controllers, and no control, in perturbed scenarios in a folder, draw the improvement; return the runs.
 
-    sigmas: standard deviations of the demand noise (veh/s)
-    scenarios: noise draws for every sigma
+    kind: "demand", "demand-total", "mfd-scale", "mfd-axis" or "trip-lengths" (nmfd.model.scenario.perturbed)
+    sigmas: standard deviations of the demand noise (veh/s), or of the logarithms of MFDs or trip lengths (-)
+    scenarios: draws for every sigma
     out, workers, progress: see `benchmark`
     """
     scenario = _loaded(scenario)
@@ -184,11 +186,11 @@ def robustness(
     runs = [
         Run(
             run_name(strategy.name, number),
-            {**key(strategy.name), "sigma_veh_per_s": sigma},
-            partial(benchmark_study.run_perturbed, strategy, number, scenario=scenario, sigma=sigma),
-            folder=f"sigma-{sigma:g}",
+            {**key(strategy.name), "kind": kind, "sigma": sigma},
+            partial(benchmark_study.run_perturbed, strategy, number, scenario=scenario, sigma=sigma, kind=kind),
+            folder=f"{kind}-{sigma:g}",
         )
-        for sigma in sigmas
+        for sigma in sigmas or (SIGMAS_VEH_S if kind.startswith("demand") else SPREADS)
         for number in range(scenarios)
         for strategy in strategies
     ]

@@ -242,19 +242,25 @@ def benchmark(scenario: Path, settings: dict, out: Path | None, **options: Any) 
 @SCENARIO
 @CONTROLLERS
 @click.option(
+    "--kind",
+    type=click.Choice(["demand", "demand-total", "mfd-scale", "mfd-axis", "trip-lengths"]),
+    default="demand",
+    help="What differs from the scenario.",
+)
+@click.option(
     "--sigmas",
     type=listed(Number(0.0)),
-    default="0,0.25,0.5,0.75,1,1.5,2,3,5",
-    help="Standard deviations of the demand noise (veh/s).",
+    help="Noise on the demand (veh/s), or spread of the logarithm. [default: 0,0.25,...,5, or 0,0.05,...,0.4]",
 )
-@click.option("--scenarios", type=COUNT, default=20, help="Noise draws for every sigma.")
+@click.option("--scenarios", type=COUNT, default=20, help="Draws for every sigma.")
 @WORKERS
 @out_option("runs/SCENARIO-TIME")
 def robustness(scenario: Path, settings: dict, out: Path | None, **options: Any) -> None:
-    """Run controllers against perturbed demand.
+    """Run controllers against a demand or MFDs that they do not expect.
 
-    Controllers expect the scenario's demand; the plant gets max(0, demand + noise), drawn for every pair of regions and
-    control interval. Prints and draws the improvement over no-control.
+    The plant gets max(0, demand + noise), drawn for every pair of regions and control interval; with demand-total,
+    scaled to the trips of the scenario; or outflow, accumulation axis or exit rates with a random factor for every
+    region. Prints and draws the improvement over no-control.
 
     \b
     Example:

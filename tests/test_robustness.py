@@ -8,6 +8,8 @@ import pytest
 import tiny
 
 from nmfd.api import load_scenario, robustness
+from nmfd.controllers.strategy import parse
+from nmfd.errors import InputError
 from nmfd.model.scenario import pairs_with_demand, perturbed
 from nmfd.studies import benchmark as study
 
@@ -40,11 +42,47 @@ def test_noise_is_common_to_all_sigmas_and_follows_its_seed(scenario):
     assert not np.array_equal(perturbed(high, 1.0, 4).demand - high.demand, one)
 
 
+def test_noise_with_the_trips_of_the_scenario(scenario):
+    noisy = perturbed(scenario, 5.0, 0, "demand-total")
+    np.testing.assert_allclose(noisy.demand.sum(axis=0), scenario.demand.sum(axis=0))
+    assert noisy.demand.min() >= 0.0 and np.abs(noisy.demand - scenario.demand).max() > 0.5
+
+
+@pytest.mark.parametrize("kinds", [lambda network: network, tiny.mixed], ids=["cubic", "mixed"])
+@pytest.mark.parametrize("kind, power", [("mfd-scale", 0), ("mfd-axis", 1)])
+def test_other_mfds_have_the_declared_spread_and_the_plant_follows_them(scenario, kinds, kind, power):
+    network = kinds(scenario.network)
+    scenario = replace(scenario, network=network, substeps=4)
+    logs, totals = [], []
+    for seed in range(60):
+        other = perturbed(scenario, 0.1, seed, kind)
+        for mfd, own in zip(other.network.mfds, network.mfds, strict=True):
+            wide = mfd.jam / own.jam
+            high = mfd.rate(0.6 * wide * own.jam) / own.rate(0.6 * own.jam)
+            assert (wide if power == 0 else high) == pytest.approx(1.0)
+            logs.append(np.log(wide * high))
+        if seed < 2:
+            rows = study.closed_loop_of(parse("no-control"), 0, scenario=scenario, plant="acyclic", actual=other)
+            totals.append(rows.accumulation.sum())
+    assert np.std(logs) == pytest.approx(0.1, rel=0.2) and abs(np.mean(logs)) < 0.03 and totals[0] != totals[1]
+    np.testing.assert_allclose(
+        np.log(perturbed(scenario, 0.2, 59, kind).network.mfds[-1].jam / own.jam), 2 * power * logs[-1]
+    )
+
+
+def test_trip_lengths_stay_within_the_integration_step_and_a_wrong_kind_is_one_line(scenario):
+    rates = [perturbed(scenario, sigma, 0, "trip-lengths").network.exit_rates for sigma in (0.1, 0.2, 9.0)]
+    np.testing.assert_allclose(rates[1], rates[0] ** 2)
+    assert rates[2].max() * scenario.network.mfds[0].rate(0.0) == pytest.approx(scenario.substeps / scenario.step)
+    with pytest.raises(InputError, match="kind: expected one of demand, .* got 'weather'"):
+        perturbed(scenario, 0.1, 0, "weather")
+
+
 def test_rows_and_picture_of_a_comparison(folder, tmp_path):
     out, options = tmp_path / "out", {"sigmas": [0.0, 1.0], "scenarios": 2}
     rows = robustness(folder, ["pi-gating"], out=out, **options)
-    assert {path.name for path in out.iterdir()} >= {"runs.csv", "robustness.png", "manifest.json", "sigma-1"}
-    assert [tuple(row) for row in rows[["sigma_veh_per_s", "seed", "controller"]].to_numpy()] == [
+    assert {path.name for path in out.iterdir()} >= {"runs.csv", "robustness.png", "manifest.json", "demand-1"}
+    assert [tuple(row) for row in rows[["sigma", "seed", "controller"]].to_numpy()] == [
         (sigma, number, name) for sigma in (0.0, 1.0) for number in (0, 1) for name in ("no-control", "pi-gating")
     ]
     assert rows["trips_veh"].iloc[0] == pytest.approx(360.0) and rows["trips_veh"].iloc[-1] > 400.0
@@ -52,12 +90,22 @@ def test_rows_and_picture_of_a_comparison(folder, tmp_path):
     assert "pi-gating" in table and "±" in table
     more = robustness(folder, ["greedy"], out=out, sigmas=[1.0], scenarios=1)
     assert len(more) == 9 and set(more["failure"]) == {""}
+    other = robustness(folder, ["pi-gating"], kind="trip-lengths", out=out, sigmas=[0.1], scenarios=1)
+    table = study.improvement_table(other)
+    assert "360" in table and "sigma of trip-lengths: spread" in table and "greedy" not in table
 
 
 def test_improvement_is_over_no_control_in_the_same_scenario():
     rows = pd.DataFrame(
         [
-            {"sigma_veh_per_s": 1.0, "seed": seed, "controller": name, "total_time_spent_veh_s": total, "failure": ""}
+            {
+                "sigma": 1,
+                "seed": seed,
+                "controller": name,
+                "total_time_spent_veh_s": total,
+                "failure": "",
+                "kind": "demand",
+            }
             for seed, name, total in (
                 (0, "no-control", 100.0),
                 (0, "pi-gating", 50.0),

@@ -204,7 +204,11 @@ def stacked(mfds: Sequence[Mfd], array: Callable[[Sequence[float]], Any]) -> Mfd
         alike = [m if k == key else first for m, k in zip(mfds, keys, strict=True)]  # the others get any numbers
         columns = {name: [vars(m)[name] for m in alike] for name in vars(first)}
         numbers = {
-            name: tuple(map(array, zip(*column, strict=True))) if isinstance(column[0], tuple) else array(column)
+            name: tuple(map(array, zip(*column, strict=True)))
+            if isinstance(column[0], tuple)
+            else stacked(column, array)  # of a scaled curve
+            if hasattr(column[0], "rate_up_to_jam")
+            else array(column)
             for name, column in columns.items()
         }
         kinds[key] = array([float(k == key) for k in keys]), of_numbers(type(first), **numbers)

@@ -23,6 +23,7 @@ from nmfd.runs.config import Name, Numbers, Problem, Regions, Rows, Settings, Te
 LONGEST_STEP_S = 86_400.0
 MOST_STEPS = 10**6
 MOST_FLOW_VEH_S = 1e6
+KINDS = ("demand", "demand-total", "mfd-scale", "mfd-axis", "trip-lengths")  # of `perturbed`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,15 +118,38 @@ def pairs_with_demand(demand: PairsOverTime) -> Bool[np.ndarray, "R R"]:
     return (demand > 0).any(axis=0)
 
 
-def perturbed(scenario: Scenario, sigma: float, seed: int) -> Scenario:
-    """Return `scenario` with demand max(0, d_ij(k) + sigma n_ij(k)) [veh/s], n standard normal.
+def perturbed(scenario: Scenario, sigma: float, seed: int, kind: str = "demand") -> Scenario:
+    """Return `scenario` with another demand or other MFDs; n are standard normal draws. Raise InputError.
 
-    The same seed gives the same n for every sigma (common random numbers). Clipping passes only the positive half of
-    the noise while no demand is planned, which adds 0.4 sigma veh/s per pair.
+    demand: max(0, d_ij(k) + sigma n_ij(k)) [veh/s]. Clipping passes only the positive half of the noise while no demand
+        is planned, which adds 0.4 sigma veh/s per pair.
+    demand-total: the same, scaled to the planned trips of every pair
+    mfd-scale, mfd-axis: outflow, or accumulation axis and storage, of every region times exp(sigma n_i)
+    trip-lengths: exit rates times exp(sigma n_ij), as if trips were longer or shorter
+
+    The same seed gives the same n for every sigma (common random numbers). No outflow rises above the largest that the
+    integration step allows.
     """
-    noise = np.random.default_rng([seed, 0x64656D]).standard_normal(scenario.demand.shape)
-    noise *= pairs_with_demand(scenario.demand)
-    return replace(scenario, demand=np.maximum(scenario.demand + sigma * noise, 0.0))
+    if kind not in KINDS:
+        raise InputError(f"kind: expected one of {', '.join(KINDS)}, got {kind!r}; correct it")
+    random, network = np.random.default_rng([seed, 0x64656D]), scenario.network
+    if kind.startswith("demand"):
+        noise = random.standard_normal(scenario.demand.shape) * pairs_with_demand(scenario.demand)
+        demand = np.maximum(scenario.demand + sigma * noise, 0.0)
+        if kind == "demand-total":
+            demand *= scenario.demand.sum(axis=0) / np.maximum(demand.sum(axis=0), 1e-9)
+        return replace(scenario, demand=demand)
+    rates = np.ones(network.adjacency.shape) if network.exit_rates is None else network.exit_rates
+    highest = scenario.substeps / scenario.step / np.array([mfd.rate_up_to_jam(0.0) for mfd in network.mfds])
+    if kind == "trip-lengths":
+        rates = np.minimum(rates * np.exp(sigma * random.standard_normal(rates.shape)), highest[:, None])
+        return replace(scenario, network=replace(network, exit_rates=rates))
+    factor = np.exp(sigma * random.standard_normal(network.regions))
+    high = np.minimum(factor if kind == "mfd-scale" else 1.0, highest / rates.max(axis=1)).tolist()
+    wide = factor if kind == "mfd-axis" else np.ones_like(factor)
+    mfds = tuple(mfd.scaled(*by) for mfd, *by in zip(network.mfds, wide.tolist(), high, strict=True))
+    storage = None if network.storage is None else wide * network.storage
+    return replace(scenario, network=replace(network, mfds=mfds, storage=storage))
 
 
 class DemandTable(Settings):
