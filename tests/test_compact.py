@@ -9,7 +9,6 @@ import tiny
 import torch
 from commands import good, nmfd
 
-from nmfd import closed_loop
 from nmfd.api import load_scenario
 from nmfd.controllers import training
 from nmfd.controllers.dpc.compact import FILL_TIME_S, CompactPolicy, Numbers
@@ -20,7 +19,6 @@ from nmfd.controllers.rules import PiGating
 from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
 from nmfd.model.planning import planning_model
-from nmfd.model.plant import NmfdPlant
 from nmfd.types import Observation
 
 NUMBERS = Numbers(
@@ -197,11 +195,3 @@ def test_wrong_numbers_of_a_rule(numbers, protected, problem):
     scenario = replace(load_scenario("economic_mpc"), protected=protected, controller_options=options)
     with pytest.raises(InputError, match=f"controllers.pricing-rule.{problem}"):
         parse("pricing-rule").make(scenario)
-
-
-def test_prices_are_in_the_run(network):
-    scenario = replace(load_scenario("economic_mpc"), steps=4)
-    made = policy(network, NUMBERS._replace(elsewhere_from=0.0))
-    run = closed_loop.run(NmfdPlant(scenario), DpcController(made), scenario, seed=0)
-    expected = [made.prices(torch.from_numpy(x)).detach().numpy() for x in run.observed[:4]]
-    np.testing.assert_allclose(run.prices, expected, atol=1e-5)

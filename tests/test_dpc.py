@@ -12,7 +12,7 @@ import torch
 import nmfd
 from nmfd.api import load_scenario
 from nmfd.controllers import training
-from nmfd.controllers.dpc.policy import Architecture, DpcController, Policy
+from nmfd.controllers.dpc.policy import FILL_TIME_S, MOST_PRICE, Architecture, DpcController, Policy
 from nmfd.controllers.dpc.policy_file import checkpoint, load, load_policy
 from nmfd.controllers.rules import PiGating
 from nmfd.controllers.strategy import parse
@@ -23,12 +23,13 @@ from nmfd.model.plant import NmfdPlant
 from nmfd.model.regional_model import load_network
 from nmfd.types import Controls, Observation, Status
 
+PRICED = {"guidance": True, "prices": True, "metering": True}
 NETWORK = load_network(Path(__file__).parents[1] / "networks" / "hexagon7")
 
 
-def policy(*, guidance, network=NETWORK, spread=1.0):
+def policy(*, guidance, network=NETWORK, spread=1.0, **outputs):
     torch.manual_seed(0)
-    made = Policy(network, Architecture(width=16, guidance=guidance))
+    made = Policy(network, Architecture(width=16, guidance=guidance, **outputs))
     with torch.no_grad():
         for weights in made.parameters():
             weights.add_(spread * torch.randn_like(weights))
@@ -39,20 +40,23 @@ def measurement(accumulation):
     return Observation(step=0, time=0.0, accumulation=accumulation, backlog=np.zeros_like(accumulation))
 
 
-@pytest.mark.parametrize("guidance", [False, True], ids=["pc", "pcrg"])
-def test_any_weights_and_any_state_give_admissible_controls(guidance):
-    controller, random = DpcController(policy(guidance=guidance)), np.random.default_rng(0)
+@pytest.mark.parametrize("outputs", [{}, {"guidance": True}, PRICED, {**PRICED, "sparse": True}], ids=str)
+def test_any_weights_and_any_state_give_admissible_controls(outputs):
+    controller, random = DpcController(policy(**{"guidance": False, **outputs})), np.random.default_rng(0)
     for scale in (0.0, 1.0, 1e3, 1e5, 1e7):
         controls = controller.act(measurement(scale * random.standard_normal((7, 7))))
         assert controls.status == Status.OK
         u = controls.perimeter[NETWORK.adjacency]
         assert NETWORK.u_min - 1e-7 <= u.min() and u.max() <= NETWORK.u_max + 1e-7
         assert (controls.perimeter[~NETWORK.adjacency] == 0.0).all()
-        assert (controls.splits is not None) == guidance
-        if guidance:
+        assert (controls.splits is not None) == ("guidance" in outputs)
+        if controls.splits is not None:
             assert controls.splits.min() >= 0.0
             assert (controls.splits[~NETWORK.split_mask] == 0.0).all()
             np.testing.assert_allclose(controls.splits.sum(axis=1), 1.0 - np.eye(7), rtol=0.0, atol=1e-12)
+        if "prices" in outputs:
+            assert (controls.prices >= 0.0).all() and (controls.prices <= MOST_PRICE).all()
+            assert (controls.metering >= 0.0).all() and (controls.metering * FILL_TIME_S < NETWORK.critical + 0.1).all()
 
 
 def test_forbidden_regions_have_no_gradient_and_no_nan():
