@@ -15,6 +15,7 @@ from nmfd.controllers.dpc.rollout import Rollout
 from nmfd.controllers.strategy import parse
 from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
+from nmfd.studies.benchmark import lower_bound
 
 
 def test_every_decoder_descends_the_total_time_spent():
@@ -52,3 +53,10 @@ def test_a_trained_network_closes_the_loop_and_its_trips_wait(tmp_path):
     expected = controller.policy.prices(torch.from_numpy(run.observed[:-1]).float()).detach().numpy()
     np.testing.assert_allclose(run.prices, expected, rtol=1e-4)
     assert run.prices.max() < 1.0 and run.backlog.max() > 1.0
+
+
+def test_the_lower_bound_without_metering_is_not_that_of_a_policy_that_meters():
+    scenario, strategy = load_scenario("economic_mpc"), parse("dpc-pcrg")
+    assert lower_bound(scenario, strategy, "nmfd") > 4e7
+    metered = replace(scenario, controller_options={"dpc-pcrg": {"metering": True}})
+    assert np.isnan(lower_bound(metered, strategy, "nmfd"))

@@ -98,9 +98,10 @@ def lower_bound(scenario: Scenario, strategy: Strategy, plant: str) -> float:
 
     Controllers of the user's own may meter, and plants of the user's own are other models.
     """
+    metered = scenario.controller_options.get(strategy.table(scenario), {}).get("metering", False)
     file = (scenario.folder or Path()) / f"bound-{'pcrg' if strategy.guides else 'pc'}.npz"
     renormalised = plant == "acyclic" and bool(scenario.network.observed_split_ratios)
-    if strategy.controller.own or plant not in PLANTS or renormalised or not file.is_file():
+    if strategy.controller.own or metered or plant not in PLANTS or renormalised or not file.is_file():
         return math.nan
     try:
         return open_loop.read(file, scenario, guidance=strategy.guides).lower
