@@ -17,6 +17,10 @@ from cosim.sumo.signals import GREEN, Signal
 from nmfd.arrays import PerPair
 from nmfd.model.regional_model import RegionalModel
 
+OPEN_SHARE = (
+    0.95  # of what a boundary can let through: above, a gate holds no queue, but shortens greens that are needed
+)
+
 
 class Actuation:
     """All signals under control: `command` once per control interval, `play` before every simulation step.
@@ -70,6 +74,7 @@ class Actuation:
         """Set u (R, R) [-] of the control interval that begins. vehicles: (E,) [veh] on the streets"""
         network = self._network
         share = np.clip((perimeter - network.u_min) / (network.u_max - network.u_min), 0.0, 1.0)
+        share[share >= OPEN_SHARE] = 1.0
         if self._supervisor:
             accumulation = np.bincount(self._region_of, vehicles, minlength=len(share))
             share[:, self._supervisor.opened(share, accumulation)] = 1.0

@@ -6,6 +6,7 @@ Random initial states and demand keep gradients alive: a rollout that gridlocks 
 import copy
 import io
 import math
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -42,8 +43,10 @@ WORTH_COMPILING = 200  # Adam steps
 # First policy from a gate: Adam steps, states in each, learning rate; width of the gate and largest accumulation, as a
 # share of the set point; opening without a gate.
 GATE_STEPS, GATE_BATCH, GATE_RATE, GATE_WIDTH, GATE_FULLEST, GATE_OPEN = 1000, 256, 2e-3, 0.05, 2.5, 0.95
-# First policy from no control: factor of the weights, logit of u, least theta.
+# First policy from no control: factor of the weights, logit of u, least theta. Instead of it, a policy that is open
+# whatever happens is kept if none gains WORTH in validation.
 NO_CONTROL_WEIGHT, NO_CONTROL_LOGIT, NO_CONTROL_SPLIT = 0.1, 3.0, 1e-3
+OPEN_LOGIT, WORTH = 12.0, 0.03
 
 
 def settings(scenario: Scenario, strategy: Strategy, steps: int | None = None) -> Training:
@@ -146,7 +149,8 @@ def train(
     policy = _first_policy(setup, planning, guidance=guidance) if module is None else module
     device = "cpu" if isinstance(policy, CompactPolicy) else device
     policy = policy.to(device).train()
-    rollout = Rollout(planning, device=device, detour_cost=setup.detour_cost, process_std=recipe.process_std)
+    costs = {"detour_cost": setup.detour_cost, "holding_cost": setup.holding_cost}
+    rollout = Rollout(planning, device=device, process_std=recipe.process_std, **costs)
     if setup.from_gating and not resume and module is None:
         begin_as_gate(policy, rollout, generator)
     advance = compiled_step(rollout.step) if compiled else rollout.step
@@ -169,6 +173,12 @@ def train(
 
     if resume and state_file is not None:
         first, best = _restore(state_file, configuration, policy, optimizer, generator)
+    bar = None
+    if setup.from_no_control and not resume and module is None and not task.own:
+        initial = copy.deepcopy(policy.state_dict())
+        begin_as_no_control(policy, planning.network, weight=0.0, logit=OPEN_LOGIT)
+        bar = best = (1.0 - WORTH) * keep_the_better(best)
+        policy.load_state_dict(initial)
     for step in range(first, steps):
         _set_rate(optimizer, setup, step / steps)
         _descend(policy, objective(generator, recipe.batch, advance), optimizer, setup, step)
@@ -180,6 +190,8 @@ def train(
                 write(state | {"generator": generator.get_state()}, state_file)
         if progress:
             progress(step + 1, steps, f"best {best:.4g}" + ("" if task.own else " veh s"))
+    if best == bar:
+        print(f"nmfd: no policy gained {WORTH:.0%} on the model: its gates stay open", file=sys.stderr)
     if not math.isfinite(best):
         raise RunFailed(f"{strategy.name}: every validation of {steps} steps diverged; lower the learning rate")
     if state_file is not None:
@@ -264,12 +276,17 @@ def _descend(policy: nn.Module, loss: torch.Tensor, optimizer: Adam, setup: Trai
         policy.bound()
 
 
-def begin_as_no_control(policy: Policy, network: RegionalModel) -> None:
-    """Make `policy` nearly independent of the state, with open gateways, nominal split ratios or no prices."""
+def begin_as_no_control(
+    policy: Policy, network: RegionalModel, weight: float = NO_CONTROL_WEIGHT, logit: float = NO_CONTROL_LOGIT
+) -> None:
+    """Make `policy` nearly independent of the state, with open gateways, nominal split ratios or no prices.
+
+    weight: factor of the weights; logit: of u
+    """
     with torch.no_grad():
         for decoder in policy.decoders:
-            decoder.weight.mul_(NO_CONTROL_WEIGHT)
-        policy.perimeter_decoder.bias.fill_(NO_CONTROL_LOGIT)
+            decoder.weight.mul_(weight)
+        policy.perimeter_decoder.bias.fill_(logit)
         if policy.architecture.guidance and not policy.architecture.prices:
             own = torch.tensor(network.nominal_splits[np.arange(network.regions)[:, None], policy.onward.numpy()])
             policy.splits_decoder.bias.copy_(own.clamp(min=NO_CONTROL_SPLIT).log().flatten())

@@ -73,6 +73,9 @@ class Training(Options):
     mfd_scale: float = setting(
         "factor of the MFDs' accumulation axes; below 1 for a city that may lock early", 1.0, unit="-", ge=0.1, le=1.0
     )
+    holding_cost: float = setting(
+        "time lost by a vehicle that a gate holds, so that gates close for a gain only", 0.0, unit="s", ge=0.0, le=1e6
+    )
     detour_cost: float = setting("time lost by a vehicle off the nominal splits", 0.0, unit="s", ge=0.0, le=1e6)
     preset: Literal["ours", "published"] = setting("recipe of the training; published: that of Tumu et al.", "ours")
     preset_without: Texts = setting(

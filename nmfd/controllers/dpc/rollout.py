@@ -15,7 +15,7 @@ from nmfd.controllers.dpc.policy import commanded
 from nmfd.model import dynamics
 from nmfd.model.planning import PlanningModel
 from nmfd.model.scenario import pairs_with_demand
-from nmfd.tensors import PerPair, PerTurn
+from nmfd.tensors import PerPair, PerRegion, PerTurn
 
 States = Float[torch.Tensor, "B R R"]
 Demands = Float[torch.Tensor, "T B R R"]  # or states over time
@@ -55,10 +55,12 @@ class Rollout:
         device: str = "cpu",
         *,
         detour_cost: float = 0.0,
+        holding_cost: float = 0.0,
         process_std: float = 0.0,
     ):
         """detour_cost: time lost by a vehicle that is guided off the nominal split ratios (s)
 
+        holding_cost: time lost by a vehicle that a gate holds (s)
         process_std: as of a scenario (veh)
         """
 
@@ -66,7 +68,7 @@ class Rollout:
             return torch.tensor(values, dtype=dtype, device=device)
 
         network = planning.network
-        self.detour_cost, self.process_std = detour_cost, process_std
+        self.detour_cost, self.holding_cost, self.process_std = detour_cost, holding_cost, process_std
         self.planning, self.dtype, self.device = planning, dtype, torch.device(device)
         self.parameters = self._nominal = dynamics.parameters(network, dtype=dtype, device=device)
         self.demand = tensor(planning.forecast)
@@ -189,7 +191,15 @@ class Rollout:
         vehicles = exact.sum((0, -2, -1)) + waiting.sum((-2, -1)).sum(0)
         if self.detour_cost and (splits := commanded(policy, seen)[1]) is not None:
             vehicles = vehicles + self.detour_cost * self._diverted(exact, splits).sum((0, -2, -1))
+        if self.holding_cost:
+            vehicles = vehicles + self.holding_cost * self._held(exact, commanded(policy, seen)[0]).sum((0, -1))
         return self.planning.step * vehicles
+
+    def _held(self, x: PerPair, perimeter: PerPair) -> PerRegion:
+        """Return the flow out of a region times the mean share by which its boundaries are closed (veh/s, (..., R))."""
+        p, network, vehicles = self.parameters, self.planning.network, x.sum(-1)
+        closed = (network.u_max - perimeter) / (network.u_max - network.u_min) * p.adjacency
+        return dynamics.rate(p, vehicles) * vehicles * closed.sum(-1) / p.adjacency.sum(-1).clamp(min=1.0)
 
     def _diverted(self, x: PerPair, splits: PerTurn) -> PerPair:
         """Return the flow that leaves a region off the nominal split ratios (veh/s, (..., R, R))."""
