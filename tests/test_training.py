@@ -256,12 +256,32 @@ def test_nothing_is_trained_on_a_guess_unless_anyway(scenario, tmp_path):
     assert training.train(city, parse("dpc-pc"), seed=0, out=tmp_path / "a.pt", steps=1, anyway=True).is_file()
 
 
-def test_a_policy_that_begins_as_no_control_is_nearly_that_after_a_step(scenario, tmp_path):
-    table = {"from_no_control": True, "learning_rate": 1e-6}
+def test_a_policy_that_begins_as_no_control_and_gains_nothing_stays_open(scenario, tmp_path, capsys):
+    table = {"from_no_control": True, "learning_rate": 1e-6, "holding_cost": 30.0}
     chosen = replace(scenario, controller_options={"dpc-pcrg": table})
     file = training.train(chosen, parse("dpc-pcrg"), seed=0, out=tmp_path / "a.pt", steps=1)
+    assert "its gates stay open" in capsys.readouterr().err
     perimeter, splits = load_policy(file, scenario.network)[0](torch.rand(2, 2, generator=torch.manual_seed(0)) * 100.0)
-    assert perimeter[0, 1] > 0.8 and np.allclose(splits.detach(), scenario.network.nominal_splits, atol=0.05)
+    assert perimeter[0, 1].item() == pytest.approx(scenario.network.u_max, abs=1e-4)
+    assert np.allclose(splits.detach(), scenario.network.nominal_splits, atol=0.05)
+
+
+def test_holding_costs_by_the_vehicle(scenario):
+    """Vehicles that would leave per second, times the mean closed share of their boundaries, times the cost."""
+    rollout, costly = (Rollout(planning_model(scenario, "dpc-pc"), holding_cost=cost) for cost in (0.0, 30.0))
+    x, generator = rollout.start[None], torch.manual_seed(0)
+    network = scenario.network
+
+    class Half(torch.nn.Module):
+        def forward(self, x):
+            return torch.full_like(x, 0.5 * (network.u_min + network.u_max)) * rollout.parameters.adjacency
+
+    free, paid = (r.total_time_spent(Half(), x, r.demand[:, None], generator) for r in (rollout, costly))
+    states = rollout.states(Half(), x, rollout.demand[:, None], generator)[0].sum(-1)
+    leaving = torch.tensor(
+        np.array([mfd.outflow(n) for mfd, n in zip(network.mfds, states.squeeze(1).numpy().T, strict=True)])
+    )
+    assert (paid - free).item() == pytest.approx(30.0 * scenario.step * 0.5 * leaving.sum().item(), rel=1e-3)
 
 
 def test_a_model_of_its_own_counts(tmp_path):
