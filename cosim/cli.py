@@ -31,7 +31,7 @@ CONTROLLER = click.option(
     required=True,
     metavar="NAME[+...]",
     help="Controller of `nmfd show` or FILE:Class, and what else the city does, joined by +: actuated, max-pressure or "
-    "max-pressure-cyclic signals, rerouting-N, guided, compliance-N (percent of drivers), guidance-period-N (s), "
+    "signals, rerouting-N, guided, compliance-N (percent of drivers), guidance-period-N (s), "
     "metering, estimate.",
 )
 AGAINST = click.option("--against", metavar="NAME[+...]", help="Second controller, on the same trips.")

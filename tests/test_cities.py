@@ -89,7 +89,7 @@ def test_max_pressure_takes_no_longer_than_fixed_time(tmp_path, name, level):
         pytest.skip(f"no real city: {CITIES / name} is not there")
     good(cosim("import", config, "--regions", 3, "--out", tmp_path / "networks" / name))
     spent = {}
-    for signals in ("no-control", "max-pressure", "max-pressure-cyclic"):
+    for signals in ("no-control", "max-pressure"):
         run = simulate(Simulation(load_scenario(tmp_path / "scenarios" / name), parse(signals), seed=1, demand=level))
         spent[signals] = total_time_spent(run)
         assert run.completed_veh == run.trips, signals

@@ -220,27 +220,15 @@ def shown_by(crossing, vehicles, seconds, *, town=TOWN, **options):
     return shown
 
 
-@pytest.mark.parametrize("cyclic", [False, True])
-def test_no_green_outlasts_the_maximum_while_others_wait(cyclic):
+def test_no_green_outlasts_the_maximum_while_others_wait():
     """A single vehicle waits on c, a hundred on a; nobody anywhere else: then a keeps its green."""
 
     def greens(**vehicles):
-        shown = shown_by(CROSSING, vehicles, 200, cyclic=cyclic)
+        shown = shown_by(CROSSING, vehicles, 200)
         return [time for time, state in shown if state == "rG"]
 
     assert greens(a=100.0) == []
     assert greens(a=100.0, c=1.0) == [53.0, 113.0, 173.0]  # decided every 5 s: 50 s of green, 3 s; 47 s, 3 s
-
-
-@pytest.mark.parametrize("cyclic, order", [(False, [2, 0, 2]), (True, [1, 2, 0])])
-def test_stages_keep_their_order_if_cyclic(cyclic, order):
-    """The third of three stages has the highest pressure; the second one somebody who waits."""
-    phases = [("Grr", 30), ("yrr", 3), ("rGr", 30), ("ryr", 3), ("rrG", 30), ("rry", 3)]
-    three = signal(phases, (link(0, "a", "b"), link(1, "c", "d"), link(2, "x", "e")), "s")
-    after = {**AFTER, "x": ("e",)}
-    town = SimpleNamespace(**{**vars(TOWN), "successors": after})
-    shown = shown_by(three, {"a": 1.0, "c": 0.5, "x": 9.0}, 110, town=town, cyclic=cyclic)
-    assert [state.index("G") for _, state in shown if "G" in state][1:4] == order
 
 
 def test_who_waits_too_long_comes_first(monkeypatch):

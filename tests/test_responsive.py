@@ -101,10 +101,9 @@ def test_open_gates_leave_sumo_s_own_signals_to_the_byte(town, opened):
     assert np.isnan(alone.record.gateway_green).all() and not np.isnan(opened.record.gateway_green).all()
 
 
-@pytest.mark.parametrize("signals", ["max-pressure", "max-pressure-cyclic"])
-def test_rationed_under_max_pressure(town, signals, opened):
+def test_rationed_under_max_pressure(town, opened):
     """Max-pressure runs their stages, and closed gateways let less through."""
-    run = drive(town[1], [0.1] * 3, signals=signals)
+    run = drive(town[1], [0.1] * 3, signals="max-pressure")
     assert run.record.gateway_flow[1:3].sum() < 0.6 * opened.record.gateway_flow[1:3].sum()
     assert all(gateway.signal is None for gateway in run.leaks)
 
@@ -138,7 +137,6 @@ def places(tmp_path_factory):
     "command, name, city, said",
     [
         ("run", "max-pressure", "queues", "max-pressure counts vehicles lane by lane"),
-        ("evaluate", "pi-gating+max-pressure-cyclic", "queues", "max-pressure-cyclic counts vehicles lane by lane"),
         ("evaluate", "route-guidance+estimate", "queues", "needs loop detectors on lanes"),
         ("evaluate", "mine.py:Mine+max-pressure", "queues", "counts vehicles lane by lane"),
         ("run", "webster", "bare", "webster needs fixed-time signals"),

@@ -20,7 +20,7 @@ from nmfd.api import load_scenario
 from nmfd.controllers.strategy import parse
 from nmfd.types import Controls
 
-CONTROLS = ("", "max-pressure", "max-pressure-cyclic", "actuated", "webster", "metering")
+CONTROLS = ("", "max-pressure", "actuated", "webster", "metering")
 
 
 def judge(phases, shown, crossings=()):

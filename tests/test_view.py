@@ -106,9 +106,6 @@ def test_the_page_draws_every_street_and_escapes_names(drawn, whole):
     streets = one.maps[0].streets.data
     assert list(streets["edge"]) == list(drawn.edges) and len(streets["xs"]) == len(drawn.edges)
     np.testing.assert_array_equal(streets["density"], whole[-1].density.astype(np.float32))
-    assert one.maps[0].arrows.data["width"].any()
-    one.show([replace(whole[-1], guided=np.full_like(whole[-1].guided, -1.0)), None], whole[-1].time)
-    assert not one.maps[0].arrows.data["width"].any()
     assert len(one.curves.lines[0].data["time"]) == STEPS + 1 and len(one.curves.lines[1].data["time"]) == 2
     content = file_html(document, CDN, title=EVIL)
     assert EVIL not in content and EVIL not in one.numbers.text

@@ -11,7 +11,7 @@ from cosim.evaluation.simulate import Simulation
 from cosim.plant import incidents
 from cosim.plant.launch import own_vehicles
 from cosim.plant.programmes import check_strategy
-from cosim.plant.settings import FILES, PRESSURES, own_files, settings
+from cosim.plant.settings import FILES, MAX_PRESSURE, own_files, settings
 from cosim.sumo.net import check_adjacency, city_files, load_city
 from cosim.sumo.signals import HELD, read_signals
 from cosim.sumo.xml_files import read_xml
@@ -66,7 +66,7 @@ def city_key(scenario: Scenario, strategies: Sequence[Strategy]) -> dict[str, ob
     own_vehicles(scenario, chosen, city)
     used = {strategy.city.get("signals", chosen.signals) for strategy in strategies}
     simple, _ = read_signals(city, own_files(scenario, chosen.additional), HELD)
-    everywhere = not used.isdisjoint(PRESSURES)
+    everywhere = MAX_PRESSURE in used
     incidents.check(scenario.ordered_faults, city, "faults", [signal.id for signal in simple] if everywhere else ())
     for path in own_files(scenario, (*chosen.background, *chosen.additional)):
         read_xml(path)

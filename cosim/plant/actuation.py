@@ -8,7 +8,7 @@ from cosim.plant.gates import GatewaySignal, ResponsiveSignal
 from cosim.plant.incidents import Incidents
 from cosim.plant.max_pressure import FACTS, MaxPressure
 from cosim.plant.room import Room
-from cosim.plant.settings import CYCLIC, Settings
+from cosim.plant.settings import Settings
 from cosim.plant.supervisor import Supervisor
 from cosim.sumo.arrays import PerEdge, PerGateway
 from cosim.sumo.net import City, Gateway, gateway_movements
@@ -51,8 +51,7 @@ class Actuation:
         self._pressure, show = None, incidents.show
         self._controls: list[MaxPressure | GatewaySignal | ResponsiveSignal] = []
         if flows is not None:
-            cyclic, lookahead = settings.signals == CYCLIC, settings.lookahead
-            self._pressure = MaxPressure(session, city, steered, flows, show=show, lookahead=lookahead, cyclic=cyclic)
+            self._pressure = MaxPressure(session, city, steered, flows, show=show, lookahead=settings.lookahead)
             self._controls.append(self._pressure)
             phases = {signal.id: signal.phases for signal in steered if signal.id in movements}
         left = {*phases, *settings.leave_signals}

@@ -10,11 +10,9 @@ x counts vehicles per lane; on shared lanes and upstream of the turn lanes, r di
 routes. Vehicles on streets closed to cars, such as buses, press for the stages that serve them. A shared lane counts
 for the stages that serve all of it; if there is none, for the others with the chance that its first vehicle is served.
 
-Acyclic (Varaiya): the next stage is the one with the highest pressure; a link that was red for MAX_RED_S while a
-vehicle waited there comes first. Cyclic (Levin, Hu and Odell, "Max-pressure signal control with cyclical phase
-structure", 2020): stages keep their order, stay while none has a higher pressure, and are left out without a vehicle.
-In both no green outlasts MAX_GREEN_S while others wait. A change costs yellow and red: the pressure of another stage
-counts for the share of green in these and the `lookahead` that follows: the shorter, the fewer the changes.
+The next stage is the one with the highest pressure; a link that was red for MAX_RED_S while a vehicle waited there
+comes first. No green outlasts MAX_GREEN_S while others wait. A change costs yellow and red: the pressure of another
+stage counts for the share of green in these and the `lookahead` that follows: the shorter, the fewer the changes.
 """
 
 from collections import defaultdict
@@ -61,10 +59,9 @@ class MaxPressure:
         *,
         show: Show,
         lookahead: float,
-        cyclic: bool = False,
     ):
         """flows: (edge, next edge) -> flow, any unit; lookahead: green that follows a change [s]"""
-        self._session, self._show, self._cyclic, self._lookahead = session, show, cyclic, lookahead
+        self._session, self._show, self._lookahead = session, show, lookahead
         roads = Roads(city, signals, flows)
         self._roads, self._start = roads, session.time
         movements = gateway_movements(city)
@@ -121,15 +118,14 @@ class MaxPressure:
         in_turn = [n % len(pressure) for n in range(own + 1, own + len(pressure)) if called[n % len(pressure)]]
         if not in_turn:
             return own
-        if not self._cyclic:
-            overdue = approaches.serves @ (waiting * approaches.overdue(now))
-            if overdue.any():
-                return int(np.argmax(overdue))
+        overdue = approaches.serves @ (waiting * approaches.overdue(now))
+        if overdue.any():
+            return int(np.argmax(overdue))
         worth = {n: pressure[n] * self._lookahead / (self._lookahead + junction.loss(n)) for n in in_turn}
         best = max(in_turn, key=worth.__getitem__)
         too_long = now + DECISION_PERIOD_S > junction.stage_since + MAX_GREEN_S + 1e-6
         if worth[best] > pressure[own] or too_long:
-            return in_turn[0] if self._cyclic else best
+            return best
         return own
 
     def _pressure(self, present: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from cosim.plant.gates import MIN_GREEN_S, least_times
-from cosim.plant.settings import ACTUATED, FIXED, PRESSURES, Settings, check_lanes, own_files, settings
+from cosim.plant.settings import ACTUATED, FIXED, MAX_PRESSURE, Settings, check_lanes, own_files, settings
 from cosim.sumo.net import City
 from cosim.sumo.programs import run_tool
 from cosim.sumo.signals import FIXED as FIXED_TIME
@@ -38,7 +38,7 @@ def city_signals(city: City, scenario: Scenario, settings: Settings) -> tuple[li
 
     Signals with gateways that stay fixed-time are in neither. Raises InputError if `settings.signals` fits none.
     """
-    pressure = settings.signals in PRESSURES
+    pressure = settings.signals == MAX_PRESSURE
     kinds = HELD if pressure else (FIXED_TIME,)
     simple, others = read_signals(city, own_files(scenario, settings.additional), kinds)
     left = {signal.id for signal in simple} & set(settings.leave_signals)

@@ -12,9 +12,8 @@ from nmfd.runs.config import Problem, Seconds, Share, Text, Texts, setting
 if TYPE_CHECKING:  # heavy, and the help of a command imports this module
     from nmfd.model.scenario import Scenario
 
-Signals = Literal["fixed", "webster", "actuated", "max-pressure", "max-pressure-cyclic"]
-FIXED, WEBSTER, ACTUATED, MAX_PRESSURE, CYCLIC = get_args(Signals)
-PRESSURES = (MAX_PRESSURE, CYCLIC)
+Signals = Literal["fixed", "webster", "actuated", "max-pressure"]
+FIXED, WEBSTER, ACTUATED, MAX_PRESSURE = get_args(Signals)
 EXACT, ESTIMATE = "exact", "estimate"
 FILES = ("routes", "background", "additional")
 
@@ -97,7 +96,7 @@ def own_files(scenario: "Scenario", names: Texts) -> list[Path]:
 def check_lanes(scenario: "Scenario", settings: Settings) -> None:
     """Raise InputError for settings that the mesoscopic model, which has no lanes, cannot do."""
     for key, values, what in (
-        ("signals", PRESSURES, "counts vehicles lane by lane"),
+        ("signals", (MAX_PRESSURE,), "counts vehicles lane by lane"),
         ("measurement", (ESTIMATE,), "needs loop detectors on lanes"),
     ):
         if settings.mesoscopic and (value := getattr(settings, key)) in values:

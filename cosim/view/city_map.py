@@ -17,7 +17,6 @@ JAM_DENSITY = 1000.0 / 7.5  # veh/km and lane
 LINE_OFFSET = 0.006  # of the map's width, by which the two directions of a street are drawn apart
 MAP_HEIGHT = 500  # pixels
 GATE_RADII = ((60, 6.0), (150, 4.5), (10**9, 3.5))  # up to so many gates, pixels
-ARROW_WIDTH = 9.0  # pixels, of the widest arrow
 
 
 class CityMap:
@@ -37,7 +36,6 @@ class CityMap:
         self.plot.axis.visible = self.plot.grid.visible = False
         self.regions = self._add_regions()
         self.streets = self._add_streets()
-        self.arrows = self._add_arrows()
         self.gates = self._add_gates()
         self._add_numbers()
 
@@ -53,10 +51,6 @@ class CityMap:
             queue=queue,
             halo=np.where(queue >= 0.5, 2.0 * self._radius + 4.0 * np.sqrt(queue), 0.0),
         )
-        # A driver who is sent elsewhere when asked again counts negative on the earlier way.
-        guided = np.maximum([frame.guided[pair] for pair in self._pairs], 0.0)
-        width = ARROW_WIDTH * np.sqrt(guided / max(guided.max(initial=0.0), 1.0))
-        patch(self.arrows, width=width, head=np.where(guided > 0, 6.0 + 1.5 * width, 0.0), guided=guided)
 
     def choose(self, region: int) -> None:
         """Highlight a region."""
@@ -127,22 +121,6 @@ class CityMap:
         share = {"start_angle": np.pi / 2, "end_angle": "end", "direction": "clock", "radius_units": "screen"}
         self.plot.wedge("x", "y", "radius", source=source, color=colours.GREEN, line_color=None, **share)
         self._hover(discs, ("gate", "@way"), ("green / original green", "@green"), ("queue [veh]", "@queue{0.0}"))
-        return source
-
-    def _add_arrows(self) -> ColumnDataSource:
-        self._pairs = sorted({(gate.source, gate.target) for gate in self._picture.gates})
-        rows = []
-        for i, h in self._pairs:
-            begin, along = self._picture.places[i], self._picture.places[h] - self._picture.places[i]
-            begin = begin + 0.05 * np.array([along[1], -along[0]])
-            angle = np.arctan2(along[1], along[0]) - np.pi / 2
-            rows.append([*(begin + 0.3 * along), *(begin + 0.7 * along), angle])
-        columns = dict(zip(("x", "y", "x1", "y1", "angle"), np.array(rows).reshape(-1, 5).T, strict=True))
-        source = _source(**columns, **{name: np.zeros(len(rows)) for name in ("width", "head", "guided")})
-        self.plot.segment("x", "y", "x1", "y1", source=source, line_width="width", color=colours.GUIDED, alpha=0.55)
-        tip = {"marker": "triangle", "angle": "angle", "size": "head", "line_color": None, "alpha": 0.8}
-        heads = self.plot.scatter("x1", "y1", source=source, color=colours.GUIDED, **tip)
-        self._hover(heads, ("guided drivers [veh]", "@guided{0}"))
         return source
 
     def _add_numbers(self) -> None:

@@ -21,8 +21,7 @@ TOP_SHARE = 0.02  # of the streets; short ones would leave all others pale
 NARROWEST = 330  # pixels, of a plot; on a narrower screen plots stand below each other
 KEY = (
     f"<span style='color:{colours.GREEN}'>◕</span> gate, green part: share of its original green time &ensp; "
-    f"<span style='color:{colours.QUEUE}'>●</span> halo: queue before it &ensp; "
-    f"<span style='color:{colours.GUIDED}'>▲</span> drivers guided from region to region"
+    f"<span style='color:{colours.QUEUE}'>●</span> halo: queue before it"
 )
 
 
@@ -110,7 +109,6 @@ def with_slider(
     moving = [
         *((one.streets, ["density"]) for one in page.maps),
         *((one.gates, ["end", "green", "queue", "halo"]) for one in page.maps),
-        *((one.arrows, ["width", "head", "guided"]) for one in page.maps),
     ]
     of_region = [
         *((one.regions, ["width", "line", "fill"]) for one in page.maps),

@@ -20,7 +20,7 @@ REGION_REACH = 0.08  # of the map's extent: places farther from all streets belo
 GATE_SETBACK = 0.015  # of the map's extent: distance of a gate from the end of its street
 ROW = (  # variables of a result that `after` reads
     *("gateway_green", "gateway_original_green", "gateway_queue"),
-    *("arrivals", "crossings", "edge_vehicles", "guided", "time_spent"),
+    *("arrivals", "crossings", "edge_vehicles", "time_spent"),
 )
 
 
@@ -102,7 +102,7 @@ class Frame:
     density: (E,) [veh/km and lane]; accumulation: (R,) [veh]; outflow: (R,) [veh/s]; waiting: to enter [veh]
     completed, removed: since the start [veh]
     time_spent: total since the start [veh s]; perimeter: (R, R) commanded u; green: (G,) share of the original green,
-    NaN without control; queue: (G,) halting vehicles; guided: (R, R) reroutes from i to h [veh]; note: a warning
+    NaN without control; queue: (G,) halting vehicles; note: a warning
     """
 
     time: float = 0.0
@@ -118,7 +118,6 @@ class Frame:
     perimeter: PerPair
     green: PerGateway
     queue: PerGateway
-    guided: PerPair
     note: str = ""
 
 
@@ -133,7 +132,6 @@ def first(picture: CityPicture, gateways: int, state: State) -> Frame:
         perimeter=np.full((regions, regions), np.nan),
         green=np.full(gateways, np.nan),
         queue=np.zeros(gateways),
-        guided=np.zeros((regions, regions)),
     )
 
 
@@ -168,7 +166,6 @@ def after(
         perimeter=controls.perimeter,
         green=green,
         queue=row["gateway_queue"].astype(float),
-        guided=row["guided"].sum(axis=2).astype(float),
         note="; ".join(filter(None, (controls.note, state.problem))),
     )
 

@@ -31,6 +31,7 @@ from jaxtyping import Float
 from scipy import sparse
 
 from nmfd import closed_loop
+from nmfd.controllers.dpc.policy import PerimeterLayer, SplitsLayer
 from nmfd.controllers.open_loop import NAMES, Plan
 from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
@@ -136,21 +137,16 @@ def solve(
 
 
 class _Controls:
-    """Admissible controls of T intervals and B plans from logits: a scaled sigmoid and a masked softmax."""
+    """Admissible controls of T intervals and B plans from logits."""
 
     def __init__(self, network: RegionalModel, steps: int, starts: Iterable[tuple], *, guidance: bool):
-        mask = torch.tensor(network.split_mask)
-        self._adjacency = torch.tensor(network.adjacency, dtype=torch.float64)
-        self._mask, self._bounds = mask.double(), (network.u_min, network.u_max)
-        # Rows without next region (j = i) keep finite logits and are zeroed: a softmax of only -inf is NaN.
-        self._blocked = ~mask & mask.any(dim=1, keepdim=True)
-        self._nominal = torch.tensor(network.nominal_splits).expand(steps, 1, *mask.shape)
-        width = network.u_max - network.u_min
+        self._box, self._simplex = PerimeterLayer(network).double(), SplitsLayer(network).double()
+        self._nominal = torch.tensor(network.nominal_splits).expand(steps, 1, *network.split_mask.shape)
         perimeters, splits = zip(*starts, strict=True)
-        share = (torch.tensor(np.stack(perimeters, axis=1)) - network.u_min) / width
+        share = (torch.tensor(np.stack(perimeters, axis=1)) - network.u_min) / (network.u_max - network.u_min)
         self.logits = [torch.logit(share.clamp(INSIDE, 1.0 - INSIDE))]
         if guidance:
-            even = self._mask / self._mask.sum(dim=1, keepdim=True).clamp(min=1.0)
+            even = self._simplex(torch.zeros_like(self._nominal[0]))
             theta = (1.0 - INSIDE) * torch.tensor(np.stack(splits, axis=1)) + INSIDE * even
             self.logits.append(torch.log(theta.clamp(min=1e-6)))
         for logits in self.logits:
@@ -158,11 +154,8 @@ class _Controls:
 
     def __call__(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return perimeter (T, B, R, R) and splits (T, B, R, R, R), or (T, 1, R, R, R) without guidance."""
-        low, high = self._bounds
-        perimeter = (low + (high - low) * torch.sigmoid(self.logits[0])) * self._adjacency
-        if len(self.logits) == 1:
-            return perimeter, self._nominal
-        return perimeter, torch.softmax(self.logits[1].masked_fill(self._blocked, -torch.inf), dim=-2) * self._mask
+        perimeter = self._box(self.logits[0])
+        return perimeter, self._nominal if len(self.logits) == 1 else self._simplex(self.logits[1])
 
 
 def _total_time_spent(
