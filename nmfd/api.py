@@ -275,8 +275,10 @@ def bound(
     open_loop.write(plan, scenario, file)
     totals = sorted(plan.totals.items(), key=lambda item: item[1])
     lines = [f"from {name}: {total:.5g} veh s" + (" (kept)" if name == plan.start else "") for name, total in totals]
-    above = benchmark_study.percent_change(totals[0][1], plan.lower)
-    lines += [f"lower bound: {plan.lower:.5g} veh s; the best plan is at most {above:.1f} % above the optimum"]
+    lines += [f"lower bound: {plan.lower:.5g} veh s"]
+    if plan.lower > 0:
+        above = benchmark_study.percent_change(totals[0][1], plan.lower)
+        lines[-1] += f"; the best plan is at most {above:.1f} % above the optimum"
     return "\n".join([*lines, f"Written to {file}"])
 
 

@@ -7,7 +7,7 @@ figures are consistent.
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Real
@@ -27,6 +27,7 @@ def of_numbers(kind: "type[Mfd]", **numbers: Any) -> Any:
     return curve
 
 
+@runtime_checkable
 class Mfd(Protocol):
     """Outflow of one region against its accumulation; or of R regions, if its numbers are arrays (R,).
 
@@ -63,6 +64,8 @@ class Mfd(Protocol):
     @property
     def critical(self) -> float:
         """Accumulation of maximum outflow [veh], the smallest if there are several."""
+        if np.ndim(self.jam):
+            raise AttributeError("critical: only the curve of one region has it")
         grid = np.linspace(0.0, self.jam, 20001)
         outflow = self.rate_up_to_jam(grid) * grid
         return float(grid[np.argmax(outflow >= outflow.max() * (1.0 - 1e-13))])

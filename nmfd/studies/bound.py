@@ -203,6 +203,8 @@ def lower_bound(scenario: Scenario, *, guidance: bool) -> float:
     if scenario.process_std:
         problem = f"expected 0 for a lower bound, got {scenario.process_std:g}"
         raise InputError(f"{scenario.where}: process_std: {problem}; add --set process_std=0")
+    if not (scenario.demand.any() or scenario.start.any()):
+        return 0.0
     lp = relaxation(scenario, guidance=guidance)
     limits = {"A_ub": lp.upper, "b_ub": lp.most, "A_eq": lp.equal, "b_eq": lp.given}
     answer = linprog(lp.cost, **limits, bounds=(0.0, 1.0), method="highs-ipm")
