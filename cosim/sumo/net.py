@@ -258,6 +258,8 @@ def read_regions(path: Path, regions: int = 10**6) -> dict[str, int]:
         raise InputError(f"{path}: line 1: expected edge,region, got {','.join(header) or 'nothing'} instead")
     region_of: dict[str, int] = {}
     for number, row in enumerate(rows, start=2):
+        if not row:
+            continue
         if len(row) != 2 or not row[1].isdecimal() or len(row[1]) > 9 or int(row[1]) >= regions:
             expected = f"an edge and a region from 0 to {regions - 1}"
             raise InputError(f"{path}: line {number}: expected {expected}, got {','.join(row)} instead")

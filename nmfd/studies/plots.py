@@ -27,6 +27,8 @@ COLOURS = {
     "mpc-pcrg": "#0059a8",
     "dpc-pc": "#e377c2",
     "dpc-pcrg": "#882255",
+    "gating-rule": "#d95f02",
+    "pricing-rule": "#b2182b",
     "route-guidance": "#8c6d31",
     "probing-pc": "#bcbd22",
     "probing-pcrg": "#637939",
