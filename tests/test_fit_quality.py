@@ -85,6 +85,9 @@ def test_persistence_is_what_it_says(network):
     assert (errors["ahead_s"] == 900.0).all()
     shares = errors[["next_interval_persistence_rmse_share", "ahead_persistence_rmse_share"]].to_numpy()
     assert shares[0] * critical == pytest.approx([10.0, 40.0]) and (shares[1:] == 0.0).all()
+    unseen = replace(network, critical_above={0: 0.5 * critical})
+    twice = predictions(unseen, [run, run], {"step": 225.0, "substeps": 8, "integrator": "euler"})
+    assert twice["ahead_persistence_rmse_share"][0] == pytest.approx(2.0 * shares[0, 1])
     text = prediction_text(errors, 225.0)
     assert f"225 s ahead (unchanged: {100 * shares[:, 0].mean():.1f} %)" in text and "900 s ahead (unchanged: " in text
 

@@ -36,7 +36,10 @@ MEANINGS = {  # beginning of a doubt -> meaning and remedy
     ),
     ALONE: "there is no held-out error; give --seeds 2 or more",
 }
-HELD_OUT = "RMSE of accumulations, in percent of critical ones, in the runs of the last seed, by a fit without them: "
+HELD_OUT = (
+    "RMSE of accumulations, in percent of critical ones (where these were not seen, of the largest), in runs of the last"
+    " seed, by a fit without them: "
+)
 
 
 def with_guesses(
@@ -167,11 +170,14 @@ def fit_table(network: RegionalModel, fits: pd.DataFrame, known: Mapping[str, st
 def predictions(network: RegionalModel, runs: Sequence[Observed], scheme: dict) -> pd.DataFrame:
     """Return the RMSE of predicted accumulations as shares of the critical ones [-], a row per region.
 
+    Where a critical accumulation was not seen, it is the largest one that was.
+
     Columns: next_interval_rmse_share and ahead_rmse_share, of the regional model one interval and ahead_s [s] ahead;
     next_interval_persistence_rmse_share and ahead_persistence_rmse_share, of the prediction that nothing changes.
 
     scheme: step [s], substeps and integrator
     """
+    largest = np.array([network.critical_above.get(r, one) for r, one in enumerate(network.critical)])
     ahead = min(max(1, round(AHEAD_S / scheme["step"])), max(len(run.demand) for run in runs))
     columns = {}
     for when, intervals in (("next_interval", 1), ("ahead", ahead)):
@@ -179,7 +185,7 @@ def predictions(network: RegionalModel, runs: Sequence[Observed], scheme: dict) 
         states = [run.accumulation.sum(axis=2) for run in runs]
         unchanged = np.concatenate([state[:-intervals] - state[intervals:] for state in states])
         for name, part in (("rmse_share", errors), ("persistence_rmse_share", unchanged)):
-            columns[f"{when}_{name}"] = np.sqrt((part**2).mean(axis=0)) / network.seen_critical
+            columns[f"{when}_{name}"] = np.sqrt((part**2).mean(axis=0)) / largest
     return pd.DataFrame({**columns, "ahead_s": ahead * scheme["step"]})
 
 
