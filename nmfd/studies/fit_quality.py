@@ -37,8 +37,8 @@ MEANINGS = {  # beginning of a doubt -> meaning and remedy
     ALONE: "there is no held-out error; give --seeds 2 or more",
 }
 HELD_OUT = (
-    "RMSE of accumulations, in percent of critical ones (where these were not seen, of the largest), in runs of the last"
-    " seed, by a fit without them: "
+    "RMSE of accumulations, in percent of critical ones (where these were not seen, of the largest), in runs of the "
+    "last seed, by a fit without them: "
 )
 
 
