@@ -1,5 +1,8 @@
 """Two leaders who wait for each other's lane block a street for ever; guided drivers go on instead."""
 
+import math
+
+import libsumo
 import numpy as np
 import pytest
 import streets
@@ -88,6 +91,13 @@ def test_with_a_way_out_each_goes_on_where_the_lane_leads(session):
     for _ in range(60):
         session.step()
     assert not LEADERS.keys() & {vehicle for vehicle in session.running() if session.road(vehicle) == "ab"}
+
+
+@pytest.mark.parametrize("session", [100], indirect=True)
+def test_no_way_begins_on_a_street_that_is_closed_to_cars(session):
+    assert session.fastest("br", "le")[1] == ("br", "rl", "le")
+    libsumo.lane.setAllowed("br_0", ["bus"])
+    assert session.fastest("br", "le") == (math.inf, ())
 
 
 @pytest.mark.parametrize("session, late", [(-0.5, True), (100, False)], indirect=["session"])

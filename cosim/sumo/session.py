@@ -1,6 +1,7 @@
 """The SUMO session; only it and `departures` import libsumo. At most one simulation per process."""
 
 import ctypes
+import math
 import os
 import sys
 import tempfile
@@ -216,7 +217,10 @@ class Session:
 
     def fastest(self, edge: str, target: str) -> tuple[float, tuple[str, ...]]:
         """Return time [s] and edges of a car's fastest way on empty streets, () if there is none."""
-        stage = libsumo.simulation.findRoute(edge, target)
+        try:
+            stage = libsumo.simulation.findRoute(edge, target)
+        except REFUSALS:  # the edge is closed to cars, such as a bus street
+            return math.inf, ()
         return stage.travelTime, tuple(stage.edges)
 
     def set_route(self, vehicle: str, edges: list[str]) -> bool:
