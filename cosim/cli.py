@@ -30,7 +30,7 @@ CONTROLLER = click.option(
     "--controller",
     required=True,
     metavar="NAME[+...]",
-    help="Controller of `nmfd show` or FILE:Class, and what else the city does, joined by +: actuated, max-pressure or "
+    help="Controller of `nmfd show` or FILE:Class, and what else the city does, joined by +: actuated or max-pressure "
     "signals, rerouting-N, guided, compliance-N (percent of drivers), guidance-period-N (s), "
     "metering, estimate.",
 )
