@@ -190,7 +190,7 @@ def by_region(level: Level, city: City, region_names: Sequence[str], names: Sequ
     runs = common_runs(level, names)
     if not runs[0]:
         return None
-    region = np.array([city.region_of[edge] for edge in city.edges])
+    region = city.edge_region
     means = [np.mean([_numbers(run, region, len(region_names)) for run in of], axis=0) for of in runs]
     columns: dict[tuple[str, str], list[str]] = {("", "region"): [*region_names, "all"]}
     for n, heading in enumerate(("trip from here [s]", "CO2 [kg]")):

@@ -17,9 +17,7 @@ from cosim.sumo.signals import GREEN, Signal
 from nmfd.arrays import PerPair
 from nmfd.model.regional_model import RegionalModel
 
-OPEN_SHARE = (
-    0.95  # of what a boundary can let through: above, a gate holds no queue, but shortens greens that are needed
-)
+OPEN_SHARE = 0.95  # of what a boundary can let through; above it a gate holds no queue, but takes green that is needed
 
 
 class Actuation:
@@ -66,7 +64,6 @@ class Actuation:
         self.original_green = _programmed_green(city, phases, step)
         self.room = Room(session, city, self.original_green, limit=settings.chain_limit, lanes=not settings.mesoscopic)
         self._supervisor = Supervisor(network, step) if settings.chain_limit > 0 else None
-        self._region_of = [city.region_of[edge] for edge in city.edges]
         self.states: dict[str, list[tuple[float, str]]] = {signal: [] for signal in session.signals()}
 
     def command(self, perimeter: PerPair, vehicles: PerEdge) -> None:
@@ -75,7 +72,7 @@ class Actuation:
         share = np.clip((perimeter - network.u_min) / (network.u_max - network.u_min), 0.0, 1.0)
         share[share >= OPEN_SHARE] = 1.0
         if self._supervisor:
-            accumulation = np.bincount(self._region_of, vehicles, minlength=len(share))
+            accumulation = np.bincount(self._city.edge_region, vehicles, len(share))
             share[:, self._supervisor.opened(share, accumulation)] = 1.0
         self.room.command(share, vehicles)
         self._obey()

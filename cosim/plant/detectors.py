@@ -69,7 +69,7 @@ def _stations(length: float, place: float) -> tuple[float, ...]:
 def instruments(city: City, layout: Layout, probe_share: float) -> Instruments:
     """Return shares and errors that follow from the layout."""
     lane_length = np.array([city.length[edge] * city.lanes[edge] for edge in city.edges])
-    region = np.array([city.region_of[edge] for edge in city.edges])
+    region = city.edge_region
     equipped = np.isin(np.arange(len(region)), layout.edges)
     weights = lane_length, lane_length * equipped, lane_length**2 * equipped
     whole, seen, squares = (np.bincount(region, weight, city.regions) for weight in weights)

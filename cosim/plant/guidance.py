@@ -115,10 +115,10 @@ class Guide:
         self._most_detour, self._ways_return = most_detour, ways_return
         self._session, self._city, self._compliance, self._random = session, city, compliance, random
         self._index = {edge: n for n, edge in enumerate(city.edges)}
-        self._region = [city.region_of[edge] for edge in city.edges]
+        self._region = city.edge_region.tolist()
         self._times = times = TravelTimes(city, lanes=lanes)
         self._move = {move: n for n, move in enumerate(zip(times.first.tolist(), times.second.tolist(), strict=True))}
-        here = [np.array(self._region) == region for region in range(city.regions)]
+        here = [city.edge_region == region for region in range(city.regions)]
         self._within, self._homeward, self._without_back = (
             [Moves(times.first, times.second, allowed=allowed ^ outside, reverse=reverse) for allowed in here]
             for outside, reverse in ((False, False), (False, True), (True, True))

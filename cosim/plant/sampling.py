@@ -45,7 +45,7 @@ class StreetSampler:
     def __init__(self, session: Session, city: City):
         self._session, self._city = session, city
         self._number = {edge: n for n, edge in enumerate(city.edges)}
-        self._region = np.array([city.region_of[edge] for edge in city.edges])
+        self._region = city.edge_region
         self._inside = {edge: n for n, edge in enumerate(city.inside)}
         self._upstream = sorted({g.from_edge for g in city.gateways})  # gateways may share the edge before them
         self._upstream_of = np.array([self._upstream.index(g.from_edge) for g in city.gateways], dtype=int)

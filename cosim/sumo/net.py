@@ -5,6 +5,7 @@ import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
@@ -81,6 +82,11 @@ class City:
     signals: Mapping[str, str]
     over: Mapping[tuple[str, str], tuple[str, ...]] = field(default_factory=dict)
     inside: Mapping[str, float] = field(default_factory=dict)
+
+    @cached_property
+    def edge_region(self) -> np.ndarray:
+        """Regions (E,) of the edges."""
+        return np.array([self.region_of[edge] for edge in self.edges])
 
 
 _Lane: TypeAlias = tuple[float, float, str]  # length [m], speed [m/s], id

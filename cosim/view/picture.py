@@ -73,7 +73,7 @@ class CityPicture:
     def of(cls, scenario: Scenario, city: City) -> Self:
         """Return the picture of a scenario's city."""
         shapes, network = edge_shapes(city), scenario.network
-        region = np.array([city.region_of[edge] for edge in city.edges])
+        region = city.edge_region
         middles = np.array([shape.mean(axis=0) for shape in shapes])
         axes = [np.linspace(0.0, min(mfd.jam, CURVE_END * mfd.critical), CURVE_POINTS) for mfd in network.mfds]
         return cls(

@@ -309,9 +309,8 @@ def _lines(mfd: Mfd, vehicles: float) -> tuple[np.ndarray, np.ndarray, float, fl
     highest = np.maximum(rate[:-1], rate[1:])
     grid = np.concatenate([body[:-1], body[1:], [end]])
     flow = np.concatenate([highest * body[:-1], highest * body[1:], [mfd.outflow(end)]])
-    last = min(
-        0.0, float(((flow[-1] - flow[:-1]) / np.maximum(end - grid[:-1], 1e-9)).min())
-    )  # of the envelope, at its end
+    at_end = (flow[-1] - flow[:-1]) / np.maximum(end - grid[:-1], 1e-9)  # slopes of the envelope, at its end
+    last = min(0.0, float(at_end.min()))
     slopes = np.append(np.linspace(last, 0.0, LINES // 4), rate.max() * np.linspace(0.0, 1.0, LINES)[1:] ** 2)
     intercepts = np.array([(flow - slope * grid).max() for slope in slopes])
     return slopes, intercepts, float(min(rate.min(), mfd.rate(end))), float(rate.max())

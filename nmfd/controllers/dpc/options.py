@@ -78,11 +78,7 @@ class Training(Options):
     )
     detour_cost: float = setting("time lost by a vehicle off the nominal splits", 0.0, unit="s", ge=0.0, le=1e6)
     preset: Literal["ours", "published"] = setting("recipe of the training; published: that of Tumu et al.", "ours")
-    preset_without: Texts = setting(
-        "parts of the preset that stay ours: learning_rate, weight_decay, batch, clip, activation, decoder_layers, "
-        "loss, epoch, process_std, largest_start",
-        (),
-    )
+    preset_without: Texts = setting(f"parts of the preset that stay ours: {', '.join(vars(PUBLISHED))}", ())
     from_no_control: bool = setting("the initial policy is nearly no control", False)
     from_gating: bool = setting("the initial policy is nearly a gate at the set point of pi-gating", False)
 

@@ -186,13 +186,15 @@ class Rollout:
     def total_time_spent(
         self, policy: nn.Module, x: States, demand: Demands, generator: Generator, step: Callable | None = None
     ) -> Levels:
-        """Return the TTS (veh s, (B,)) of rollouts from x under `policy`, with detours; arguments as `states`."""
+        """Return the TTS (veh s, (B,)) of rollouts from x under `policy`, with both costs; arguments as `states`."""
         exact, seen, waiting = self.states(policy, x, demand, generator, step)
         vehicles = exact.sum((0, -2, -1)) + waiting.sum((-2, -1)).sum(0)
-        if self.detour_cost and (splits := commanded(policy, seen)[1]) is not None:
-            vehicles = vehicles + self.detour_cost * self._diverted(exact, splits).sum((0, -2, -1))
-        if self.holding_cost:
-            vehicles = vehicles + self.holding_cost * self._held(exact, commanded(policy, seen)[0]).sum((0, -1))
+        if self.detour_cost or self.holding_cost:
+            perimeter, splits = commanded(policy, seen)
+            if self.detour_cost and splits is not None:
+                vehicles = vehicles + self.detour_cost * self._diverted(exact, splits).sum((0, -2, -1))
+            if self.holding_cost:
+                vehicles = vehicles + self.holding_cost * self._held(exact, perimeter).sum((0, -1))
         return self.planning.step * vehicles
 
     def _held(self, x: PerPair, perimeter: PerPair) -> PerRegion:
