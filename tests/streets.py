@@ -24,19 +24,19 @@ def city(region_of: Mapping[str, int], successors: Mapping[str, Sequence[str]], 
     ]
     properties = {
         "length": dict.fromkeys(edges, 10.0),
+        "lanes": dict.fromkeys(edges, 1),
+        "lane_ids": {},
         "speed": dict.fromkeys(edges, 1.0),
         "turn_time": dict.fromkeys(moves, 0.0),
+        "gateways": tuple(sorted(gateways, key=lambda g: (g.source, g.target))),
+        "signals": {},
     }
     return City(
         net_file=Path(),
         regions=max(region_of.values()) + 1,
         region_of=region_of,
         edges=edges,
-        lanes=dict.fromkeys(edges, 1),
-        lane_ids={},
         successors={edge: tuple(successors[edge]) for edge in edges},
-        gateways=tuple(sorted(gateways, key=lambda g: (g.source, g.target))),
-        signals={},
         **(properties | others),
     )
 

@@ -14,7 +14,6 @@ import cosim
 from cosim.evaluation import simulate
 from cosim.plant.meter import Trip
 from cosim.plant.plant import SumoPlant
-from cosim.sumo.net import edge_room
 from cosim.sumo.outputs import TripReader
 from nmfd import metrics
 from nmfd.api import load_scenario
@@ -154,7 +153,7 @@ def test_open_gateways_show_the_original_green(run):
 
 def test_full_edges_before_gateways(run):
     plant, record, _, _ = run
-    city, room = plant.city, edge_room(plant.city)
+    city, room = plant.city, plant.city.room
     for share, expected in ((0.0, 0.0), (0.7, 0.0), (0.9, 1.0)):
         full = SimpleNamespace(**vars(record) | {"edge_vehicles": np.tile(share * room, (3, 1))})
         row = simulate.queue_facts(full, city)

@@ -6,6 +6,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+import streets
 import tiny_city
 from signal_rules import CROSS, MIN_GREEN, PHASES, SINGLE, WALK, check, signal
 
@@ -113,14 +114,7 @@ def link(index, start, end, lane=0):
 LANES = dict.fromkeys("acdefx", 1) | {"b": 2}
 AFTER = {"x": ("a",), "a": ("b",), "c": ("d",), "b": ("e", "f"), "d": (), "e": (), "f": ()}
 LANE_IDS = {edge: tuple(f"{edge}_{n}" for n in range(lanes)) for edge, lanes in LANES.items()}
-TOWN = SimpleNamespace(
-    edges=tuple("abcdefx"),
-    lanes=LANES,
-    lane_ids=LANE_IDS,
-    length=dict.fromkeys(LANES, 200.0),
-    successors=AFTER,
-    gateways=(),
-)
+TOWN = streets.city(dict.fromkeys(LANES, 0), AFTER, lanes=LANES, lane_ids=LANE_IDS, length=dict.fromkeys(LANES, 200.0))
 CROSSING = signal(CROSS, (link(0, "a", "b"), link(1, "c", "d")), "s")
 END = signal(
     [("GGg", 30), ("yyy", 3), ("rrG", 30), ("rry", 3)],
@@ -150,7 +144,7 @@ def test_weights_by_hand():
 def test_a_short_piece_before_the_signal_is_not_all_of_the_queue(length, weight):
     """x leads into a, and for three quarters of its vehicles elsewhere; within 100 m they count by that share."""
     after = {**AFTER, "x": ("a", "f")}
-    town = SimpleNamespace(**{**vars(TOWN), "successors": after, "length": {**TOWN.length, "a": length}})
+    town = replace(TOWN, successors=after, length={**TOWN.length, "a": length})
     roads = Roads(town, [CROSSING], {("x", "a"): 1.0, ("x", "f"): 3.0})
     present = np.array([{"a": 5.0, "x": 8.0}.get(lane[0], 0.0) for lane in roads.lanes])
     assert (roads.weights @ present)[roads.movements["a", "b"]] == pytest.approx(weight)
@@ -158,7 +152,7 @@ def test_a_short_piece_before_the_signal_is_not_all_of_the_queue(length, weight)
 
 def test_who_waits_behind_a_piece_too_short_to_be_seen_on_is_seen():
     """A vehicle stands on x, before the 5 m of a, where a detector would find nobody: it gets its green."""
-    town = SimpleNamespace(**{**vars(TOWN), "length": {**TOWN.length, "a": 5.0}})
+    town = replace(TOWN, length={**TOWN.length, "a": 5.0})
     shown = [state for _, state in shown_by(CROSSING, {"x": 1.0, "c": 9.0}, 120, town=town)]
     assert shown.count("rG") == 2 and shown.count("Gr") >= 2
 
@@ -234,7 +228,7 @@ def test_no_green_outlasts_the_maximum_while_others_wait():
 def test_who_waits_too_long_comes_first(monkeypatch):
     """c has no pressure at all, as its road ahead is full; after 120 s of red its link gets the minimum green."""
     monkeypatch.setattr(max_pressure, "MAX_GREEN_S", 500.0)
-    town = SimpleNamespace(**{**vars(TOWN), "successors": {**AFTER, "d": ("e",)}})
+    town = replace(TOWN, successors={**AFTER, "d": ("e",)})
     shown = shown_by(CROSSING, {"a": 5.0, "c": 2.0, "d": 30.0}, 150, town=town)
     assert [entry for entry in shown if entry[1] == "rG"] == [(MAX_RED_S + 3.0, "rG")]
     assert shown[-1] == (MAX_RED_S + 13.0, "Gr")
@@ -297,9 +291,7 @@ def test_the_higher_pressure_wins_and_the_green_stays_in_doubt(junctions, a, b, 
 
 def test_a_spent_ration_exerts_no_pressure():
     """The gateway a -> b has 10 s of green in a cycle; then it is red, and c gets the green for a single vehicle."""
-    town = SimpleNamespace(
-        **{**vars(TOWN), "gateways": (Gateway(source=0, target=1, from_edge="a", to_edge="b", signal="s", links=(0,)),)}
-    )
+    town = replace(TOWN, gateways=(Gateway(source=0, target=1, from_edge="a", to_edge="b", signal="s", links=(0,)),))
     shown, session = [], SimpleNamespace(time=0.0, lane_vehicles=lambda lane: {"a": 50.0, "c": 1.0}.get(lane[0], 0.0))
     control = MaxPressure(session, town, [CROSSING], FLOWS, show=lambda name, state: shown.append(state), lookahead=1.0)
     control.command(np.full(1, 5.0 / 61.0))  # 5 s, and so much of the other 61 s

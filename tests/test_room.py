@@ -6,25 +6,24 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import streets
 from test_responsive import imported
 
 from cosim.plant.plant import SumoPlant
 from cosim.plant.room import Room, shared, upstream
 from cosim.plant.settings import settings
 from cosim.plant.supervisor import Supervisor
-from cosim.sumo.net import Gateway, predecessors
+from cosim.sumo.net import Gateway
 from nmfd.api import load_scenario
 from nmfd.controllers.rules import PiGating
 from nmfd.model.planning import planning_model
 from nmfd.types import Controls, Observation
 
 # Streets a and b lead to the gateways a -> x and b -> y; c, which has a signal at its end, d and e lead to a.
-TOWN = SimpleNamespace(
-    regions=2,
-    edges=("a", "b", "c", "d", "e", "x", "y"),
+TOWN = streets.city(
+    dict.fromkeys("abcde", 0) | {"x": 1, "y": 1},
+    {"a": "x", "b": "y", "c": "a", "d": "a", "e": "d", "x": "", "y": ""},
     length={"a": 150.0, "b": 150.0, "c": 75.0, "d": 300.0, "e": 75.0, "x": 75.0, "y": 75.0},
-    lanes=dict.fromkeys("abcdexy", 1),
-    successors={"a": ("x",), "b": ("y",), "c": ("a",), "d": ("a",), "e": ("d",), "x": (), "y": ()},
     signals={"a": "s", "b": "s", "c": "t"},
     gateways=tuple(
         Gateway(source=0, target=1, from_edge=one, to_edge=other, signal="s", links=(n,), lanes=(0,))
@@ -58,9 +57,9 @@ def test_the_mean_by_capacity_is_the_command_unless_floors_let_more_through(seed
 
 
 def test_the_chain_ends_at_a_signal_and_400_m_before_the_gateway():
-    before, nearer = predecessors(TOWN), SimpleNamespace(**{**vars(TOWN), "length": TOWN.length | {"d": 200.0}})
-    assert upstream(TOWN, "a", before) == ["a", "d"] and upstream(TOWN, "b", before) == ["b"]
-    assert upstream(nearer, "a", before) == ["a", "d", "e"]
+    nearer = replace(TOWN, length={**TOWN.length, "d": 200.0})
+    assert upstream(TOWN, "a") == ["a", "d"] and upstream(TOWN, "b") == ["b"]
+    assert upstream(nearer, "a") == ["a", "d", "e"]
 
 
 def test_the_fuller_gateway_gets_more_and_a_full_one_is_open():

@@ -147,8 +147,7 @@ def _identify(
     samples = outflow_samples(static, runs)
     model = fitted(runs, samples)
     states, city = [run.accumulation for run in runs], city_of(static)
-    metres = [city.length[edge] * city.lanes[edge] for edge in city.edges]
-    lane_km = np.bincount(city.edge_region, metres, city.regions) / 1000.0
+    lane_km = np.bincount(city.edge_region, city.lane_metres, city.regions) / 1000.0
     model = fit_quality.with_guesses(model, samples, lane_km, states, fastest=loaded.substeps / loaded.step)
     fits = fit_quality.region_fits(model, samples, states, seeds=len(seeds), lane_km=lane_km)
     text, errors = fit_quality.fit_table(model, fits), None

@@ -50,7 +50,7 @@ def lay_out(city: City, share: float) -> Layout:
     random, links = np.random.default_rng(LAYOUT), []
     place = random.uniform(0.02, 0.98, len(city.edges))  # within the part of the link that a loop stands for
     for region in range(city.regions):
-        own = [n for n, edge in enumerate(city.edges) if city.region_of[edge] == region]
+        own = np.flatnonzero(city.edge_region == region)
         links += list(random.permutation(own)[: int(np.ceil(share * len(own) - 1e-9))])
     edges = sorted(int(n) for n in links)
     names = {city.edges[n] for n in edges}
@@ -68,8 +68,7 @@ def _stations(length: float, place: float) -> tuple[float, ...]:
 
 def instruments(city: City, layout: Layout, probe_share: float) -> Instruments:
     """Return shares and errors that follow from the layout."""
-    lane_length = np.array([city.length[edge] * city.lanes[edge] for edge in city.edges])
-    region = city.edge_region
+    lane_length, region = city.lane_metres, city.edge_region
     equipped = np.isin(np.arange(len(region)), layout.edges)
     weights = lane_length, lane_length * equipped, lane_length**2 * equipped
     whole, seen, squares = (np.bincount(region, weight, city.regions) for weight in weights)

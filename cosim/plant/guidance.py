@@ -114,7 +114,6 @@ class Guide:
         self._due: dict[int, list[_Visit]] = {}  # simulation step -> visits to guide again then
         self._most_detour, self._ways_return = most_detour, ways_return
         self._session, self._city, self._compliance, self._random = session, city, compliance, random
-        self._index = {edge: n for n, edge in enumerate(city.edges)}
         self._region = city.edge_region.tolist()
         self._times = times = TravelTimes(city, lanes=lanes)
         self._move = {move: n for n, move in enumerate(zip(times.first.tolist(), times.second.tolist(), strict=True))}
@@ -126,7 +125,7 @@ class Guide:
         if ways_return:  # everywhere, of ways home, and of ways on that come back
             ends, everywhere = (times.first, times.second), np.full(len(city.edges), True)
             self._homeward = [Moves(*ends, allowed=everywhere, reverse=reverse) for reverse in (True, False)]
-        gateways = [(self._index[g.from_edge], self._index[g.to_edge], g.target, g.source) for g in city.gateways]
+        gateways = [(city.number[g.from_edge], city.number[g.to_edge], g.target, g.source) for g in city.gateways]
         rows = np.array([(a, b, self._move[a, b], *pair) for a, b, *pair in gateways], dtype=int).reshape(-1, 5).T
         self._gateways = [rows[:4, rows[4] == region] for region in range(city.regions)]
         spread = SPREAD if lanes else MESO_SPREAD
@@ -169,7 +168,7 @@ class Guide:
             self._visits.pop(event.vehicle, None)
             if event.free and self._random.random() < self._compliance:
                 visit = _Visit(event, int(self._random.integers(DRIVER_CLASSES)))
-                if event.edge in self._index:  # else it uses roads closed to cars, as taxis do
+                if event.edge in self._city.number:  # else it uses roads closed to cars, as taxis do
                     self._guide(visit)
         for visit in self._due.pop(self._steps, ()):
             if self._visits.get(visit.event.vehicle) is visit:
@@ -177,10 +176,10 @@ class Guide:
 
     def _guide(self, visit: _Visit) -> None:
         """Guide a driver, except on a junction, in the next region already, or too late to turn: then again soon."""
-        event, target, after = visit.event, self._index[visit.event.edge], self._period
+        event, target, after = visit.event, self._city.number[visit.event.edge], self._period
         self._late = False
         try:
-            here = self._index.get(self._session.road(event.vehicle))
+            here = self._city.number.get(self._session.road(event.vehicle))
         except REFUSALS:  # it has arrived
             self._visits.pop(event.vehicle, None)
             return
@@ -304,7 +303,7 @@ class Guide:
     def _present(self, vehicle: str, here: int, time: PerEdge) -> _Present:
         """Return the present way of a driver on edge `here`, at `time` (E,) [s]."""
         route = self._session.route(vehicle)[self._session.route_index(vehicle) :]
-        way = [self._index[edge] for edge in route if edge in self._index]
+        way = [self._city.number[edge] for edge in route if edge in self._city.number]
         if len(way) < len(route):
             return _Present(None)
         if way[0] != here:

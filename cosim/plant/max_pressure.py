@@ -25,7 +25,7 @@ from scipy.sparse import csr_array
 
 from cosim.plant.gates import MIN_GREEN_S, NEVER, Movements, Ration, Show, ends_bare, run_length, yellow_time
 from cosim.sumo.arrays import PerGateway
-from cosim.sumo.net import City, gateway_movements, predecessors
+from cosim.sumo.net import City, gateway_movements
 from cosim.sumo.session import Phase, Session
 from cosim.sumo.signals import GREEN, Link, Signal, is_stage, lane_id
 
@@ -336,7 +336,7 @@ class Roads:
 
     def __init__(self, city: City, signals: Sequence[Signal], flows: Mapping[tuple[str, str], float]):
         """flows: (edge, next edge) -> flow, any unit, for the turning shares"""
-        self._city, self._flows, self._before = city, flows, predecessors(city)
+        self._city, self._flows, self._before = city, flows, city.before
         cars = [lane for edge in city.edges for lane in city.lane_ids[edge]]
         links = [link for signal in signals for link in signal.links]
         others = (lane_id(link) for signal in signals for link in signal.others)

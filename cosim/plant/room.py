@@ -16,12 +16,10 @@ the gates: Keyvan-Ekbatani, Carlson, Knoop and Papageorgiou, "Optimizing distrib
 perimeter control: queue and delay balancing approaches", 2021.
 """
 
-from collections.abc import Mapping, Sequence
-
 import numpy as np
 
 from cosim.sumo.arrays import PerEdge, PerGateway
-from cosim.sumo.net import JAM_SPACING, City, edge_room, predecessors
+from cosim.sumo.net import JAM_SPACING, City
 from cosim.sumo.session import Session
 from nmfd.arrays import PerPair
 
@@ -39,7 +37,7 @@ class Room:
 
         limit: share of the room; 0: all gateways of a boundary get the same share
         """
-        gateways, number = city.gateways, {edge: n for n, edge in enumerate(city.edges)}
+        gateways, number = city.gateways, city.number
         self._session, self._limit = session, limit
         self._source, self._target = np.array([(g.source, g.target) for g in gateways], dtype=int).reshape(-1, 2).T
         self._capacity = np.nan_to_num(green) * [len(g.lanes) for g in gateways]
@@ -48,10 +46,9 @@ class Room:
         self._boundaries = {
             (int(i), int(h)): obedient[(pairs[0] == i) & (pairs[1] == h)] for i, h in set(zip(*pairs, strict=True))
         }
-        self._room = edge_room(city)
+        self._room = city.room
         self._behind = np.array([number[g.to_edge] for g in gateways], dtype=int)
-        leading_to = predecessors(city)
-        self._chains = [[number[edge] for edge in upstream(city, g.from_edge, leading_to)] for g in gateways]
+        self._chains = [[number[edge] for edge in upstream(city, g.from_edge)] for g in gateways]
         self._lanes = [[f"{g.from_edge}_{lane}" for lane in g.lanes] if lanes else [] for g in gateways]
         self._lane_room = np.array([len(g.lanes) * max(city.length[g.from_edge] / JAM_SPACING, 1.0) for g in gateways])
         self._commanded = np.ones((city.regions, city.regions))
@@ -108,12 +105,12 @@ def shared(share: float, urgency: PerGateway, floor: PerGateway, capacity: PerGa
     return np.clip(urgency + np.interp(share, means, bends), floor, 1.0)
 
 
-def upstream(city: City, edge: str, leading_to: Mapping[str, Sequence[str]]) -> list[str]:
+def upstream(city: City, edge: str) -> list[str]:
     """Return `edge` and all streets that lead there past no signal and end less than CHAIN_M before its end."""
     chain, waiting = {edge: city.length[edge]}, [edge]
     while waiting:
         street = waiting.pop(0)
-        for source in leading_to[street]:
+        for source in city.before[street]:
             if chain[street] < CHAIN_M and source not in city.signals and source not in chain:
                 chain[source] = chain[street] + city.length[source]
                 waiting.append(source)

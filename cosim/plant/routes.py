@@ -36,9 +36,8 @@ class TravelTimes:
     def __init__(self, city: City, *, lanes: bool = True):
         """lanes: False in the mesoscopic model"""
         self._lanes = lanes
-        number = {edge: n for n, edge in enumerate(city.edges)}
         moves = [(e, f) for e, after in city.successors.items() for f in after]
-        self.first, self.second = np.array([(number[e], number[f]) for e, f in moves]).T
+        self.first, self.second = np.array([(city.number[e], city.number[f]) for e, f in moves]).T
         self._length = np.array([city.length[edge] for edge in city.edges])
         self._limit = np.array([city.speed[edge] for edge in city.edges])
         self.free, self.free_turns = self._length / self._limit, np.array([city.turn_time[move] for move in moves])
@@ -49,7 +48,7 @@ class TravelTimes:
         over = [(n, inside[edge]) for n, move in enumerate(moves) for edge in city.over.get(move, ()) if edge in inside]
         self._move, self._via = np.array(over, dtype=int).reshape(-1, 2).T
         # Weighted sums: time [veh s] and distance [veh m] on edges, time and ways over [veh] on internal ones.
-        self._spent, self._driven = np.zeros((2, len(number)))
+        self._spent, self._driven = np.zeros((2, len(city.edges)))
         self._crossing, self._crossed = np.zeros((2, len(inside)))
 
     def learn(self, seen: StreetMeans) -> None:

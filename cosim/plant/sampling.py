@@ -44,8 +44,6 @@ class StreetSampler:
 
     def __init__(self, session: Session, city: City):
         self._session, self._city = session, city
-        self._number = {edge: n for n, edge in enumerate(city.edges)}
-        self._region = city.edge_region
         self._inside = {edge: n for n, edge in enumerate(city.inside)}
         self._upstream = sorted({g.from_edge for g in city.gateways})  # gateways may share the edge before them
         self._upstream_of = np.array([self._upstream.index(g.from_edge) for g in city.gateways], dtype=int)
@@ -91,8 +89,8 @@ class StreetSampler:
             duration=self._session.time - self._start,
             vehicles=self._vehicles / samples,
             speed=speed,
-            accumulation=np.bincount(self._region, self._vehicles, self._city.regions) / samples,
-            production=np.bincount(self._region, self._metres, self._city.regions) / samples,
+            accumulation=np.bincount(self._city.edge_region, self._vehicles, self._city.regions) / samples,
+            production=np.bincount(self._city.edge_region, self._metres, self._city.regions) / samples,
             queue=queues.mean(axis=0),
             queue_max=queues.max(axis=0),
             crossing=self._crossing / samples,
@@ -107,4 +105,6 @@ class StreetSampler:
         if 2 * len(vehicles) > len(self._city.edges):
             return list(range(len(self._city.edges))), list(self._inside)
         roads = set(map(self._session.road, vehicles))  # some may be closed to cars
-        return [self._number[road] for road in roads & self._number.keys()], sorted(roads & self._inside.keys())
+        return [self._city.number[road] for road in roads & self._city.number.keys()], sorted(
+            roads & self._inside.keys()
+        )

@@ -66,6 +66,8 @@ class City:
     turn_time: (from_edge, to_edge) -> free-flow time on the junction [s], as far as where a turn waits
     over: (from_edge, to_edge) -> internal edges of this turn, in order; inside: internal edge of a turn -> length [m]
     gateways: sorted by source, target, from_edge, to_edge; signals: edge -> signal at its end
+    number: edge -> its place in `edges`; before: edge -> edges that lead there, sorted
+    edge_region, lane_metres, room: by number, (E,) the region, length times lanes [m], and [veh] at JAM_SPACING
     """
 
     net_file: Path
@@ -84,9 +86,28 @@ class City:
     inside: Mapping[str, float] = field(default_factory=dict)
 
     @cached_property
+    def number(self) -> dict[str, int]:
+        return {edge: n for n, edge in enumerate(self.edges)}
+
+    @cached_property
+    def before(self) -> dict[str, list[str]]:
+        before: dict[str, list[str]] = {edge: [] for edge in self.edges}
+        for edge, after in self.successors.items():
+            for other in after:
+                before[other].append(edge)
+        return before
+
+    @cached_property
     def edge_region(self) -> np.ndarray:
-        """Regions (E,) of the edges."""
         return np.array([self.region_of[edge] for edge in self.edges])
+
+    @cached_property
+    def lane_metres(self) -> PerEdge:
+        return np.array([self.length[edge] * self.lanes[edge] for edge in self.edges])
+
+    @property
+    def room(self) -> PerEdge:
+        return np.maximum(self.lane_metres / JAM_SPACING, 1.0)
 
 
 _Lane: TypeAlias = tuple[float, float, str]  # length [m], speed [m/s], id
@@ -341,24 +362,9 @@ def gateway_movements(city: City) -> dict[str, dict[int, int]]:
     return movements
 
 
-def predecessors(city: City) -> dict[str, list[str]]:
-    """Return edge -> edges that lead there, sorted."""
-    before: dict[str, list[str]] = {edge: [] for edge in city.edges}
-    for edge, after in city.successors.items():
-        for other in after:
-            before[other].append(edge)
-    return before
-
-
-def edge_room(city: City) -> PerEdge:
-    """Return (E,) [veh] that can stand on each edge at JAM_SPACING."""
-    return np.array([max(city.lanes[edge] * city.length[edge] / JAM_SPACING, 1.0) for edge in city.edges])
-
-
 def gateway_room_taken(
     edge_vehicles: Float[np.ndarray, "*intervals E"], city: City
 ) -> Float[np.ndarray, "*intervals G"]:
     """Return (..., G) [-], the share of the room before each gateway that edge_vehicles (..., E) [veh] take."""
-    index = {edge: n for n, edge in enumerate(city.edges)}
-    before = [index[gateway.from_edge] for gateway in city.gateways]
-    return edge_vehicles[..., before] / edge_room(city)[before]
+    before = [city.number[gateway.from_edge] for gateway in city.gateways]
+    return edge_vehicles[..., before] / city.room[before]

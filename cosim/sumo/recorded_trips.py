@@ -164,9 +164,8 @@ def own_flows(
         else:
             legs += [leg for leg in pairs if leg[0] != leg[1]]
     if legs:
-        number = {edge: n for n, edge in enumerate(city.edges)}
         random = np.random.default_rng(PLANNING_SEEDS[0])
-        begin, end = np.array([[number[edge] for edge in leg] for leg in legs]).T
+        begin, end = np.array([[city.number[edge] for edge in leg] for leg in legs]).T
         noise = perception(len(city.edges), random)
         for route in routes_in(city, (begin, end), random.integers(DRIVER_CLASSES, size=len(legs)), noise):
             turns.update(pairwise(route))

@@ -11,7 +11,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from cosim.sumo.arrays import PerEdge, PerMove, PerTrip, TripNumbers
-from cosim.sumo.net import City, predecessors
+from cosim.sumo.net import City
 from nmfd.arrays import PairsOverTime
 from nmfd.errors import InputError
 
@@ -80,14 +80,13 @@ def make_trips(city: City, demand: PairsOverTime, step: float, seed: int) -> Tri
     tastes = rng.integers(DRIVER_CLASSES, size=len(depart))
     positions = rng.random(len(depart))
     noise = perception(len(city.edges), rng)
-    number = {edge: n for n, edge in enumerate(city.edges)}
     first, last = np.empty((2, len(depart)), dtype=int)
     for n, (i, j) in enumerate(zip(origin, destination, strict=True)):
-        first[n] = number[_draw(starts[i], draws[n, 0])]
-        last[n] = number[_draw(goals[j], draws[n, 1])]
+        first[n] = city.number[_draw(starts[i], draws[n, 0])]
+        last[n] = city.number[_draw(goals[j], draws[n, 1])]
     for n in np.flatnonzero(first == last):  # to the next edge instead
         edges, _ = goals[destination[n]]
-        last[n] = number[edges[(edges.index(city.edges[first[n]]) + 1) % len(edges)]]
+        last[n] = city.number[edges[(edges.index(city.edges[first[n]]) + 1) % len(edges)]]
     routes = routes_in(city, (first, last), tastes, noise)
     for n, route in enumerate(routes):
         if len(route) < 2:
@@ -131,12 +130,11 @@ def _departures(
 def _ends(city: City, region: int, *, departing: bool) -> tuple[list[str], np.ndarray]:
     """Return the edges where trips of a region start or end, with cumulated weights: if there are any, good ones."""
     edges = [edge for edge in city.edges if city.region_of[edge] == region]
-    before = predecessors(city)
-    onward: Mapping[str, Sequence[str]] = city.successors if departing else before
+    onward: Mapping[str, Sequence[str]] = city.successors if departing else city.before
     good = [
         edge
         for edge in edges
-        if _stays(city, edge, onward) and city.length[edge] >= SHORT_EDGE_M and not _is_pocket(city, edge, before[edge])
+        if _stays(city, edge, onward) and city.length[edge] >= SHORT_EDGE_M and not _is_pocket(city, edge)
     ]
     ends = good if len(good) >= 2 else edges
     weights = np.cumsum([city.length[edge] * city.lanes[edge] for edge in ends])
@@ -154,8 +152,9 @@ def _stays(city: City, edge: str, onward: Mapping[str, Sequence[str]]) -> bool:
     return any(city.region_of[other] == city.region_of[edge] for other in onward[here])
 
 
-def _is_pocket(city: City, edge: str, before: list[str]) -> bool:
+def _is_pocket(city: City, edge: str) -> bool:
     """Return True for a short piece with more lanes at the end of a road."""
+    before = city.before[edge]
     return (
         len(before) == 1
         and city.length[edge] < POCKET_M
@@ -178,14 +177,13 @@ def routes_in(
     city: City, ends: tuple[TripNumbers, TripNumbers], tastes: TripNumbers, noise: Float[np.ndarray, "classes E"]
 ) -> list[tuple[str, ...]]:
     """Return `fastest_routes` in a city, as ids of edges."""
-    number = {edge: n for n, edge in enumerate(city.edges)}
     moves = [(a, b) for a, after in city.successors.items() for b in after]
     routes = fastest_routes(
         ends,
         tastes,
         noise,
         time=np.array([city.length[edge] / city.speed[edge] for edge in city.edges]),
-        links=np.array([(number[a], number[b]) for a, b in moves], dtype=int).reshape(-1, 2),
+        links=np.array([(city.number[a], city.number[b]) for a, b in moves], dtype=int).reshape(-1, 2),
         turn=np.array([city.turn_time[move] for move in moves]),
     )
     return [tuple(city.edges[edge] for edge in route) for route in routes]
