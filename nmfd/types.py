@@ -112,7 +112,7 @@ class Controls:
 
 @runtime_checkable
 class Plant(Protocol):
-    """City, regional or microscopic. `step` is one control interval."""
+    """City, regional or microscopic. `step` is one control interval. A method `close` releases what it holds."""
 
     def reset(self, seed: int) -> State:
         """Start again from the beginning."""
@@ -122,9 +122,6 @@ class Plant(Protocol):
 
     def observe(self) -> Observation | None:
         """Return the estimate of the plant's own instruments; None without any: the state is measured with noise."""
-
-    def close(self) -> None:
-        """Release all resources; only `reset` may be called afterwards."""
 
 
 @runtime_checkable

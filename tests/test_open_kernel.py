@@ -151,6 +151,6 @@ def test_a_named_policy_takes_a_cost_too(tmp_path):
         ({"constraints": [crowded]}, r"constraints: expected pairs \(function, weight\), got <function crowded"),
     ],
 )
-def test_wrong_parts_are_one_line(given, message):
+def test_wrong_parts_are_one_line(given, message, unchecked):
     with pytest.raises(nmfd.InputError, match=message):
         nmfd.train(ring(), steps=1, progress=False, **{"policy": Linear(ring().network), **given})

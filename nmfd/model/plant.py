@@ -52,9 +52,6 @@ class NmfdPlant:
     def observe(self) -> Observation | None:
         """Return None: controllers observe the state with noise."""
 
-    def close(self) -> None:
-        """Do nothing."""
-
     def _disturb(self) -> float:
         """Add the process noise to each x_ij that is not empty; return the vehicles that it adds in all [veh]."""
         if not self._scenario.process_std:

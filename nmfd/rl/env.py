@@ -18,7 +18,7 @@ from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario, read_scenario
 from nmfd.types import Controls, Observation, Plant
 
-Vector = Float[np.ndarray, " N"]
+Vector, Action = Float[np.ndarray, " N"], Float[np.ndarray, " A"]
 
 NOISE_RANGE = 10.0  # standard deviations of the measurement noise within the observation space
 LOGIT_SCALE = 5.0  # times an action in [-1, 1]: logits of split ratios, up to a factor e^10 between two next regions
@@ -71,7 +71,7 @@ class Interface:
         """Vectors (action_size,) in [-1, 1]."""
         return Box(-1.0, 1.0, (self.action_size,), np.float32)
 
-    def controls(self, action: Vector, where: str = "") -> Controls:
+    def controls(self, action: Action, where: str = "") -> Controls:
         """Return the controls of an action: u_max at the boundaries and theta = 0 in the other regions.
 
         Raises: InputError, which begins with `where`, for NaN
@@ -136,15 +136,15 @@ class RegionalEnv(gymnasium.Env):
         """Begin an episode; without a seed, the next one of the sequence begun by the last seed."""
         return self._clipped(self.begin(seed)), self._info()
 
-    def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict]:
+    def step(self, action: Action) -> tuple[Vector, float, bool, bool, dict]:
         """Advance by one control interval."""
         controls = self.interface.controls(action, f"RegionalEnv: interval {self._k}: ")
         observation, vehicles, over = self.advance(controls)
         return self._clipped(observation), -float(vehicles.sum()) / self.unit, False, over, self._info()
 
     def close(self) -> None:
-        """Close the plant."""
-        self.plant.close()
+        """Close the plant, if it holds anything."""
+        getattr(self.plant, "close", lambda: None)()
 
     def _observe(self) -> Observation:
         noise = self.scenario.measurement_std * self._random.standard_normal(self._state.accumulation.shape)
