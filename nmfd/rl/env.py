@@ -18,7 +18,8 @@ from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario, read_scenario
 from nmfd.types import Controls, Observation, Plant
 
-Vector, Action = Float[np.ndarray, " N"], Float[np.ndarray, " A"]
+Vector = Float[np.ndarray, " N"]
+Action = Float[np.ndarray, " A"]
 
 NOISE_RANGE = 10.0  # standard deviations of the measurement noise within the observation space
 LOGIT_SCALE = 5.0  # times an action in [-1, 1]: logits of split ratios, up to a factor e^10 between two next regions
