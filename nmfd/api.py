@@ -44,9 +44,7 @@ def load_scenario(folder: Path | str, settings: Mapping[str, Any] | None = None)
 
     folder: folder of a scenario.toml, or the name of a shipped scenario (`nmfd show`)
     settings: changes by dotted key, such as {"steps": 12, "controllers.pi-gating.kp": 2.0}
-
-    Raises:
-        InputError: if a file, key or value is wrong
+    Raises: InputError if a file, key or value is wrong
     """
     scenario = read_scenario(folder, settings)
     check_tables(scenario)
@@ -62,8 +60,7 @@ def controller(name: str, scenario: Scenario | Path | str, *, policy: Path | str
         >>> nmfd.controller("pi-gating", "economic_mpc").regions  # protected ones
         array([3])
 
-    Raises:
-        InputError: an unknown name, a wrong option, or a policy that is missing or made for another network
+    Raises: InputError for an unknown name, a wrong option, or a policy that is missing or made for another network
     """
     return parse(name).make(_loaded(scenario), None if policy is None else Path(policy))
 

@@ -26,7 +26,6 @@ class Number(click.FloatRange):
     """Number in a range; NaN is in none."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """Parse a number."""
         number = super().convert(value, param, ctx)
         return number if number == number else self.fail(f"{value!r} is not a number.", param, ctx)
 

@@ -29,7 +29,6 @@ class Fault:
     end: int = FOREVER
 
     def active(self, k: int) -> bool:
-        """Return True if the fault is active in control interval k."""
         return self.begin <= k < self.end
 
 

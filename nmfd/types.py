@@ -201,8 +201,7 @@ class Result:
     def read(cls, path: Path | str) -> "Result":
         """Return the result in the netCDF file `path`.
 
-        Raises:
-            InputError: the file is missing, or damaged
+        Raises: InputError if the file is missing, or damaged
         """
         import xarray
 

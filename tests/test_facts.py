@@ -41,12 +41,12 @@ def test_trips_that_never_began_count_with_what_they_have_waited():
         Trip(1, False, "completed", 0.0, 90.0, 40.0, True),
         Trip(1, False, "waiting", 80.0, 80.0, public=True),
     ]
-    row = simulate.trip_measures(trips)
+    row, by_origin = simulate.trip_measures(trips, 3)
     assert (row["trips"], row["removed_veh"], row["removed_waiting_veh"], row["other_trips"]) == (4, 1, 1, 3)
     assert (row["public_transport_trips"], row["public_transport_delay_s"]) == (2, 40.0)
-    np.testing.assert_array_equal(simulate.time_by_origin(trips, 3), [87.5, 212.5, np.nan])
+    np.testing.assert_array_equal(by_origin, [87.5, 212.5, np.nan])
     assert (row["mean_trip_time_s"], row["mean_departure_delay_s"], row["mean_time_loss_s"]) == (150.0, 107.5, 20.0)
-    nobody = simulate.trip_measures([])
+    nobody, _ = simulate.trip_measures([], 3)
     assert nobody["trips"] == nobody["other_time_spent_veh_s"] == 0 and np.isnan(nobody["mean_trip_time_s"])
 
 
@@ -71,7 +71,7 @@ def run():
 
 def test_time_on_the_road_is_that_of_the_vehicles_seen_second_by_second(run):
     plant, record, running, facts = run
-    trips = plant.trips()
+    trips = plant.meter.trips()
     assert sum(trip.time - trip.departure_delay for trip in trips) == pytest.approx(sum(running))
     assert record.time_spent.sum() == pytest.approx(sum(trip.time for trip in trips))
     assert len(trips) >= record.departures.sum()

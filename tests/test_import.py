@@ -123,7 +123,7 @@ def test_scenario_drives_the_original_vehicles(imported, config):
     assert scenario.demand.sum() * scenario.step == pytest.approx(len(traffic.vehicles), rel=1e-4)
     assert settings(scenario).begin == 600.0 and settings(scenario).ways_return
     with tiny_city.played(scenario, 10, 0.9, scenario.network.nominal_splits) as (plant, measurement, record):
-        due = len(plant.trips())
+        due = len(plant.meter.trips())
         # every car, and the buses: one, and one per 200 s in ten minutes
         assert due == (traffic.depart < 600.0 + 10 * scenario.step - 10).sum() + 1 + 3
         assert record.departures.sum() == due - measurement.backlog.sum()

@@ -90,7 +90,7 @@ def ran(scenario, seed=5, **changes):
     opened = Controls(perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=None, metering=rate)
     plant = SumoPlant(scenario, settings=settings(scenario).changed(**changes))
     plant.reset(seed)
-    states, trips = [plant.step(opened) for _ in range(scenario.steps)], plant.trips()
+    states, trips = [plant.step(opened) for _ in range(scenario.steps)], plant.meter.trips()
     plant.close()
     return states, trips
 

@@ -193,7 +193,7 @@ def test_phases_that_do_not_follow_in_order(net, city):
     assert "no gateway has a signal that perimeter control can use" in said
     assert "branching signal" in (scenario.network.folder / "gateways.csv").read_text()
     with tiny_city.played(scenario, 0, 0.4) as (plant, _, _):
-        assert len(plant.leaks()) == len(plant.city.gateways) > 0
+        assert len(plant.actuation.leaks()) == len(plant.city.gateways) > 0
 
 
 def test_cycles_shorter_than_half_a_second(net, tmp_path):

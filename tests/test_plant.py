@@ -52,7 +52,7 @@ def test_open_gateways_leave_sumo_alone(scenario, plant_of):
         plant.reset(1)
         if not actuated:
             plant.session.set_signal_state = None  # would fail if anything were played
-            plant._actuation._controls.clear()
+            plant.actuation._controls.clear()
         states = []
         step = plant.session.step
         plant.session.step = lambda step=step, states=states, session=plant.session: (

@@ -67,7 +67,7 @@ def drive(folder, gates, faults=(), **overrides):
         return SimpleNamespace(
             shown=shown,
             record=SimpleNamespace(**plant.record()),
-            leaks=plant.leaks(),
+            leaks=plant.actuation.leaks(),
             gateways=plant.city.gateways,
             programmes={name: plant.session.programme_id(name) for name in shown},
         )

@@ -77,7 +77,7 @@ def proven(folder, words, intervals, tmp_path):
             u = network.u_min + share * (network.u_max - network.u_min)
             rate = random.uniform(0.0, 1.0, network.regions)
             plant.step(Controls(perimeter=np.where(network.adjacency, u, 0.0), splits=None, metering=rate))
-        end, observed = plant.session.time, plant.signal_states()
+        end, observed = plant.session.time, plant.actuation.states
     finally:
         plant.close()
     states = {}

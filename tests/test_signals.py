@@ -43,7 +43,7 @@ def driven(scenario):
     def run(u, **overrides):
         plant = SumoPlant(scenario, settings=Settings(**overrides))
         try:
-            return *drive(plant, scenario, 4, u=u), plant.leaks()
+            return *drive(plant, scenario, 4, u=u), plant.actuation.leaks()
         finally:
             plant.close()
 

@@ -127,5 +127,5 @@ def played(scenario: Scenario, intervals: int, gates: float, splits: np.ndarray 
 def driven(scenario: Scenario, intervals: int, gates: float, **overrides) -> tuple:
     """(trips due, departures, arrivals, accumulation, backlog) of `played` with nominal split ratios."""
     with played(scenario, intervals, gates, scenario.network.nominal_splits, **overrides) as (plant, state, record):
-        due, inside = len(plant.trips()), state.accumulation.sum()
+        due, inside = len(plant.meter.trips()), state.accumulation.sum()
         return due, record.departures.sum(), record.arrivals.sum(), inside, state.backlog.sum()

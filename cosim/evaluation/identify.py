@@ -118,7 +118,11 @@ def _identify(
     if (guided or options) and target.resolve() == own.resolve():
         what = f"--with: {loaded.name} runs on {target}, the model of its own drivers and signals"
         raise InputError(f"{what}; name another folder with --network")
-    _check_target(target, own)
+    if shipped.installed(target):
+        shipped.beside(own, "network.toml", "another folder with --network")
+    there = next(folder for folder in (target, *target.absolute().parents) if folder.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK):  # before hours of loading
+        raise InputError(f"--network: {there} is no folder that can be written to; choose another")
     if protect:
         shipped.beside(loaded.folder or Path(), "scenario.toml", "a scenario of your own")
     stages = ("route-guidance", "probing-pcrg") if guided else ("no-control", "probing-pc")
@@ -201,15 +205,6 @@ def _protected(scenario: Scenario, regions: tuple[int, ...], *, write: bool) -> 
 def _named(progress: Callable[..., None] | None, stage: str) -> Callable[..., None] | None:
     """Return a progress function whose notes begin with the stage."""
     return progress and (lambda done, total, note="": progress(done, total, stage + note))
-
-
-def _check_target(target: Path, own: Path) -> None:
-    """Raise InputError for a target that cannot be written, before hours of loading."""
-    if shipped.installed(target):
-        shipped.beside(own, "network.toml", "another folder with --network")
-    there = next(folder for folder in (target, *target.absolute().parents) if folder.exists())
-    if not there.is_dir() or not os.access(there, os.W_OK):
-        raise InputError(f"--network: {there} is no folder that can be written to; choose another")
 
 
 def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool) -> RegionalModel:

@@ -59,9 +59,7 @@ def compare(found: Finished, model: Path | None = None) -> pd.DataFrame:
     """Draw the runs of a folder beside predictions; return the errors by strategy, demand level and region.
 
     model: folder of the predicting network; None for that with which each controller plans
-
-    Raises:
-        InputError: if the city has changed since the runs.
+    Raises: InputError if the city has changed since the runs
     """
     found.map()
     tables = []

@@ -34,7 +34,6 @@ class Level:
         return [self.read(row.controller, row.seed) for row in rows.itertuples()]
 
     def read(self, controller: str, seed: int) -> Result:
-        """Return a run. Raise InputError if it is missing."""
         return read_run(self.folder, controller, seed)
 
 

@@ -51,7 +51,6 @@ class Simulation:
     trip_file: Path | None = None
 
     def __call__(self) -> Result:
-        """Return `simulate` of it."""
         return simulate(self)
 
 
@@ -83,18 +82,18 @@ def simulate(
         result = result.assign(controller=strategy.name, plant="sumo").add({}, RECORD, **plant.record())
         if gui:
             return result
-        plant_facts, leaks, emissions = plant.facts(), set(plant.leaks()), plant.trip_facts()
+        plant_facts, leaks, emissions = plant.facts(), set(plant.actuation.leaks()), plant.trip_facts()
         programmes, end = own_files(scenario, chosen.additional), chosen.begin + scenario.steps * scenario.step
-        sheet = proof_sheet(plant.signal_states(), [plant.city.net_file, *programmes], end=end, step=chosen.step_length)
-        trips, totals = plant.trips(), plant.edge_totals()
-        totals["trip_time_by_origin"] = time_by_origin(trips, plant.city.regions)
+        shown, files, totals = plant.actuation.states, [plant.city.net_file, *programmes], plant.edge_totals()
+        sheet = proof_sheet(shown, files, end=end, step=chosen.step_length)
+        measures, totals["trip_time_by_origin"] = trip_measures(plant.meter.trips(), plant.city.regions)
         result = settled(result.add({}, {**RECORD, **SHEET, **TOTALS}, **plant.record(), **sheet, **totals))
         facts = {
             "scenario": job.scenario.name,
             "scenario_folder": str(scenario.folder or ""),
             "demand": float(job.demand),
             **plant_facts,
-            **trip_measures(trips),
+            **measures,
             **emissions,
             "teleports": int(result.teleports.sum()),
             "signal_violations": int(sum(sheet[name].sum() for name in VIOLATIONS)),
@@ -119,14 +118,17 @@ def regional_outflow(record: Mapping[str, np.ndarray] | Result, step: float) -> 
     return (record["arrivals"] + record["crossings"].sum(axis=(2, 3))) / step
 
 
-def trip_measures(trips: Sequence[Trip]) -> dict[str, float]:
-    """Return counts and times [s] of the trips that were due: of private vehicles, and apart of others."""
+def trip_measures(trips: Sequence[Trip], regions: int) -> tuple[dict[str, float], PerRegion]:
+    """Return counts and times [s] of the trips that were due: of private vehicles, and apart of others.
+
+    And the mean time (R,) [s] of the private ones by region of origin; NaN without any.
+    """
     table = pd.DataFrame(trips, columns=Trip._fields).astype(Trip.__annotations__)
     private, other = table[table["private"]], table[~table["private"]]
     count = Counter(private["outcome"])
     entered = table[table["outcome"].isin((COMPLETED, REMOVED, UNDER_WAY))]
     public, entered = entered[entered["public"]], entered[entered["private"]]
-    return {
+    row = {
         "trips": len(private),
         "departed_veh": len(entered),
         "completed_veh": count[COMPLETED],
@@ -146,12 +148,7 @@ def trip_measures(trips: Sequence[Trip]) -> dict[str, float]:
         "other_time_spent_veh_s": other["time"].sum(),
         "other_departure_delay_veh_s": other["departure_delay"].sum(),
     }
-
-
-def time_by_origin(trips: Sequence[Trip], regions: int) -> PerRegion:
-    """Return the mean time (R,) [s] of private trips that were due, by region of origin; NaN without any."""
-    table = pd.DataFrame(trips, columns=Trip._fields).astype(Trip.__annotations__)
-    return table[table["private"]].groupby("origin")["time"].mean().reindex(range(regions)).to_numpy()
+    return row, private.groupby("origin")["time"].mean().reindex(range(regions)).to_numpy()
 
 
 def queue_facts(result: Result, city: City) -> dict[str, float]:

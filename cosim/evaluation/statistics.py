@@ -33,7 +33,6 @@ class Paired(NamedTuple):
 
     @property
     def excludes_zero(self) -> bool:
-        """True if the interval excludes zero."""
         return abs(self.percent) > self.percent_half  # never with a single seed
 
 

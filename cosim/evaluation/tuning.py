@@ -65,7 +65,6 @@ class Tuning:
     search_seed: int = 0
 
     def __post_init__(self) -> None:
-        """Check the options. Raise InputError."""
         for name, (low, high) in self.options.items():
             if not (OPTION.fullmatch(name) and -math.inf < low < high < math.inf):
                 raise InputError(
@@ -77,7 +76,6 @@ class Tuning:
 
     @cached_property
     def space(self) -> dict[str, Range]:
-        """Option -> its distribution."""
         declared = self.strategy.controller.options.model_fields
         return {
             name: IntDistribution(math.ceil(low), math.floor(high))
@@ -123,7 +121,6 @@ class Tuning:
         return point
 
     def policy(self, number: int) -> Path:
-        """Return the policy file of a candidate."""
         return self.out / "policies" / f"{number:03d}.pt"
 
 

@@ -56,9 +56,7 @@ def assign(
 
     net: an absolute path; elements: the vehicle types, and the vehicles by departure
     iterations: at most, one or more; mesoscopic: the city is driven in the mesoscopic model
-
-    Raises:
-        InputError: with SUMO's own words if it refuses.
+    Raises: InputError with SUMO's own words if it refuses
     """
     with temporary_folder() as folder:
         root = ElementTree.Element("routes")

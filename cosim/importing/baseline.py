@@ -103,9 +103,7 @@ def averaged_runs(
     files: routes of the demand, background and additional -> names of files in the folder
     times: SUMO's options begin, end [s], and all others that change the traffic
     factor: multiplies the demand [-]; seed 0 departs as recorded
-
-    Raises:
-        InputError: with SUMO's own words if it refuses.
+    Raises: InputError with SUMO's own words if it refuses
     """
     begin, end = float(times["begin"]), float(times["end"])
     background, additional = ([folder / name for name in files[key]] for key in ("background", "additional"))

@@ -86,9 +86,7 @@ def sumo_input(source: Path | Box, progress: Progress) -> Iterator[SumoInput]:
     """Provide the simulation of a source; a network that is built for it goes at the end of the block.
 
     source: a sumocfg, a net.xml(.gz), a file of OpenStreetMap, or a box of it
-
-    Raises:
-        InputError: for a source that cannot be read, or no answer for a box.
+    Raises: InputError for a source that cannot be read, or no answer for a box
     """
     if isinstance(source, Path) and source.suffix == ".pbf":
         osm = source.stem.removesuffix(".osm")

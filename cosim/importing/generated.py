@@ -25,9 +25,7 @@ def morning_peak(streets: Streets, *, level: float, begin: float, seed: int) -> 
     """Generate trips on the largest part of the network in which every edge can be reached from every other.
 
     level: 1 keeps PEAK_DENSITY under way if vehicles meet no queue; begin: of the peak [s]
-
-    Raises:
-        InputError: for a network that is too small.
+    Raises: InputError for a network that is too small
     """
     if (count := streets.core.sum()) < 4:
         raise InputError(f"{streets.path}: only {count} streets can be reached from each other; give vehicles instead")
@@ -88,7 +86,6 @@ class _Ends:
         self._central = weight * np.exp(-0.5 * (self._distance / (0.3 * radius)) ** 2)
 
     def draw(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Draw the edges where trips begin and end."""
         kind = self._random.random(count)
         inward, through = kind < INWARD_SHARE, (kind >= INWARD_SHARE) & (kind < INWARD_SHARE + THROUGH_SHARE)
         first = self._random.choice(self._all, size=count)

@@ -71,9 +71,7 @@ def import_city(
     begin, end: time window, in seconds or as h:m:s, instead of the sumocfg's
     seeds: runs without control whose densities are averaged
     iterations: of the assignment of the peak
-
-    Raises:
-        InputError: for input that cannot be used; nothing is written then.
+    Raises: InputError for input that cannot be used; nothing is written then
     """
     count = int(str(regions)) if str(regions).isdecimal() else None
     if count is not None and count < 2:

@@ -36,7 +36,6 @@ class Clock:
 
     @property
     def end(self) -> float:
-        """End of the last control interval [s], in SUMO's time."""
         return self.begin + self.steps * self.step
 
 

@@ -68,9 +68,7 @@ def partition(
 
     regions: requested number; fewer result if clusters cannot be reached from each other
     uncontrollable: signals that perimeter control cannot use
-
-    Raises:
-        InputError: if the network has too few streets for the requested regions.
+    Raises: InputError if the network has too few streets for the requested regions
     """
     blocks = make_blocks(streets)
     count = len(blocks.weight)

@@ -61,12 +61,10 @@ class Streets:
 
     @cached_property
     def number(self) -> dict[str, int]:
-        """Number of an edge in `edges`."""
         return {edge: n for n, edge in enumerate(self.edges)}
 
     @property
     def lane_metres(self) -> PerEdge:
-        """Length times lanes for cars (E,) [m]."""
         return self.length * self.lanes
 
     @cached_property

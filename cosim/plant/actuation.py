@@ -127,9 +127,7 @@ class Actuation:
 
     def pressure_facts(self) -> dict[str, float]:
         """Return max_pressure.FACTS of this run; NaN without max-pressure."""
-        if self._pressure is None:
-            return dict.fromkeys(FACTS, float("nan"))
-        return self._pressure.facts(self._session.time)
+        return self._pressure.facts(self._session.time) if self._pressure else dict.fromkeys(FACTS, float("nan"))
 
     def leaks(self) -> list[Gateway]:
         """Return the gateways that no command reaches."""

@@ -128,7 +128,6 @@ class Estimation:
         self._departed = meter.probe_departures.copy()
 
     def sample(self) -> None:
-        """Read all loops."""
         occupancy = self._session.loop_occupancy
         self._occupancy += [occupancy(loop) for loop in self._loops]
         self._samples += 1

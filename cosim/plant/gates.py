@@ -150,7 +150,6 @@ class Ration:
 
     @property
     def limited(self) -> bool:
-        """Return True if this cycle limits the green."""
         return self._budget < NEVER
 
     @property
@@ -178,7 +177,6 @@ class Ration:
         return self._green_time + (now - self._since if self._light in GREEN else 0.0)
 
     def opened(self, now: float) -> bool:
-        """Return True if the link turned green just now."""
         return self._open and self._opened_at >= now - 1e-6
 
     def _filter(self, light: str, now: float, lasting: bool) -> tuple[str, float]:

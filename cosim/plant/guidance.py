@@ -321,7 +321,6 @@ class Guide:
         return float(time[way[1:]].sum() + self._times.turns[[self._move[pair] for pair in pairwise(way)]].sum())
 
     def _regions(self, way: list[int]) -> list[int]:
-        """Return the regions along a way."""
         return [region for region, _ in groupby(map(self._region.__getitem__, way))]
 
     def _keeps(self, present: _Present, cost: float, following: int | None = None) -> bool:

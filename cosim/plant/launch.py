@@ -91,7 +91,6 @@ class Launch:
         return recorded.own_flows(self._city, self._recorded, self._shared_routes, self._scenario.demand_factor)
 
     def close(self) -> None:
-        """Remove the temporary folder."""
         self._temporary.cleanup()
 
     def _options(self) -> list[str]:

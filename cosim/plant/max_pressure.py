@@ -303,7 +303,6 @@ class Approaches:
         self._last_green = np.full(self.serves.shape[1], now)
 
     def observe(self, state: str, now: float) -> None:
-        """Note the state at `now` [s]."""
         self._last_green[_green(state)] = now
 
     def waiting(self, present: np.ndarray, closed: Collection[int]) -> np.ndarray:

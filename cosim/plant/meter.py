@@ -293,7 +293,6 @@ class Meter:
         return waiting
 
     def _settle(self, ends: Iterable[End]) -> None:
-        """Book ends of trips."""
         for end in ends:
             if end.vehicle not in self._gone:  # removed by another program, which SUMO does not call arrived
                 if end.vehicle not in self._vehicles:
@@ -313,7 +312,6 @@ class Meter:
         )
 
     def _book(self, gone: _Vehicle, end: End) -> None:
-        """Book the end of a vehicle."""
         self._end(_trip(gone, REMOVED if end.reason else COMPLETED, end.time, end.time_loss))
         i, j = gone.region, gone.destination
         h = self._city.region_of.get(end.edge, i if end.reason else j)

@@ -47,7 +47,6 @@ class Metering:
         self._before = accumulation
 
     def play(self) -> None:
-        """Begin the trips that are due and allowed."""
         now, depart, origin = self._session.time, self._trips.depart, self._trips.origin
         while self._due < len(depart) and depart[self._due] <= now:
             self._queues[origin[self._due]].append(self._due)

@@ -11,7 +11,7 @@ from cosim.plant.detectors import READING_PERIOD_S, Estimation, instruments, lay
 from cosim.plant.guidance import Guide
 from cosim.plant.incidents import Incidents
 from cosim.plant.launch import Launch
-from cosim.plant.meter import Meter, Trip
+from cosim.plant.meter import Meter
 from cosim.plant.metering import Metering
 from cosim.plant.programmes import city_signals
 from cosim.plant.record import Recorder
@@ -20,7 +20,7 @@ from cosim.plant.settings import ESTIMATE, MAX_PRESSURE, Settings, check_lanes
 from cosim.plant.settings import settings as settings_of
 from cosim.plant.stuck import Junctions
 from cosim.sumo.arrays import PerEdge
-from cosim.sumo.net import City, Gateway, check_adjacency, city_of
+from cosim.sumo.net import City, check_adjacency, city_of
 from cosim.sumo.outputs import TripReader, edge_emissions
 from cosim.sumo.session import Session
 from nmfd.model.planning import PlanningModel, planning_model
@@ -47,6 +47,7 @@ class SumoPlant:
     """A SUMO simulation of the scenario's city (nmfd.types.Plant).
 
     city: its edges, regions and gateways; steered, other_signals: see programmes.city_signals
+    meter, actuation: of the run; after `trip_facts` all trips have their whole time losses
     """
 
     def __init__(
@@ -91,7 +92,7 @@ class SumoPlant:
             self._metering = Metering(session, held, critical, level=settings.metering, step=scenario.step)
         estimated = settings.measurement == ESTIMATE
         known = probes(self._launch.vehicles, settings.probe_share if estimated else 0.0, seed)
-        self._meter = meter = Meter(session, city, known, self._trips if session.flush else None, self._metering)
+        self.meter = meter = Meter(session, city, known, self._trips if session.flush else None, self._metering)
         self._estimation = None
         if estimated:
             self._estimation = Estimation(session, city, self._layout, meter, self._instruments, self._planning)
@@ -109,12 +110,12 @@ class SumoPlant:
             random=np.random.default_rng([seed, GUIDANCE]),
         )
         flows = self._launch.turning_flows() if settings.signals == MAX_PRESSURE else None
-        self._actuation = Actuation(
+        self.actuation = Actuation(
             session, city, scenario.network, scenario.step, settings, self.steered, self._incidents, flows
         )
         self._junctions = None if settings.mesoscopic else Junctions(session, city)
         self._state = meter.state(0, 0.0)
-        self._recorder = Recorder(meter, self._guide, self._actuation)
+        self._recorder = Recorder(meter, self._guide, self.actuation)
         self._observer.began(city, self._state)
         return self._state
 
@@ -126,7 +127,7 @@ class SumoPlant:
             min(max(1, round(seconds / session.step_length)), steps) for seconds in (READING_PERIOD_S, SAMPLE_PERIOD_S)
         )
         self._incidents.begin(self._k)
-        self._actuation.command(controls.perimeter, self._sampler.last[0])
+        self.actuation.command(controls.perimeter, self._sampler.last[0])
         splits = controls.splits
         if controls.prices is not None or (splits is None and self._settings.guided):  # by travel times alone
             splits = scenario.network.nominal_splits
@@ -136,24 +137,24 @@ class SumoPlant:
         if self._junctions:
             self._junctions.free()
         for n in range(1, steps + 1):
-            self._actuation.play()
+            self.actuation.play()
             if self._metering:
                 self._metering.play()
             session.step()
-            self._actuation.observe()
-            events = self._meter.observe()
+            self.actuation.observe()
+            events = self.meter.observe()
             if self._estimation and n % reading == 0:
                 self._estimation.sample()
             if n % sampling == 0:
                 self._sampler.sample()
                 if n < steps:
-                    self._actuation.update(self._sampler.last[0])
+                    self.actuation.update(self._sampler.last[0])
                 self._observer.sampled(session.time, *self._sampler.last)
             self._guide.apply(events)
         self._k += 1
-        state = self._meter.state(self._k, self._k * scenario.step)
+        state = self.meter.state(self._k, self._k * scenario.step)
         self._streets = streets = self._sampler.finish(self._incidents.closed)
-        realised = self._actuation.realised()
+        realised = self.actuation.realised()
         if self._estimation:
             self._estimation.update(controls if realised is None else replace(controls, perimeter=realised))
         self._state = replace(state, problem=self._incidents.problem(), realised=realised)
@@ -189,7 +190,7 @@ class SumoPlant:
             "signals_left_alone": len(self.other_signals),
             "freed_veh": 0 if self._junctions is None else self._junctions.freed,
             "led_on_veh": self._guide.led_on,
-            **self._actuation.pressure_facts(),
+            **self.actuation.pressure_facts(),
         }
 
     def trip_facts(self) -> dict[str, float]:
@@ -200,7 +201,7 @@ class SumoPlant:
         followed = self.session.flush is not None
         self._end_session()
         if followed:
-            self._meter.close_books()
+            self.meter.close_books()
         else:
             self._trips.finish()
         self._recorder.close()
@@ -215,18 +216,6 @@ class SumoPlant:
         for (_, edge), turn in self.city.over.items():
             co2[edge] += sum(emitted.get(inside, 0.0) for inside in turn)
         return {"co2": np.array([*co2.values()], np.float32), "queue_max": self._sampler.longest_queue.astype(np.int32)}
-
-    def trips(self) -> list[Trip]:
-        """Return all trips that were due; after `trip_facts` with their whole time losses."""
-        return self._meter.trips()
-
-    def signal_states(self) -> dict[str, list[tuple[float, str]]]:
-        """Return signal -> time [s] and state at every change since the reset."""
-        return self._actuation.states
-
-    def leaks(self) -> list[Gateway]:
-        """Return the gateways that no command reaches."""
-        return self._actuation.leaks()
 
     @property
     def session(self) -> Session:

@@ -59,7 +59,6 @@ class StreetSampler:
         self._queues: list[list[int]] = []
 
     def sample(self) -> None:
-        """Take one sample."""
         streets, crossed = self._travelled()
         session, edges = self._session, self._city.edges
         counts, speeds, routing = np.zeros((3, len(edges)))

@@ -49,7 +49,6 @@ class Programme:
 
     @property
     def cycle(self) -> float:
-        """Return the cycle time [s]."""
         return sum(phase.duration for phase in self.phases)
 
 

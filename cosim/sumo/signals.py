@@ -46,7 +46,6 @@ class Signal:
 
     @property
     def stages(self) -> tuple[int, ...]:
-        """Return the numbers of the phases that are stages."""
         return tuple(n for n, phase in enumerate(self.phases) if is_stage(phase.state))
 
 

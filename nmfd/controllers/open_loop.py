@@ -33,7 +33,6 @@ class Plan:
 
     @property
     def name(self) -> str:
-        """Name of the controller."""
         return "bound-pc" if self.splits is None else "bound-pcrg"
 
     def reset(self, seed: int = 0) -> None:

@@ -133,7 +133,6 @@ class Strategy:
 
     @property
     def metered(self) -> bool:
-        """True if trips may wait outside."""
         return bool(self.city.get("metering"))
 
     def regional(self) -> "Strategy":

@@ -261,7 +261,6 @@ def _loss(
 
 
 def _descend(policy: nn.Module, loss: torch.Tensor, optimizer: Adam, setup: Training, step: int) -> None:
-    """Do one Adam step."""
     if not loss.requires_grad:
         raise InputError("cost: has no gradient by the weights of the policy; compute it from the run with torch")
     optimizer.zero_grad()

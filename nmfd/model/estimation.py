@@ -131,7 +131,6 @@ class Estimator:
         self.reset()
 
     def reset(self) -> None:
-        """Return to an empty network."""
         self._k, self._seen = 0, list[np.ndarray]()
         variance = torch.cat([self._spread**2, torch.full((self._cells,), FLOOR, dtype=torch.float64)])
         probes = np.zeros((self._regions, self._regions))

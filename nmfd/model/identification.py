@@ -77,7 +77,6 @@ class _Model(torch.nn.Module):
         return self.free_rate.exp(), first, drop - first, self.jam.exp()
 
     def regional(self) -> dynamics.Parameters:
-        """Return the parameters of the regional model."""
         c, first, second, jam = self.shape()
         rates = EXIT_RATES ** torch.tanh(self.exit_rates)
         rates = torch.minimum(rates, 0.999 * self._fastest / c.unsqueeze(-1))

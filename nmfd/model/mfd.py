@@ -147,7 +147,6 @@ class PiecewiseLinear(Mfd):
 
     @property
     def jam(self) -> Any:
-        """Jam accumulation [veh]."""
         return self.accumulations[-1]
 
     def rate_up_to_jam(self, accumulation: Any, xp: Any = np) -> Any:
@@ -253,7 +252,6 @@ def fit(accumulation: Samples, outflow: Samples, *, max_rate: float = np.inf, bi
 
 
 def _fit_cubic(x: np.ndarray, g: np.ndarray, jam: float, max_rate: float) -> Cubic:
-    """Fit a curve with a given jam accumulation."""
     from scipy.optimize import minimize  # slow to import
 
     # Scaled: g = (A y^2 + B y + C) y with y = x / jam, at most 1. Falling: B <= 0 and 2 A + B <= 0 (q' is linear).

@@ -26,7 +26,6 @@ class NmfdPlant:
         self._build()
 
     def reset(self, seed: int) -> State:
-        """Return to the start of the scenario."""
         self._k, self._entered, self._ended = 0, float(self._scenario.start.sum()), 0.0
         self._random = np.random.default_rng([seed, 0x70726F63])
         self._backlog = torch.zeros(self._scenario.demand.shape[1:], dtype=torch.float64)

@@ -76,7 +76,6 @@ class RegionalModel:
 
     @property
     def regions(self) -> int:
-        """R."""
         return len(self.region_names)
 
     @property
@@ -176,7 +175,6 @@ class MfdTable(Settings):
 
     @property
     def mfd(self) -> Cubic:
-        """The curve."""
         return Cubic(**vars(self))
 
 

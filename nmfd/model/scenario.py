@@ -214,7 +214,9 @@ def read_scenario(folder: Path | str, settings: Mapping[str, Any] | None = None)
     path = folder / "scenario.toml"
     tables = read_tables(folder)
     for key, value in (settings or {}).items():
-        tables = _completed(_nested(key, value), tables)
+        for part in reversed(re.findall(r'"[^"]*"|[^.]+', key)):  # parts with dots stand in double quotes
+            value = {part.strip('"'): value}
+        tables = _completed(value, tables)
     table = config.checked(ScenarioTable, tables, path)
     network = load_network(folder / table.network)
     check_step(network, table.step / table.substeps, str(path))
@@ -269,13 +271,6 @@ def _relocate(own: dict, folder: Path, here: Path) -> None:
     for options in controllers.values() if isinstance(controllers, dict) else ():
         if isinstance(options, dict) and isinstance(options.get("model"), str):
             options["model"] = seen(options["model"], shipped.NETWORK)
-
-
-def _nested(key: str, value: Any) -> dict:
-    """Return {"a": {"b": value}} of the key a.b; parts with dots stand in double quotes."""
-    for part in reversed(re.findall(r'"[^"]*"|[^.]+', key)):
-        value = {part.strip('"'): value}
-    return value
 
 
 def _completed(content: dict, base: dict) -> dict:

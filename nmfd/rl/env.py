@@ -138,7 +138,6 @@ class RegionalEnv(gymnasium.Env):
         return self._clipped(self.begin(seed)), self._info()
 
     def step(self, action: Action) -> tuple[Vector, float, bool, bool, dict]:
-        """Advance by one control interval."""
         controls = self.interface.controls(action, f"RegionalEnv: interval {self._k}: ")
         observation, vehicles, over = self.advance(controls)
         return self._clipped(observation), -float(vehicles.sum()) / self.unit, False, over, self._info()

@@ -8,7 +8,6 @@
 
 import atexit
 import json
-import math
 import multiprocessing
 import os
 import platform
@@ -18,7 +17,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 import traceback
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, as_completed
@@ -49,7 +47,7 @@ if TYPE_CHECKING:
 
 MANIFEST, TABLE, LOCK = "manifest.json", "runs.csv", ".lock"
 DASK_PATIENCE_S = 10.0  # for the scheduler to answer
-POLL_S, EXIT_S = 0.2, 5.0  # between looks at the time limit; for a process to end after its outcome
+POLL_S, EXIT_S = 0.2, 5.0  # longest wait: Windows lets Ctrl-C through after it; for a process to end after its outcome
 PRELOADED = "xarray", "dask.array"  # which a Result imports, if they are there
 STARTING = threading.Lock()  # held while a process starts
 SERVED: set[str] = set()  # modules of the jobs that the server has imported
@@ -85,7 +83,6 @@ def run_many(
     *,
     workers: int = 1,
     scheduler: str | None = None,
-    time_limit: float | None = None,
     progress: Progress = None,
 ) -> "pd.DataFrame":
     """Do the `runs` whose files are not in the folder `out`, and return one row per run.
@@ -96,11 +93,8 @@ def run_many(
     workers: runs at a time, each in a process of its own; 0: one after the other in this process
     scheduler: address of a Dask scheduler, whose workers do the runs; it takes TLS certificates from Dask's own
         configuration
-    time_limit: wall time of a run (s), in processes only
     progress: None for a bar, False for none, or a function of done, total and the name of a run
-
-    Raises:
-        InputError: another process has the folder, or it is not a folder of runs
+    Raises: InputError if another process has the folder, or it is not a folder of runs
     """
     out = Path(out)
     with locked(out):
@@ -108,7 +102,7 @@ def run_many(
         rows = {file: _row(file, result) for file, key in keys.items() if (result := _finished(out / file, key))}
         todo = [run for run in runs if run.file not in rows]
         try:
-            with watched("runs", progress) as show, closing(_outcomes(todo, workers, scheduler, time_limit)) as ended:
+            with watched("runs", progress) as show, closing(_outcomes(todo, workers, scheduler)) as ended:
                 if show and todo:
                     show(0, len(todo))
                 for done, (run, outcome) in enumerate(ended, 1):
@@ -146,46 +140,42 @@ def attempt(job: Callable[[], Result | str]) -> Result | str:
         return f"{type(error).__name__}: {error} ({Path(last.filename).name}:{last.lineno})"
 
 
-def _outcomes(
-    todo: Sequence[Run], workers: int, scheduler: str | None, time_limit: float | None
-) -> Generator[tuple[Run, Result | str]]:
+def _outcomes(todo: Sequence[Run], workers: int, scheduler: str | None) -> Generator[tuple[Run, Result | str]]:
     """Yield every run with its result or the reason of its failure, as they end."""
     if scheduler is not None and todo:
         with _dask(scheduler) as executor:
-            futures = {executor.submit(_alone, run.job, os.getcwd(), time_limit): run for run in todo}
+            futures = {executor.submit(_alone, run.job, os.getcwd()): run for run in todo}
             for future in as_completed(list(futures)):
                 run = futures.pop(future)  # with its result, which may be large
                 yield run, attempt(future.result)
     elif workers == 0:
         yield from ((run, attempt(run.job)) for run in todo)
     else:
-        yield from processes(todo, workers, time_limit)
+        yield from processes(todo, workers)
 
 
-def _alone(job: Callable[[], Result | str], folder: str, time_limit: float | None) -> Result | str:
+def _alone(job: Callable[[], Result | str], folder: str) -> Result | str:
     """Do `job` in a new process in `folder`, from a worker of Dask."""
     multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]  # may have a child
-    return list(processes([Run("", {}, job)], 1, time_limit, folder))[0][1]
+    return list(processes([Run("", {}, job)], 1, folder))[0][1]
 
 
-def processes(
-    todo: Sequence[Run], workers: int, time_limit: float | None = None, folder: str = ""
-) -> Generator[tuple[Run, Any]]:
+def processes(todo: Sequence[Run], workers: int, folder: str = "") -> Generator[tuple[Run, Any]]:
     """Yield every run with its outcome from a process of its own in `folder`, `workers` at a time."""
-    waiting, live = list(reversed(todo)), dict[connection.Connection, tuple[Run, BaseProcess, float]]()
+    waiting, live = list(reversed(todo)), dict[connection.Connection, tuple[Run, BaseProcess]]()
     try:
         while waiting or live:
             while waiting and len(live) < workers:
                 channel, process = _start(waiting[-1].job, os.path.abspath(folder))
-                live[channel] = waiting.pop(), process, time.monotonic() + (time_limit or math.inf)
+                live[channel] = waiting.pop(), process
                 with suppress(BrokenPipeError):  # it has died, which is an outcome
                     channel.send(live[channel][0].job)
-            ready, now = connection.wait(live, POLL_S), time.monotonic()
-            for channel in [one for one, (_, _, end) in live.items() if one in ready or now > end]:
+            ready = connection.wait(live, POLL_S)
+            for channel in [one for one in live if one in ready]:
                 outcome = _outcome(channel, live[channel][1])
                 yield live.pop(channel)[0], outcome
     finally:  # after Ctrl-C there are some
-        for _, process, _ in live.values():
+        for _, process in live.values():
             process.kill()
             process.join()
 
@@ -251,9 +241,6 @@ def _work(channel: connection.Connection, folder: str, environment: Mapping[str,
 
 def _outcome(channel: connection.Connection, process: BaseProcess) -> Result | str:
     """Return what comes through `channel`, or why nothing does; wait for the end of the process."""
-    if not channel.poll():
-        process.kill()
-        return "not finished within the time limit"
     try:
         return channel.recv()
     except (EOFError, OSError):

@@ -30,9 +30,7 @@ def found(name: Path | str, *kinds: str, beside: Path | None = None) -> Path:
 
     name: a path, from `beside` if given, or the name of a folder of the package, or a path below it
         (grid7_peak/dpc-pc.pt). A path to nothing is returned unchanged
-
-    Raises:
-        InputError: a single word that names nothing
+    Raises: InputError for a single word that names nothing
     """
     path, word = Path(name) if beside is None else beside / name, Path(name)
     if os.path.isfile(path) or any(os.path.exists(path / f"{kind}.toml") for kind in kinds):
@@ -62,9 +60,7 @@ def beside(folder: Path, file: str, option: str, *, scenario: bool = False) -> P
     """Return the path of `file` in `folder`.
 
     option: names another place; scenario: True if the user's own scenario may be based on `folder` instead
-
-    Raises:
-        InputError: the folder cannot be written to, or is of the installed package
+    Raises: InputError if the folder cannot be written to, or is of the installed package
     """
     remedy = f"give {option}"
     if scenario:

@@ -77,8 +77,7 @@ def key_of(
 ) -> Callable[[str], dict]:
     """Return the function that gives everything the runs of a controller depend on.
 
-    Raises:
-        InputError: a controller cannot be made, or the regional model has no such fault
+    Raises: InputError if a controller cannot be made, or the regional model has no such fault
     """
     for fault in scenario.ordered_faults:
         if fault.kind in faults.CITY:

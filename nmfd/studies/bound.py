@@ -195,8 +195,7 @@ def lower_bound(scenario: Scenario, *, guidance: bool) -> float:
 
     It is the value of the dual solution, which is a bound even if the solver stops short of the optimum.
 
-    Raises:
-        InputError: the plant has process noise, or the solver fails
+    Raises: InputError if the plant has process noise, or the solver fails
     """
     from scipy.optimize import linprog  # slow to import
 

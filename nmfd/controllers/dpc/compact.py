@@ -115,7 +115,6 @@ class CompactPolicy(Policy):
         return self.scale.squeeze(-1) * room.clamp(min=0.0) / FILL_TIME_S
 
     def bound(self) -> None:
-        """Set negative numbers to 0."""
         with torch.no_grad():
             self.numbers.clamp_(min=0.0)
 

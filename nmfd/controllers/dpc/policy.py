@@ -134,7 +134,6 @@ class Policy(nn.Module):
             self.answer = Answer(network)
 
     def _build(self, network: RegionalModel) -> None:
-        """Create the weights."""
         architecture, regions, width = self.architecture, self.regions, self.architecture.width
         here, onward = np.arange(regions)[:, None], self.onward.numpy()
         activation = SoftExponential if architecture.soft_exponential else nn.GELU

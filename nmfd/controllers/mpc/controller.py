@@ -205,7 +205,6 @@ class EconomicMpc:
         return replace(controls, perimeter=gating.perimeter, note=f"{reason}: pi-gating in control")
 
     def _first(self, status: Status = Status.OK, note: str = "") -> Controls:
-        """Return the first interval of the plan."""
         perimeter, splits = self.admissible.controls(self._plan[0])
         return Controls(perimeter=perimeter, splits=splits, status=status, note=note)
 
