@@ -205,14 +205,12 @@ def evaluate(
     seeds = list(range(2000, 2010) if seeds is None else seeds)
     name = Path(scenario).stem if len(chosen) > 1 else chosen[0][0].name
     out = out or Path("runs") / f"{file_name(name)}-evaluate"
+    runs = evaluation.plan(chosen, strategies, seeds, policies)
     if check is not None:
-        runs = evaluation.plan(chosen, strategies, seeds, policies)
         lines = evaluation.check(runs, out, check, workers=workers)
         return "\n".join(lines) or f"{min(check, len(runs))} runs of {out} done again: no difference"
     with locked(out):
-        rows = evaluation.evaluate(
-            chosen, strategies, seeds, out=out, policies=policies, workers=workers, scheduler=scheduler
-        )
+        rows = evaluation.evaluate(runs, out, workers=workers, scheduler=scheduler)
         text = []
         for each in dict.fromkeys(results.finished_rows(rows).get("scenario", ())):
             finished = results.read(out, each)

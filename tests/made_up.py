@@ -97,7 +97,8 @@ def folder(out: Path, *, controllers=tuple(SHARE), seeds=(2000, 2001), levels=(1
     scenario = with_demand(load_scenario(SCENARIO), steps=STEPS)
     with pytest.MonkeyPatch.context() as patch:
         instead_of_sumo(patch, partial(result, city=city_of(scenario.network)))
-        evaluate.evaluate([(scenario, levels)], [parse(name) for name in controllers], seeds, out=out, progress=False)
+        runs = evaluate.plan([(scenario, levels)], [parse(name) for name in controllers], seeds)
+        evaluate.evaluate(runs, out, progress=False)
     return out
 
 

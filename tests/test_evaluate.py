@@ -51,7 +51,8 @@ def ran(monkeypatch):
 def evaluated(city, tmp_path, *, controllers=("no-control", "pi-gating"), seeds=(2000, 2001), levels=(1.0,)):
     scenario = with_demand(load_scenario(city), steps=STEPS)
     strategies = [parse(name) for name in controllers]
-    return evaluate.evaluate([(scenario, levels)], strategies, seeds, out=tmp_path / "out", progress=False)
+    runs = evaluate.plan([(scenario, levels)], strategies, seeds)
+    return evaluate.evaluate(runs, tmp_path / "out", progress=False)
 
 
 @pytest.mark.parametrize(
@@ -115,7 +116,8 @@ def test_a_suite_is_one_ranked_table(city, tmp_path, ran):
     suite = tmp_path / "suite.toml"
     suite.write_text('seeds = [2000]\n[scenarios]\n"scenarios/peak" = [1.0, 1.2]\ndemo = [1.0]\n')
     chosen, seeds = evaluate.read_suite(suite, {"steps": 1})
-    evaluate.evaluate(chosen, [parse("no-control"), parse("pi-gating")], seeds, out=tmp_path / "out", progress=False)
+    runs = evaluate.plan(chosen, [parse("no-control"), parse("pi-gating")], seeds)
+    evaluate.evaluate(runs, tmp_path / "out", progress=False)
     text = (tmp_path / "out" / "evaluate.md").read_text()
     assert "| 1 | no-control | +0.0 % | 3 |" in text and "# demo" in text
     assert [level.demand for level in results.read(tmp_path / "out", "grid7_peak").levels] == [1.0, 1.2]

@@ -122,7 +122,7 @@ def test_ways_that_come_back_are_found_where_they_are_the_fastest_of_all(city, w
                     assert min(returning, cost.min()) == pytest.approx(exact[here, target])
                 if returning >= min(most, cost.min() - 1e-9):
                     continue
-                way = found.returning_route(here, gateway, target)
+                way = found.route(here, gateway, target, returning=True)
                 assert (way[0], way[-1]) == (here, target) and takes(way, city) == pytest.approx(returning)
                 crossing = max(n for n, edge in enumerate(way) if REGION[edge] == 0)
                 assert (way[crossing], way[crossing + 1]) == (gate[gateway], entry[gateway])

@@ -23,7 +23,6 @@ from nmfd.api import load_scenario
 from nmfd.controllers.strategy import Strategy
 from nmfd.model.scenario import Scenario
 from nmfd.runs import config, files
-from nmfd.runs.progress import Progress
 from nmfd.runs.run_many import TABLE, Run, read_manifest, run_many
 from nmfd.runs.tables import markdown_table
 from nmfd.types import HOST_TIMES
@@ -50,20 +49,9 @@ def read_suite(file: Path, settings: Mapping[str, Any] | None = None) -> tuple[P
     return scenarios, suite.seeds
 
 
-def evaluate(
-    scenarios: Planned,
-    strategies: Sequence[Strategy],
-    seeds: Sequence[int],
-    *,
-    out: Path,
-    policies: Mapping[str, Path] | None = None,
-    workers: int = 1,
-    scheduler: str | None = None,
-    progress: Progress = None,
-) -> pd.DataFrame:
-    """Do the runs that are not in `out`, write the tables, and return one row per run (nmfd.runs.run_many)."""
-    runs = plan(scenarios, strategies, seeds, policies)
-    rows = run_many(runs, out, workers=workers, scheduler=scheduler, progress=progress)
+def evaluate(runs: Sequence[Run], out: Path, **how: Any) -> pd.DataFrame:
+    """Do the runs that are not in `out`, write the tables, and return one row per run; how: see nmfd.runs.run_many."""
+    rows = run_many(runs, out, **how)
     if len(done := results.finished_rows(rows)):
         files.write_text(out / "evaluate.md", report(out, done))
     return rows

@@ -49,12 +49,11 @@ def runs_of(
     for strategy in strategies:
         strategy.make(scenario, policies.get(strategy.name))  # reports mistakes before the first run
     keys = {s.name: {**shared, "controller": s.fingerprint(scenario, policies.get(s.name))} for s in strategies}
-    runs = []
-    for seed in seeds:
-        for strategy in strategies:
-            job = Simulation(scenario, strategy, seed, demand, policies.get(strategy.name))
-            runs.append(Run(run_name(strategy.name, seed), keys[strategy.name], job, folder))
-    return runs
+    return [
+        Run(run_name(s.name, seed), keys[s.name], Simulation(scenario, s, seed, demand, policies.get(s.name)), folder)
+        for seed in seeds
+        for s in strategies
+    ]
 
 
 def city_key(scenario: Scenario, strategies: Sequence[Strategy]) -> dict[str, object]:

@@ -263,7 +263,7 @@ class Guide:
 
         def way(n: int) -> list[int]:
             if n == returning:
-                return ways.returning_route(here, gateway, target)
+                return ways.route(here, gateway, target, returning=True)
             return ways.route(here, int(ways.begins[n] + np.argmin(cost[ways.begins[n] : ways.ends[n]])), target)
 
         return least, open_ways, way

@@ -238,17 +238,9 @@ class Ways:
         gateway = int(cost.argmin())
         return float(cost[gateway]), gateway
 
-    def route(self, here: int, gateway: int, target: int) -> list[int]:
-        """Return the edges from `here` to `target` through `gateway`, after `cost`."""
-        return self._through(self._there, here, gateway, target)
-
-    def returning_route(self, here: int, gateway: int, target: int) -> list[int]:
-        """Return the edges of the way of `returning`."""
-        assert self._everywhere is not None
-        return self._through(self._everywhere[0], here, gateway, target)
-
-    def _through(self, trees: Trees, here: int, gateway: int, target: int) -> list[int]:
-        """Return the edges from `here` to `target` through `gateway`, as far as that by `trees`."""
+    def route(self, here: int, gateway: int, target: int, *, returning: bool = False) -> list[int]:
+        """Return the edges from `here` to `target` through `gateway`, after `cost`; or those of `returning`."""
+        trees = self._everywhere[0] if returning and self._everywhere else self._there
         first, second = int(self._first[gateway]), int(self._second[gateway])
         return trees.back(here, first)[::-1] + self._onward.back(target, second)
 

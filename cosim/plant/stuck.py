@@ -13,6 +13,7 @@ junction that is blocked by a full street stays blocked: that is gridlock, and i
 
 from collections import defaultdict
 from collections.abc import Sequence
+from functools import cache
 
 from cosim.sumo.net import City
 from cosim.sumo.session import Session
@@ -28,8 +29,7 @@ class Lanes:
     """The lanes of one simulation. near_m: from there to its end, a lane cannot be left; 0: it always can."""
 
     def __init__(self, session: Session, near_m: float = QUEUE_END_M):
-        self._session, self._near = session, near_m
-        self._lanes: dict[str, tuple[float, frozenset[str]]] = {}  # lane -> length [m], next edges
+        self._session, self._near, self._lane = session, near_m, cache(session.lane)
 
     def too_late(self, vehicle: str, way: Sequence[str]) -> bool:
         """Return True if a vehicle on way[0] cannot take this way any more."""
@@ -52,9 +52,7 @@ class Lanes:
     def _left(self, vehicle: str) -> tuple[float, frozenset[str]]:
         """Return the way to the end of the vehicle's lane [m], and the edges that the lane leads to."""
         lane, position = self._session.place(vehicle)
-        if lane not in self._lanes:
-            self._lanes[lane] = self._session.lane(lane)
-        length, onward = self._lanes[lane]
+        length, onward = self._lane(lane)
         return length - position, onward
 
 
@@ -67,7 +65,7 @@ class Junctions:
         for edge in sorted(city.region_of):
             if edge.startswith(":"):
                 self._inside[edge[1:].rpartition("_")[0]].append(edge)
-        self._onward: dict[str, str] = {}  # lane on a junction -> the lane behind it
+        self._behind = cache(self._street_behind)
 
     def free(self) -> None:
         """Free the vehicles of all junctions, those first that have stood longest."""
@@ -90,11 +88,8 @@ class Junctions:
             vehicle = next(vehicle for vehicle, other in ahead if other == lane)
             self.freed += self._session.set_down(vehicle, lane, length[vehicle] + GAP_M)
 
-    def _behind(self, lane: str) -> str:
+    def _street_behind(self, lane: str) -> str:
         """Return the lane of a street that a lane on a junction leads to."""
-        if lane not in self._onward:
-            onward = lane
-            while onward.startswith(":"):
-                onward = self._session.next_lane(onward)
-            self._onward[lane] = onward
-        return self._onward[lane]
+        while lane.startswith(":"):
+            lane = self._session.next_lane(lane)
+        return lane

@@ -29,16 +29,8 @@ DrawnTrip = tuple[float, int, str]  # departure [s], number of the vehicle, id
 MADE = {"type": "car", "departLane": "best", "departSpeed": "max", "departPos": "random_free"}
 HELD = "held."  # prefix of the ids of routes that only one vehicle uses
 # Attribute of a vehicle -> argument of Session.begin_trip, whose defaults are those of the attributes.
-ORDERED = {
-    "type": "typeID",
-    "departLane": "departLane",
-    "departPos": "departPos",
-    "departSpeed": "departSpeed",
-    "arrivalLane": "arrivalLane",
-    "arrivalPos": "arrivalPos",
-    "arrivalSpeed": "arrivalSpeed",
-    "speedFactor": "speedFactor",
-}
+ALIKE = "departLane", "departPos", "departSpeed", "arrivalLane", "arrivalPos", "arrivalSpeed", "speedFactor"
+ORDERED = {"type": "typeID"} | {name: name for name in ALIKE}
 
 
 @dataclass(frozen=True, kw_only=True)

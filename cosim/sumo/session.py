@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -105,7 +106,7 @@ class Session:
             raise InputError(f"{net_file}: SUMO cannot run it with {routes}: {one_line(error)}") from None
         Session._open = True
         self.time = libsumo.simulation.getTime()
-        self._lanes_of: dict[str, tuple[str, ...]] = {}  # edge -> its lanes
+        self._lanes = cache(lambda edge: tuple(f"{edge}_{n}" for n in range(libsumo.edge.getLaneNumber(edge))))
         self._bind()
 
     def _bind(self) -> None:
@@ -160,9 +161,7 @@ class Session:
         drivers with another lane.
         """
         routing = libsumo.edge.getLastStepMeanSpeed(edge)
-        if edge not in self._lanes_of:
-            self._lanes_of[edge] = self._lanes(edge)
-        lanes = self._lanes_of[edge]
+        lanes = self._lanes(edge)
         if len(lanes) > 1:
             counts = [libsumo.lane.getLastStepVehicleNumber(lane) for lane in lanes]
             if total := sum(counts):  # 0 in the mesoscopic model, which has no lanes
@@ -268,9 +267,6 @@ class Session:
         for lane, limit in zip(lanes, limits * len(lanes) if len(limits) == 1 else limits, strict=True):
             libsumo.lane.setMaxSpeed(lane, limit)
         return before
-
-    def _lanes(self, edge: str) -> tuple[str, ...]:
-        return tuple(f"{edge}_{n}" for n in range(libsumo.edge.getLaneNumber(edge)))
 
     def _logic(self, signal: str, programme: str) -> Any:
         logics = libsumo.trafficlight.getAllProgramLogics(signal)
