@@ -1,11 +1,13 @@
 """Commands, called in this process as a user calls them."""
 
 from functools import partial
+from pathlib import Path
 
 from click.testing import CliRunner, Result
 
 import cosim.cli
 import nmfd.cli
+from nmfd.types import Result as Run
 
 MAINS = {"nmfd": nmfd.cli.main, "cosim": cosim.cli.main}
 
@@ -21,6 +23,16 @@ def good(result: Result) -> str:
     """Return the output of a command that ended well."""
     assert result.exit_code == 0, result.output + result.stderr + repr(result.exception)
     return result.stdout
+
+
+def runs(folder: Path) -> dict:
+    """Return path -> Dataset without times of every run below a folder."""
+    files = folder.rglob("[!.]*.nc")
+    return {str(file.relative_to(folder)): Run.read(file).without_times() for file in files}
+
+
+def same(left: dict, right: dict) -> bool:
+    return set(left) == set(right) and all(left[name].identical(right[name]) for name in left)
 
 
 def error_line(result: Result, program: str = "cosim") -> str:

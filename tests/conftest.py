@@ -64,6 +64,21 @@ def _fail_if_skipped(report: pytest.TestReport | pytest.CollectReport, config: p
 
 
 @pytest.fixture
+def folder(tmp_path):
+    """The folder of the tiny scenario; some modules have another `scenario` of their own."""
+    import tiny  # not before annotations are checked
+
+    return tiny.write(tmp_path)
+
+
+@pytest.fixture
+def scenario(folder):
+    from nmfd.api import load_scenario
+
+    return load_scenario(folder)
+
+
+@pytest.fixture
 def plant_of(scenario):
     """Plants of a module's scenario that are closed in any case: SUMO allows one session per process."""
     from cosim.plant.plant import SumoPlant  # not before annotations are checked

@@ -54,7 +54,6 @@ def result(scenario, strategy, *, seed, demand, city) -> Result:
         perimeter=perimeter,
         splits=np.repeat(network.nominal_splits[None], steps, axis=0),
         decision_time=random.uniform(0.001, 0.01, steps),
-        wall_time=1.0,
     )
     edges, gateways = len(city.edges), len(city.gateways)
     original = np.full((steps, gateways), 30.0)

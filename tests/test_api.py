@@ -60,23 +60,16 @@ def test_run_and_benchmark_agree_with_the_command_line(tmp_path):
     assert len(rows) == 2 and summary_table(rows) in done.output
 
 
-class Half:
-    name = "half"
-
-    def reset(self, seed=0):
-        pass
-
-    def act(self, measurement):
-        return nmfd.Controls(perimeter=np.full(measurement.accumulation.shape, 0.5), splits=None)
+HALF = tiny.Acting(lambda seen: nmfd.Controls(perimeter=np.full(seen.accumulation.shape, 0.5), splits=None), "half")
 
 
 def test_a_controller_and_a_plant_as_objects(tmp_path):
     scenario = nmfd.load_scenario(tiny.write(tmp_path))
     inner = nmfd.NmfdPlant(scenario)
     own = SimpleNamespace(reset=inner.reset, step=inner.step, observe=inner.observe)  # all that the docstring asks for
-    trajectory = nmfd.run(scenario, Half(), steps=5, plant=own)
+    trajectory = nmfd.run(scenario, HALF, steps=5, plant=own)
     assert (trajectory.controller, trajectory.plant) == ("half", "SimpleNamespace")
-    assert (trajectory.accumulation == nmfd.run(scenario, Half(), steps=5).accumulation).all()
+    assert (trajectory.accumulation == nmfd.run(scenario, HALF, steps=5).accumulation).all()
     assert trajectory.perimeter.shape == (5, 2, 2) and (trajectory.perimeter == 0.5).all()
 
 
@@ -85,9 +78,9 @@ def test_a_controller_and_a_plant_as_objects(tmp_path):
     [
         (("nobody",), {}, "controller 'nobody' is unknown"),
         (("pi-gating",), {"plant": "sumo"}, "plant 'sumo' is unknown; choose from nmfd, acyclic"),
-        (("pi-gating",), {"plant": Half()}, "plant: Half has no step"),
+        (("pi-gating",), {"plant": HALF}, "plant: Acting has no step"),
         (("pi-gating",), {"steps": 0}, "steps: expected 1 or more"),
-        ((Half(),), {"policy": "x.pt"}, "x.pt: controller half reads no policy"),
+        ((HALF,), {"policy": "x.pt"}, "x.pt: controller half reads no policy"),
         ((3,), {}, "with reset and act, got 3"),
     ],
 )

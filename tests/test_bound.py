@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tiny
 import torch
 from commands import good, nmfd
 
@@ -22,16 +21,6 @@ from nmfd.model.scenario import with_demand
 from nmfd.studies import bound
 
 ECONOMIC = Path(__file__).parents[1] / "scenarios" / "economic_mpc"
-
-
-@pytest.fixture
-def folder(tmp_path):
-    return tiny.write(tmp_path)
-
-
-@pytest.fixture
-def scenario(folder):
-    return load_scenario(folder)
 
 
 def closed(scenario, controller):

@@ -6,9 +6,8 @@ import sys
 import time
 
 import pytest
-import tiny
 import torch
-from commands import MAINS, call, error_line, good, nmfd
+from commands import MAINS, call, error_line, good, nmfd, runs, same
 
 from nmfd import closed_loop
 from nmfd.controllers import training
@@ -20,13 +19,8 @@ HEAVY = ("pydantic", "torch", "casadi", "libsumo", "numpy", "pandas", "matplotli
 
 
 @pytest.fixture
-def scenario(tmp_path):
-    return tiny.write(tmp_path)
-
-
-@pytest.fixture
-def benchmark(scenario, tmp_path):
-    return ["benchmark", scenario, "--controllers", "no-control,pi-gating", "--seeds", 2, "--out", tmp_path / "out"]
+def benchmark(folder, tmp_path):
+    return ["benchmark", folder, "--controllers", "no-control,pi-gating", "--seeds", 2, "--out", tmp_path / "out"]
 
 
 @pytest.fixture
@@ -37,15 +31,6 @@ def in_process(monkeypatch):
         return run_many(*args, **{**options, "workers": 0})
 
     monkeypatch.setattr("nmfd.api.run_many", here)
-
-
-def arrays(folder):
-    """Return name -> result without times of every run in a folder."""
-    return {file.name: Result.read(file).without_times() for file in folder.glob("*.nc")}
-
-
-def same(left, right):
-    return set(left) == set(right) and all(left[name].identical(right[name]) for name in left)
 
 
 @pytest.mark.parametrize("package", MAINS)
@@ -70,13 +55,13 @@ def test_benchmark_writes_a_run_folder(benchmark, tmp_path):
     lines = good(nmfd(*benchmark)).splitlines()
     assert lines[1].split()[:2] == ["no-control", "2"] and lines[2].split()[:2] == ["pi-gating", "2"]
     assert "±" in lines[2] and lines[-1] == f"Written to {tmp_path / 'out'}"
-    runs = {f"{name}-{seed}.nc" for name in ("no-control", "pi-gating") for seed in (0, 1)}
-    assert runs | {"runs.csv", "manifest.json", "mfd.png"} <= {path.name for path in (tmp_path / "out").iterdir()}
+    names = {f"{name}-{seed}.nc" for name in ("no-control", "pi-gating") for seed in (0, 1)}
+    assert names | {"runs.csv", "manifest.json", "mfd.png"} <= {path.name for path in (tmp_path / "out").iterdir()}
 
 
-def test_settings(scenario, tmp_path):
+def test_settings(folder, tmp_path):
     """--set changes a key, in a nested table too, and mistakes name the key."""
-    command = ("benchmark", scenario, "--controllers", "pi-gating", "--out", tmp_path / "out", "--set")
+    command = ("benchmark", folder, "--controllers", "pi-gating", "--out", tmp_path / "out", "--set")
     good(nmfd(*command, "steps=3", "--set", "controllers.pi-gating.kp=2.5"))
     assert Result.read(tmp_path / "out" / "pi-gating-0.nc").accumulation.shape[0] == 4
     for text, problem in (
@@ -93,7 +78,7 @@ def test_a_failing_controller_names_itself_and_the_others_are_kept(benchmark, tm
     result = nmfd(*benchmark)
     assert result.exit_code == 1 and result.stderr.count("\n") == 1
     assert "pi-gating, seed 0: ZeroDivisionError: division by zero (test_cli.py:" in result.stderr
-    assert set(arrays(tmp_path / "out")) == {"no-control-0.nc", "no-control-1.nc"}
+    assert set(runs(tmp_path / "out")) == {"no-control-0.nc", "no-control-1.nc"}
 
 
 def test_an_interrupted_benchmark_continues(benchmark, tmp_path, monkeypatch, in_process):
@@ -110,13 +95,13 @@ def test_an_interrupted_benchmark_continues(benchmark, tmp_path, monkeypatch, in
     result = nmfd(*benchmark)
     assert result.exit_code == 130 and result.stderr.count("\n") == 1
     assert result.stderr.startswith("nmfd: interrupted: finished runs are in ")
-    assert len(arrays(tmp_path / "out")) == 2
+    assert len(runs(tmp_path / "out")) == 2
     good(nmfd(*benchmark))
     assert len(calls) == 5  # two, the interrupted one, and the two that were left
-    assert same(arrays(tmp_path / "out"), arrays(tmp_path / "whole"))
+    assert same(runs(tmp_path / "out"), runs(tmp_path / "whole"))
 
 
-def test_training_can_be_interrupted_and_resumed(scenario, monkeypatch):
+def test_training_can_be_interrupted_and_resumed(folder, monkeypatch):
     monkeypatch.setattr(training, "VALIDATION_PERIOD", 1)
     calls, clip = [], torch.nn.utils.clip_grad_norm_
 
@@ -127,40 +112,40 @@ def test_training_can_be_interrupted_and_resumed(scenario, monkeypatch):
         return clip(*args)
 
     monkeypatch.setattr(torch.nn.utils, "clip_grad_norm_", stopped)
-    command = ["train", scenario, "--controller", "dpc-pc", "--steps", 4]
+    command = ["train", folder, "--controller", "dpc-pc", "--steps", 4]
     result = nmfd(*command)
     assert result.exit_code == 130 and result.stderr.count("\n") == 1
-    assert result.stderr.endswith(f"is {scenario / 'dpc-pc.pt'}; add --resume to continue\n")
-    assert (scenario / "dpc-pc.pt").is_file()
+    assert result.stderr.endswith(f"is {folder / 'dpc-pc.pt'}; add --resume to continue\n")
+    assert (folder / "dpc-pc.pt").is_file()
     good(nmfd(*command, "--resume"))
     assert len(calls) == 5
-    assert {path.name for path in scenario.iterdir()} == {"scenario.toml", "dpc-pc.pt"}
+    assert {path.name for path in folder.iterdir()} == {"scenario.toml", "dpc-pc.pt"}
 
 
-def test_without_a_compiler_training_is_not_compiled(scenario, tmp_path, monkeypatch):
+def test_without_a_compiler_training_is_not_compiled(folder, tmp_path, monkeypatch):
     (tmp_path / "bin").mkdir()
     monkeypatch.setenv("PATH", str(tmp_path / "bin"))
     monkeypatch.delenv("CXX", raising=False)
     monkeypatch.setattr(training, "WORTH_COMPILING", 2)
-    good(nmfd("train", scenario, "--controller", "dpc-pc", "--steps", 2))
-    content = torch.load(scenario / "dpc-pc.pt", weights_only=True)
+    good(nmfd("train", folder, "--controller", "dpc-pc", "--steps", 2))
+    content = torch.load(folder / "dpc-pc.pt", weights_only=True)
     assert content["configuration"]["compiled"] is False
 
 
-def test_a_gpu_that_is_not_there_is_one_line(scenario, monkeypatch):
+def test_a_gpu_that_is_not_there_is_one_line(folder, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    result = nmfd("train", scenario, "--controller", "dpc-pc", "--steps", 1, "--device", "cuda")
+    result = nmfd("train", folder, "--controller", "dpc-pc", "--steps", 1, "--device", "cuda")
     assert "finds no GPU here" in error_line(result, "nmfd")
 
 
-def test_show_draws_the_scenario(scenario, tmp_path):
-    assert "2 regions, 360 trips between 1 pairs" in good(nmfd("show", scenario, "--out", tmp_path / "figures"))
+def test_show_draws_the_scenario(folder, tmp_path):
+    assert "2 regions, 360 trips between 1 pairs" in good(nmfd("show", folder, "--out", tmp_path / "figures"))
     assert {path.name for path in (tmp_path / "figures").iterdir()} == {"spawn_matrix.png", "region_map.png", "mfd.png"}
 
 
-def test_a_new_controller_runs(scenario, tmp_path, monkeypatch):
+def test_a_new_controller_runs(folder, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert "nmfd benchmark economic_mpc" in good(nmfd("new-controller", "mine.py"))
-    good(nmfd("benchmark", scenario, "--controllers", "mine.py:MyController", "--set", "steps=2", "--out", "out"))
+    good(nmfd("benchmark", folder, "--controllers", "mine.py:MyController", "--set", "steps=2", "--out", "out"))
     for name, problem in (("mine.py", "exists; choose another"), ("mine.txt", "ends in .py"), ("no/x.py", "No such")):
         assert problem in error_line(nmfd("new-controller", name), "nmfd")

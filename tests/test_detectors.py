@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tiny
 
 from cosim.evaluation.simulate import Simulation, estimation_errors, simulate
 from cosim.plant.detectors import instruments, lay_out, probes
@@ -18,7 +19,7 @@ from nmfd.api import load_scenario
 from nmfd.controllers.rules import PiGating
 from nmfd.controllers.strategy import parse
 from nmfd.model.planning import planning_model
-from nmfd.types import Controls, Observation
+from nmfd.types import Controls
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
 INTERVALS = 3
@@ -111,17 +112,8 @@ def test_the_closed_loop_runs_on_estimates(scenario, run):
 
 def test_estimating_changes_nothing_but_what_is_seen(scenario, run):
     """The same controls give the same city, with detectors or without."""
-
-    class Again:
-        name = "again"
-
-        def reset(self, seed=0):
-            pass
-
-        def act(self, measurement: Observation):
-            return Controls(perimeter=run.perimeter[measurement.step], splits=None)
-
-    exact = drive(scenario, Again())
+    again = tiny.Acting(lambda seen: Controls(perimeter=run.perimeter[seen.step], splits=None))
+    exact = drive(scenario, again)
     assert not exact.estimated and run.estimated
     assert (exact.accumulation == run.accumulation).all()
 

@@ -83,11 +83,6 @@ def test_a_batch_is_the_same_as_one_by_one():
             torch.testing.assert_close(batched[n], single, rtol=1e-5, atol=1e-6)
 
 
-@pytest.fixture
-def scenario(tmp_path):
-    return load_scenario(tiny.write(tmp_path))
-
-
 def saved(path, made, network):
     torch.save(checkpoint(made, network, {"seed": 0}), path)
     return path

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import streets
+import tiny
 from streets import seen
 
 from cosim.evaluation.simulate import Simulation, simulate
@@ -181,29 +182,14 @@ def test_in_the_mesoscopic_model_another_way_must_save_a_share_of_its_own_time(a
     assert town.routes["x"] == ("t", "u" if best else "t2", "v")
 
 
-class _Gate:
-    """Gates that are half open; `splits`: what drivers are told."""
-
-    name = "gate"
-
-    def __init__(self, splits=None):
-        self._splits = splits
-
-    def reset(self, seed):
-        pass
-
-    def act(self, observation):
-        return Controls(perimeter=np.full_like(observation.accumulation, 0.4), splits=self._splits)
-
-
 def test_guided_is_guidance_by_travel_times_wherever_the_controller_says_nothing():
     """The bytes are those of a controller that commands the nominal split ratios; without it no driver is guided."""
     scenario = load_scenario(Path(__file__).parents[1] / "scenarios" / "grid7_peak")
     scenario = replace(scenario, steps=1, demand=scenario.demand[15:16])
-    own = scenario.network.nominal_splits
+    half = Controls(perimeter=np.full((7, 7), 0.4), splits=scenario.network.nominal_splits)
     by_hand, option, off = (
-        simulate(Simulation(scenario, parse(_Gate(splits), city), seed=1))
-        for city, splits in (("", own), ("guided", None), ("", None))
+        simulate(Simulation(scenario, parse(tiny.Acting(lambda _, told=told: told), city), seed=1))
+        for city, told in (("", half), ("guided", replace(half, splits=None)), ("", replace(half, splits=None)))
     )
     assert option["guided"].sum() > 0 and off["guided"].sum() == 0
     assert option.without_times().equals(by_hand.without_times())

@@ -154,8 +154,7 @@ def test_networks_as_they_are(tmp_path):
 
 def test_signals_that_are_left_alone(config, tmp_path):
     """A timetable switches one: perimeter control leaves it alone."""
-    for file in config.parent.iterdir():
-        (tmp_path / file.name).write_bytes(file.read_bytes())
+    shutil.copytree(config.parent, tmp_path, dirs_exist_ok=True)
     timetable = (
         '<WAUT id="day" startProg="0" refTime="0"><wautSwitch time="900" to="0"/></WAUT>'
         '<wautJunction wautID="day" junctionID="C2"/></additional>'
@@ -205,18 +204,8 @@ def test_options_and_includes_of_the_user_count(config, tmp_path):
     scenario = load_scenario(tmp_path / "scenarios" / "x")
     assert scenario.demand_factor == 1.0 and scenario.demand.sum() * scenario.step == pytest.approx(150.0)
     assert settings(scenario).mesoscopic
-    good(
-        cosim(
-            "import",
-            tmp_path / "city.net.xml",
-            "--routes",
-            tmp_path / "cars.rou.xml",
-            "--regions",
-            2,
-            "--out",
-            tmp_path / "networks" / "y",
-        )
-    )  # without any sumocfg
+    options = "--routes", tmp_path / "cars.rou.xml", "--regions", 2, "--out", tmp_path / "networks" / "y"
+    good(cosim("import", tmp_path / "city.net.xml", *options))  # without any sumocfg
     assert load_scenario(tmp_path / "scenarios" / "y").demand.sum() * scenario.step == pytest.approx(60.0)
     (tmp_path / "more" / "cars.rou.xml").write_text('<routes><include href="../cars.rou.xml"/></routes>')
     with pytest.raises(InputError, match="include each other without end"):
@@ -257,8 +246,7 @@ def test_signal_plans_know_the_city_s_own_vehicles(imported):
     ],
 )
 def test_one_clear_line(config, tmp_path, change, expected):
-    for file in config.parent.iterdir():
-        (tmp_path / file.name).write_bytes(file.read_bytes())
+    shutil.copytree(config.parent, tmp_path, dirs_exist_ok=True)
     change(tmp_path)
     line = error_line(cosim("import", tmp_path / "city.sumocfg", "--regions", 3, "--out", tmp_path / "networks" / "x"))
     assert expected in line

@@ -10,20 +10,9 @@ import time
 import pytest
 import tiny
 import torch
-from commands import error_line, good, nmfd
+from commands import error_line, good, nmfd, runs, same
 
 from nmfd.controllers import training
-from nmfd.types import Result
-
-
-def results(folder):
-    """Return path -> Dataset without times of every run below a folder."""
-    files = folder.rglob("[!.]*.nc")
-    return {str(file.relative_to(folder)): Result.read(file).without_times() for file in files}
-
-
-def same(left, right):
-    return set(left) == set(right) and all(left[name].identical(right[name]) for name in left)
 
 
 def stopped(program, *arguments, out, by, after="[!.]*.nc", wait=0.0):
@@ -54,7 +43,7 @@ def test_ctrl_c_at_any_moment_is_one_line(tmp_path, after, wait):
 def test_runs_are_kept_without_standard_streams(tmp_path, streams):
     command = [sys.executable, "-m", "nmfd", "benchmark", str(tiny.write(tmp_path)), "--controllers", "no-control"]
     subprocess.run([f"{shlex.join(command)} --workers 2 --seeds 2 --out {tmp_path}/out {streams}"], shell=True)
-    assert len(results(tmp_path / "out")) == 2 and (tmp_path / "out" / "total_accumulation.png").exists()
+    assert len(runs(tmp_path / "out")) == 2 and (tmp_path / "out" / "total_accumulation.png").exists()
 
 
 @pytest.mark.parametrize(
@@ -72,12 +61,12 @@ def test_a_stopped_benchmark_continues(tmp_path, by, status):
     assert returned == status and "Traceback" not in said, said
     if status == 130:
         assert said.splitlines()[-1].startswith("nmfd: interrupted: finished runs are in"), said
-    first = results(tmp_path / "out")
+    first = runs(tmp_path / "out")
     assert 0 < len(first) < 20
     good(nmfd(*command, "--out", tmp_path / "out"))
     good(nmfd(*command, "--out", tmp_path / "whole"))
-    whole = results(tmp_path / "whole")
-    assert len(whole) == 20 and same(results(tmp_path / "out"), whole)
+    whole = runs(tmp_path / "whole")
+    assert len(whole) == 20 and same(runs(tmp_path / "out"), whole)
     assert same(first, {name: whole[name] for name in first})
 
 

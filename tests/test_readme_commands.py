@@ -11,18 +11,14 @@ from documents import FILES, NOTEBOOKS, ROOT, read
 STEPS = ["--steps", 2]
 REDUCED = {  # what is added; of an option that is there already the last counts. The city is tiny_city
     "nmfd benchmark": ["--seeds", 1],
-    "nmfd train": ["--steps", 1, "--no-compile", "--anyway"],
-    "nmfd show": [],
+    "nmfd train": ["--steps", 1],
     "nmfd new-controller": [],
-    "nmfd export": [],
     "cosim run": STEPS,
     "cosim compare": [],
     "cosim report": [],
     "cosim evaluate": [*STEPS, "--seeds", 1, "--demand", 1],
     "cosim import": ["--regions", 3],
-    "cosim identify": ["--levels", 6, "--seeds", 1, "--own", "--iterations", 10],
-    "cosim list": [],
-    "nmfd list": [],
+    "cosim identify": ["--levels", 6, "--seeds", 1, "--with", "own"],
 }
 NOT_RUN = {  # what takes long or needs more, and where it is tested
     "cosim watch": "test_view.py",
@@ -34,12 +30,6 @@ NOT_RUN = {  # what takes long or needs more, and where it is tested
     "nmfd identify": "test_measured.py",
 }
 LONG = ("scenarios/grid7_peak", "networks/grid7", "scenarios/demo")  # whose loading runs and training take minutes
-DESCRIBED = {
-    "scenarios/r100": """base = "../grid7_peak"
-[controllers."dpc-pc+rerouting-100"]
-model = "../../networks/grid7_rerouting"
-"""
-}  # of a user's own, as the text says that it is
 FIRST = ["README.md", "nmfd/README.md", "cosim/README.md"]  # with every controller that they name
 HERE = [
     str(file.relative_to(ROOT).as_posix())
@@ -90,13 +80,8 @@ def test_the_commands_run(name, tmp_path, monkeypatch):
         shape = (kind, *sorted(word for word in words if word.startswith("--")), words[0])
         if (shape in done and command != "import") or (command in ("identify", "train") and words[0] in LONG):
             continue
-        if command == "export":
-            pytest.importorskip("onnxscript", reason="no extra onnx")
         if command == "import":
             words = instead(words)
-        elif words and words[0] in DESCRIBED and not Path(words[0]).exists():
-            Path(words[0]).mkdir()
-            Path(words[0], "scenario.toml").write_text(DESCRIBED[words[0]], encoding="utf-8")
         good(call(program, command, *reduced(name, kind, words)))
         done.add(shape)
         ran += 1

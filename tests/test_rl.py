@@ -96,25 +96,10 @@ def test_every_action_is_admissible_and_reaches_the_bounds(hexagon, guidance):
     assert guidance or splits is None
 
 
-class Constant:
-    """Plays one action."""
-
-    name = "constant"
-
-    def __init__(self, interface, action):
-        self.controls = interface.controls(action)
-
-    def reset(self, seed=0):
-        pass
-
-    def act(self, measurement):
-        return self.controls
-
-
 def test_return_is_the_total_time_spent_of_the_same_closed_loop(hexagon):
     env = rl.RegionalEnv(hexagon, guidance=True)
     action = np.random.default_rng(1).uniform(-1, 1, env.interface.action_size).astype(np.float32)
-    trajectory = api.run(hexagon, Constant(env.interface, action), seed=5)
+    trajectory = api.run(hexagon, tiny.Acting(lambda seen: env.interface.controls(action)), seed=5)
     env.reset(seed=5)
     total, over, steps = 0.0, False, 0
     while not over:

@@ -7,21 +7,11 @@ import pandas as pd
 import pytest
 import tiny
 
-from nmfd.api import load_scenario, robustness
+from nmfd.api import robustness
 from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
 from nmfd.model.scenario import pairs_with_demand, perturbed
 from nmfd.studies import benchmark as study
-
-
-@pytest.fixture
-def folder(tmp_path):
-    return tiny.write(tmp_path)
-
-
-@pytest.fixture
-def scenario(folder):
-    return load_scenario(folder)
 
 
 def test_noise_has_the_declared_size_and_place(scenario):
@@ -91,24 +81,10 @@ def test_rows_and_picture_of_a_comparison(folder, tmp_path):
 
 
 def test_improvement_is_over_no_control_in_the_same_scenario():
+    totals = {(0, "no-control"): 100.0, (0, "pi-gating"): 50.0, (1, "no-control"): 1000.0, (1, "pi-gating"): 700.0}
     rows = pd.DataFrame(
-        [
-            {
-                "sigma": 1,
-                "seed": seed,
-                "controller": name,
-                "total_time_spent_veh_s": total,
-                "failure": "",
-                "kind": "demand",
-            }
-            for seed, name, total in (
-                (0, "no-control", 100.0),
-                (0, "pi-gating", 50.0),
-                (1, "no-control", 1000.0),
-                (1, "pi-gating", 700.0),
-                (2, "pi-gating", 1.0),
-            )
-        ]
-    )
+        [(*run, total) for run, total in [*totals.items(), ((2, "pi-gating"), 1.0)]],
+        columns=["seed", "controller", "total_time_spent_veh_s"],
+    ).assign(sigma=1, failure="", kind="demand")
     mean, half = study.improvements(rows, "pi-gating")[1.0]
     assert mean == pytest.approx(40.0) and half == pytest.approx(12.706 * 10.0, rel=1e-3)

@@ -7,17 +7,11 @@ import pytest
 import tiny
 
 from cosim.plant.settings import Settings
-from nmfd.api import load_scenario
 from nmfd.controllers.rules import NoControl
 from nmfd.controllers.strategy import ALONE, CITY_NUMBERS, CITY_WORDS, CONTROLLERS, city_words, parse
 from nmfd.errors import InputError
 from nmfd.model.planning import planning_model
 from nmfd.types import Observation
-
-
-@pytest.fixture
-def scenario(tmp_path):
-    return load_scenario(tiny.write(tmp_path))
 
 
 @pytest.mark.parametrize(

@@ -21,11 +21,6 @@ from nmfd.model.planning import planning_model
 
 
 @pytest.fixture
-def scenario(tmp_path):
-    return load_scenario(tiny.write(tmp_path))
-
-
-@pytest.fixture
 def generator():
     return torch.Generator().manual_seed(0)
 

@@ -1,5 +1,6 @@
 """A scenario small enough for tests: two or three regions in a row, 0-1-2, twenty control intervals."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -109,6 +110,17 @@ def mixed(network: RegionalModel) -> RegionalModel:
     )
     others = own, flat, lines, replace(flat, outflows=(0.9 * high, high, 0.2 * high))
     return replace(network, mfds=(*others, *network.mfds)[: network.regions])
+
+
+@dataclass
+class Acting:
+    """A controller that is a function of what it sees."""
+
+    act: Callable
+    name: str = "acting"
+
+    def reset(self, seed=0):
+        pass
 
 
 def random_controls(random, network, batch=()):

@@ -65,23 +65,8 @@ def run(program: str, *arguments) -> None:
 def network(folder: Path, *options: str, name: str = "city.net.xml") -> Path:
     """A grid of 4 x 4 junctions A0 to D3, 200 m apart, with signals at all inner ones unless told otherwise."""
     options = options or ("--tls.set", "B1,B2,C1,C2,B3,C0")
-    run(
-        "netgenerate",
-        "--grid",
-        "--grid.number",
-        4,
-        "--grid.length",
-        200,
-        "--default.lanenumber",
-        2,
-        "--no-turnarounds",
-        "true",
-        "--seed",
-        1,
-        "--output-file",
-        folder / name,
-        *options,
-    )
+    grid = "--grid --grid.number 4 --grid.length 200 --default.lanenumber 2 --no-turnarounds true --seed 1".split()
+    run("netgenerate", *grid, "--output-file", folder / name, *options)
     return folder / name
 
 

@@ -38,7 +38,6 @@ def trajectory(controller="no-control", seed=0, steps=4):
         decision_time=rng.random(steps),
         note=("",) * (steps - 1) + ("no",),
         status=np.array([0] * (steps - 1) + [(Status.SOLVER_FAILURE | Status.FALLBACK).value]),
-        wall_time=1.0,
     )
 
 
@@ -57,8 +56,6 @@ def in_city(scenario, strategy, seed: int, demand: float, *, tts: float, trips: 
         completed=np.array([0.0, completed]),
         perimeter=np.ones((1, regions, regions)),
         splits=np.zeros((1, regions, regions, regions)),
-        decision_time=np.zeros(1),
-        wall_time=1.0,
     )
     facts = {name: 0 for name in FACTS} | {
         "outside_training": "",
