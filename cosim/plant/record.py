@@ -1,6 +1,6 @@
 """The record of a run in SUMO per control interval, beside its states and controls."""
 
-from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 
@@ -8,49 +8,14 @@ from cosim.plant.actuation import Actuation
 from cosim.plant.guidance import Guide
 from cosim.plant.meter import Meter
 from cosim.plant.sampling import StreetMeans
+from nmfd.runs import config
 from nmfd.types import Quantity, Result
 
 BOOKS = ("departures", "arrivals", "removals", "given_up", "crossings", "jumps", "redirected")  # of the meter
-_PAIRS = ("interval", "region", "destination")
-_TURNS = ("interval", "region", "next_region", "destination")
-_GATEWAYS = ("interval", "gateway")
-
-# Gateways that share the edge before them share its queue.
-RECORD: Mapping[str, Quantity] = {
-    "departures": Quantity(_PAIRS, "veh", "trips begun"),
-    "arrivals": Quantity(("interval", "destination"), "veh", "trips completed, on the last edge of their route"),
-    "removals": Quantity(_PAIRS, "veh", "vehicles taken out on their way"),
-    "given_up": Quantity(_PAIRS, "veh", "trips that SUMO dropped before they began"),
-    "crossings": Quantity(_TURNS, "veh", "vehicles that crossed a boundary"),
-    "jumps": Quantity(_TURNS, "veh", "vehicles that came into another region where no gateway leads there"),
-    "redirected": Quantity(
-        ("interval", "region", "destination", "next_region"),
-        "veh",
-        "vehicles whose route was changed to end in another region, the next, instead of destination",
-    ),
-    "production": Quantity(("interval", "region"), "veh m/s", "travel production, mean of samples"),
-    "mean_accumulation": Quantity(("interval", "region"), "veh", "vehicles inside, mean of the same samples"),
-    "edge_vehicles": Quantity(("interval", "edge"), "veh", "vehicles on the edge to 0.1 %, mean of the same samples"),
-    "gateway_green": Quantity(_GATEWAYS, "s", "green shown, mean of the gateway's links; NaN without a signal"),
-    "gateway_original_green": Quantity(_GATEWAYS, "s", "green in the original programme, mean of the gateway's links"),
-    "gateway_command": Quantity(_GATEWAYS, "1", "share of the boundary's capacity that was commanded"),
-    "gateway_share": Quantity(_GATEWAYS, "1", "share of the green that the gateway was given, mean over the interval"),
-    "gateway_flow": Quantity(_GATEWAYS, "veh", "vehicles that crossed the boundary"),
-    "gateway_queue": Quantity(_GATEWAYS, "veh", "vehicles halting on the edge before it, mean of samples"),
-    "gateway_queue_max": Quantity(_GATEWAYS, "veh", "vehicles halting on the edge before it, largest of samples"),
-    "teleports": Quantity(("interval",), "1", "vehicles that SUMO took out of a jam"),
-    "time_spent": Quantity(("interval",), "veh s", "by private vehicles on the road, or due and waiting to enter"),
-    "other_time_spent": Quantity(("interval",), "veh s", "by public transport and classes that nothing commands"),
-    "guided": Quantity(_TURNS, "veh", "reroutes by route guidance"),
-}
-# Over the whole run.
-TOTALS: Mapping[str, Quantity] = {
-    "co2": Quantity(("edge",), "kg", "CO2 of all vehicles on the edge and on the turns over junctions into it"),
-    "queue_max": Quantity(("edge",), "veh", "vehicles halting on the edge, largest of samples"),
-    "trip_time_by_origin": Quantity(
-        ("region",), "s", "mean time of private trips that began here, as mean_trip_time_s; NaN without any"
-    ),
-}
+RECORD, TOTALS = (
+    {name: Quantity(tuple(axes.split()), unit, text) for name, (axes, unit, text) in arrays.items()}
+    for arrays in config.read(Path(__file__).with_name("record.toml")).values()
+)
 
 
 def settled(result: Result) -> Result:

@@ -16,33 +16,11 @@ from matplotlib.ticker import MaxNLocator, MultipleLocator, StrMethodFormatter
 from nmfd.model.mfd import Mfd
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
+from nmfd.runs import config
 from nmfd.runs.files import atomic
 from nmfd.types import Result
 
-# Colours distinct for colour-blind readers.
-COLOURS = {
-    "no-control": "#333333",
-    "pi-gating": "#e69f00",
-    "mpc-pc": "#56b4e9",
-    "mpc-pcrg": "#0059a8",
-    "dpc-pc": "#e377c2",
-    "dpc-pcrg": "#882255",
-    "gating-rule": "#d95f02",
-    "pricing-rule": "#b2182b",
-    "route-guidance": "#8c6d31",
-    "probing-pc": "#bcbd22",
-    "probing-pcrg": "#637939",
-    "bound-pc": "#9aa33c",
-    "bound-pcrg": "#4d6600",
-    "greedy": "#2e8b57",
-    "mpc-pc-terminal": "#7fd1c7",
-    "mpc-pcrg-terminal": "#00695c",
-    "webster": "#00838f",
-    "actuated": "#7e57c2",
-    "max-pressure": "#009e73",
-    "rerouting-30": "#7f7f7f",
-    "rerouting-100": "#b5a642",
-}
+COLOURS = config.read(Path(__file__).with_name("colours.toml"))  # of controllers
 OTHER_COLOURS = ("#17becf", "#5254a3", "#843c39", "#66c2a5", "#bc80bd", "#1b5e20", "#fb8072", "#556b2f")
 PLANT_LABELS = {"nmfd": "regional model", "acyclic": "acyclic model", "sumo": "SUMO", "estimate": "estimate"}
 LINE_STYLES, MARKERS = ("-", "--", ":", "-."), "o^sDvPX"
