@@ -240,7 +240,6 @@ class Result:
             temporary.unlink(missing_ok=True)
 
     def __getattr__(self, name: str) -> Any:
-        """Return the array of a variable, or an attribute."""
         if name.startswith("__") or name == "data":
             raise AttributeError(name)
         if name in self.data.variables:
@@ -250,11 +249,9 @@ class Result:
         raise AttributeError(f"result without variable or attribute {name!r}")
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """Return the array of a variable."""
         return self.data.variables[name].values
 
     def __contains__(self, name: str) -> bool:
-        """Return whether there is a variable `name`."""
         return name in self.data.variables
 
     def assign(self, **values: Any) -> "Result":

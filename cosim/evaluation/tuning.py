@@ -158,11 +158,6 @@ def tune(order: Tuning, *, workers: int = 1, progress: Progress = None) -> pd.Da
                 raise_failures(rows)
 
 
-def best(table: pd.DataFrame) -> pd.Series:
-    """Return the row with the lowest score."""
-    return table.loc[table[SCORE].idxmin()]
-
-
 def _key_and_index(name: str) -> tuple[str, int | None]:
     key, _, index = name.rstrip("]").partition("[")
     return key, int(index) if index else None
@@ -255,7 +250,7 @@ def _write(order: Tuning, study: optuna.Study) -> pd.DataFrame:
     )
     files.write_table(order.out / "tune.csv", table)
     if table[SCORE].notna().any():
-        row = best(table)
+        row = table.loc[table[SCORE].idxmin()]
         values = {name: study.trials[int(row["candidate"])].params[name] for name in order.options}
         tuned = order.tuned(values).controller_options[order.strategy.table(order.scenario)]
         keys = dict.fromkeys(_key_and_index(name)[0] for name in order.options)

@@ -64,7 +64,10 @@ class Room:
         """Share the commands again. vehicles: (E,) [veh] on the streets"""
         self.share = self.command_of_gateways()
         if self._limit > 0 and any(self._commanded[pair] < 1.0 for pair in self._boundaries):
-            before, behind = self._taken(vehicles), vehicles[self._behind] / self._room[self._behind]
+            own = np.array([sum(map(self._session.lane_vehicles, lanes)) for lanes in self._lanes])
+            chain = [vehicles[edges].sum() / self._room[edges].sum() for edges in self._chains]
+            before = np.clip(np.maximum(own / self._lane_room, chain), 0.0, 1.0)
+            behind = vehicles[self._behind] / self._room[self._behind]
             floor = np.clip(2.0 * before / self._limit - 1.0, 0.0, 1.0)
             for pair, members in self._boundaries.items():
                 urgency, capacity = (before - behind)[members], self._capacity[members]
@@ -87,13 +90,6 @@ class Room:
         for pair, members in self._boundaries.items():
             realised[pair] = np.average(share[members], weights=self._capacity[members])
         return realised
-
-    def _taken(self, vehicles: PerEdge) -> PerGateway:
-        """Return (G,) [-], the share f_g of the room before every gateway that is taken."""
-        count = self._session.lane_vehicles
-        own = np.array([sum(map(count, lanes)) for lanes in self._lanes])
-        chain = [vehicles[edges].sum() / self._room[edges].sum() for edges in self._chains]
-        return np.clip(np.maximum(own / self._lane_room, chain), 0.0, 1.0)
 
 
 def shared(share: float, urgency: PerGateway, floor: PerGateway, capacity: PerGateway) -> PerGateway:

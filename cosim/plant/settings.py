@@ -29,15 +29,11 @@ class Settings(config.Settings):
     background: Texts = setting("route files of traffic outside the demand: public transport, persons", ())
     additional: Texts = setting("additional files: vehicle types, stops, signal programmes", ())
     options: dict[Text, Text] = setting(
-        "SUMO's options that change the traffic, such as max-depart-delay; other keys of [sumo] override them",
-        {},
+        "SUMO's options that change the traffic, such as max-depart-delay; other keys of [sumo] override them", {}
     )
     signals: Signals = setting("control of the signals", FIXED)
     lookahead: float = setting(
-        "green after a change of stage for which max-pressure compares pressures; less: fewer changes",
-        1.0,
-        unit="s",
-        gt=0.0,
+        "green after a change of stage over which max-pressure compares; less: fewer changes", 1.0, unit="s", gt=0.0
     )
     leave_signals: Texts = setting("signals that perimeter control does not change", ())
     chain_limit: Share = setting(

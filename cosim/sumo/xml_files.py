@@ -16,10 +16,6 @@ BROKEN = (OSError, EOFError, zlib.error, ElementTree.ParseError, LookupError, Ty
 MAX_INCLUDE_DEPTH = 20  # of files that include each other
 
 
-class Missing(ValueError):
-    """An XML element without a required part."""
-
-
 def opened(path: Path) -> io.BufferedIOBase:
     """Return a binary stream of a file, unzipped if its name ends in .gz. Raises one of BROKEN."""
     check_file(path)
@@ -27,18 +23,18 @@ def opened(path: Path) -> io.BufferedIOBase:
 
 
 def attribute(element: ElementTree.Element, name: str) -> str:
-    """Return the text of a required attribute. Raises Missing, one of BROKEN."""
+    """Return the text of a required attribute. Raises ValueError, one of BROKEN."""
     value = element.get(name)
     if value is None:
-        raise Missing(f"{element.tag} {element.get('id', '')}".rstrip() + f": {name}: missing")
+        raise ValueError(f"{element.tag} {element.get('id', '')}".rstrip() + f": {name}: missing")
     return value
 
 
 def child(element: ElementTree.Element, tag: str) -> ElementTree.Element:
-    """Return the first required element `tag` directly below `element`. Raises Missing, one of BROKEN."""
+    """Return the first required element `tag` directly below `element`. Raises ValueError, one of BROKEN."""
     below = element.find(tag)
     if below is None:
-        raise Missing(f"{element.tag}: {tag}: missing")
+        raise ValueError(f"{element.tag}: {tag}: missing")
     return below
 
 

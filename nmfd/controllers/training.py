@@ -180,7 +180,9 @@ def train(
         bar = best = (1.0 - WORTH) * keep_the_better(best)
         policy.load_state_dict(initial)
     for step in range(first, steps):
-        _set_rate(optimizer, setup, step / steps)
+        cosine = 0.5 * (1.0 + math.cos(math.pi * (step / steps)))
+        for group in optimizer.param_groups:
+            group["lr"] = recipe.learning_rate or setup.learning_rate * (0.1 + 0.9 * cosine)
         _descend(policy, objective(generator, recipe.batch, advance), optimizer, setup, step)
         if (step + 1) % VALIDATION_PERIOD == 0 or step + 1 == steps:
             best = keep_the_better(best)
@@ -219,13 +221,6 @@ def _first_policy(setup: Training, planning: PlanningModel, *, guidance: bool) -
     if setup.from_no_control:
         begin_as_no_control(policy, planning.network)
     return policy
-
-
-def _set_rate(optimizer: Adam, setup: Training, done: float) -> None:
-    """Set the learning rate after a share `done` of the steps."""
-    cosine = 0.5 * (1.0 + math.cos(math.pi * done))
-    for group in optimizer.param_groups:
-        group["lr"] = setup.recipe.learning_rate or setup.learning_rate * (0.1 + 0.9 * cosine)
 
 
 def _loss(

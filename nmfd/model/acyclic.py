@@ -156,10 +156,3 @@ def advance_counted(
 ) -> tuple[PerCell, float]:
     """Return x after one control interval of `step` [s] under constant inputs, and the completed trips [veh]."""
     return counted(lambda x: derivative(model, x, demand, perimeter, theta), x, step, **scheme)
-
-
-def translate(model: Acyclic, x: PerCell) -> PerPair:
-    """Return x_ij = sum over o, g of x_ogij (R, R) [veh], including o = j and g = j for i = j."""
-    regions = len(model.start)
-    flat = np.bincount(model.region * regions + model.destination, x, minlength=regions**2)
-    return flat.reshape(regions, regions)

@@ -138,7 +138,6 @@ class Estimator:
 
     @property
     def accumulation(self) -> PerPair:
-        """Estimate of x_ij (R, R) [veh]."""
         return self.belief.mean[self._x].reshape(self._regions, self._regions).copy()
 
     def step(self, controls: Controls, readings: Readings) -> PerPair:

@@ -107,7 +107,9 @@ class AcyclicPlant(NmfdPlant):
         self._x[self._model.start] = start
 
     def _accumulation(self) -> PerPair:
-        return acyclic.translate(self._model, self._x)
+        model, regions = self._model, len(self._model.start)
+        cells = model.region * regions + model.destination
+        return np.bincount(cells, self._x, minlength=regions**2).reshape(regions, regions)
 
     def _scale(self, factor: PerPair) -> None:
         self._x = self._x * factor[self._model.region, self._model.destination]

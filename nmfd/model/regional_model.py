@@ -186,9 +186,7 @@ class RegionTable(Settings):
     adjacent: Regions = setting("regions into which roads lead from here")
     mfd: MfdTable | None = setting("own MFD instead of [mfd]", None)
     exit_rates: config.PositiveNumbers | None = setting(
-        "rate at which vehicles leave, relative to the MFD, per destination region; for all regions or none",
-        None,
-        unit="-",
+        "rate at which vehicles leave, relative to the MFD, per destination; for all regions or none", None, unit="-"
     )
     capacity: config.PositiveNumbers | None = setting(
         "largest flow into each adjacent region while that is empty, at the largest u, in the order of adjacent; with "
@@ -206,10 +204,7 @@ class RegionTable(Settings):
         unit="-",
     )
     critical_above: float | None = setting(
-        "largest accumulation in data that show no falling branch; the critical one is above it",
-        None,
-        unit="veh",
-        ge=0.0,
+        "largest accumulation in data without a falling branch; the critical one is above it", None, unit="veh", ge=0.0
     )
     doubts: config.Texts = setting("warnings of cosim identify about the fit", ())
     observed_split_ratios: dict[str, dict[str, Share]] = setting(
@@ -226,11 +221,7 @@ class NetworkTable(Settings):
     placeholder: bool = setting("MFDs are guesses from lanes and speed limits; no policy is trained on them", False)
     perimeter: PerimeterTable = setting("bounds of the control")
     dispersion: float = setting(
-        "spread of the travel times by which guided drivers answer prices, a logit",
-        DISPERSION_S,
-        unit="s",
-        ge=1.0,
-        le=1e4,
+        "spread of travel times by which guided drivers answer prices (logit)", DISPERSION_S, unit="s", ge=1.0, le=1e4
     )
     mfd: MfdTable | None = setting("MFD of every region without one of its own", None)
     regions: Rows[RegionTable] = setting("one table per region", min_length=1)

@@ -69,7 +69,6 @@ class Interface:
 
     @property
     def action_space(self) -> Box:
-        """Vectors (action_size,) in [-1, 1]."""
         return Box(-1.0, 1.0, (self.action_size,), np.float32)
 
     def controls(self, action: Action, where: str = "") -> Controls:

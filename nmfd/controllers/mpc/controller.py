@@ -45,10 +45,7 @@ class Mpc(Options):
 
     horizon: int = whole("horizon of the plan, in control intervals", 8, low=2, high=1000)
     control_horizon: int | None = whole(
-        "intervals with controls of their own, the last of which hold to the end; by default all",
-        None,
-        low=1,
-        high=1000,
+        "intervals with controls of their own, of which the last hold on; by default all", None, low=1, high=1000
     )
     solver: Literal["projected-gradient", "ipopt"] = setting(
         "ipopt: the published formulation, as a reference, a hundred times slower", "projected-gradient"
