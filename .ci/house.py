@@ -19,13 +19,11 @@ from pydantic import BaseModel
 
 ROOT = Path(__file__).parents[1]
 PICTURE = Path(__file__).with_name("house.svg")
-# The limits of lines are 20,000 and, of tests, 14,000 again when the open issues are done.
 LINES, MODULES, TEST_LINES, WORDS, WORDS_OF_A_PAGE, COMMANDS, PARAMETERS, SETTINGS = (
-    20_200, 140, 14_150, 12_000, 900, 17, 110, 120,
+    20_000, 140, 14_000, 12_000, 900, 17, 110, 120,
 )  # fmt: skip
 LONG_PAGES = {"scenarios/settings.md"}
 ODD = re.compile(r"(Of|What|Whether|Who|Where|As|The same)\b")
-FLOORS = ("cli", "api", "report", "view", "evaluation", "importing", "plant", "sumo", "studies", "rl", "closed_loop")
 
 
 def main() -> None:
