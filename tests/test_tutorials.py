@@ -11,8 +11,8 @@ from nmfd.runs import shipped
 MOST = 200_000  # bytes of a notebook with its outputs
 
 
-def test_there_are_four_and_all_are_small_and_have_their_outputs():
-    assert [file.name[0] for file in NOTEBOOKS] == list("1234")
+def test_all_are_there_and_are_small_and_have_their_outputs():
+    assert [file.name[0] for file in NOTEBOOKS] == list("12345")
     nbformat = pytest.importorskip("nbformat")
     for file in NOTEBOOKS:
         assert file.stat().st_size < MOST, file
