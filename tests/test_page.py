@@ -6,6 +6,7 @@ from html.parser import HTMLParser
 
 import made_up
 import numpy as np
+import pandas as pd
 import pytest
 from commands import cosim, error_line
 
@@ -91,17 +92,21 @@ def test_the_card_has_the_figures_of_the_best_strategy(evaluation):
     rows.loc[rows["controller"] == "no-control", "mean_trip_time_s"] = 600.0
     rows.loc[rows["controller"] == "dpc-pcrg", "mean_trip_time_s"] = [299.0, 301.0]
     heading, shown, name = html.card(rows)
-    assert heading == "dpc-pcrg compared with no control" and name == "dpc-pcrg"
-    trip, served, spent = shown  # CO2 was not recorded
-    assert (trip.value, trip.before, trip.better) == ("5.0 min", "10.0 min without control", True)
-    assert trip.change == "-50 % ± 2 (95 %, 2 seeds)"
+    assert heading.startswith("dpc-pcrg compared with no control: ") and name == "dpc-pcrg"
+    spent, served, trip = shown  # CO2 was not recorded
+    assert (trip.value, trip.before, trip.change) == ("5.0 min", "10.0 min without control", "50 ± 2 % less")
     assert served.value == "500" and served.better is None
     times = rows.groupby("controller")["total_time_spent_veh_s"].mean() / 3600
-    assert spent.value == f"{times['dpc-pcrg']:,.0f} veh h" and spent.better
+    assert spent.label == "Vehicle hours saved" and spent.value == f"{times['no-control'] - times['dpc-pcrg']:,.0f} veh h"
+    assert all(one.verdict == "no proof (2 seeds)" and one.better is None for one in shown)
+    third = rows[rows["seed"] == 2000].assign(seed=2002)
+    assert html.card(pd.concat([rows, third]))[1][2][-2:] == ("significant", True)
+    same = pd.concat([rows, third]).assign(mean_trip_time_s=600.0)
+    assert html.card(same)[1][2][-3:] == ("no change", "not significant", None)
     alone = html.card(rows[rows["controller"] == "no-control"])
     assert alone[0] == "no-control" and all(figure.change == "" for figure in alone[1])
     single = html.card(rows[rows["seed"] == 2000])[1]
-    assert all(figure.better is None and figure.change.endswith("on one seed") for figure in single)
+    assert all(one.better is None and one.verdict == "no proof (1 seed)" and "±" not in one.change for one in single)
 
 
 def test_names_are_escaped_and_several_folders_fit_on_a_page(evaluation, tmp_path, monkeypatch):

@@ -99,7 +99,7 @@ def test_the_frame_at_a_time(whole):
 
 def test_the_page_draws_every_street_and_escapes_names(drawn, whole):
     named = replace(drawn, name=EVIL, region_names=(EVIL,) * drawn.regions)
-    one, document = page.Page(named, [EVIL, "no-control"]), Document()
+    one, document = page.Page(named, {EVIL: "red", "no-control": "black"}), Document()
     document.add_root(one.layout([Button(label=EVIL)]))
     one.show([replace(whole[-1], note=EVIL), None], whole[-1].time)
     one.trace([whole, whole[:2]], whole[-1].time)
@@ -117,7 +117,7 @@ def test_finished_runs_on_one_page_with_a_slider(drawn, plain):
     later = picture.frames(drawn, plain)
     emptier = [replace(frame, density=frame.density / 2, accumulation=frame.accumulation / 2) for frame in later]
     runs = {"plain": later, EVIL: emptier}
-    layout = page.with_slider(drawn, runs, picture.totals(drawn, [plain, plain]))
+    layout = page.with_slider(drawn, runs, dict.fromkeys(runs, "red"), picture.totals(drawn, [plain, plain]))
     choose = next(layout.select({"name": "streets"}))
     layers = choose.js_property_callbacks["change:value"][0].args["layers"]
     shown = [label for label, parts in layers if all(part.visible for part in parts)]

@@ -3,6 +3,7 @@
 import base64
 import json
 import math
+import re
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -22,38 +23,31 @@ from cosim.report import figures
 from cosim.view.page import with_slider
 from cosim.view.picture import CityPicture, frames, totals
 from nmfd.errors import InputError
-from nmfd.runs import files
+from nmfd.runs import config, files
+from nmfd.studies import plots
 from nmfd.studies.benchmark import REFERENCE
 
-PICTURES = {  # file -> caption
-    "total_accumulation": "Vehicles in the network, with those that wait to enter, over time.",
-    "region_accumulation": "Vehicles in each region over time, and the critical accumulation of the regional model.",
-    "mfd": "Macroscopic fundamental diagram of each region. Dots: control intervals; line: the regional model; "
-    "hatched: beyond all dots.",
-}
+CAPTIONS = config.read(Path(__file__).with_name("captions.toml"))
+PICTURES, LEVEL_PICTURES = CAPTIONS["level"], CAPTIONS["levels"]  # file -> caption
 PICTURE_DPI, CSS_DPI = 150, 96  # of nmfd.studies.plots.save, and of browsers
-LEVEL_PICTURES = {
-    "frontier": "Trips served, as a share of those that are due, over the demand.",
-    "demand": "Total time spent relative to the reference, over the demand, with 95 % intervals.",
-}
-
 MINUTE, HOUR = 60.0, 3600.0  # s
 QUANTITIES = {  # label -> column, its unit on the card, format of a value, sign of an improvement, meaning
+    "Time spent": (statistics.TTS, HOUR, "{:,.0f} veh h", -1, "private vehicles on the road or waiting to enter"),
+    "Trips completed": ("completed_veh", 1.0, "{:,.0f}", 1, "mean over seeds"),
     "Time per trip": ("mean_trip_time_s", MINUTE, "{:.1f} min", -1, "from wanted departure to end of trip or run"),
-    "Trips served": ("completed_veh", 1.0, "{:,.0f}", 1, "completed trips, mean over seeds"),
     "CO2": ("co2_kg", 1000.0, "{:.2f} t", -1, "of all vehicles while the run lasted, by SUMO's HBEFA4 petrol car"),
-    "Total time spent": (statistics.TTS, HOUR, "{:,.0f} veh h", -1, "private vehicles on the road or waiting to enter"),
 }
 
 
 class Figure(NamedTuple):
-    """Figure of the card: of the best strategy, before of the reference; better: None if the interval holds zero."""
+    """Figure of the card: of the best strategy, before of the reference; better: None if not significant."""
 
     label: str
     value: str
     meaning: str
     before: str = ""
     change: str = ""
+    verdict: str = ""
     better: bool | None = None
 
 
@@ -63,13 +57,13 @@ def write_page(path: Path, runs: Sequence[Finished], *, seed: int | None = None)
     seed: of the runs on the map; the first that both have if None
     Raises: InputError if there is no run with this seed
     """
-    title, script, div = _map(runs[0], seed)
+    shown, script, div = _map(runs[0], seed)
     loader = PackageLoader("cosim.report", ".")
     environment = Environment(loader=loader, autoescape=True, trim_blocks=True, undefined=StrictUndefined)
     page = environment.get_template("report.html.j2").render(
         name=", ".join(dict.fromkeys(run.scenario.name for run in runs)),
         runs=[_run(run) for run in runs],
-        map_title=title,
+        seed=shown,
         map_div=div,
         scripts=[*Resources(mode="inline", components=["bokeh", "bokeh-widgets"]).js_raw, script],
         style=(Path(__file__).parent / "report.css").read_text(encoding="utf-8"),
@@ -79,8 +73,8 @@ def write_page(path: Path, runs: Sequence[Finished], *, seed: int | None = None)
     return path
 
 
-def _map(run: Finished, seed: int | None) -> tuple[str, str, str]:
-    """Return title, script and HTML of the best run beside its reference, with a slider over their time."""
+def _map(run: Finished, seed: int | None) -> tuple[int, str, str]:
+    """Return seed, script and HTML of the best run beside its reference, with a slider over their time."""
     level = run.level()
     names = _pair(level.rows)
     seeds = [set(level.rows.loc[level.rows["controller"] == name, "seed"]) for name in names]
@@ -94,8 +88,9 @@ def _map(run: Finished, seed: int | None) -> tuple[str, str, str]:
     results = {name: level.read(name, seed) for name in names}
     whole = {name: frames(picture, result) for name, result in results.items()}
     picture = replace(picture, steps=max(map(len, whole.values())) - 1)
-    script, div = components(with_slider(picture, whole, totals(picture, list(results.values()))), wrap_script=False)
-    return f"{' and '.join(names)}, seed {seed}", script, div
+    tones = plots.colours(run.rows["controller"])
+    page = with_slider(picture, whole, tones, totals(picture, list(results.values())))
+    return seed, *components(page, wrap_script=False)
 
 
 def _pair(rows: pd.DataFrame) -> list[str]:
@@ -109,30 +104,30 @@ def _run(run: Finished) -> dict:
     level, rows = run.level(), run.rows
     seeds = ", ".join(map(str, sorted(set(rows["seed"]))))
     heading, shown, name = card(level.rows)
-    manifest = {"runs": level.key, "controllers": level.controllers, "sessions": run.sessions}
+    manifest = json.dumps({"runs": level.key, "controllers": level.controllers, "sessions": run.sessions}, indent=1)
     minutes = level.key["steps"] * level.key["step_s"] / 60
     pictures = _pictures(partial(figures.draw_levels, rows=rows), LEVEL_PICTURES) if len(run.levels) > 1 else []
     return {
         "name": run.path.resolve().name,
-        "heading": heading + (f", demand times {level.demand:g}" if len(run.levels) > 1 else ""),
+        "heading": f"Demand times {level.demand:g}: " * (len(run.levels) > 1) + heading,
         "figures": shown,
         "why": explain.paragraph(level, run, name),
         "intro": f"Scenario {run.scenario.name}, {minutes:.0f} min in SUMO; seeds {seeds}. With the same seed every "
-        "strategy has the same trips.",
+        "controller has the same trips.",
         "pictures": pictures,
         "levels": [_level(run, level) for level in run.levels],
-        "manifest": json.dumps(manifest, indent=1),
+        "manifest": re.sub(r"(?<![\w.])/(?:[^/\s\"']+/)+", "", manifest),  # no folders of a machine
     }
 
 
 def card(rows: pd.DataFrame) -> tuple[str, list[Figure], str]:
-    """Return a heading, the figures that were recorded, and the name of the best strategy of one demand level.
+    """Return a sentence, the figures that were recorded, and the name of the best strategy of one demand level.
 
     It is compared with the reference on the seeds that both have.
     """
     against, level = statistics.compared_with(rows), rows["demand"].iloc[0]
     name = next((name for name in figures.ranked(rows) if name != against), against)
-    heading = name if name == against else f"{name} compared with {against.replace('-', ' ')}"
+    heading = name
     than = "without control" if against == REFERENCE else f"under {against}"
     shown = []
     for label, (column, unit, form, good, meaning) in QUANTITIES.items():
@@ -141,15 +136,26 @@ def card(rows: pd.DataFrame) -> tuple[str, list[Figure], str]:
         value = mean(now[seed] for seed in common or now) / unit
         figure = Figure(label, form.format(value), meaning)
         if name != against and not math.isnan(pair.percent):
-            single = math.isnan(pair.percent_half)
-            spread = " on one seed" if single else f" ± {pair.percent_half:.0f} (95 %, {pair.seeds} seeds)"
-            figure = figure._replace(
-                before=f"{form.format(mean(before[seed] for seed in common) / unit)} {than}",
-                change=f"{pair.percent:+.0f} %{spread}",
-                better=pair.percent * good > 0 if pair.excludes_zero else None,
-            )
+            reference = mean(before[seed] for seed in common) / unit
+            change, verdict, better = _judged(pair, good)
+            figure = Figure(label, figure.value, meaning, f"{form.format(reference)} {than}", change, verdict, better)
+            if column == statistics.TTS:
+                heading = f"{name} compared with {against.replace('-', ' ')}: {change} time spent, {verdict}."
+                figure = figure._replace(label="Vehicle hours saved", value=form.format(reference - value))
         shown += [] if math.isnan(value) else [figure]
     return heading, shown, name
+
+
+def _judged(pair: statistics.Paired, good: int) -> tuple[str, str, bool | None]:
+    """Return change, verdict and better of a figure; good: sign of an improvement."""
+    seeds, half, clear = pair.seeds, pair.percent_half, pair.excludes_zero and pair.seeds >= explain.FEWEST_SEEDS
+    digits = 0 if half >= 1.0 or seeds == 1 else 1
+    spread = "" if seeds == 1 else f" ± {max(half, 0.1):.{digits}f}"
+    size = f"{abs(pair.percent):.{digits}f}{spread} % {'more' if pair.percent > 0 else 'less'}"
+    change = size if pair.percent or half else "no change"
+    few = f"no proof ({seeds} seed{'s' * (seeds > 1)})"
+    verdict = few if seeds < explain.FEWEST_SEEDS else "significant" if clear else "not significant"
+    return change, verdict, pair.percent * good > 0 if clear else None
 
 
 def _level(run: Finished, level: Level) -> dict:

@@ -1,22 +1,24 @@
 """The map of one run: streets by density, regions with their numbers, gates with their green."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bokeh.models import ColorBar, ColumnDataSource, FixedTicker, HoverTool, LinearColorMapper, Model, ScaleBar
+from bokeh.models import ColorBar, ColumnDataSource, CustomJS, FixedTicker, HoverTool, LinearColorMapper, ScaleBar
 from bokeh.plotting import figure
 from bokeh.transform import linear_cmap
 
 from cosim.sumo.arrays import PerEdge, Points
 from cosim.view import colours
-from cosim.view.picture import CityPicture, Frame
+from cosim.view.picture import CityPicture, Frame, Gate
 
 DENSITY = "density [veh/km and lane]"
 JAM_DENSITY = 1000.0 / 7.5  # veh/km and lane
 LINE_OFFSET = 0.006  # of the map's width, by which the two directions of a street are drawn apart
-MAP_HEIGHT = 500  # pixels
-GATE_RADII = ((60, 6.0), (150, 4.5), (10**9, 3.5))  # up to so many gates, pixels
+MAP_HEIGHT = 440  # pixels
+GATE_RADIUS = 6.0  # pixels
+CLOSER = 0.7  # of the map's extent: within so much every gate is shown, and further out every boundary
 
 
 class CityMap:
@@ -28,29 +30,36 @@ class CityMap:
     def __init__(self, picture: CityPicture, title: str, totals: Mapping[str, tuple[PerEdge, float]] = {}):
         """totals: label -> values (E,) of other layers, and the upper end of their scale"""
         self._picture, self._totals = picture, totals
-        self.layers: dict[str, list[Model]] = {}
-        self._radius = next(radius for count, radius in GATE_RADII if len(picture.gates) <= count)
+        self.layers: dict[str, list[Any]] = {}
         size = {"height": MAP_HEIGHT, "sizing_mode": "stretch_width", "match_aspect": True, "lod_threshold": None}
         bare = {"tools": "pan,wheel_zoom,reset", "toolbar_location": None, "outline_line_color": None}
         self.plot = figure(title=title, active_scroll="wheel_zoom", **size, **bare)
         self.plot.axis.visible = self.plot.grid.visible = False
         self.regions = self._add_regions()
         self.streets = self._add_streets()
-        self.gates = self._add_gates()
+        both = picture.boundaries, picture.gates  # the former from afar, the latter closer
+        self._members = [[list(gate.gateways) for gate in gates] for gates in both]
+        (far, far_parts), (near, near_parts) = (self._add_gates(gates) for gates in both)
+        self.gates = far, near
         self._add_numbers()
+        for part in near_parts:
+            part.visible = False
+        limit = CLOSER * float(np.ptp(np.concatenate(picture.shapes), axis=0).max())
+        code = CustomJS.from_file(Path(__file__).with_name("gates.js"), far=far_parts, near=near_parts, limit=limit)
+        self.plot.x_range.js_on_change("end", code)
 
     def show(self, frame: Frame) -> None:
         """Draw a frame."""
         patch(self.streets, density=frame.density)
-        members = [list(gate.gateways) for gate in self._picture.gates]
-        share, queue = (np.array([mean(x[n]) for n in members]) for x in (frame.green, frame.queue))
-        patch(
-            self.gates,
-            end=_wedge_end(np.nan_to_num(np.clip(share, 0.0, 1.0), nan=1.0)),
-            green=["not controlled" if np.isnan(one) else f"{one:.0%}" for one in share],
-            queue=queue,
-            halo=np.where(queue >= 0.5, 2.0 * self._radius + 4.0 * np.sqrt(queue), 0.0),
-        )
+        for source, members in zip(self.gates, self._members, strict=True):
+            share, queue = (np.array([mean(x[n]) for n in members]) for x in (frame.green, frame.queue))
+            patch(
+                source,
+                end=_wedge_end(np.nan_to_num(np.clip(share, 0.0, 1.0), nan=1.0)),
+                green=["not controlled" if np.isnan(one) else f"{one:.0%}" for one in share],
+                queue=queue,
+                halo=np.where(queue >= 0.5, 2.0 * GATE_RADIUS + 4.0 * np.sqrt(queue), 0.0),
+            )
 
     def choose(self, region: int) -> None:
         """Highlight a region."""
@@ -100,8 +109,8 @@ class CityMap:
         self._hover(drawn, ("street", "@edge"), (label, f"@{{{column}}}{{0.0}}"))
         self.layers[label] = [drawn, bar]
 
-    def _add_gates(self) -> ColumnDataSource:
-        gates = self._picture.gates
+    def _add_gates(self, gates: Sequence[Gate]) -> tuple[ColumnDataSource, list[Any]]:
+        """Return the source of gates, and what draws them."""
         places = np.array([gate.place for gate in gates]).reshape(-1, 2)
         signal = np.array([gate.signal for gate in gates], dtype=bool)
         source = _source(
@@ -112,23 +121,26 @@ class CityMap:
             green=["100%"] * len(gates),
             queue=np.zeros(len(gates)),
             halo=np.zeros(len(gates)),
-            size=np.where(signal, 2.0 * self._radius + 2.0, self._radius),
-            radius=np.where(signal, self._radius, 0.0),
+            size=np.where(signal, 2.0 * GATE_RADIUS + 2.0, GATE_RADIUS),
+            radius=np.where(signal, GATE_RADIUS, 0.0),
             rim=[colours.INK if one else colours.FAINT for one in signal],
         )
-        self.plot.scatter("x", "y", size="halo", source=source, color=colours.QUEUE, alpha=0.3, line_color=None)
+        halo = self.plot.scatter("x", "y", size="halo", source=source, color=colours.QUEUE, alpha=0.3, line_color=None)
         discs = self.plot.scatter("x", "y", size="size", source=source, fill_color=colours.PAPER, line_color="rim")
         share = {"start_angle": np.pi / 2, "end_angle": "end", "direction": "clock", "radius_units": "screen"}
-        self.plot.wedge("x", "y", "radius", source=source, color=colours.GREEN, line_color=None, **share)
-        self._hover(discs, ("gate", "@way"), ("green / original green", "@green"), ("queue [veh]", "@queue{0.0}"))
-        return source
+        wedges = self.plot.wedge("x", "y", "radius", source=source, color=colours.GREEN, line_color=None, **share)
+        self._hover(discs, ("gate", "@way"), ("green / original green", "@green"), ("mean queue [veh]", "@queue{0.0}"))
+        return source, [halo, discs, wedges]
 
     def _add_numbers(self) -> None:
         x, y = self._picture.places.astype(np.float32).T
-        self.plot.scatter(x, y, size=24, fill_color=colours.PAPER, fill_alpha=0.9, line_color=colours.INK)
         labels = [str(r) for r in range(self._picture.regions)]
+        marked = [r in self._picture.protected for r in range(self._picture.regions)]
+        pair = colours.INK, colours.PAPER
+        fill, ink = [pair[not one] for one in marked], [pair[one] for one in marked]
+        self.plot.scatter(x, y, size=24, fill_color=fill, fill_alpha=0.9, line_color=colours.INK)
         middle = {"text_align": "center", "text_baseline": "middle", "text_font_size": "12px"}
-        self.plot.text(x, y, text=labels, text_color=colours.INK, **middle)
+        self.plot.text(x, y, text=labels, text_color=ink, **middle)
         clear = {"background_fill_alpha": 0.0, "border_line_alpha": 0.0, "label_text_font_size": "11px"}
         scale = ScaleBar(range=self.plot.x_range, unit="m", location="bottom_left", bar_length=0.15, **clear)
         self.plot.add_layout(scale)

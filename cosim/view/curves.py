@@ -1,6 +1,6 @@
 """The curves beside the map: load of all regions, accumulation, MFD plane and perimeter of one, totals of the city."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from bokeh.models import CDSView, ColumnDataSource, FixedTicker, HoverTool, IndexFilter, LinearColorMapper, Plot, Span
@@ -53,7 +53,8 @@ class Curves:
     lines: one source per run, a row per whole frame; present: filters for the large point in the MFD plane
     """
 
-    def __init__(self, picture: CityPicture, names: Sequence[str]):
+    def __init__(self, picture: CityPicture, tones: Mapping[str, str]):
+        """tones: name of a run -> its colour"""
         self._picture = picture
         self.region = _figure("", "time [min]", "accumulation [veh]")
         self.plane = _figure("", "accumulation [veh]", "outflow [veh/s]")
@@ -69,8 +70,8 @@ class Curves:
         self.plane.line("x", "y", source=self.mfd, color=colours.FAINT, line_width=2, legend_label="MFD of the model")
         self.lines: list[ColumnDataSource] = []
         self.present: list[IndexFilter] = []
-        for n, name in enumerate(names):
-            self._add_run(n, name)
+        for n, (name, colour) in enumerate(tones.items()):
+            self._add_run(n, name, colour)
         for plot in (*over_time, self.plane):
             style = {"label_text_font_size": "11px", "background_fill_alpha": 0.75, "border_line_alpha": 0.0}
             plot.legend[0].update(location="top_left", spacing=0, padding=2, **style)
@@ -113,8 +114,8 @@ class Curves:
         for now in self.now:
             now.location = time / MINUTE
 
-    def _add_run(self, n: int, name: str) -> None:
-        (colour, dash), marker = colours.RUNS[n], MARKERS[n]
+    def _add_run(self, n: int, name: str, colour: str) -> None:
+        dash, marker = colours.DASHES[n], MARKERS[n]
         columns = ("time", *OF_REGION, "completed", "spent")
         source = ColumnDataSource({column: np.zeros(0, np.float32) for column in columns})
         style = {"source": source, "color": colour, "line_dash": dash, "line_width": 2}

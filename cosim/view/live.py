@@ -28,6 +28,7 @@ from cosim.view.picture import CityPicture, Frame, after, between, first
 from nmfd.errors import InputError, RunFailed
 from nmfd.metrics import summary
 from nmfd.model.scenario import Scenario
+from nmfd.studies import plots
 from nmfd.types import Controls, State
 
 REFRESH_MS = 250  # between two pictures
@@ -178,7 +179,8 @@ class Viewer:
 
     def __init__(self, show: Show, document: Document):
         assert show.picture is not None
-        self._show, self._page = show, Page(show.picture, [seen.name for seen in show.runs])
+        tones = plots.colours(names := [seen.name for seen in show.runs])
+        self._show, self._page = show, Page(show.picture, {name: tones[name] for name in names})
         self._traced: tuple[object, ...] = ()
         self._pause = Button(label="Pause", button_type="primary", name="pause", width=90)
         self._pause.on_click(self._toggle)

@@ -16,39 +16,45 @@ from cosim.view.curves import HOUR, MINUTE, OF_REGION, Curves, Load
 from cosim.view.picture import CityPicture, Frame
 
 HERE = Path(__file__).parent
+STYLE = (HERE / "page.css").read_text(encoding="utf-8")
 PLAY_PERIOD_MS = 150  # wall time per control interval
+TO_TIME = "slider.value = Math.min(slider.end, Math.max(0, Math.round(cb_obj.x / slider.step) * slider.step))"
 TOP_SHARE = 0.02  # of the streets; short ones would leave all others pale
 NARROWEST = 330  # pixels, of a plot; on a narrower screen plots stand below each other
 KEY = (
-    f"<span style='color:{colours.GREEN}'>◕</span> gate, green part: share of its original green time &ensp; "
-    f"<span style='color:{colours.QUEUE}'>●</span> halo: queue before it"
+    f"<span style='color:{colours.GREEN}'>◕</span> gates of a boundary, closer each gate; green: share of its original "
+    f"green time &ensp; <span style='color:{colours.QUEUE}'>●</span> halo: queue before it &ensp; ➍ protected region"
 )
 
 
 class Page:
     """Maps, curves and numbers of the runs `names` side by side."""
 
-    def __init__(self, picture: CityPicture, names: Sequence[str], totals: Mapping[str, Sequence[PerEdge]] = {}):
-        """totals: label -> values (E,) of every run, which the maps can show instead of the density"""
-        self.picture, self.names = picture, names
+    def __init__(self, picture: CityPicture, tones: Mapping[str, str], totals: Mapping[str, Sequence[PerEdge]] = {}):
+        """Draw the empty page.
+
+        tones: name of a run -> its colour
+        totals: label -> values (E,) of every run, which the maps can show instead of the density
+        """
+        self.picture, self.names, self.tones = picture, list(tones), tones
         # Above a scale is only TOP_SHARE of the values of all runs; its upper end has two digits.
         upper = {label: np.quantile(np.concatenate(values), 1.0 - TOP_SHARE) for label, values in totals.items()}
         tops = {label: float(f"{end:.2g}") or 1.0 for label, end in upper.items()}
         self.maps = [
             CityMap(picture, name, {label: (values[n], tops[label]) for label, values in totals.items()})
-            for n, name in enumerate(names)
+            for n, name in enumerate(tones)
         ]
         layers = [[label, parts] for one in self.maps for label, parts in one.layers.items()]
         labels = list(self.maps[0].layers)
-        self.streets = Select(title="Streets by", name="streets", width=190, value=labels[0], options=labels)
+        self.streets = Select(title="Streets by", name="streets", width=150, value=labels[0], options=labels)
         self.streets.js_on_change("value", CustomJS.from_file(HERE / "layers.js", layers=layers))
-        self.loads = [Load(picture, f"{name}: load of the regions") for name in names]
-        self.curves = Curves(picture, names)
-        self.numbers = Div(sizing_mode="stretch_width", styles={"overflow-x": "auto"})
+        self.loads = [Load(picture, f"{name}: load of the regions") for name in tones]
+        self.curves = Curves(picture, tones)
+        self.numbers = Div(sizing_mode="stretch_width", css_classes=["numbers"], stylesheets=[STYLE])
         ends = [region for gate in picture.gates for region in (gate.source, gate.target)]
         self.choose(max(range(picture.regions), key=ends.count))
         options = [(str(n), name if name == str(n) else f"{n} {name}") for n, name in enumerate(picture.region_names)]
-        self.regions = Select(name="region", title="Region", width=190, value=str(self.region), options=options)
+        self.regions = Select(name="region", title="Region", width=150, value=str(self.region), options=options)
 
     def choose(self, region: int) -> None:
         """Select the region whose curves are shown; `trace` draws them."""
@@ -65,7 +71,7 @@ class Page:
         for load in self.loads:
             load.now.location = time / MINUTE
         self.curves.mark(time)
-        self.numbers.text = numbers(self.names, frames, time)
+        self.numbers.text = numbers(self.tones, frames, time)
 
     def trace(self, runs: Sequence[Sequence[Frame]], time: float) -> None:
         """Draw the curves from the whole frames of every run, with the time [s] marked."""
@@ -82,11 +88,13 @@ class Page:
             one.plot.name = f"map{n}"
         curves.plane.name = "plane"
         self.numbers.name = "numbers"
+        above = _wrapped(bar, narrowest=0)
+        above.update(css_classes=["bar"], stylesheets=[STYLE])
         return column(
-            _wrapped(bar, narrowest=0),
-            self.numbers,
+            above,
             _wrapped([*(one.plot for one in self.maps), *beside]),
-            Div(text=KEY, styles={"color": colours.FAINT, "font-size": "13px"}),
+            Div(text=KEY, css_classes=["key"], stylesheets=[STYLE]),
+            self.numbers,
             _wrapped([load.plot for load in self.loads]),
             _wrapped([*below, curves.gates, curves.trips, curves.spent]),
             sizing_mode="stretch_width",
@@ -94,21 +102,21 @@ class Page:
 
 
 def with_slider(
-    picture: CityPicture, runs: Mapping[str, Sequence[Frame]], totals: Mapping[str, Sequence[PerEdge]] = {}
+    picture: CityPicture, runs: Mapping[str, Sequence[Frame]], tones: Mapping[str, str], totals: Mapping[str, Any] = {}
 ) -> LayoutDOM:
     """Return the page of finished runs, which needs no server.
 
-    It starts where two runs differ most, or where one has most vehicles. runs: whole frames by name
-    totals: as in `Page`
+    It starts where two runs differ most while vehicles drive in both, or where one has most vehicles.
+    runs: whole frames by name; tones: colours of these and perhaps others; totals: as in `Page`
     """
-    page, whole = Page(picture, list(runs), totals), list(runs.values())
+    page, whole = Page(picture, {name: tones[name] for name in runs}, totals), list(runs.values())
     last, step = max(map(len, whole)) - 1, picture.step / MINUTE
     padded = [[*frames, *[frames[-1]] * (last + 1 - len(frames))] for frames in whole]
-    inside = [[frame.accumulation.sum() for frame in frames] for frames in padded]
-    begin = int(np.argmax(np.abs(np.subtract(inside[0], inside[-1]) if len(inside) > 1 else inside[0])))
+    inside = np.array([[frame.accumulation.sum() for frame in frames] for frames in padded])
+    begin = int(np.argmax(np.ptp(inside, axis=0) * inside.min(axis=0) if len(inside) > 1 else inside[0]))
     moving = [
         *((one.streets, ["density"]) for one in page.maps),
-        *((one.gates, ["end", "green", "queue", "halo"]) for one in page.maps),
+        *((source, ["end", "green", "queue", "halo"]) for one in page.maps for source in one.gates),
     ]
     of_region = [
         *((one.regions, ["width", "line", "fill"]) for one in page.maps),
@@ -134,7 +142,7 @@ def with_slider(
     page.choose(first)
     page.trace(whole, begin * picture.step)
     page.show([frames[begin] for frames in padded], begin * picture.step)
-    wide = {"sizing_mode": "stretch_width", "styles": {"flex": "1 1 240px"}}
+    wide = {"sizing_mode": "stretch_width", "styles": {"flex": "1 1 200px"}}
     slider = Slider(start=0.0, end=last * step, value=begin * step, step=step, title="time [min]", name="time", **wide)
     play = Toggle(label="Play", name="play", width=90, button_type="primary")
     args = {"slider": slider, "region": page.regions, "film": film, "choices": choices}
@@ -143,6 +151,8 @@ def with_slider(
     callback = CustomJS.from_file(HERE / "slider.js", **args)
     slider.js_on_change("value", callback)
     page.regions.js_on_change("value", callback)
+    for load in page.loads:
+        load.plot.js_on_event("tap", CustomJS(args={"slider": slider}, code=TO_TIME))
     playing = CustomJS.from_file(HERE / "play.js", slider=slider, period=PLAY_PERIOD_MS)
     play.js_on_change("active", playing)
     return page.layout([play, slider, page.regions, *[page.streets] * bool(totals)])
@@ -163,20 +173,16 @@ def _wrapped(parts: Sequence[LayoutDOM], narrowest: int = NARROWEST) -> LayoutDO
     return row(*parts, sizing_mode="stretch_width", styles={"flex-wrap": "wrap", "gap": "8px 14px"})
 
 
-def numbers(names: Sequence[str], frames: Sequence[Frame | None], time: float) -> str:
+def numbers(tones: Mapping[str, str], frames: Sequence[Frame | None], time: float) -> str:
     """Return the totals of the runs at a time [s], as an HTML table."""
     labels = ("inside [veh]", "waiting [veh]", "completed [veh]", "time spent [veh h]", "removed [veh]")
-    heads = "".join(f"<td style='color:{colours.FAINT};padding:0 10px'>{label}</td>" for label in labels)
+    heads = "".join(f"<td class=head>{label}</td>" for label in labels)
     lines = []
-    for (colour, _), name, frame in zip(colours.RUNS, names, frames, strict=False):
+    for (name, colour), frame in zip(tones.items(), frames, strict=True):
         cells = ""
         if frame is not None:
             totals = [frame.accumulation.sum(), frame.waiting, frame.completed, frame.time_spent / HOUR, frame.removed]
-            cells = "".join(f"<td style='font-size:18px;padding:0 10px'>{value:,.0f}</td>" for value in totals)
-            cells += f"<td style='color:{colours.QUEUE}'>{escape(frame.note[:200])}</td>"
-        head = f"<th style='color:{colour};text-align:left;font-size:15px'>{escape(name)}</th>"
-        lines.append(f"<tr>{head}{cells}</tr>")
-    return (
-        "<table style='text-align:right'><tr><th style='font-size:20px;text-align:left;white-space:nowrap'>"
-        f"{time / MINUTE:.1f} min</th>{heads}</tr>{''.join(lines)}</table>"
-    )
+            cells = "".join(f"<td>{value:,.0f}</td>" for value in totals)
+            cells += f"<td class=note>{escape(frame.note[:200])}</td>"
+        lines.append(f"<tr><th><span style='color:{colour}'>■</span> {escape(name)}</th>{cells}</tr>")
+    return f"<table><tr><th class=time>{time / MINUTE:.1f} min</th>{heads}</tr>{''.join(lines)}</table>"

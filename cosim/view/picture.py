@@ -18,6 +18,7 @@ CURVE_POINTS = 60  # of an MFD
 CURVE_END = 2.0  # critical accumulations, or the jam accumulation if that is less
 REGION_REACH = 0.08  # of the map's extent: places farther from all streets belong to no region
 GATE_SETBACK = 0.015  # of the map's extent: distance of a gate from the end of its street
+BOUNDARY_SETBACK = 0.02  # of the map's extent: further distance of the mark of a boundary
 ROW = (  # variables of a result that `after` reads
     *("gateway_green", "gateway_original_green", "gateway_queue"),
     *("arrivals", "crossings", "edge_vehicles", "time_spent"),
@@ -45,7 +46,7 @@ class CityPicture:
     name: of the scenario; region_names: R; edges: E ids; shapes: E lines (n, 2) [m]
     lane_km: (E,) length times lanes; lanes, region: (E,)
     outlines: rings (n, 2) [m] of every region; places: (R, 2) [m] of its number
-    critical: (R,) [veh], NaN where not seen; curves: R MFDs (n, 2) in veh and veh/s
+    protected: regions; critical: (R,) [veh], NaN where not seen; curves: R MFDs (n, 2) in veh and veh/s
     step: control interval [s]; steps: number of them
     """
 
@@ -59,6 +60,7 @@ class CityPicture:
     outlines: Sequence[Sequence[Points]]
     places: Points
     gates: tuple[Gate, ...]
+    protected: tuple[int, ...]
     critical: PerRegion
     curves: Sequence[Points]
     step: float
@@ -68,6 +70,21 @@ class CityPicture:
     def regions(self) -> int:
         """Number of regions R."""
         return len(self.region_names)
+
+    @property
+    def boundaries(self) -> tuple[Gate, ...]:
+        """One gate from a region to another for all between them, the controlled ones if there are any."""
+        merged = []
+        setback = BOUNDARY_SETBACK * float(np.ptp(np.concatenate(self.shapes), axis=0).max())
+        for ends in dict.fromkeys((gate.source, gate.target) for gate in self.gates):
+            gates = [gate for gate in self.gates if (gate.source, gate.target) == ends]
+            gates = [gate for gate in gates if gate.signal] or gates
+            middle = np.mean([gate.place for gate in gates], axis=0)
+            back = self.places[ends[0]] - middle
+            x, y = middle + setback * back / max(np.hypot(*back), 1e-9)
+            numbers = tuple(n for gate in gates for n in gate.gateways)
+            merged.append(replace(gates[0], place=(float(x), float(y)), gateways=numbers))
+        return tuple(merged)
 
     @classmethod
     def of(cls, scenario: Scenario, city: City) -> Self:
@@ -87,6 +104,7 @@ class CityPicture:
             outlines=rings_round(shapes, region, REGION_REACH),
             places=np.stack([middles[region == r].mean(axis=0) for r in range(city.regions)]),
             gates=_gates(city, dict(zip(city.edges, shapes, strict=True))),
+            protected=scenario.protected,
             critical=network.seen_critical,
             curves=[np.stack([x, mfd.outflow(x)], axis=1) for x, mfd in zip(axes, network.mfds, strict=True)],
             step=scenario.step,

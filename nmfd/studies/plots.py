@@ -1,11 +1,10 @@
 """Figures of networks, scenarios and runs; each function draws into an `ax` and returns it, without pyplot."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from itertools import cycle
 from pathlib import Path
+from zlib import crc32
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -29,9 +28,16 @@ LAST = CRITICAL, UNSEEN  # labels at the end of legends
 
 
 def colours(controllers: Iterable[str]) -> dict[str, str]:
-    """Return the colour of each controller; unknown names get distinct ones of OTHER_COLOURS if possible."""
-    unknown = [name for name in dict.fromkeys(controllers) if name not in COLOURS]
-    return COLOURS | dict(zip(unknown, cycle(OTHER_COLOURS), strict=False))
+    """Return the colour of each controller; unknown names get distinct ones of OTHER_COLOURS if possible.
+
+    It follows from the name, so that a controller looks the same in every picture, unless two names collide.
+    """
+    tones = dict(COLOURS)
+    for name in sorted({*controllers} - {*COLOURS}):
+        first = crc32(name.encode()) % len(OTHER_COLOURS)
+        turned = OTHER_COLOURS[first:] + OTHER_COLOURS[:first]
+        tones[name] = next((tone for tone in turned if tone not in tones.values()), turned[0])
+    return tones
 
 
 def figure(width: float, height: float) -> Figure:
@@ -122,8 +128,9 @@ def mfd(ax: Axes, mfd: Mfd, samples: Mapping[str, np.ndarray] | None = None, *, 
         ax.axvspan(largest, max(right, largest), label=UNSEEN, **style)
     if seen:
         ax.axvline(mfd.critical, color="0.35", linewidth=1.0, linestyle=":", label=CRITICAL, zorder=1)
-    for (label, cloud), tone in zip(clouds.items(), _tones(len(clouds)), strict=True):
-        ax.scatter(cloud[:, 0], cloud[:, 1], s=7, color=COLOURS.get(label, tone), alpha=0.6, linewidths=0, label=label)
+    tones = colours(clouds)
+    for label, cloud in clouds.items():
+        ax.scatter(cloud[:, 0], cloud[:, 1], s=7, color=tones[label], alpha=0.6, linewidths=0, label=label)
     grid = np.linspace(0.0, right, 1001)
     ax.plot(grid, mfd.outflow(grid), color="black", linewidth=1.8, label="MFD")
     if seen and not clouds:
@@ -188,7 +195,9 @@ def demand(ax: Axes, scenario: Scenario) -> Axes:
     if len(used):
         rates = np.concatenate([arriving[used, :end], arriving[used, end - 1 : end]], axis=1)
         labels = [f"to {scenario.network.titles[j]}" for j in used]
-        ax.stackplot(time, rates, step="post", labels=labels, colors=_tones(len(used)), linewidth=0)
+        ax.stackplot(
+            time, rates, step="post", labels=labels, colors=[f"C{n % 10}" for n in range(len(used))], linewidth=0
+        )
     ax.set(ylabel="demand [veh/s]", ylim=(0.0, None))
     ax.spines[["top", "right"]].set_visible(False)
     return ax
@@ -230,7 +239,3 @@ def time_axis(ax: Axes, seconds: np.ndarray) -> np.ndarray:
 
 def _thousands(axis: Axis) -> None:
     axis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
-
-
-def _tones(count: int) -> list:
-    return [colormaps["tab10"](n % 10) for n in range(count)]
