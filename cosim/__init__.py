@@ -5,10 +5,11 @@
     >>> result.accumulation.shape  # states, regions, destinations; as a table: result.data.accumulation.to_dataframe()
     (3, 5, 5)
 
-`run` is one closed loop in SUMO, `read_run` reads one of a run folder, `City` shows a city. Names here are imported at
-their first use; `cosim.api` has a function for every command.
+`run` is one closed loop in SUMO, `read_run` reads one of a run folder, `City` shows a city, `list` what is shipped.
+Names here are imported at their first use; `cosim.api` has a function for every command.
 """
 
+from collections.abc import Iterable
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from cosim.report.city import City
     from nmfd.types import Result
 
-__all__ = ["City", "Result", "Settings", "SumoPlant", "evaluate", "read_run", "run", "settings", "tune"]
+__all__ = ["City", "Result", "Settings", "SumoPlant", "evaluate", "list", "read_run", "run", "settings", "tune"]
 _PLACES = {
     "City": "cosim.report.city",
     "Result": "nmfd.types",
@@ -43,5 +44,10 @@ def __getattr__(name: str) -> Any:
     return getattr(import_module(_PLACES[name]), name)
 
 
-def __dir__() -> list[str]:
+def __dir__() -> Iterable[str]:
     return sorted({*globals(), *__all__})
+
+
+def list() -> None:
+    """Print the shipped scenarios, networks and policies, and all controllers."""
+    print(import_module("nmfd.api").catalogue())

@@ -7,6 +7,7 @@ from typing import Any
 import click
 
 import cosim
+import nmfd.cli
 from nmfd.cli import (
     CONTROLLERS,
     COUNT,
@@ -58,6 +59,7 @@ def span(text: str) -> tuple[float, float]:
         "Studies": ("evaluate", "compare", "report", "tune"),
         "A city of your own": ("get", "import", "identify"),
     },
+    elsewhere={name: f"nmfd {name}" for name in nmfd.cli.main.commands},
 )
 @VERSION
 def main() -> None:
@@ -107,13 +109,7 @@ def run(scenario: Path, controller: str, against: str | None, **options: Any) ->
 @AGAINST
 @seed_option("Seed of trips, drivers and guidance.")
 @DEMAND
-@click.option(
-    "--port",
-    type=click.IntRange(0, 65535),
-    default=0,
-    show_default=False,
-    help="Port of the page. [default: any that is free]",
-)
+@click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port of the page; 0: any that is free.")
 @click.option("--gui", is_flag=True, help="Open sumo-gui instead of a page, with one run.")
 def watch(scenario: Path, controller: str, against: str | None, gui: bool, **options: Any) -> None:
     """Watch runs on a live page with map and curves.

@@ -11,7 +11,9 @@ name. Any object with `reset` and `act` is a controller (see `Controller`; `nmfd
 Names here are imported at their first use.
 """
 
+import sys
 from importlib import import_module
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -58,3 +60,7 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
+
+
+if "gymnasium" in sys.modules and find_spec("pettingzoo"):
+    import_module("nmfd.rl")  # registers environments

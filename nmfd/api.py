@@ -42,10 +42,13 @@ def load_scenario(folder: Path | str, settings: Mapping[str, Any] | None = None)
         >>> nmfd.load_scenario("economic_mpc").network.region_names
         ('north-west', 'north-east', 'west', 'centre', 'east', 'south-west', 'south-east')
 
-    folder: folder of a scenario.toml, or the name of a shipped scenario (`nmfd show`)
+    folder: folder of a scenario.toml, or the name of one (`nmfd show`), or of a network with a scenario of its name
     settings: changes by dotted key, such as {"steps": 12, "controllers.pi-gating.kp": 2.0}
     Raises: InputError if a file, key or value is wrong
     """
+    folder = shipped.found(folder, shipped.SCENARIO, shipped.NETWORK)
+    if (folder / "network.toml").is_file() and not (folder / "scenario.toml").is_file():
+        folder = folder.resolve().parent.parent / "scenarios" / folder.name
     scenario = read_scenario(folder, settings)
     check_tables(scenario)
     return scenario

@@ -33,9 +33,16 @@ class Number(click.FloatRange):
 class Commands(click.Group):
     """Command group with sections in its help that ends user errors and Ctrl-C in one line on stderr."""
 
-    def __init__(self, *args: Any, sections: Mapping[str, Sequence[str]], **options: Any):
+    def __init__(self, *args: Any, sections: Mapping[str, Sequence[str]], elsewhere: Mapping[str, str], **options: Any):
+        """elsewhere: a command of the other program -> its name"""
         super().__init__(*args, **options)
-        self.sections = sections
+        self.sections, self.elsewhere = sections, elsewhere
+
+    def resolve_command(self, ctx: click.Context, args: list[str]) -> Any:
+        """Find the command; name the other program's one."""
+        if args[0] not in self.commands and (command := self.elsewhere.get(args[0])):
+            ctx.fail(f"No such command '{args[0]}': it is `{command}`.")
+        return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the commands section by section, in the order of use."""
@@ -183,6 +190,8 @@ def out_option(default: str, text: str = "Run folder; finished runs in it are ke
         "Controllers": ("train", "bound", "new-controller"),
         "Networks from measured data": ("identify",),
     },
+    elsewhere={"run": "nmfd benchmark, or in SUMO cosim run"}
+    | {name: f"cosim {name}" for name in ("demo", "watch", "evaluate", "report", "compare", "tune", "get", "import")},
 )
 @VERSION
 def main() -> None:

@@ -30,7 +30,7 @@ def publish(monkeypatch, tmp_path):
     def add(content: bytes = CONTENT, source: str | None = None):
         (tmp_path / "archive.zip").write_bytes(content)
         source = source or (tmp_path / "archive.zip").as_uri()
-        city = get.Published(about="a city", licence="MIT", source=source, folder="top-1/city", start="a.sumocfg")
+        city = dict(about="a city", licence="MIT", source=source, folder="top-1/city", start="a.sumocfg")
         monkeypatch.setattr(get, "published", lambda: {"there": city})
 
     return add
@@ -79,5 +79,5 @@ def test_one_line_and_nothing_left(publish, tmp_path, content, source, expected)
 def test_the_list_and_the_names():
     text = good(cosim("get"))
     for name, city in get.published().items():
-        assert name in text and city.licence in text
+        assert name in text and city["licence"] in text
     assert "did you mean cologne8?" in error_line(cosim("get", "colone8"))

@@ -97,7 +97,9 @@ def test_the_card_has_the_figures_of_the_best_strategy(evaluation):
     assert (trip.value, trip.before, trip.change) == ("5.0 min", "10.0 min without control", "50 ± 2 % less")
     assert served.value == "500" and served.better is None
     times = rows.groupby("controller")["total_time_spent_veh_s"].mean() / 3600
-    assert spent.label == "Vehicle hours saved" and spent.value == f"{times['no-control'] - times['dpc-pcrg']:,.0f} veh h"
+    assert (
+        spent.label == "Vehicle hours saved" and spent.value == f"{times['no-control'] - times['dpc-pcrg']:,.0f} veh h"
+    )
     assert all(one.verdict == "no proof (2 seeds)" and one.better is None for one in shown)
     third = rows[rows["seed"] == 2000].assign(seed=2002)
     assert html.card(pd.concat([rows, third]))[1][2][-2:] == ("significant", True)

@@ -72,9 +72,6 @@ def identify(
     out: folder of samples, figures and loading runs, runs/SCENARIO-identify if None
     Raises: InputError for a network without a folder or one that must not be written, RunFailed if a run failed
     """
-    scenario = shipped.found(scenario, shipped.SCENARIO, shipped.NETWORK)
-    if (scenario / "network.toml").exists():
-        scenario = scenario.resolve().parent.parent / "scenarios" / scenario.name
     loaded = load_scenario(scenario, settings)
     strategy = parse("no-control", "" if city == "own" else city or "")
     options = [word for word in strategy.words if word != "guided"]

@@ -22,15 +22,9 @@ from nmfd.runs.files import temporary_folder
 INTERVAL_S = 300.0  # of the densities
 PEAK_INTERVALS = 3  # in a row: those with the most vehicles count for the partition
 JITTER_S = 10.0  # of departures, in which seeds differ, as in the scenario that is written
-SILENT = {
-    "no-step-log": "true",
-    "no-warnings": "true",
-    "ignore-route-errors": "true",
-    "vehroute-output.exit-times": "true",
-    "vehroute-output.last-route": "true",
-    "vehroute-output.write-unfinished": "true",
-    "duration-log.statistics": "true",
-}
+RECORDED = ("exit-times", "last-route", "write-unfinished")
+SILENT = dict.fromkeys(("no-step-log", "no-warnings", "ignore-route-errors", "duration-log.statistics"), "true")
+SILENT |= {f"vehroute-output.{name}": "true" for name in RECORDED}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,7 +6,6 @@ import subprocess
 import sys
 import urllib.request
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
@@ -17,21 +16,10 @@ from nmfd.runs.files import temporary_folder
 SERVER_TIME_LIMIT_S = 60.0  # without a byte
 
 
-@dataclass(frozen=True, kw_only=True)
-class Published:
-    """A city as its owner publishes it; cities.toml says what is what."""
-
-    about: str
-    licence: str
-    source: str
-    folder: str
-    start: str
-
-
 @cache
-def published() -> Mapping[str, Published]:
-    """Return the cities of cities.toml by name."""
-    return {name: Published(**city) for name, city in config.read(Path(__file__).with_name("cities.toml")).items()}
+def published() -> Mapping[str, Mapping[str, str]]:
+    """Return the cities of cities.toml, which says what is what, by name."""
+    return config.read(Path(__file__).with_name("cities.toml"))
 
 
 def get(name: str, out: Path) -> str:
@@ -43,29 +31,29 @@ def get(name: str, out: Path) -> str:
         raise InputError(f"--out: {out} exists; choose another folder, or remove it")
     city = cities[name]
     out.parent.mkdir(parents=True, exist_ok=True)
-    notice = f"{name}: {city.about}\nLicence: {city.licence}\nFetched from {city.source}\n"
+    source, contents = city["source"], city["folder"]
+    notice = f"{name}: {city['about']}\nLicence: {city['licence']}\nFetched from {source}\n"
     with temporary_folder(f".{out.name}-", where=out.parent) as folder:
         archive = folder / "archive.whl"
         pip = [sys.executable, "-m", "pip", "download", "--no-deps", "--only-binary", ":all:", "--dest", str(folder)]
         try:
-            if "://" in city.source:
-                with urllib.request.urlopen(city.source, timeout=SERVER_TIME_LIMIT_S) as answer:
+            if "://" in source:
+                with urllib.request.urlopen(source, timeout=SERVER_TIME_LIMIT_S) as answer:
                     archive.write_bytes(answer.read())
             else:
-                subprocess.run([*pip, city.source], check=True, capture_output=True, text=True)
+                subprocess.run([*pip, source], check=True, capture_output=True, text=True)
                 archive = next(folder.glob("*.whl"))
             shutil.unpack_archive(archive, folder, "zip")
-            (folder / city.folder / "NOTICE.cosim.txt").write_text(notice, encoding="utf-8")
-            os.replace(folder / city.folder, out)
+            (folder / contents / "NOTICE.cosim.txt").write_text(notice, encoding="utf-8")
+            os.replace(folder / contents, out)
         except (OSError, StopIteration, subprocess.CalledProcessError) as error:
             reason = (getattr(error, "stderr", "") or str(error)).strip().splitlines()[-1:]
             raise InputError(
-                f"{name}: {city.folder} of {city.source} cannot be fetched ({' '.join(reason)}); try again with "
-                "internet access"
+                f"{name}: {contents} of {source} cannot be fetched ({' '.join(reason)}); try again with internet access"
             ) from None
-    return f"{notice}Next: cosim import {out / city.start} --out networks/{name}"
+    return f"{notice}Next: cosim import {out / city['start']} --out networks/{name}"
 
 
 def listed() -> str:
     """Return the catalogue, a city with its licence on two lines."""
-    return "\n".join(f"{name:<14}{city.about}\n{'':<14}{city.licence}" for name, city in published().items())
+    return "\n".join(f"{name:<14}{city['about']}\n{'':<14}{city['licence']}" for name, city in published().items())

@@ -236,17 +236,13 @@ def _peak(
 
 def _write_traffic(folder: Path, traffic: Traffic) -> dict[str, list[str]]:
     """Write vehicles, background and what they refer to; return the file names by key of [sumo]."""
-    contents = {
-        "routes": (traffic.vehicles, "routes"),
-        "background": (traffic.background, "routes"),
-        "additional": (traffic.shared, "additional"),
-    }
-    for key, (elements, tag) in contents.items():
+    contents = {"routes": traffic.vehicles, "background": traffic.background, "additional": traffic.shared}
+    for key, elements in contents.items():
         if elements:
-            root = wrapped(elements, tag)
+            root = wrapped(elements, "additional" if key == "additional" else "routes")
             ElementTree.indent(root)
             _zip(folder / FILES[key], ElementTree.tostring(root))
-    return {key: [FILES[key]] if elements else [] for key, (elements, _) in contents.items()}
+    return {key: [FILES[key]] if elements else [] for key, elements in contents.items()}
 
 
 def _zip(path: Path, content: bytes) -> None:

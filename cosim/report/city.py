@@ -14,6 +14,7 @@ from cosim.sumo import net
 from nmfd.api import load_scenario
 from nmfd.model.regional_model import RegionalModel, load_network
 from nmfd.model.scenario import Scenario
+from nmfd.runs import shipped
 from nmfd.studies import plots
 
 REGION_COLUMNS = ["region", "name", "edges", "lane_km", "signals", "gateways", "controlled_gateways"]
@@ -33,8 +34,8 @@ class City:
     def __init__(self, city: Path | str | Scenario | RegionalModel):
         """city: a loaded scenario or network, its folder or its name. Raises InputError without a SUMO city."""
         if not isinstance(city, Scenario | RegionalModel):
-            alone = any(Path(city).parent.glob("*/network.toml"))  # there, or misspelt
-            city = load_network(city) if alone else load_scenario(city)
+            folder = shipped.found(city, shipped.SCENARIO, shipped.NETWORK)
+            city = load_network(folder) if (folder / "network.toml").is_file() else load_scenario(folder)
         self.scenario = city if isinstance(city, Scenario) else None
         self.network = city.network if isinstance(city, Scenario) else city
         self.name = city.name

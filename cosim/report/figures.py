@@ -29,14 +29,15 @@ def over_levels(ax: Axes, values: Mapping[str, Mapping[float, tuple[float, float
 
 def ranked(rows: pd.DataFrame) -> list[str]:
     """Return the controllers of one demand level, the best first: by paired change, else by mean time spent."""
-    level = rows["demand"].iloc[0]
-    reference = statistics.by_seed(rows, level, statistics.compared_with(rows))
-    score = {}
-    for name in dict.fromkeys(rows["controller"]):
-        values = statistics.by_seed(rows, level, name)
-        percent = statistics.paired(values, reference).percent
-        score[name] = float(np.mean(list(values.values()))) if np.isnan(percent) else percent
-    return sorted(score, key=score.__getitem__)
+    table = statistics.statistics(rows).set_index("controller")
+    score = table["change_percent"].where(table.index != table["against"], 0.0).fillna(table[statistics.TTS])
+    return list(score.sort_values(kind="stable").index)
+
+
+def pair(rows: pd.DataFrame) -> list[str]:
+    """Return the reference and the best other controller, if there is one."""
+    against = statistics.compared_with(rows)
+    return [against, *(name for name in ranked(rows) if name != against)][:2]
 
 
 def draw_all(finished: Finished) -> None:
@@ -54,12 +55,9 @@ def draw_level(out: Path, finished: Finished, level: Level) -> None:
     runs = level.results()
     title = f"seed {seed}{', shaded: all seeds' if rows['seed'].nunique() > 1 else ''}"
     draw_accumulations(out, finished.scenario, runs, seed=seed, title=title)
-    best_first = {run.controller: run for run in runs if run.seed == seed}
-    best_first = {name: best_first[name] for name in ranked(rows) if name in best_first}
-    against = statistics.compared_with(rows)
-    other = next((name for name in best_first if name != against), None)
-    shown = [best_first[name] for name in (against, other) if name in best_first]
-    clouds = [(run.controller, model_validation.outflow_samples(network, [run])) for run in shown]
+    shown = pair(rows[rows["seed"] == seed])
+    there = {run.controller: run for run in runs if run.seed == seed}
+    clouds = [(name, model_validation.outflow_samples(network, [there[name]])) for name in shown]
     samples = [{name: np.concatenate([*of[n].values()]) for name, of in clouds} for n in range(network.regions)]
     plots.draw_mfds(out / "mfd.png", network, samples)
 

@@ -29,14 +29,7 @@ from nmfd.studies.benchmark import REFERENCE
 
 CAPTIONS = config.read(Path(__file__).with_name("captions.toml"))
 PICTURES, LEVEL_PICTURES = CAPTIONS["level"], CAPTIONS["levels"]  # file -> caption
-PICTURE_DPI, CSS_DPI = 150, 96  # of nmfd.studies.plots.save, and of browsers
-MINUTE, HOUR = 60.0, 3600.0  # s
-QUANTITIES = {  # label -> column, its unit on the card, format of a value, sign of an improvement, meaning
-    "Time spent": (statistics.TTS, HOUR, "{:,.0f} veh h", -1, "private vehicles on the road or waiting to enter"),
-    "Trips completed": ("completed_veh", 1.0, "{:,.0f}", 1, "mean over seeds"),
-    "Time per trip": ("mean_trip_time_s", MINUTE, "{:.1f} min", -1, "from wanted departure to end of trip or run"),
-    "CO2": ("co2_kg", 1000.0, "{:.2f} t", -1, "of all vehicles while the run lasted, by SUMO's HBEFA4 petrol car"),
-}
+QUANTITIES = CAPTIONS["card"]  # column -> label, unit on the card, format of a value, sign of an improvement, meaning
 
 
 class Figure(NamedTuple):
@@ -76,11 +69,10 @@ def write_page(path: Path, runs: Sequence[Finished], *, seed: int | None = None)
 def _map(run: Finished, seed: int | None) -> tuple[int, str, str]:
     """Return seed, script and HTML of the best run beside its reference, with a slider over their time."""
     level = run.level()
-    names = _pair(level.rows)
-    seeds = [set(level.rows.loc[level.rows["controller"] == name, "seed"]) for name in names]
-    if not set.intersection(*seeds):
-        names, seeds = names[:1], seeds[:1]
-    common = sorted(set.intersection(*seeds))
+    names = figures.pair(level.rows)
+    seeds = [set(statistics.by_seed(level.rows, level.demand, name)) for name in names]
+    if not (common := sorted(set.intersection(*seeds))):
+        names, common = names[:1], sorted(seeds[0])
     if seed is not None and seed not in common:
         raise InputError(f"--seed: {' and '.join(names)} have no run with seed {seed}; choose from {common}")
     seed = common[0] if seed is None else seed
@@ -91,12 +83,6 @@ def _map(run: Finished, seed: int | None) -> tuple[int, str, str]:
     tones = plots.colours(run.rows["controller"])
     page = with_slider(picture, whole, tones, totals(picture, list(results.values())))
     return seed, *components(page, wrap_script=False)
-
-
-def _pair(rows: pd.DataFrame) -> list[str]:
-    """Return the reference and the best other controller, if there is one."""
-    against = statistics.compared_with(rows)
-    return [against, *(name for name in figures.ranked(rows) if name != against)][:2]
 
 
 def _run(run: Finished) -> dict:
@@ -125,12 +111,11 @@ def card(rows: pd.DataFrame) -> tuple[str, list[Figure], str]:
 
     It is compared with the reference on the seeds that both have.
     """
-    against, level = statistics.compared_with(rows), rows["demand"].iloc[0]
-    name = next((name for name in figures.ranked(rows) if name != against), against)
+    level, (against, name) = rows["demand"].iloc[0], (figures.pair(rows) * 2)[:2]
     heading = name
     than = "without control" if against == REFERENCE else f"under {against}"
     shown = []
-    for label, (column, unit, form, good, meaning) in QUANTITIES.items():
+    for column, (label, unit, form, good, meaning) in QUANTITIES.items():
         now, before = (statistics.by_seed(rows, level, one, column) for one in (name, against))
         common, pair = [seed for seed in now if seed in before], statistics.paired(now, before)
         value = mean(now[seed] for seed in common or now) / unit
@@ -162,7 +147,7 @@ def _level(run: Finished, level: Level) -> dict:
     """Return what the page shows of a demand level."""
     rows = level.rows
     draw = partial(figures.draw_level, finished=run, level=level)
-    regions = statistics.by_region(level, run.map(), run.scenario.network.region_names, _pair(rows))
+    regions = statistics.by_region(level, run.map(), run.scenario.network.region_names, figures.pair(rows))
     return {
         "title": f"Demand times {level.demand:g}",
         "tables": [_html(table) for table in statistics.shown(statistics.statistics(rows))],
@@ -173,17 +158,15 @@ def _level(run: Finished, level: Level) -> dict:
     }
 
 
-def _pictures(draw: Callable[[Path], None], captions: dict[str, str]) -> list[tuple[str, str, int]]:
-    """Return data URI, caption and width [px] of the pictures that `draw` writes into a folder."""
+def _pictures(draw: Callable[[Path], None], captions: dict[str, str]) -> list[tuple[str, str]]:
+    """Return data URI and caption of the pictures that `draw` writes into a folder."""
     pictures = []
     with tempfile.TemporaryDirectory() as folder:
         draw(Path(folder))
         for name, caption in captions.items():
             if (file := Path(folder) / f"{name}.png").is_file():
-                content = file.read_bytes()
-                width = int.from_bytes(content[16:20], "big") * CSS_DPI / PICTURE_DPI
-                uri = f"data:image/png;base64,{base64.b64encode(content).decode()}"
-                pictures.append((uri, caption, round(width)))
+                encoded = base64.b64encode(file.read_bytes()).decode()
+                pictures.append((f"data:image/png;base64,{encoded}", caption))
     return pictures
 
 

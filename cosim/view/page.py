@@ -28,14 +28,10 @@ KEY = (
 
 
 class Page:
-    """Maps, curves and numbers of the runs `names` side by side."""
+    """Maps, curves and numbers of runs side by side."""
 
     def __init__(self, picture: CityPicture, tones: Mapping[str, str], totals: Mapping[str, Sequence[PerEdge]] = {}):
-        """Draw the empty page.
-
-        tones: name of a run -> its colour
-        totals: label -> values (E,) of every run, which the maps can show instead of the density
-        """
+        """tones: name of a run -> its colour; totals: label -> values (E,) of every run, other layers of the maps"""
         self.picture, self.names, self.tones = picture, list(tones), tones
         # Above a scale is only TOP_SHARE of the values of all runs; its upper end has two digits.
         upper = {label: np.quantile(np.concatenate(values), 1.0 - TOP_SHARE) for label, values in totals.items()}

@@ -348,6 +348,8 @@ def _own(name: str) -> ControllerType | None:
 
 
 def _unknown(name: str, word: str, *, controllers: bool) -> InputError:
+    if word.endswith(".py"):
+        return InputError(f"controller {word}: name its class, such as {word}:MyController")
     where = f"controller {name!r}" if word == name else f"strategy {name!r}: {word!r}"
     words = [*CITY_WORDS, *(f"{stem}-N" for stem in CITY_NUMBERS)]
     hint = did_you_mean(word, [*(CONTROLLERS if controllers else ()), *words])

@@ -4,7 +4,8 @@
     RegionsEnv      pettingzoo.ParallelEnv: one agent per region
     Interface       observations and actions as vectors; turns the actions of a trained agent into controls
 
-Importing this module registers nmfd/Hexagon7-v0 and nmfd/Scenario-v0 (scenario="FOLDER") for gymnasium.make.
+Importing this module, or nmfd after gymnasium, registers nmfd/Hexagon7-v0 and nmfd/Scenario-v0 (scenario="FOLDER") for
+gymnasium.make.
 """
 
 from nmfd.errors import need

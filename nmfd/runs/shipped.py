@@ -4,6 +4,7 @@ In a checkout they are its folders scenarios and networks, in an installed packa
 paths lead from one to another in both.
 """
 
+import itertools
 import os
 from importlib import resources
 from pathlib import Path
@@ -28,8 +29,9 @@ def folders(kind: str) -> list[Path]:
 def found(name: Path | str, *kinds: str, beside: Path | None = None) -> Path:
     """Return the folder of one of these kinds, or the file, `name`.
 
-    name: a path, from `beside` if given, or the name of a folder of the package, or a path below it
-        (grid7_peak/dpc-pc.pt). A path to nothing is returned unchanged
+    name: a path, from `beside` if given; or the name of a folder, with or without networks/ or scenarios/ before it, of
+        the package or of this folder or one above; or a path below it (grid7_peak/dpc-pc.pt). A path to nothing is
+        returned unchanged
     Raises: InputError for a single word that names nothing
     """
     path, word = Path(name) if beside is None else beside / name, Path(name)
@@ -37,9 +39,11 @@ def found(name: Path | str, *kinds: str, beside: Path | None = None) -> Path:
         return path
     if word.is_absolute() or ".." in word.parts:
         return path
-    for kind in kinds:
-        folder = root() / f"{kind}s" / word
-        if word.parts and os.path.exists(folder / f"{kind}.toml" if len(word.parts) == 1 else folder):
+    here = Path.cwd()
+    for place, kind in itertools.product((root(), *([here, *here.parents] if beside is None else [])), kinds):
+        short = word.relative_to(f"{kind}s") if word.parts[:1] == (f"{kind}s",) else word
+        folder = place / f"{kind}s" / short
+        if short.parts and os.path.exists(folder / f"{kind}.toml" if len(short.parts) == 1 else folder):
             return folder
     if beside is not None or not kinds or len(word.parts) != 1 or word.suffix or os.path.exists(path):
         return path

@@ -195,9 +195,8 @@ def demand(ax: Axes, scenario: Scenario) -> Axes:
     if len(used):
         rates = np.concatenate([arriving[used, :end], arriving[used, end - 1 : end]], axis=1)
         labels = [f"to {scenario.network.titles[j]}" for j in used]
-        ax.stackplot(
-            time, rates, step="post", labels=labels, colors=[f"C{n % 10}" for n in range(len(used))], linewidth=0
-        )
+        tones = [f"C{n % 10}" for n in range(len(used))]
+        ax.stackplot(time, rates, step="post", labels=labels, colors=tones, linewidth=0)
     ax.set(ylabel="demand [veh/s]", ylim=(0.0, None))
     ax.spines[["top", "right"]].set_visible(False)
     return ax
