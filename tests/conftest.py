@@ -15,7 +15,7 @@ os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL
 SHAPED = ["cosim.evaluation", "cosim.importing", "cosim.plant", "cosim.report", "cosim.sumo.net", "cosim.sumo.trips"]
 
 # Reasons for which a test may be skipped all the same; benchmarks run when they are asked for.
-ALLOWED = ("no GPU", "no real city", "--benchmark-skip active")
+ALLOWED = ("no GPU", "no real city", "no neuromancer", "--benchmark-skip active")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

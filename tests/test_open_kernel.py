@@ -136,6 +136,20 @@ def test_rollouts_are_the_closed_loop():
     assert run.backlog.max() > 1.0 and run.total_time_spent.item() == pytest.approx(nmfd.total_time_spent(result))
 
 
+class Plan(torch.nn.Linear):
+    """A policy: float64 gates that no state changes."""
+
+    def forward(self, x):
+        return [0.9 - 0.8 * torch.sigmoid(self.weight), None]
+
+
+def test_a_policy_may_ignore_the_state():
+    plan = Plan(4, 4).double()
+    before = plan.weight.detach().clone()
+    nmfd.train(ring(), policy=plan, cost=lambda run: run.perimeter.mean((0, 2, 3)), steps=40, progress=False)
+    assert (plan.weight > before + 0.5).all()
+
+
 def test_a_named_policy_takes_a_cost_too(tmp_path):
     file = nmfd.train(ring(), cost=burnt, out=tmp_path / "mine.pt", steps=1, progress=False)
     assert load_policy(file, ring().network)[1]["configuration"]["task"] == "burnt"
@@ -144,7 +158,9 @@ def test_a_named_policy_takes_a_cost_too(tmp_path):
 @pytest.mark.parametrize(
     "given, message",
     [
-        ({"policy": torch.nn.Identity()}, "Identity: interval 0: perimeter.*expected 0.1 to 0.9, got 0 instead"),
+        ({"policy": torch.nn.LayerNorm(4)}, "LayerNorm: interval 0: perimeter.*expected 0.1 to 0.9, got 0 instead"),
+        ({"policy": torch.nn.Identity()}, "policy: expected an nn.Module with weights to train"),
+        ({"cost": "time"}, "cost, sample: expected functions, got 'time'"),
         ({"out": "mine.pt"}, "policy: a module is returned, not written"),
         ({"sample": lambda generator, batch: (torch.zeros(batch, 4, 4),) * 2}, r"sample: expected start \(16, R, R\)"),
         ({"cost": lambda run: run.states.detach().sum()}, "cost: has no gradient"),

@@ -99,6 +99,8 @@ class Task:
     constraints: Sequence[tuple[Callable[[Trajectories], torch.Tensor], float]] = ()
 
     def __post_init__(self) -> None:
+        if not all(map(callable, filter(None, (self.cost, self.sample)))):
+            raise InputError(f"cost, sample: expected functions, got {self.cost!r} and {self.sample!r}; see nmfd.train")
         for pair in self.constraints:
             if not (isinstance(pair, tuple) and len(pair) == 2 and callable(pair[0])):
                 raise InputError(f"constraints: expected pairs (function, weight), got {pair!r}; add the weight")
@@ -136,6 +138,8 @@ def train(
     """
     setup = settings(scenario, strategy, steps)
     if module is not None:
+        if not isinstance(module, nn.Module) or not any(weights.requires_grad for weights in module.parameters()):
+            raise InputError(f"policy: expected an nn.Module with weights to train, got {module!r:.60}; give one")
         empty = np.zeros(scenario.network.adjacency.shape)
         ModuleController(module, scenario).act(Observation(step=0, time=0.0, accumulation=empty, backlog=empty))
     elif not anyway:
@@ -149,8 +153,8 @@ def train(
     policy = _first_policy(setup, planning, guidance=guidance) if module is None else module
     device = "cpu" if isinstance(policy, CompactPolicy) else device
     policy = policy.to(device).train()
-    costs = {"detour_cost": setup.detour_cost, "holding_cost": setup.holding_cost}
-    rollout = Rollout(planning, device=device, process_std=recipe.process_std, **costs)
+    costs = {"detour_cost": setup.detour_cost, "holding_cost": setup.holding_cost, "process_std": recipe.process_std}
+    rollout = Rollout(planning, next(policy.parameters()).dtype, device, **costs)
     if setup.from_gating and not resume and module is None:
         begin_as_gate(policy, rollout, generator)
     advance = compiled_step(rollout.step) if compiled else rollout.step

@@ -252,7 +252,7 @@ class DpcController:
 def commanded(policy: nn.Module, x: PerPair) -> tuple[PerPair, PerTurn | None]:
     """Return perimeter, and splits or None, of any module in the states x."""
     values = policy(x)
-    return values if isinstance(values, tuple) else (values, None)
+    return (values, None) if isinstance(values, torch.Tensor) else tuple(values)
 
 
 class ModuleController:

@@ -177,10 +177,10 @@ class Rollout:
         """Return the rollouts from x with their controls; arguments as `states`."""
         exact, seen, backlog = self.states(policy, x, demand, generator, step)
         perimeter, splits = commanded(policy, seen)
-        rate, given = dynamics.rate(self.parameters, exact.sum(-1)), {"states": exact, "backlog": backlog}
+        given = {"states": exact, "backlog": backlog, "rate": dynamics.rate(self.parameters, exact.sum(-1))}
         splits = (self.nominal_splits if splits is None else splits).expand(*exact.shape, -1)
-        step_s = self.planning.step
-        return Trajectories(step=step_s, demand=demand, rate=rate, perimeter=perimeter, splits=splits, **given)
+        given |= {"perimeter": perimeter.expand_as(exact), "splits": splits}
+        return Trajectories(step=self.planning.step, demand=demand, **given)
 
     def total_time_spent(
         self, policy: nn.Module, x: States, demand: Demands, generator: Generator, step: Callable | None = None
