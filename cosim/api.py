@@ -21,14 +21,14 @@ from cosim.importing import get as cities
 from cosim.importing.importer import import_city as import_city
 from cosim.report import figures
 from nmfd.api import check_policies, load_scenario
-from nmfd.controllers.strategy import parse, parse_many
+from nmfd.controllers.strategy import Strategy, parse, parse_many
 from nmfd.errors import InputError, RunFailed
 from nmfd.metrics import summary
 from nmfd.model.scenario import Scenario, with_demand
 from nmfd.runs.files import default_folder, file_name, write_table
 from nmfd.runs.progress import Progress, watched
 from nmfd.runs.run_many import locked, raise_failures, run_many
-from nmfd.studies.benchmark import draw_accumulations
+from nmfd.studies.benchmark import REFERENCE, draw_accumulations
 from nmfd.types import Controller, Result
 
 DEMO = "demo"  # a shipped scenario
@@ -94,10 +94,8 @@ def run_controllers(
     Raises: InputError, and RunFailed if a run failed
     """
     loaded = with_demand(load_scenario(scenario, settings), steps=steps)
-    strategies = [parse(name) for name in dict.fromkeys(controllers)]
-    policies = {} if policy is None else {strategies[0].name: policy}
-    if all(strategy.name != "no-control" for strategy in strategies):
-        strategies.reverse()  # the other controllers are compared with the first one
+    strategies = _reference_first(controllers)
+    policies = {} if policy is None else {parse(controllers[0]).name: policy}
     out = default_folder(loaded.name) if out is None else out
     runs = runs_of(loaded, strategies, [seed], demand=demand, policies=policies)
     with locked(out):
@@ -111,7 +109,7 @@ def run_controllers(
         for run in there
         if run.signal_violations
     ]
-    return "\n".join([statistics.text(finished.rows), *wrong, f"Written to {out}"])
+    return "\n".join([statistics.text(finished.rows), *wrong, f"Written to {out}; a page about it: cosim report {out}"])
 
 
 def demo(out: Path, *, seed: int = 1000) -> str:
@@ -150,7 +148,7 @@ def watch(
     from cosim.view import live
 
     loaded = load_scenario(scenario, settings)
-    jobs = [Simulation(loaded, parse(name), seed, demand) for name in dict.fromkeys(controllers)]
+    jobs = [Simulation(loaded, strategy, seed, demand) for strategy in _reference_first(controllers)]
     if gui:
         try:
             with watched("watch", None) as show:
@@ -217,7 +215,9 @@ def evaluate(
             figures.draw_all(finished)
             text += [each] * (len(chosen) > 1) + [statistics.text(finished.rows)]
     raise_failures(rows)
-    return "\n".join([*text, f"Written to {out}: see evaluate.md, runs.csv and the figures"])
+    return "\n".join(
+        [*text, f"Written to {out}: see evaluate.md, runs.csv and the figures; a page: cosim report {out}"]
+    )
 
 
 def compare(folder: Path, *, model: Path | None = None) -> str:
@@ -267,12 +267,18 @@ def tune(
     order = tuning.Tuning(scenario=loaded, strategy=parse(controller), options=options, seeds=numbers, out=out, **how)
     tuning.tune(order, workers=workers)
     best = (out / "tune.toml").read_text(encoding="utf-8")
-    return f"{best}Written to {out}: see tune.toml and tune.csv"
+    return f"{best}Written to {out}: see tune.csv; to use the options, copy tune.toml into the scenario.toml"
 
 
 def get(name: str | None, out: Path | None = None) -> str:
     """Download a published city to a folder, cities/NAME if None; without a name list the cities."""
     return cities.listed() if name is None else cities.get(name, out or Path("cities") / name)
+
+
+def _reference_first(controllers: Sequence[str]) -> list[Strategy]:
+    """Return the strategies, first no control, else the last one: the others are compared with it."""
+    strategies = [parse(name) for name in reversed(dict.fromkeys(controllers))]
+    return sorted(strategies, key=lambda strategy: strategy.name != REFERENCE)
 
 
 def _has_screen() -> bool:

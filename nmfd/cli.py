@@ -298,7 +298,9 @@ def train(scenario: Path, settings: dict, controller: str, **options: Any) -> No
     Example:
       nmfd train economic_mpc --controller dpc-pc --steps 200 --out mine.pt
     """
-    click.echo(f"Written to {nmfd.api.train(nmfd.load_scenario(scenario, settings), controller, **options)}")
+    file = nmfd.api.train(nmfd.load_scenario(scenario, settings), controller, **options)
+    trial = f"nmfd benchmark {scenario} --controllers no-control,{controller} --policy {controller}={file}"
+    click.echo(f"Written to {file}; try it: {trial}")
 
 
 @main.command()

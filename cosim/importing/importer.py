@@ -177,7 +177,7 @@ def import_city(
         for temporary, place in ((net_folder, out), (folder, scenario)):
             place.parent.mkdir(parents=True, exist_ok=True)
             shutil.move(temporary, place)
-    written = f"Written to {out} (see map.png, quality.csv, gateways.csv) and {scenario}"
+    written = f"Written to {out} (see map.png, quality.csv, gateways.csv) and {scenario}; next: cosim identify {out}"
     return "\n".join([*report, written])
 
 

@@ -76,7 +76,7 @@ class Curves:
             style = {"label_text_font_size": "11px", "background_fill_alpha": 0.75, "border_line_alpha": 0.0}
             plot.legend[0].update(location="top_left", spacing=0, padding=2, **style)
         for plot in (self.gates, self.plane):  # where values may be anywhere
-            plot.legend[0].update(location="left", ncols=2, margin=0)
+            plot.legend[0].update(location="left", margin=0)
             plot.add_layout(plot.legend[0], "below")
         self.titles = [plot.title for plot in (self.region, self.plane, self.gates)]  # they name the region
         self.now = [_now(plot) for plot in over_time]

@@ -44,7 +44,7 @@ class Page:
         labels = list(self.maps[0].layers)
         self.streets = Select(title="Streets by", name="streets", width=150, value=labels[0], options=labels)
         self.streets.js_on_change("value", CustomJS.from_file(HERE / "layers.js", layers=layers))
-        self.loads = [Load(picture, f"{name}: load of the regions") for name in tones]
+        self.loads = [Load(picture, f"{name}: load") for name in tones]
         self.curves = Curves(picture, tones)
         self.numbers = Div(sizing_mode="stretch_width", css_classes=["numbers"], stylesheets=[STYLE])
         ends = [region for gate in picture.gates for region in (gate.source, gate.target)]
@@ -82,7 +82,7 @@ class Page:
         beside, below = ([], pair) if len(self.maps) > 1 else ([column(*pair, sizing_mode="stretch_width")], [])
         for n, one in enumerate(self.maps):
             one.plot.name = f"map{n}"
-        curves.plane.name = "plane"
+        curves.plane.name, curves.trips.name = "plane", "trips"
         self.numbers.name = "numbers"
         above = _wrapped(bar, narrowest=0)
         above.update(css_classes=["bar"], stylesheets=[STYLE])

@@ -63,13 +63,14 @@ class Run:
         only runs of this controller depend on; all else is the same for all runs of a folder
     job: a picklable function without arguments that returns the Result, or the reason why there is none; `processes`
         takes any outcome for a Result
-    folder: below that of all runs
+    folder: below that of all runs; expected: wall time [s], 0 if unknown
     """
 
     name: str
     key: Mapping[str, Any]
     job: Callable[[], Any]
     folder: str = ""
+    expected: float = 0.0
 
     @property
     def file(self) -> str:
@@ -101,6 +102,9 @@ def run_many(
         keys = _write_manifest(out, runs, workers)
         rows = {file: _row(file, result) for file, key in keys.items() if (result := _finished(out / file, key))}
         todo = [run for run in runs if run.file not in rows]
+        minutes = sum(run.expected for run in todo) / max(workers, 1) / 60.0
+        if minutes > 0.5 and scheduler is None:
+            print(f"{len(todo)} runs take about {minutes:.0f} min, {workers} at a time", file=sys.stderr)
         try:
             with watched("runs", progress) as show, closing(_outcomes(todo, workers, scheduler)) as ended:
                 if show and todo:
