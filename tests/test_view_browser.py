@@ -10,12 +10,16 @@ import pytest
 import tiny_city
 from commands import call, good
 
+from nmfd.studies import plots
+
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 EVIL = "<script>alert(1)</script>"
 DENSITIES = """() => [0, 1].map(n => Array.from(Bokeh.documents[0].get_model_by_name(`map${n}`)
     .renderers.map(one => one.data_source.data).find(data => data.edge).density))"""
 NUMBERS = "() => Bokeh.documents[0].get_model_by_name('numbers').text"
 PLANE = "() => Bokeh.documents[0].get_model_by_name('plane').title.text"
+LINES = "() => Bokeh.documents[0].get_model_by_name('trips').renderers.map(one => one.glyph.line_color.value)"
+TIME = "() => Bokeh.documents[0].get_model_by_name('time').value"
 NARROW = "() => document.documentElement.scrollWidth <= window.innerWidth + 1"
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no browser")]
 
@@ -68,12 +72,24 @@ def test_the_report(report, width):
         page.wait_for_timeout(500)
         before = page.evaluate(DENSITIES)
         assert before[0] != at_the_end[0] and before[1] != at_the_end[1]
-        page.locator("select").select_option(index=1)
+        page.locator("select").first.select_option(index=1)
         page.wait_for_timeout(300)
         assert page.evaluate(PLANE).startswith("Region 1")
         page.get_by_role("button", name="Play").click()
         page.wait_for_timeout(2000)
         assert page.evaluate(DENSITIES) == at_the_end
+        tones = plots.colours(["no-control", "no-control+guided"])
+        assert page.evaluate(LINES) == [tones["no-control"], tones["no-control+guided"]]
+        heat = page.locator(".bk-Figure").nth(2)
+        heat.scroll_into_view_if_needed()
+        box = heat.bounding_box()
+        page.mouse.click(box["x"] + 0.5 * box["width"], box["y"] + 60)
+        page.wait_for_timeout(500)
+        assert page.evaluate(TIME) == 4.5
+        assert 0 <= page.locator(".noUi-handle").bounding_box()["y"] < 200, "the bar stays in view"
+        assert page.evaluate("() => document.documentElement.scrollHeight") < (3000 if width > 1000 else 5000)
+        page.locator("summary").first.click()
+        assert page.locator("table").last.is_visible()
         assert page.evaluate("() => [...document.images].every(one => one.naturalWidth > 100)")
 
 
