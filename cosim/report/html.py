@@ -80,9 +80,8 @@ def _map(run: Finished, seed: int | None) -> tuple[int, str, str]:
     results = {name: level.read(name, seed) for name in names}
     whole = {name: frames(picture, result) for name, result in results.items()}
     picture = replace(picture, steps=max(map(len, whole.values())) - 1)
-    tones = plots.colours(run.rows["controller"])
-    page = with_slider(picture, whole, tones, totals(picture, list(results.values())))
-    return seed, *components(page, wrap_script=False)
+    layers, tones = totals(picture, list(results.values())), plots.colours(run.rows["controller"])
+    return seed, *components(with_slider(picture, whole, tones, layers), wrap_script=False)
 
 
 def _run(run: Finished) -> dict:
