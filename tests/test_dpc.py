@@ -190,6 +190,7 @@ def test_the_device_is_the_gpu_where_there_is_one(monkeypatch):
         ("dpc-pc", {"compact": True, "numbers": [1.0]}, "numbers: should have at least 8"),
         ("dpc-pc", {"compact": True, "numbers": [-1.0] * 8}, "numbers: expected 8 to 11 numbers >= 0"),
         ("dpc-pc", {"compact": True, "local": True}, "compact: begins with its numbers"),
+        ("dpc-pc", {"kept": ["gain"]}, "kept: expected numbers of a compact policy"),
         ("dpc-pc", {"local": True, "metering": True}, "metering: a local policy controls gates only"),
         ("dpc-pc", {"prices": True}, "prices: prices guide drivers"),
         ("dpc-pcrg", {"compact": True, "prices": True}, "prices: a compact policy has prices anyway"),

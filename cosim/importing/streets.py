@@ -65,6 +65,7 @@ class Streets:
 
     @property
     def lane_metres(self) -> PerEdge:
+        """Length times lanes for cars (E,) [m]."""
         return self.length * self.lanes
 
     @cached_property

@@ -264,6 +264,8 @@ def _descend(policy: nn.Module, loss: torch.Tensor, optimizer: Adam, setup: Trai
         raise InputError("cost: has no gradient by the weights of the policy; compute it from the run with torch")
     optimizer.zero_grad()
     loss.backward()
+    if isinstance(policy, CompactPolicy):
+        policy.numbers.grad[[Numbers._fields.index(name) for name in setup.kept]] = 0.0
     decoders = policy.decoders if isinstance(policy, Policy) else []
     for n, decoder in enumerate(decoders):  # in turn; not by requires_grad, which would compile the step once for each
         for weights in decoder.parameters() if n != step // setup.recipe.epoch % len(decoders) else ():

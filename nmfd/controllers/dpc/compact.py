@@ -28,7 +28,7 @@ It corrects errors of the regional model, so that rollouts of that model do not 
 The regional model answers prices by a logit (nmfd.model.answer); the policy is trained like a network.
 """
 
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import torch
@@ -42,11 +42,9 @@ from nmfd.runs import config
 from nmfd.runs.config import Problem, setting
 from nmfd.tensors import PerPair, PerRegion
 
-MIN_NUMBERS = 8  # in a file: up to metering
-
 
 class Numbers(NamedTuple):
-    """Parameters of a compact policy (-); the last three may be missing in a file."""
+    """Parameters of a compact policy (-); the last three may be omitted in scenario.toml."""
 
     set_point: float = 1.0
     gain: float = 2.0
@@ -61,7 +59,7 @@ class Numbers(NamedTuple):
     metering_gain: float = 1.0
 
 
-NumbersOption = Annotated[config.Numbers, Field(min_length=MIN_NUMBERS, max_length=11)]
+NumbersOption = Annotated[config.Numbers, Field(min_length=8, max_length=11)]
 MEANING = (
     "set_point, gain, relief, price, price_from, elsewhere, elsewhere_from, metering, integral (0), "
     "metering_protected (0), metering_gain (1); see nmfd/controllers/dpc/compact.py"
@@ -115,15 +113,9 @@ class CompactPolicy(Policy):
         return self.scale.squeeze(-1) * room.clamp(min=0.0) / FILL_TIME_S
 
     def bound(self) -> None:
+        """Set negative numbers to 0."""
         with torch.no_grad():
             self.numbers.clamp_(min=0.0)
-
-    def _load_from_state_dict(self, state_dict: dict, prefix: str, *others: Any) -> None:
-        """Complete the numbers of a file by their defaults."""
-        kept = state_dict.get(f"{prefix}numbers")
-        if isinstance(kept, torch.Tensor) and kept.dim() == 1 and MIN_NUMBERS <= len(kept) < len(Numbers()):
-            state_dict[f"{prefix}numbers"] = torch.tensor(Numbers(*kept.tolist()))
-        super()._load_from_state_dict(state_dict, prefix, *others)
 
     def _read(self) -> Numbers:
         return Numbers(*self.numbers.clamp(min=0.0))

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import model_validator
 
-from nmfd.controllers.dpc.compact import MEANING, NumbersOption
+from nmfd.controllers.dpc.compact import MEANING, Numbers, NumbersOption
 from nmfd.model.planning import Options, PlanningModel
 from nmfd.runs.config import Flow, Problem, Share, Texts, got, setting, whole
 
@@ -62,6 +62,7 @@ class Training(Options):
     local: bool = setting("one small network for every boundary, which fits other cities; perimeter control", False)
     compact: bool = setting("gates and prices of a few readable numbers instead of a network; on the CPU", False)
     numbers: NumbersOption | None = setting(f"initial numbers of a compact policy: {MEANING}", None, unit="-")
+    kept: Texts = setting("numbers of a compact policy that training leaves as they are", ())
     prices: bool = setting("a network chooses prices of the ways through regions instead of split ratios", False)
     metering: bool = setting("the policy makes trips wait while regions are full; for +metering", False)
     steps: int = whole("Adam steps", 400, low=1, high=10**7)
@@ -90,6 +91,9 @@ class Training(Options):
             raise Problem("compact", "begins with its numbers; omit local, from_gating, from_no_control")
         if self.numbers and not (self.compact and min(self.numbers) >= 0.0):
             raise Problem("numbers", "expected 8 to 11 numbers >= 0 of a compact policy; add compact = true")
+        if self.kept and not (self.compact and set(self.kept) <= set(Numbers._fields)):
+            names = got(f"numbers of a compact policy, of {', '.join(Numbers._fields)}", list(self.kept))
+            raise Problem("kept", f"{names}; correct them or add compact = true")
         if self.local and self.metering:
             raise Problem("metering", "a local policy controls gates only; omit it")
         if self.compact and self.prices:

@@ -41,6 +41,7 @@ class Trajectories:
 
     @property
     def total_time_spent(self) -> Levels:
+        """Total time spent (veh s, (B,))."""
         return self.step * (self.states + self.backlog).sum((0, -2, -1))
 
 
