@@ -123,7 +123,7 @@ class Estimation:
         each = dict(zip(layout.edges, map(len, layout.positions), strict=True))
         # The length of lane that a loop stands for.
         self._length = np.array([city.length[city.edges[edge]] / each[edge] for edge in edges])
-        self._region = np.array([city.region_of[city.edges[edge]] for edge in edges], dtype=int)
+        self._region = city.edge_region[edges]
         self._occupancy, self._samples = np.zeros(len(self._loops)), 0
         self._departed = meter.probe_departures.copy()
 

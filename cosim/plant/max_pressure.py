@@ -335,7 +335,7 @@ class Roads:
 
     def __init__(self, city: City, signals: Sequence[Signal], flows: Mapping[tuple[str, str], float]):
         """flows: (edge, next edge) -> flow, any unit, for the turning shares"""
-        self._city, self._flows, self._before = city, flows, city.before
+        self._city, self._flows = city, flows
         cars = [lane for edge in city.edges for lane in city.lane_ids[edge]]
         links = [link for signal in signals for link in signal.links]
         others = (lane_id(link) for signal in signals for link in signal.others)
@@ -427,7 +427,7 @@ class Roads:
         """Return edge without a signal, within REACH_M of one -> share of its vehicles that take `edge`."""
         shares, todo = {edge: 1.0}, [(edge, length)]
         for onward, there in todo:
-            for before in self._before[onward] if there < REACH_M else ():
+            for before in self._city.before[onward] if there < REACH_M else ():
                 if before not in self._links and before not in shares:
                     shares[before] = shares[onward] * self._turns(before)[onward]
                     todo.append((before, there + self._city.length[before]))
@@ -451,7 +451,7 @@ class Roads:
 
     def _upstream(self, edge: str) -> str | None:
         """Return the edge before if the road only gets turn lanes here."""
-        before = self._before[edge]
+        before = self._city.before[edge]
         alone = len(before) == 1 and len(self._city.successors[before[0]]) == 1 and before[0] not in self._links
         return before[0] if alone else None
 
