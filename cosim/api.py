@@ -220,14 +220,11 @@ def evaluate(
     )
 
 
-def compare(folder: Path, *, model: Path | None = None) -> str:
-    """Compare finished runs with what the regional model predicts; write a table and figures beside them.
-
-    model: folder of the network that predicts, the controller's model if None
-    """
+def compare(folder: Path) -> str:
+    """Compare finished runs with what the regional model predicts; write a table and figures beside them."""
     finished = results.read(folder)
     with locked(folder):
-        rows = model_validation.compare(finished, model)
+        rows = model_validation.compare(finished)
         write_table(folder / "foresight.csv", rows, float_format="%.6g")
     return f"{model_validation.prediction_table(rows)}\nWritten to {folder}: see foresight.csv and the figures"
 

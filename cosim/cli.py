@@ -154,8 +154,7 @@ def evaluate(scenario: Path, controllers: tuple[str, ...], seeds: int, first_see
 
 @main.command()
 @click.argument("folder", type=FOLDER, metavar="RUN")
-@click.option("--model", type=FOLDER, metavar="DIR", help="Network that predicts. [default: the controller's model]")
-def compare(folder: Path, **options: Any) -> None:
+def compare(folder: Path) -> None:
     """Compare finished runs with the regional model.
 
     RUN is a folder of `cosim run` or `cosim evaluate`. The regional model gets the recorded departures and controls.
@@ -165,7 +164,7 @@ def compare(folder: Path, **options: Any) -> None:
     Example:
       cosim compare runs/grid7_peak-evaluate
     """
-    click.echo(cosim.api.compare(folder, **options))
+    click.echo(cosim.api.compare(folder))
 
 
 @main.command()

@@ -55,17 +55,16 @@ def predict(scenario: Scenario, result: Result) -> Result:
     return result.assign(accumulation=torch.stack(states).numpy(), backlog=np.zeros_like(result.backlog), plant="nmfd")
 
 
-def compare(found: Finished, model: Path | None = None) -> pd.DataFrame:
+def compare(found: Finished) -> pd.DataFrame:
     """Draw the runs of a folder beside predictions; return the errors by strategy, demand level and region.
 
-    model: folder of the predicting network; None for that with which each controller plans
     Raises: InputError if the city has changed since the runs
     """
     found.map()
     tables = []
     for level in found.levels:
         for controller in level.rows["controller"].unique():
-            network, results = parse(controller).planning(found.scenario, model).network, level.results(controller)
+            network, results = parse(controller).planning(found.scenario).network, level.results(controller)
             scenario, runs = replace(found.scenario, network=network), list(map(observed, results))
             predicted = [predict(scenario, result) for result in results]
             both = zip(predicted, results, strict=True)

@@ -165,14 +165,11 @@ class Strategy:
         known = scenario if kind.reads == PLAN else self._planning(scenario)
         return kind.make(known) if file is None else kind.make(file, known)
 
-    def planning(self, scenario: Scenario, model: Path | None = None) -> PlanningModel:
+    def planning(self, scenario: Scenario) -> PlanningModel:
         """Return the planning model that predicts the runs of the strategy. Raise InputError.
 
         It is that of the controller, or the city's model with guided drivers if nothing else guides routes.
-        model: folder of a network instead
         """
-        if model is not None:
-            return replace(planning_model(scenario), network=other_model(scenario, model))
         planned, guided = self._planning(scenario), guided_model(scenario.network)
         if planned.network.folder == scenario.network.folder and self.guides and guided is not None:
             return replace(planned, network=other_model(scenario, guided))
