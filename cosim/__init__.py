@@ -24,15 +24,12 @@ if TYPE_CHECKING:
 
 __all__ = ["City", "Result", "Settings", "SumoPlant", "evaluate", "list", "read_run", "run", "settings", "tune"]
 _PLACES = {
+    **dict.fromkeys(("evaluate", "run", "tune"), "cosim.api"),
+    "read_run": "cosim.evaluation.results",
+    "SumoPlant": "cosim.plant.plant",
+    **dict.fromkeys(("Settings", "settings"), "cosim.plant.settings"),
     "City": "cosim.report.city",
     "Result": "nmfd.types",
-    "Settings": "cosim.plant.settings",
-    "SumoPlant": "cosim.plant.plant",
-    "evaluate": "cosim.api",
-    "read_run": "cosim.evaluation.results",
-    "run": "cosim.api",
-    "settings": "cosim.plant.settings",
-    "tune": "cosim.api",
 }
 
 

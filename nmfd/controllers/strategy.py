@@ -33,7 +33,6 @@ OWN = "own"  # table in [controllers] with the tables of the user's own controll
 POLICY = ("policy", ".pt", "nmfd train {folder} --controller {name}")
 PLAN = ("plan", ".npz", "nmfd bound {folder} --controller {name}")
 VALUE = ("value function", ".npz", "python scenarios/economic_mpc/terminal_cost.py {name}")
-TERMINAL = {"mpc-pc-terminal": "dpc-pc", "mpc-pcrg-terminal": "dpc-pcrg"}  # MPC -> policy of its value function
 MODEL_FREE = ("no-control", "route-guidance", "probing-pc", "probing-pcrg")  # use no regional model
 
 

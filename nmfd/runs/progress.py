@@ -1,5 +1,8 @@
-"""Progress as a bar of tqdm, on a terminal and in a notebook."""
+"""Progress as a bar of tqdm, on a terminal and in a notebook, and how long it still takes as a line anywhere."""
 
+import math
+import sys
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -8,13 +11,17 @@ with warnings.catch_warnings(action="ignore"):  # of a notebook without ipywidge
     from tqdm.auto import tqdm
 
 Progress = Callable[..., None] | bool | None
+MEASURED_S = 2.0  # of the first steps, from which the time of all others follows
+LONG_S = 30.0  # what takes longer is announced
 
 
 @contextmanager
-def watched(label: str, progress: Progress = None) -> Iterator[Callable[..., None] | None]:
+def watched(label: str, progress: Progress = None, *, said: bool = False) -> Iterator[Callable[..., None] | None]:
     """Yield the function that shows progress.
 
-    progress: the user's own function; None for a bar on a terminal or in a notebook; False for none
+    progress: the user's own function; None for a bar on a terminal or in a notebook, and a line on stderr about the
+        time left after the first steps of every long stage; False for neither
+    said: the caller has said how long it takes, so this line is left out
     """
     if progress is False:
         yield None
@@ -22,10 +29,19 @@ def watched(label: str, progress: Progress = None) -> Iterator[Callable[..., Non
         yield progress
     else:
         with tqdm(desc=label, leave=False, dynamic_ncols=True, smoothing=0.0, disable=None) as bar:
+            first, begun = math.inf, math.nan  # NaN: nothing is to be said
 
             def show(done: int, total: int, note: str = "") -> None:
+                nonlocal first, begun
                 bar.total = total
                 bar.set_postfix_str(note, refresh=False)
                 bar.update(done - bar.n)
+                now = time.monotonic()
+                if done <= first:
+                    first, begun = done, math.nan if said else now
+                left = (total - done) * (now - begun) / max(done - first, 1)
+                if now - begun > MEASURED_S and left > LONG_S:
+                    begun = math.nan
+                    tqdm.write(f"{label}{note and ', '}{note}: about {left / 60:.0f} min left", file=sys.stderr)
 
             yield show

@@ -79,12 +79,7 @@ class Run:
 
 
 def run_many(
-    runs: Sequence[Run],
-    out: Path | str,
-    *,
-    workers: int = 1,
-    scheduler: str | None = None,
-    progress: Progress = None,
+    runs: Sequence[Run], out: Path | str, *, workers: int = 1, scheduler: str | None = None, progress: Progress = None
 ) -> "pd.DataFrame":
     """Do the `runs` whose files are not in the folder `out`, and return one row per run.
 
@@ -103,10 +98,10 @@ def run_many(
         rows = {file: _row(file, result) for file, key in keys.items() if (result := _finished(out / file, key))}
         todo = [run for run in runs if run.file not in rows]
         minutes = sum(run.expected for run in todo) / max(workers, 1) / 60.0
-        if minutes > 0.5 and scheduler is None:
+        if said := minutes > 0.5 and scheduler is None:
             print(f"{len(todo)} runs take about {minutes:.0f} min, {workers} at a time", file=sys.stderr)
         try:
-            with watched("runs", progress) as show, closing(_outcomes(todo, workers, scheduler)) as ended:
+            with watched("runs", progress, said=said) as show, closing(_outcomes(todo, workers, scheduler)) as ended:
                 if show and todo:
                     show(0, len(todo))
                 for done, (run, outcome) in enumerate(ended, 1):

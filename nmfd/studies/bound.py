@@ -113,12 +113,12 @@ def solve(
             for n in np.flatnonzero(totals.detach().numpy() < best):
                 best[n] = totals[n].item()
                 kept[n] = tuple(logits[:, n].detach().clone() for logits in controls.logits)
+            if progress:
+                progress(iteration, iterations, f"best {best.min():.4g} veh s")
             if iteration < iterations:
                 optimizer.zero_grad()
                 torch.log(totals.clamp(min=1.0)).sum().backward()  # each at its own scale
                 optimizer.step()
-                if progress:
-                    progress(iteration + 1, iterations, f"best {best.min():.4g} veh s")
     except KeyboardInterrupt:
         if not np.isfinite(best).all():
             raise

@@ -28,7 +28,7 @@ from nmfd.controllers.dpc.rollout import Demands, Rollout
 from nmfd.controllers.mpc.controller import EconomicMpc
 from nmfd.controllers.mpc.terminal import LATE, OFFSET, WEIGHTS, Terminal, clock
 from nmfd.controllers.rules import NoControl, PiGating
-from nmfd.controllers.strategy import TERMINAL, parse
+from nmfd.controllers.strategy import parse
 from nmfd.model.planning import PlanningModel, planning_model
 from nmfd.model.plant import NmfdPlant
 from nmfd.model.scenario import Scenario
@@ -36,6 +36,7 @@ from nmfd.runs.files import atomic
 from nmfd.tensors import one_thread
 from nmfd.types import Controller
 
+TERMINAL = {"mpc-pc-terminal": "dpc-pc", "mpc-pcrg-terminal": "dpc-pcrg"}  # MPC -> policy of its value function
 ROLLOUTS = 128  # at a time
 MOST_SCATTER = 0.25  # of the logarithm of every x_ij
 WIDTH = 128  # of both hidden layers
