@@ -128,7 +128,7 @@ def demo(out: Path, *, seed: int = 1000) -> str:
         page = html.write_page(out / "report.html", [results.read(out)], seed=seed).resolve()
     if _has_screen():
         webbrowser.open(page.as_uri())
-    return "\n".join([*lines, f"Both side by side: {page}"])
+    return "\n".join([*lines, f"Both side by side: {page}; next: cosim watch {DEMO} --controller pi-gating"])
 
 
 def watch(
@@ -215,9 +215,7 @@ def evaluate(
             figures.draw_all(finished)
             text += [each] * (len(chosen) > 1) + [statistics.text(finished.rows)]
     raise_failures(rows)
-    return "\n".join(
-        [*text, f"Written to {out}: see evaluate.md, runs.csv and the figures; a page: cosim report {out}"]
-    )
+    return "\n".join([*text, f"Written to {out}: see evaluate.md and the figures; a page: cosim report {out}"])
 
 
 def compare(folder: Path) -> str:
@@ -226,7 +224,8 @@ def compare(folder: Path) -> str:
     with locked(folder):
         rows = model_validation.compare(finished)
         write_table(folder / "foresight.csv", rows, float_format="%.6g")
-    return f"{model_validation.prediction_table(rows)}\nWritten to {folder}: see foresight.csv and the figures"
+    where = f"Written to {folder}: see foresight.csv and the figures"
+    return f"{model_validation.prediction_table(rows)}\n{where}; large errors: cosim identify {finished.scenario.name}"
 
 
 def report(folders: Sequence[Path], *, seed: int | None = None, out: Path | None = None) -> Path:

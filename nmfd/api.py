@@ -145,8 +145,8 @@ def benchmark(
             key(strategy.name),
             partial(closed_loop_of, strategy, seed, scenario=scenario, plant=plant, policy=files.get(strategy.name)),
         )
-        for strategy in strategies
         for seed in (range(seeds) if isinstance(seeds, int) else seeds)
+        for strategy in strategies
     ]
     out = default_folder(scenario.name) if out is None else Path(out)
     lower = {strategy.name: benchmark_study.lower_bound(scenario, strategy, plant) for strategy in strategies}

@@ -169,6 +169,7 @@ POLICIES = click.option(
     help="Policy or plan file of a controller. May be repeated. [default: SCENARIO/NAME.pt or .npz]",
 )
 WORKERS = click.option("--workers", type=COUNT, default=1, help="Runs at a time.")
+TRY = "; try it: nmfd benchmark {0} --controllers no-control,{1} --policy {1}={2}"
 
 
 def seed_option(text: str = "Random seed.") -> Callable:
@@ -242,7 +243,7 @@ def benchmark(scenario: Path, settings: dict, out: Path | None, **options: Any) 
     loaded = nmfd.load_scenario(scenario, settings)
     out = out or nmfd.api.default_folder(loaded.name)
     rows = nmfd.api.benchmark(loaded, out=out, **options)
-    click.echo(f"{nmfd.api.summary_table(rows)}\nWritten to {out}")
+    click.echo(f"{nmfd.api.summary_table(rows)}\nWritten to {out}: see the figures; more seeds: --seeds N --out {out}")
     nmfd.api.raise_failures(rows)
 
 
@@ -277,7 +278,7 @@ def robustness(scenario: Path, settings: dict, out: Path | None, **options: Any)
     loaded = nmfd.load_scenario(scenario, settings)
     out = out or nmfd.api.default_folder(loaded.name)
     rows = nmfd.api.robustness(loaded, out=out, **options)
-    click.echo(f"{nmfd.api.improvement_table(rows)}\nWritten to {out}")
+    click.echo(f"{nmfd.api.improvement_table(rows)}\nWritten to {out}: see runs.csv and robustness.png")
     nmfd.api.raise_failures(rows)
 
 
@@ -299,8 +300,7 @@ def train(scenario: Path, settings: dict, controller: str, **options: Any) -> No
       nmfd train economic_mpc --controller dpc-pc --steps 200 --out mine.pt
     """
     file = nmfd.api.train(nmfd.load_scenario(scenario, settings), controller, **options)
-    trial = f"nmfd benchmark {scenario} --controllers no-control,{controller} --policy {controller}={file}"
-    click.echo(f"Written to {file}; try it: {trial}")
+    click.echo(f"Written to {file}{TRY.format(scenario, controller, file)}")
 
 
 @main.command()
@@ -317,7 +317,9 @@ def bound(scenario: Path, settings: dict, controller: str, **options: Any) -> No
     Example:
       nmfd bound economic_mpc --controller bound-pcrg
     """
-    click.echo(nmfd.api.bound(nmfd.load_scenario(scenario, settings), controller, **options))
+    file = options["out"] or f"{scenario}/{controller}.npz"
+    text = nmfd.api.bound(nmfd.load_scenario(scenario, settings), controller, **options)
+    click.echo(text + TRY.format(scenario, controller, file))
 
 
 @main.command(name="new-controller")
@@ -338,10 +340,8 @@ def new_controller(file: Path) -> None:
         raise InputError(f"{file}: exists; choose another name")
     text = resources.files("nmfd.controllers").joinpath("template.py").read_text(encoding="utf-8")
     file.write_text(text.replace("FILE", str(file)), encoding="utf-8")
-    click.echo(
-        f"Written to {file}; try it with: nmfd benchmark economic_mpc "
-        f"--controllers no-control,{shlex.quote(str(file))}:MyController"
-    )
+    own = f"{shlex.quote(str(file))}:MyController"
+    click.echo(f"Written to {file}; try it: nmfd benchmark economic_mpc --controllers no-control,{own}")
 
 
 @main.command()
@@ -370,4 +370,4 @@ def identify(counts: Path, out: Path, **options: Any) -> None:
       nmfd identify counts.csv --detectors detectors.csv --regions regions.csv --trip-length 1500 --out networks/mine
     """
     click.echo(nmfd.api.identify(counts, out=out, **options).text)
-    click.echo(f"Written to {out}: see network.toml, mfd.png and identify.txt")
+    click.echo(f'Written to {out}: see mfd.png and identify.txt; next: a scenario.toml with network = "{out}"')

@@ -88,7 +88,8 @@ def identify(
             report.append(
                 _identify(loaded, guided=guided, protect=protect and not report, out=folder, progress=show, **how)
             )
-    return "\n".join(report)
+    trial = f"cosim run {scenario} --controller pi-gating --against no-control"
+    return "\n".join([*report, f"Next: try control with the new model: {trial}"])
 
 
 def _identify(
