@@ -19,7 +19,7 @@ HEAVY = ("pydantic", "torch", "casadi", "libsumo", "numpy", "pandas", "matplotli
 
 
 @pytest.fixture
-def benchmark(folder, tmp_path):
+def both(folder, tmp_path):
     return ["benchmark", folder, "--controllers", "no-control,pi-gating", "--seeds", 2, "--out", tmp_path / "out"]
 
 
@@ -51,8 +51,8 @@ def test_help_is_quick_fits_a_screen_and_shows_examples(package):
     assert f"Begin with `{package}" in " ".join(lines)
 
 
-def test_benchmark_writes_a_run_folder(benchmark, tmp_path):
-    lines = good(nmfd(*benchmark)).splitlines()
+def test_benchmark_writes_a_run_folder(both, tmp_path):
+    lines = good(nmfd(*both)).splitlines()
     assert lines[1].split()[:2] == ["no-control", "2"] and lines[2].split()[:2] == ["pi-gating", "2"]
     assert "±" in lines[2] and lines[-1].startswith(f"Written to {tmp_path / 'out'}: see ")
     names = {f"{name}-{seed}.nc" for name in ("no-control", "pi-gating") for seed in (0, 1)}
@@ -73,16 +73,16 @@ def test_settings(folder, tmp_path):
         assert problem in error_line(nmfd(*command, text), "nmfd")
 
 
-def test_a_failing_controller_names_itself_and_the_others_are_kept(benchmark, tmp_path, monkeypatch, in_process):
+def test_a_failing_controller_names_itself_and_the_others_are_kept(both, tmp_path, monkeypatch, in_process):
     monkeypatch.setattr(PiGating, "act", lambda self, measurement: 1 / 0)
-    result = nmfd(*benchmark)
+    result = nmfd(*both)
     assert result.exit_code == 1 and result.stderr.count("\n") == 1
     assert "pi-gating, seed 0: ZeroDivisionError: division by zero (test_cli.py:" in result.stderr
     assert set(runs(tmp_path / "out")) == {"no-control-0.nc", "no-control-1.nc"}
 
 
-def test_an_interrupted_benchmark_continues(benchmark, tmp_path, monkeypatch, in_process):
-    good(nmfd(*benchmark[:-1], tmp_path / "whole"))
+def test_an_interrupted_benchmark_continues(both, tmp_path, monkeypatch, in_process):
+    good(nmfd(*both[:-1], tmp_path / "whole"))
     calls, run = [], closed_loop.run
 
     def stopped(*args, **options):
@@ -92,11 +92,11 @@ def test_an_interrupted_benchmark_continues(benchmark, tmp_path, monkeypatch, in
         return run(*args, **options)
 
     monkeypatch.setattr(closed_loop, "run", stopped)
-    result = nmfd(*benchmark)
+    result = nmfd(*both)
     assert result.exit_code == 130 and result.stderr.count("\n") == 1
     assert result.stderr.startswith("nmfd: interrupted: finished runs are in ")
     assert len(runs(tmp_path / "out")) == 2
-    good(nmfd(*benchmark))
+    good(nmfd(*both))
     assert len(calls) == 5  # two, the interrupted one, and the two that were left
     assert same(runs(tmp_path / "out"), runs(tmp_path / "whole"))
 
