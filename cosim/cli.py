@@ -262,11 +262,7 @@ def import_(source: Path | None, bbox: str | None, **options: Any) -> None:
 @click.option("--levels", type=listed(LEVEL), default="0.6,0.8,1", help="Factors on the demand.")
 @click.option("--seeds", type=COUNT, default=2, help="Loading runs per level, from seed 1000.")
 @click.option(
-    "--with",
-    "city",
-    metavar="A+...",
-    help="What the city does in the loading runs: own, guided, max-pressure, rerouting-30, ... [default: own, then "
-    "guided, a model each]",
+    "--with", "city", metavar="A+...", help="City in these runs: own, guided, max-pressure. [default: own, then guided]"
 )
 @click.option("--network", type=FOLDER, metavar="DIR", help="Folder of the model. [default: the scenario's network]")
 @click.option("--protect", is_flag=True, help="Write the regions to protect into the scenario.")
@@ -276,7 +272,7 @@ def identify(scenario: Path, **options: Any) -> None:
     """Fit the regional model of a SUMO city.
 
     Loads the city with multiples of its demand, without control and with probing gates, and writes network.toml.
-    Says which regions to protect.
+    Without --with it fits two models: with drivers on their own ways, then guided ones. Says which regions to protect.
     Policies trained on the network before do not fit the new one. SCENARIO may be the folder of an imported network.
 
     \b

@@ -132,17 +132,10 @@ def toml_or_text(value: str) -> Any:
         return value
 
 
-def print_citation(ctx: click.Context, _param: click.Parameter, requested: bool) -> None:
-    """Print CITATION.cff with the version and exit, for --cite."""
-    if requested:
-        text = resources.files("nmfd").joinpath("CITATION.cff").read_text(encoding="utf-8")
-        click.echo(f"{text}version: {nmfd.__version__}")
-        ctx.exit()
-
-
+CITATION = resources.files("nmfd").joinpath("CITATION.cff").read_text(encoding="utf-8")
 VERSION = combined(
     click.version_option(nmfd.__version__),
-    click.option("--cite", is_flag=True, expose_value=False, callback=print_citation, help="Show CITATION.cff."),
+    click.version_option(nmfd.__version__, "--cite", message=f"{CITATION}version: %(version)s", help="How to cite it."),
 )
 SET = click.option(
     "--set",
@@ -259,7 +252,7 @@ def benchmark(scenario: Path, settings: dict, out: Path | None, **options: Any) 
 @click.option(
     "--sigmas",
     type=listed(Number(0.0)),
-    help="Noise on the demand (veh/s), or spread of the logarithm. [default: 0,0.25,...,5, or 0,0.05,...,0.4]",
+    help="Noise (veh/s), or spread of logarithms. [default: 0,...,5, or 0,...,0.4]",
 )
 @click.option("--scenarios", type=COUNT, default=20, help="Draws for every sigma.")
 @WORKERS
@@ -350,7 +343,7 @@ def new_controller(file: Path) -> None:
     "--detectors",
     type=FILE,
     metavar="CSV",
-    help="Table with detid, length (km of its link), and lanes, linkid, pos, long, lat (or x, y in m), region.",
+    help="Table: detid, length (km), lanes, linkid, pos, long and lat or x and y, region.",
 )
 @click.option("--regions", type=FILE, metavar="CSV", help="Table detid,region, if no other table has the region.")
 @click.option("--about", type=FILE, metavar="CSV", help="Table of regions: region, lane_km, trip_length, x, y (m).")

@@ -164,6 +164,8 @@ def test_a_named_policy_takes_a_cost_too(tmp_path):
         ({"out": "mine.pt"}, "policy: a module is returned, not written"),
         ({"sample": lambda generator, batch: (torch.zeros(batch, 4, 4),) * 2}, r"sample: expected start \(16, R, R\)"),
         ({"cost": lambda run: run.states.detach().sum()}, "cost: has no gradient"),
+        ({"cost": lambda run: run.total_time_spent / 0 * 0}, "lambda>: in step 0 the cost is nan and .* own functions"),
+        ({"cost": lambda run: (0 * run.perimeter).sqrt()}, "the cost is 0 and the norm of its gradient nan; look for"),
         ({"constraints": [crowded]}, r"constraints: expected pairs \(function, weight\), got <function crowded"),
     ],
 )

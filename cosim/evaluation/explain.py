@@ -20,7 +20,6 @@ SMALL_SHARE = 0.01  # of commands, of the time, or of trips
 OPEN_SHARE = 0.1  # of the range of u below its upper bound: a policy never quite reaches that
 FULL_SHARE = 0.02  # more full edges before gateways than under the reference
 INTERGREEN_SHARE = 0.03  # more time between two stages than in the original programmes
-FEWEST_SEEDS = 3  # from which a difference is called significant
 WAIT_S = 1.0  # before a trip begins
 LONGER_PERCENT = 5.0  # trips from one region, while the whole gains
 
@@ -70,12 +69,13 @@ def paragraph(level: Level, finished: Finished, name: str) -> str:
     pair = statistics.paired(*values)
     if np.isnan(pair.percent):
         return f"{name} has no seed in common with {against}, or no vehicle spent time: no comparison."
-    clear, gains = pair.excludes_zero or pair.seeds < FEWEST_SEEDS, pair.percent < 0
+    few, gains = pair.seeds < statistics.FEWEST_SEEDS, pair.percent < 0
+    clear = pair.significant or few
     verdict = "changes nothing" if not pair.percent else "gains" if gains else "loses"
     if pair.percent and not clear:
         verdict = "shows no significant change"
     spread = f"± {pair.percent_half:.1f} % over {pair.seeds} seeds" if pair.seeds > 1 else "on one seed"
-    spread += ", no proof" * (pair.seeds < FEWEST_SEEDS)
+    spread += ", no proof" * few
     reasons = _reasons(level, finished.scenario, name, against, gains=clear and gains) + _removed(level, name)
     size = f"{pair.percent:+.1f} % total time spent against {against} {spread}"
     losers = _losers(level, finished.scenario.network.region_names, name, against) if clear and gains else ""

@@ -21,6 +21,7 @@ from nmfd.types import Result
 TTS = "total_time_spent_veh_s"
 COLUMNS = config.read(Path(__file__).with_name("columns.toml"))["evaluation"]  # heading without unit -> meaning
 COLUMNS |= dict(COUNTED.values()) | {"outside SUMO": "share of the wall time outside SUMO"}
+FEWEST_SEEDS = 3  # from which a difference may be called significant
 CAPTION = "; ".join(f"{heading}: {text}" for heading, text in COLUMNS.items())
 
 
@@ -32,8 +33,8 @@ class Paired(NamedTuple):
     percent_half: float
 
     @property
-    def excludes_zero(self) -> bool:
-        return abs(self.percent) > self.percent_half  # never with a single seed
+    def significant(self) -> bool:
+        return self.seeds >= FEWEST_SEEDS and abs(self.percent) > self.percent_half
 
 
 def paired(a: Mapping[int, float], b: Mapping[int, float]) -> Paired:
@@ -80,7 +81,7 @@ def statistics(rows: pd.DataFrame) -> pd.DataFrame:
                     f"half_interval_{TTS}": interval(list(part[TTS])),
                     "change_percent": pair.percent,
                     "change_half_interval_percent": pair.percent_half,
-                    "change_excludes_zero": pair.excludes_zero if pair.seeds else None,
+                    "change_significant": pair.significant if pair.seeds else None,
                     "change_seeds": pair.seeds,
                     "teleports": int(part["teleports"].sum()),
                     "gateway_queue_max_veh": part["gateway_queue_max_veh"].max(),
@@ -97,8 +98,8 @@ def pairs(rows: pd.DataFrame) -> pd.DataFrame:
     for level, names in groups(rows).items():
         for name, other in ((name, other) for name in names for other in names if other != name):
             pair = paired(by_seed(rows, level, name), by_seed(rows, level, other))
-            out.append((level, name, other, *pair, pair.excludes_zero))
-    columns = ["demand", "controller", "against", "seeds", "change_percent", "half_interval_percent", "excludes_zero"]
+            out.append((level, name, other, *pair, pair.significant))
+    columns = ["demand", "controller", "against", "seeds", "change_percent", "half_interval_percent", "significant"]
     return pd.DataFrame(out, columns=columns)
 
 
@@ -148,7 +149,8 @@ def _change(row: Mapping) -> str:
     percent, half = row["change_percent"], row["change_half_interval_percent"]
     if math.isnan(percent):
         return "-" * bool(row["change_seeds"])
-    return f"{percent:+.1f}" + (" %" if math.isnan(half) else f" ± {half:.1f} %{'*' * row['change_excludes_zero']}")
+    spread = f" ± {max(half, 0.1):.1f}" if half > 0 else ""  # NaN for one seed
+    return f"{percent:+.1f}{spread} %{'*' * row['change_significant']}"
 
 
 def text(rows: pd.DataFrame) -> str:

@@ -132,13 +132,13 @@ def card(rows: pd.DataFrame) -> tuple[str, list[Figure], str]:
 
 def _judged(pair: statistics.Paired, good: int) -> tuple[str, str, bool | None]:
     """Return change, verdict and better of a figure; good: sign of an improvement."""
-    seeds, half, clear = pair.seeds, pair.percent_half, pair.excludes_zero and pair.seeds >= explain.FEWEST_SEEDS
+    seeds, half, clear = pair.seeds, pair.percent_half, pair.significant
     digits = 0 if half >= 1.0 or seeds == 1 else 1
     spread = "" if seeds == 1 else f" ± {max(half, 0.1):.{digits}f}"
     size = f"{abs(pair.percent):.{digits}f}{spread} % {'more' if pair.percent > 0 else 'less'}"
     change = size if pair.percent or half else "no change"
     few = f"no proof ({seeds} seed{'s' * (seeds > 1)})"
-    verdict = few if seeds < explain.FEWEST_SEEDS else "significant" if clear else "not significant"
+    verdict = few if seeds < statistics.FEWEST_SEEDS else "significant" if clear else "not significant"
     return change, verdict, pair.percent * good > 0 if clear else None
 
 

@@ -187,7 +187,7 @@ def train(
         cosine = 0.5 * (1.0 + math.cos(math.pi * (step / steps)))
         for group in optimizer.param_groups:
             group["lr"] = recipe.learning_rate or setup.learning_rate * (0.1 + 0.9 * cosine)
-        _descend(policy, objective(generator, recipe.batch, advance), optimizer, setup, step)
+        _descend(policy, objective(generator, recipe.batch, advance), optimizer, setup, step, task.own)
         if (step + 1) % VALIDATION_PERIOD == 0 or step + 1 == steps:
             best = keep_the_better(best)
             state = {"configuration": configuration, "step": step + 1, "best": best}
@@ -259,7 +259,7 @@ def _loss(
     return loss + sum(weight * penalty(run).mean() for penalty, weight in task.constraints)
 
 
-def _descend(policy: nn.Module, loss: torch.Tensor, optimizer: Adam, setup: Training, step: int) -> None:
+def _descend(policy: nn.Module, loss: torch.Tensor, optimizer: Adam, setup: Training, step: int, own: str) -> None:
     if not loss.requires_grad:
         raise InputError("cost: has no gradient by the weights of the policy; compute it from the run with torch")
     optimizer.zero_grad()
@@ -270,7 +270,10 @@ def _descend(policy: nn.Module, loss: torch.Tensor, optimizer: Adam, setup: Trai
     for n, decoder in enumerate(decoders):  # in turn; not by requires_grad, which would compile the step once for each
         for weights in decoder.parameters() if n != step // setup.recipe.epoch % len(decoders) else ():
             weights.grad = None
-    torch.nn.utils.clip_grad_norm_(policy.parameters(), setup.recipe.clip)
+    size = torch.nn.utils.clip_grad_norm_(policy.parameters(), setup.recipe.clip)
+    if own and not size.isfinite():
+        what = f"{own}: in step {step} the cost is {loss.item():.4g} and the norm of its gradient {size.item():.4g}"
+        raise InputError(f"{what}; look for 0 / 0, log(0) and sqrt(0) in your own functions")
     optimizer.step()
     if isinstance(policy, CompactPolicy):
         policy.bound()
