@@ -22,13 +22,6 @@ def test_one_seed_is_shown_and_all_are_shaded(ax):
     assert len(ax.collections) == 1
 
 
-def test_demand_figure_has_the_levels_as_ticks(ax):
-    points = {"dpc-pc": {0.8: (0.9, 0.1), 1.3: (0.5, np.nan)}, "pi-gating": {0.8: (0.7, 0.1)}}
-    assert figures.over_levels(ax, points, "ratio [-]").get_ylabel() == "ratio [-]"
-    assert [tick.get_text() for tick in ax.get_xticklabels()] == ["0.8", "1.3"]
-    assert ax.get_ylim()[0] == 0.0 and len(ax.containers) == 2
-
-
 def test_the_frontier_has_the_share_of_due_trips_over_demand(tmp_path, monkeypatch):
     drawn = []
     monkeypatch.setattr(plots, "save", lambda drawing, path: drawn.append((path.name, drawing.axes[0])))

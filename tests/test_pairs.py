@@ -25,6 +25,8 @@ def test_the_reference_controller():
     rows = rows_of({(1.0, "a"): {1: 1.0}, (1.3, "no-control"): {1: 1.0}, (1.3, "a"): {1: 1.0}})
     assert statistics.compared_with(rows) == "a"  # what every level has
     assert statistics.compared_with(rows[rows["demand"] == 1.3]) == "no-control"
+    few = rows_of({(1.0, "no-control"): {1: 2.0}, (1.0, "a"): {1: 1.0, 2: 1.0, 3: 1.0}})
+    assert statistics.compared_with(few) == "a" and statistics.compared_with(few[few["seed"] < 3]) == "a"
 
 
 def test_tables_pair_with_the_first(folder):

@@ -6,7 +6,6 @@ import pytest
 from made_up import rows_of
 
 from cosim.evaluation import statistics
-from nmfd.runs.tables import text_table
 
 
 def test_paired_interval_of_a_worked_example():
@@ -64,14 +63,3 @@ def test_tables_show_a_line_per_controller_and_the_teleports(rows):
     assert "Demand times 1.3" in text and "%*" in text and "-50.0 % " in text, "no star and no ± 0 on two seeds"
     first = next(line for line in page.splitlines() if line.startswith("| dpc-pc"))
     assert first.rstrip("| ").endswith("| 0") and "-50.0 ± 2.4 %*" in first
-
-
-def test_numbers_stand_to_the_right_and_captions_are_wrapped():
-    rows = [
-        {"controller": "no-control", "TTS": "1.50e8 ± 2e5", "change": ""},
-        {"controller": "a", "TTS": "9e7", "change": "-1.0 %"},
-    ]
-    head, first, second, *caption = text_table(rows, "words " * 50 + "\n  more: " + "words " * 30).splitlines()
-    assert head == "controller           TTS  change" and first == "no-control  1.50e8 ± 2e5"
-    assert second == "a                    9e7  -1.0 %"
-    assert max(map(len, caption)) <= 120 and [line.startswith("  ") for line in caption] == [False] * 3 + [True] * 2

@@ -98,11 +98,13 @@ def test_the_frame_at_a_time(whole):
 
 
 def test_the_page_draws_every_street_and_escapes_names(drawn, whole):
-    named = replace(drawn, name=EVIL, region_names=(EVIL,) * drawn.regions)
+    unseen = np.full(drawn.regions, np.nan)
+    named = replace(drawn, name=EVIL, region_names=(EVIL,) * drawn.regions, critical=unseen)
     one, document = page.Page(named, {EVIL: "red", "no-control": "black"}), Document()
     document.add_root(one.layout([Button(label=EVIL)]))
     one.show([replace(whole[-1], note=EVIL), None], whole[-1].time)
     one.trace([whole, whole[:2]], whole[-1].time)
+    assert np.isfinite(one.loads[0].plot.renderers[0].data_source.data["image"][0]).all(), "no critical was seen"
     streets = one.maps[0].streets.data
     assert list(streets["edge"]) == list(drawn.edges) and len(streets["xs"]) == len(drawn.edges)
     np.testing.assert_array_equal(streets["density"], whole[-1].density.astype(np.float32))

@@ -13,6 +13,7 @@ from commands import call, good
 from nmfd.studies import plots
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+NAME = "no-control+guided+compliance-100+guidance-period-60"  # wider than a telephone
 EVIL = "<script>alert(1)</script>"
 DENSITIES = """() => [0, 1].map(n => Array.from(Bokeh.documents[0].get_model_by_name(`map${n}`)
     .renderers.map(one => one.data_source.data).find(data => data.edge).density))"""
@@ -20,6 +21,7 @@ NUMBERS = "() => Bokeh.documents[0].get_model_by_name('numbers').text"
 PLANE = "() => Bokeh.documents[0].get_model_by_name('plane').title.text"
 LINES = "() => Bokeh.documents[0].get_model_by_name('trips').renderers.map(one => one.glyph.line_color.value)"
 TIME = "() => Bokeh.documents[0].get_model_by_name('time').value"
+RANGES = "() => [0, 1].map(n => Bokeh.documents[0].get_model_by_name(`map${n}`).x_range.end)"
 NARROW = "() => document.documentElement.scrollWidth <= window.innerWidth + 1"
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no browser")]
 
@@ -34,7 +36,7 @@ def scenario(tmp_path_factory):
 @pytest.fixture(scope="module")
 def report(scenario, tmp_path_factory):
     out = tmp_path_factory.mktemp("report") / "run"
-    controllers = ("--controller", "no-control+guided", "--against", "no-control")
+    controllers = ("--controller", NAME, "--against", "no-control")
     good(call("cosim", "run", scenario, *controllers, "--seed", 3, "--set", "steps=6", "--out", out))
     good(call("cosim", "report", out))
     return out / "report.html"
@@ -78,8 +80,15 @@ def test_the_report(report, width):
         page.get_by_role("button", name="Play").click()
         page.wait_for_timeout(2000)
         assert page.evaluate(DENSITIES) == at_the_end
-        tones = plots.colours(["no-control", "no-control+guided"])
-        assert page.evaluate(LINES) == [tones["no-control"], tones["no-control+guided"]]
+        tones = plots.colours(["no-control", NAME])
+        assert page.evaluate(LINES) == [tones["no-control"], tones[NAME]]
+        page.locator(".bk-Figure").first.scroll_into_view_if_needed()
+        box, before = page.locator(".bk-Figure").first.bounding_box(), page.evaluate(RANGES)
+        page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 200)
+        page.mouse.wheel(0, -100)
+        page.wait_for_timeout(500)
+        first, second = page.evaluate(RANGES)
+        assert first == second < before[0], "both maps zoom together"
         heat = page.locator(".bk-Figure").nth(2)
         heat.scroll_into_view_if_needed()
         box = heat.bounding_box()

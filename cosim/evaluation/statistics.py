@@ -57,9 +57,9 @@ def groups(rows: pd.DataFrame) -> dict[float, list[str]]:
 
 
 def compared_with(rows: pd.DataFrame) -> str:
-    """Return the reference controller: no-control, or the first one that every level has."""
-    levels = groups(rows).values()
-    names = list(dict.fromkeys(rows["controller"]))
+    """Return the reference controller: no-control, or the first one, that every level and enough seeds have."""
+    levels, seeds = groups(rows).values(), rows.groupby("controller", sort=False)["seed"].nunique()
+    names = list(seeds.index[seeds >= min(FEWEST_SEEDS, seeds.max())])
     return benchmark.compared_with([name for name in names if all(name in level for level in levels)] or names)
 
 

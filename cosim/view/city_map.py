@@ -9,7 +9,7 @@ from bokeh.models import ColorBar, ColumnDataSource, CustomJS, FixedTicker, Hove
 from bokeh.plotting import figure
 from bokeh.transform import linear_cmap
 
-from cosim.sumo.arrays import PerEdge, Points
+from cosim.sumo.arrays import Points
 from cosim.view import colours
 from cosim.view.picture import CityPicture, Frame, Gate
 
@@ -27,13 +27,14 @@ class CityMap:
     layers: label -> what shows the streets by this quantity; all but the first, DENSITY, are hidden
     """
 
-    def __init__(self, picture: CityPicture, title: str, totals: Mapping[str, tuple[PerEdge, float]] = {}):
-        """totals: label -> values (E,) of other layers, and the upper end of their scale"""
+    def __init__(self, picture: CityPicture, title: str, totals: Mapping[str, tuple], *other: "CityMap"):
+        """totals: label -> values (E,) of other layers, and the upper end of their scale; other: map to move with"""
         self._picture, self._totals = picture, totals
         self.layers: dict[str, list[Any]] = {}
         size = {"height": MAP_HEIGHT, "sizing_mode": "stretch_width", "match_aspect": True, "lod_threshold": None}
         bare = {"tools": "pan,wheel_zoom,reset", "toolbar_location": None, "outline_line_color": None}
-        self.plot = figure(title=title, active_scroll="wheel_zoom", **size, **bare)
+        common = {axis: getattr(one.plot, axis) for one in other for axis in ("x_range", "y_range")}
+        self.plot: Any = figure(title=title, active_scroll="wheel_zoom", **size, **bare, **common)
         self.plot.axis.visible = self.plot.grid.visible = False
         self.regions = self._add_regions()
         self.streets = self._add_streets()

@@ -23,6 +23,8 @@ class Load:
 
     def __init__(self, picture: CityPicture, title: str):
         self._picture = picture
+        peaks = [curve[curve[:, 1].argmax(), 0] for curve in picture.curves]
+        self._critical = np.where(np.isnan(picture.critical), peaks, picture.critical)
         horizon = picture.steps * picture.step / MINUTE
         self.plot = _figure(title, "time [min]", "region", height=130 + 18 * min(picture.regions, 12))
         self.plot.y_range.start, self.plot.y_range.end = picture.regions - 0.5, -0.5
@@ -33,7 +35,7 @@ class Load:
         mapper = LinearColorMapper(palette=colours.SCALE, low=0.0, high=DARKEST_LOAD, nan_color=colours.LAND)
         place = {"x": 0.0, "y": -0.5, "dw": horizon, "dh": picture.regions}
         self.plot.image("image", source=self._source, color_mapper=mapper, **place)
-        self.plot.add_layout(colour_bar(mapper, "accumulation / critical [-]", [0.0, 1.0, 2.0]), "below")
+        self.plot.add_layout(colour_bar(mapper, "accumulation / critical of the model [-]", [0.0, 1.0, 2.0]), "below")
         self.now = _now(self.plot)
 
     def show(self, whole: Sequence[Frame]) -> None:
@@ -43,7 +45,7 @@ class Load:
     def _values(self, whole: Sequence[Frame]) -> np.ndarray:
         values = np.full((self._picture.regions, self._picture.steps), np.nan, np.float32)
         for frame in whole[1:]:
-            values[:, frame.intervals - 1] = frame.accumulation / self._picture.critical
+            values[:, frame.intervals - 1] = frame.accumulation / self._critical
         return values
 
 
@@ -72,11 +74,9 @@ class Curves:
         self.present: list[IndexFilter] = []
         for n, (name, colour) in enumerate(tones.items()):
             self._add_run(n, name, colour)
-        for plot in (*over_time, self.plane):
-            style = {"label_text_font_size": "11px", "background_fill_alpha": 0.75, "border_line_alpha": 0.0}
-            plot.legend[0].update(location="top_left", spacing=0, padding=2, **style)
-        for plot in (self.gates, self.plane):  # where values may be anywhere
-            plot.legend[0].update(location="left", margin=0)
+        for plot in (self.region, self.gates, self.plane):
+            style = {"label_text_font_size": "11px", "border_line_alpha": 0.0}
+            plot.legend[0].update(location="left", margin=0, spacing=0, padding=2, **style)
             plot.add_layout(plot.legend[0], "below")
         self.titles = [plot.title for plot in (self.region, self.plane, self.gates)]  # they name the region
         self.now = [_now(plot) for plot in over_time]
@@ -119,8 +119,9 @@ class Curves:
         columns = ("time", *OF_REGION, "completed", "spent")
         source = ColumnDataSource({column: np.zeros(0, np.float32) for column in columns})
         style = {"source": source, "color": colour, "line_dash": dash, "line_width": 2}
-        for plot, column in ((self.region, "accumulation"), (self.trips, "completed"), (self.spent, "spent")):
-            plot.line("time", column, legend_label=name, **style)
+        self.region.line("time", "accumulation", legend_label=name, **style)
+        self.trips.line("time", "completed", **style)
+        self.spent.line("time", "spent", **style)
         self.gates.step("time", "u", mode="before", legend_label=f"u, {name}", **style)
         present = IndexFilter(indices=[])
         points = {"source": source, "marker": marker, "line_color": colour}
@@ -134,7 +135,7 @@ class Curves:
 
 def _figure(title: str, x: str, y: str, height: int = CURVE_HEIGHT) -> Plot:
     bare = {"tools": "", "toolbar_location": None, "outline_line_color": None, "sizing_mode": "stretch_width"}
-    plot = figure(title=title, height=height, x_axis_label=x, y_axis_label=y, **bare)
+    plot = figure(title=title, height=height, x_axis_label=x, y_axis_label=y, frame_align=False, **bare)
     plot.axis.axis_label_text_color = plot.axis.major_label_text_color = colours.FAINT
     plot.axis.axis_line_color = plot.axis.major_tick_line_color = plot.grid.grid_line_color = colours.LINE
     plot.add_tools(HoverTool(tooltips=[(x, "$x{0.0}"), (y, "$y{0.00}")]))

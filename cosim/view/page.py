@@ -20,6 +20,7 @@ STYLE = (HERE / "page.css").read_text(encoding="utf-8")
 PLAY_PERIOD_MS = 150  # wall time per control interval
 TO_TIME = "slider.value = Math.min(slider.end, Math.max(0, Math.round(cb_obj.x / slider.step) * slider.step))"
 TOP_SHARE = 0.02  # of the streets; short ones would leave all others pale
+LONGEST = 30  # characters of a name beside a plot; the table of numbers has all
 NARROWEST = 330  # pixels, of a plot; on a narrower screen plots stand below each other
 KEY = (
     f"<span style='color:{colours.GREEN}'>◕</span> gates of a boundary, closer each gate; green: share of its original "
@@ -36,16 +37,18 @@ class Page:
         # Above a scale is only TOP_SHARE of the values of all runs; its upper end has two digits.
         upper = {label: np.quantile(np.concatenate(values), 1.0 - TOP_SHARE) for label, values in totals.items()}
         tops = {label: float(f"{end:.2g}") or 1.0 for label, end in upper.items()}
-        self.maps = [
-            CityMap(picture, name, {label: (values[n], tops[label]) for label, values in totals.items()})
-            for n, name in enumerate(tones)
-        ]
-        layers = [[label, parts] for one in self.maps for label, parts in one.layers.items()]
+        short = [name if len(name) <= LONGEST else f"{name[:14]}…{name[15 - LONGEST :]}" for name in tones]
+        titles = short if len(set(short)) == len(short) else self.names
+        self.maps: list[CityMap] = []
+        for n, name in enumerate(titles):
+            layers = {label: (values[n], tops[label]) for label, values in totals.items()}
+            self.maps.append(CityMap(picture, name, layers, *self.maps[:1]))
+        parts_of = [[label, parts] for one in self.maps for label, parts in one.layers.items()]
         labels = list(self.maps[0].layers)
         self.streets = Select(title="Streets by", name="streets", width=150, value=labels[0], options=labels)
-        self.streets.js_on_change("value", CustomJS.from_file(HERE / "layers.js", layers=layers))
-        self.loads = [Load(picture, f"{name}: load") for name in tones]
-        self.curves = Curves(picture, tones)
+        self.streets.js_on_change("value", CustomJS.from_file(HERE / "layers.js", layers=parts_of))
+        self.loads = [Load(picture, f"{name}: load") for name in titles]
+        self.curves = Curves(picture, dict(zip(titles, tones.values(), strict=True)))
         self.numbers = Div(sizing_mode="stretch_width", css_classes=["numbers"], stylesheets=[STYLE])
         ends = [region for gate in picture.gates for region in (gate.source, gate.target)]
         self.choose(max(range(picture.regions), key=ends.count))
@@ -171,7 +174,7 @@ def _wrapped(parts: Sequence[LayoutDOM], narrowest: int = NARROWEST) -> LayoutDO
 
 def numbers(tones: Mapping[str, str], frames: Sequence[Frame | None], time: float) -> str:
     """Return the totals of the runs at a time [s], as an HTML table."""
-    labels = ("inside [veh]", "waiting [veh]", "completed [veh]", "time spent [veh h]", "removed [veh]")
+    labels = ("inside [veh]", "waiting [veh]", "completed [veh]", "time spent [veh&nbsp;h]", "removed [veh]")
     heads = "".join(f"<td class=head>{label}</td>" for label in labels)
     lines = []
     for (name, colour), frame in zip(tones.items(), frames, strict=True):
