@@ -261,9 +261,7 @@ def import_(source: Path | None, bbox: str | None, **options: Any) -> None:
 @SCENARIO
 @click.option("--levels", type=listed(LEVEL), default="0.6,0.8,1", help="Factors on the demand.")
 @click.option("--seeds", type=COUNT, default=2, help="Loading runs per level, from seed 1000.")
-@click.option(
-    "--with", "city", metavar="A+...", help="City in these runs: own, guided, max-pressure. [default: own, then guided]"
-)
+@click.option("--with", "city", metavar="A+...", help="Words for the city, or own. [default: own, then guided]")
 @click.option("--network", type=FOLDER, metavar="DIR", help="Folder of the model. [default: the scenario's network]")
 @click.option("--protect", is_flag=True, help="Write the regions to protect into the scenario.")
 @WORKERS

@@ -13,7 +13,6 @@ Names here are imported at their first use.
 
 import sys
 from importlib import import_module
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -62,5 +61,23 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
 
 
-if "gymnasium" in sys.modules and find_spec("pettingzoo"):
-    import_module("nmfd.rl")  # registers environments
+def _register(gymnasium: Any) -> None:
+    for name, options in (("Scenario", {}), ("Hexagon7", {"scenario": "economic_mpc"})):
+        gymnasium.register(id=f"nmfd/{name}-v0", entry_point="nmfd.rl:RegionalEnv", kwargs=options)
+
+
+class _Finder:
+    """Import hook that registers the environments with gymnasium, which has no plug-ins since 1.0."""
+
+    @classmethod
+    def find_spec(cls, name: str, *rest: Any) -> Any:
+        others = [finder for finder in sys.meta_path if name == "gymnasium" and finder is not cls]
+        if spec := next(filter(None, (finder.find_spec(name, *rest) for finder in others)), None):
+            execute, loader = spec.loader.exec_module, spec.loader  # type: ignore[union-attr]
+            loader.exec_module = lambda module: (execute(module), _register(module))  # type: ignore
+        return spec
+
+
+if "gymnasium" in sys.modules:
+    _register(sys.modules["gymnasium"])
+sys.meta_path.insert(0, _Finder)

@@ -249,20 +249,15 @@ def benchmark(scenario: Path, settings: dict, out: Path | None, **options: Any) 
     default="demand",
     help="What differs from the scenario.",
 )
-@click.option(
-    "--sigmas",
-    type=listed(Number(0.0)),
-    help="Noise (veh/s), or spread of logarithms. [default: 0,...,5, or 0,...,0.4]",
-)
+@click.option("--sigmas", type=listed(Number(0.0)), help="Noise (veh/s) or spread (-). [default: 0,...,5 or 0,...,0.4]")
 @click.option("--scenarios", type=COUNT, default=20, help="Draws for every sigma.")
 @WORKERS
 @out_option("runs/SCENARIO-TIME")
 def robustness(scenario: Path, settings: dict, out: Path | None, **options: Any) -> None:
     """Run controllers against a demand or MFDs that they do not expect.
 
-    The plant gets max(0, demand + noise), drawn for every pair of regions and control interval; with demand-total,
-    scaled to the trips of the scenario; or outflow, accumulation axis or exit rates with a random factor for every
-    region. Prints and draws the improvement over no-control.
+    demand: plus noise for every pair of regions and control interval; demand-total: then scaled to the same trips;
+    others: MFDs or trip lengths times a random factor per region. Prints and draws the improvement over no-control.
 
     \b
     Example:
@@ -310,9 +305,8 @@ def bound(scenario: Path, settings: dict, controller: str, **options: Any) -> No
     Example:
       nmfd bound economic_mpc --controller bound-pcrg
     """
-    file = options["out"] or f"{scenario}/{controller}.npz"
     text = nmfd.api.bound(nmfd.load_scenario(scenario, settings), controller, **options)
-    click.echo(text + TRY.format(scenario, controller, file))
+    click.echo(text + TRY.format(scenario, controller, options["out"] or f"{scenario}/{controller}.npz"))
 
 
 @main.command(name="new-controller")

@@ -2,19 +2,14 @@
 
 import numpy as np
 import pandas as pd
-import pytest
 from trajectories import trajectory
 
 from cosim.report import figures
 from nmfd.studies import plots
 
 
-@pytest.fixture
-def ax():
-    return plots.figure(5, 4).subplots()
-
-
-def test_one_seed_is_shown_and_all_are_shaded(ax):
+def test_one_seed_is_shown_and_all_are_shaded():
+    ax = plots.figure(5, 4).subplots()
     runs = [trajectory("dpc-pc", seed) for seed in (0, 1, 2)]
     plots.total_accumulation(ax, runs, seed=1)
     shown = runs[1].accumulation.sum(axis=(1, 2)) + runs[1].backlog.sum(axis=(1, 2))

@@ -4,7 +4,6 @@ import io
 import itertools
 import re
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -83,7 +82,7 @@ def test_progress_is_shown_on_a_terminal_and_in_notebooks_only(monkeypatch, caps
 @pytest.mark.parametrize("said, lines", [(False, ["train, b: about 5 min left"]), (True, [])])
 def test_a_long_stage_is_announced_once_from_the_time_of_its_first_steps(monkeypatch, capsys, said, lines):
     clock = itertools.count(0.0, 3.0)
-    monkeypatch.setattr("nmfd.runs.progress.time", SimpleNamespace(monotonic=lambda: next(clock)))
+    monkeypatch.setattr(progress.time, "monotonic", lambda: next(clock))
     with progress.watched("train", said=said) as show:
         for step in ((1, 101, "slow"), (1, 101, "a"), (2, 101, "b"), (3, 101, "c"), (0, 9, "short"), (1, 9, "d")):
             show(*step)

@@ -93,13 +93,6 @@ def test_scenario_without_demand(scenario):
     left.figure.canvas.draw()
 
 
-def test_region_map_names_every_region(ax, scenario):
-    plots.region_map(ax, scenario.network)
-    texts = [text.get_text() for text in ax.texts]
-    assert set(texts) == {*map(str, range(7)), *scenario.network.region_names}
-    assert len(ax.lines) == 12
-
-
 @pytest.mark.parametrize("width", [4, 8, 16])
 def test_the_legend_fits_the_figure(scenario, width):
     drawing = plots.figure(width, 4)

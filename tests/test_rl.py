@@ -1,5 +1,7 @@
 """Environments for reinforcement learning: the libraries' own checks, and agreement with the closed loop."""
 
+import subprocess
+import sys
 import warnings
 from pathlib import Path
 
@@ -67,6 +69,13 @@ def test_gymnasium_and_pettingzoo_accept_sumo(peak):
     short = with_demand(load_scenario(peak), steps=2)
     gymnasium_check(rl.RegionalEnv(short, SumoPlant(short), guidance=True))
     pettingzoo_check(rl.RegionsEnv(short, SumoPlant(short)), 3)
+
+
+@pytest.mark.parametrize("modules", ["nmfd, gymnasium", "gymnasium, nmfd", "nmfd.rl, gymnasium"])
+def test_environments_have_names_in_any_order_of_imports(modules):
+    code = f"import {modules}; gymnasium.make('nmfd/Hexagon7-v0').reset(seed=1)"
+    done = subprocess.run([sys.executable, "-W", "error::UserWarning", "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_environments_have_names(scenario):

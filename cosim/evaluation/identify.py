@@ -88,8 +88,7 @@ def identify(
             report.append(
                 _identify(loaded, guided=guided, protect=protect and not report, out=folder, progress=show, **how)
             )
-    trial = f"cosim run {scenario} --controller pi-gating --against no-control"
-    return "\n".join([*report, f"Next: try control with the new model: {trial}"])
+    return "\n".join([*report, f"Next: cosim run {scenario} --controller pi-gating --against no-control"])
 
 
 def _identify(

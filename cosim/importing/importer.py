@@ -3,7 +3,7 @@
 import gzip
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -86,7 +86,11 @@ def import_city(
         if folder.exists():
             raise InputError(f"--out: {folder} exists; choose another name, or remove it")
     with ExitStack() as stack:
-        progress = _staged(stack.enter_context(watched("import", None)))
+        show = stack.enter_context(watched("import"))
+
+        def progress(stage: str, share: float = 0.0) -> None:
+            show and show(round(100 * share), 100, stage)
+
         progress("reading")
         case, scratch = stack.enter_context(sumo_input(place, progress)), stack.enter_context(temporary_folder())
         case = replace(case, begin=case.begin if first is None else first, end=case.end if last is None else last)
@@ -179,11 +183,6 @@ def import_city(
             shutil.move(temporary, place)
     written = f"Written to {out} (see map.png, quality.csv, gateways.csv) and {scenario}; next: cosim identify {out}"
     return "\n".join([*report, written])
-
-
-def _staged(show: Callable[[int, int, str], None] | None) -> Progress:
-    """Return a callback of stages that are shown as a bar."""
-    return lambda stage, share=0.0: show and show(round(100 * share), 100, stage)
 
 
 def _peak(

@@ -4,19 +4,13 @@
     RegionsEnv      pettingzoo.ParallelEnv: one agent per region
     Interface       observations and actions as vectors; turns the actions of a trained agent into controls
 
-Importing this module, or nmfd after gymnasium, registers nmfd/Hexagon7-v0 and nmfd/Scenario-v0 (scenario="FOLDER") for
-gymnasium.make.
+Importing nmfd registers nmfd/Hexagon7-v0 and nmfd/Scenario-v0 (scenario="FOLDER") for gymnasium.make.
 """
 
 from nmfd.errors import need
 
 need("nmfd.rl", "rl", "gymnasium", "pettingzoo")
 
-import gymnasium  # noqa: E402
-
 from nmfd.rl.env import Interface, RegionalEnv, RegionsEnv  # noqa: E402
 
 __all__ = ["Interface", "RegionalEnv", "RegionsEnv"]
-
-for name, options in (("Scenario", {}), ("Hexagon7", {"scenario": "economic_mpc"})):
-    gymnasium.register(id=f"nmfd/{name}-v0", entry_point="nmfd.rl.env:RegionalEnv", kwargs=options)
