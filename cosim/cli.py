@@ -59,7 +59,7 @@ def span(text: str) -> tuple[float, float]:
         "Studies": ("evaluate", "compare", "report", "tune"),
         "A city of your own": ("get", "import", "identify"),
     },
-    elsewhere={name: f"nmfd {name}" for name in nmfd.cli.main.commands},
+    elsewhere={"list": "nmfd show"} | {name: f"nmfd {name}" for name in nmfd.cli.main.commands},
 )
 @VERSION
 def main() -> None:
@@ -92,7 +92,7 @@ def demo(out: Path) -> None:
 def run(scenario: Path, controller: str, against: str | None, **options: Any) -> None:
     """Run one controller, or two on the same trips.
 
-    SCENARIO is a shipped name (`nmfd show`) or a folder with a scenario.toml, on a network that SUMO can simulate.
+    SCENARIO is a name of `nmfd show`, or a folder with a scenario.toml, whose network has a SUMO city.
     Prints a table and writes results, tables and figures.
 
     \b

@@ -309,9 +309,8 @@ def catalogue() -> str:
         "Controllers": {kind.name: kind.text for kind in CONTROLLERS.values()},
         "Words for a city in SUMO, behind a controller": dict(city_words()),
     }
-    width = max(len(name) for rows in sections.values() for name in rows)
     return "\n\n".join(
-        "\n".join([title, *(f"  {name:{width}}  {text}".rstrip() for name, text in rows.items())])
+        "\n".join([title, *(f"  {name:{max(map(len, rows))}}  {text}".rstrip() for name, text in rows.items())])
         for title, rows in sections.items()
     )
 

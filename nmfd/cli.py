@@ -184,14 +184,16 @@ def out_option(default: str, text: str = "Run folder; finished runs in it are ke
         "Controllers": ("train", "bound", "new-controller"),
         "Networks from measured data": ("identify",),
     },
-    elsewhere={"run": "nmfd benchmark, or in SUMO cosim run"}
+    elsewhere={"list": "nmfd show", "run": "nmfd benchmark` or, in SUMO, `cosim run"}
     | {name: f"cosim {name}" for name in ("demo", "watch", "evaluate", "report", "compare", "tune", "get", "import")},
 )
 @VERSION
 def main() -> None:
     """Perimeter control and route guidance on the regional traffic model (NMFD).
 
-    Begin with `nmfd show`, then `nmfd benchmark economic_mpc --controllers no-control,pi-gating`.
+    \b
+    Begin with `nmfd show`, then
+    `nmfd benchmark economic_mpc --controllers no-control,pi-gating`.
     """
 
 
@@ -226,8 +228,8 @@ def show(scenario: Path | None, settings: dict, out: Path | None) -> None:
 def benchmark(scenario: Path, settings: dict, out: Path | None, **options: Any) -> None:
     """Run controllers on a regional model and compare them.
 
-    SCENARIO is a shipped name or a folder with a scenario.toml. The run folder holds tables, results and figures; with
-    the same --out, only runs that are not in it yet are done.
+    SCENARIO is a name of `nmfd show` or a folder with a scenario.toml. The run folder holds tables, results and
+    figures; with the same --out, only runs that are not in it yet are done.
 
     \b
     Example:
@@ -254,7 +256,7 @@ def benchmark(scenario: Path, settings: dict, out: Path | None, **options: Any) 
 @WORKERS
 @out_option("runs/SCENARIO-TIME")
 def robustness(scenario: Path, settings: dict, out: Path | None, **options: Any) -> None:
-    """Run controllers against a demand or MFDs that they do not expect.
+    """Run controllers under unexpected demand or MFDs.
 
     demand: plus noise for every pair of regions and control interval; demand-total: then scaled to the same trips;
     others: MFDs or trip lengths times a random factor per region. Prints and draws the improvement over no-control.
@@ -296,7 +298,7 @@ def train(scenario: Path, settings: dict, controller: str, **options: Any) -> No
 @click.option("--controller", required=True, metavar="NAME", help="bound-pc or bound-pcrg.")
 @click.option("--out", type=FILE, metavar="FILE", help="Plan file. [default: SCENARIO/NAME.npz]")
 def bound(scenario: Path, settings: dict, controller: str, **options: Any) -> None:
-    """Find the best plan for known demand, and a lower bound of the total time spent.
+    """Find the best plan for known demand, and a lower bound.
 
     `nmfd benchmark --controllers bound-pc,bound-pcrg` replays the plan; its table says how far controllers are at most
     above the optimum.

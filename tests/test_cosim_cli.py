@@ -138,6 +138,7 @@ IMPORT = ("import", "--out", "{tmp}/out/city")
         ((*IMPORT, "{tmp}/none.sumocfg", "--regions", "1"), "--regions: expected 2 or more regions"),
         ((*IMPORT, "{tmp}/none.sumocfg", "--regions", "3"), "none.sumocfg"),
         (("drive",), "No such command 'drive'"),
+        (("list",), "No such command 'list': it is `nmfd show`"),
     ],
     ids=lambda value: " ".join(value[-2:])[:60] if isinstance(value, tuple) else "",
 )

@@ -138,9 +138,8 @@ def city_files(network: RegionalModel) -> CityFiles:
     path = folder / "network.toml"
     content = config.read(path)
     if "sumo" not in content:
-        raise InputError(
-            f"{path}: sumo: missing; this network has no city to simulate: add [sumo] with net and regions"
-        )
+        what = "this network has no city to simulate: use nmfd benchmark, or add [sumo] with net and regions"
+        raise InputError(f"{path}: sumo: missing; {what}")
     table = config.checked(CityTable, content["sumo"], path, "sumo.")
     files = CityFiles(folder / table.net, folder / table.regions)
     for key, file in zip(("net", "regions"), files, strict=True):
