@@ -14,14 +14,13 @@ from cosim.importing.case import Progress
 from cosim.importing.streets import Streets
 from cosim.sumo.arrays import EdgeNumbers, PerEdge
 from cosim.sumo.programs import run_sumo
-from cosim.sumo.recorded_trips import MESOSCOPIC, draw, read_recorded_trips, write_recorded_trips
+from cosim.sumo.recorded_trips import JITTER_S, MESOSCOPIC, draw, read_recorded_trips, write_recorded_trips
 from cosim.sumo.xml_files import attribute, child, file_list, read_xml
 from nmfd.arrays import PerRegion, PerTurn
 from nmfd.runs.files import temporary_folder
 
 INTERVAL_S = 300.0  # of the densities
 PEAK_INTERVALS = 3  # in a row: those with the most vehicles count for the partition
-JITTER_S = 10.0  # of departures, in which seeds differ, as in the scenario that is written
 RECORDED = ("exit-times", "last-route", "write-unfinished")
 SILENT = dict.fromkeys(("no-step-log", "no-warnings", "ignore-route-errors", "duration-log.statistics"), "true")
 SILENT |= {f"vehroute-output.{name}": "true" for name in RECORDED}

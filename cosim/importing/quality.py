@@ -11,7 +11,7 @@ from cosim.importing.baseline import INTERVAL_S, Baseline
 from cosim.importing.streets import Streets
 from cosim.sumo.arrays import EdgeMask, EdgeNumbers
 from cosim.sumo.net import City
-from cosim.sumo.signals import FIXED, HELD
+from cosim.sumo.signals import HELD, STATIC
 from nmfd.model import authority
 from nmfd.model.authority import Boundaries, Verdict
 from nmfd.model.regional_model import RegionalModel
@@ -40,7 +40,7 @@ def tables(
     left_alone: signal -> reason why perimeter control does not use it
     """
     moves = Counter() if baseline is None else baseline.moves()
-    kinds = {signal: "fixed" if logic.kind == FIXED else logic.kind for signal, logic in streets.logics.items()}
+    kinds = {signal: "fixed" if logic.kind == STATIC else logic.kind for signal, logic in streets.logics.items()}
     gateways = [
         {
             "source": g.source,

@@ -26,7 +26,6 @@ REROUTING = (
     "--device.rerouting.adaptation-interval 1 --device.rerouting.adaptation-steps 180"
 ).split()
 GIVEN = ("step-length", "time-to-teleport", "collision.action")  # arguments of Session
-DEPARTURE_JITTER_S = 10.0  # departures of recorded trips are moved by up to this, either way, by a seed other than 0
 
 
 def own_vehicles(scenario: Scenario, settings: Settings, city: City) -> RecordedTrips:
@@ -126,7 +125,7 @@ class Launch:
         """Write the route file of one run, and return the ids of its vehicles."""
         scenario, settings, originals = self._scenario, self._settings, self._vehicles_of(seed)
         factor, begin = (scenario.demand_factor, settings.begin) if settings.routes else (1.0, 0.0)
-        jitter = DEPARTURE_JITTER_S if settings.routes and seed else 0.0
+        jitter = recorded.JITTER_S if settings.routes and seed else 0.0
         drawn = recorded.draw(originals, seed=seed, factor=factor, jitter=jitter, begin=begin)
         if settings.metering > 0.0:
             self.held = recorded.write_held_trips(originals, drawn, path, self._shared_routes, self._city.region_of)

@@ -9,17 +9,15 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from cosim.plant.gates import MIN_GREEN_S, least_times
+from cosim.plant.max_pressure import MAX_GREEN_S
 from cosim.plant.settings import ACTUATED, FIXED, MAX_PRESSURE, Settings, check_lanes, own_files, settings
 from cosim.sumo.net import City
 from cosim.sumo.programs import run_tool
-from cosim.sumo.signals import FIXED as FIXED_TIME
-from cosim.sumo.signals import HELD, Signal, phases_of, read_signals
+from cosim.sumo.signals import HELD, STATIC, Signal, phases_of, read_signals
 from cosim.sumo.xml_files import attribute, read_xml
 from nmfd.controllers.strategy import Strategy
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
-
-ACTUATED_MAX_GREEN_S = 50.0  # netconvert's default
 
 
 def check_strategy(strategy: Strategy, scenario: Scenario, city: City) -> None:
@@ -39,7 +37,7 @@ def city_signals(city: City, scenario: Scenario, settings: Settings) -> tuple[li
     Signals with gateways that stay fixed-time are in neither. Raises InputError if `settings.signals` fits none.
     """
     pressure = settings.signals == MAX_PRESSURE
-    kinds = HELD if pressure else (FIXED_TIME,)
+    kinds = HELD if pressure else (STATIC,)
     simple, others = read_signals(city, own_files(scenario, settings.additional), kinds)
     left = {signal.id for signal in simple} & set(settings.leave_signals)
     simple, others = [signal for signal in simple if signal.id not in left], sorted({*others, *left})
@@ -64,7 +62,7 @@ def write_actuated(path: Path, signals: Iterable[Signal]) -> None:
         logic = SubElement(root, "tlLogic", about)
         for n, (phase, low) in enumerate(zip(signal.phases, least_times(signal.phases), strict=True)):
             row = SubElement(logic, "phase", duration=f"{phase.duration:g}", state=phase.state)
-            high = max(min(1.5 * phase.duration, ACTUATED_MAX_GREEN_S), MIN_GREEN_S, low)
+            high = max(min(1.5 * phase.duration, MAX_GREEN_S), MIN_GREEN_S, low)
             if n in signal.stages and low != high:
                 row.attrib |= {"minDur": f"{low:g}", "maxDur": f"{high:g}"}
     ElementTree(root).write(path)

@@ -43,7 +43,7 @@ class Gateway:
     """A boundary movement from an edge in region `source` over a junction to an edge in region `target`.
 
     signal: the one that controls it, None where it leaks; links: its indices in the signal's state
-    lanes: numbers of those that it comes from; shared: of these, lanes that other movements use, too
+    lanes: numbers of those that it comes from
     """
 
     source: int
@@ -53,7 +53,6 @@ class Gateway:
     signal: str | None
     links: tuple[int, ...]
     lanes: tuple[int, ...] = ()
-    shared: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -331,9 +330,7 @@ def _turns_over_junctions(
 
 def _gateways(links: list[_Connection], region_of: dict[str, int]) -> tuple[Gateway, ...]:
     movements: dict[tuple[int, int, str, str], list[_Connection]] = {}
-    onward: dict[tuple[str, int], set[str]] = {}
     for link in links:
-        onward.setdefault((link.source, link.lane), set()).add(link.target)
         source, target = region_of[link.source], region_of[link.target]
         if source != target:
             movements.setdefault((source, target, link.source, link.target), []).append(link)
@@ -346,7 +343,6 @@ def _gateways(links: list[_Connection], region_of: dict[str, int]) -> tuple[Gate
             signal=members[0].signal,
             links=tuple(sorted(link.link for link in members if link.signal)),
             lanes=tuple(sorted({link.lane for link in members})),
-            shared=tuple(sorted({link.lane for link in members if len(onward[key[2], link.lane]) > 1})),
         )
         for key, members in sorted(movements.items())
     )

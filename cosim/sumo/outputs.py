@@ -110,6 +110,6 @@ def edge_emissions(path: Path) -> dict[str, tuple[float, float]]:
         raise unfinished(path, error) from None
 
 
-def unfinished(path: Path, error: Exception | None = None) -> RunFailed:
+def unfinished(path: Path, error: Exception) -> RunFailed:
     """Return the error of a file of SUMO's that ends too early."""
-    return RunFailed(f"{path}: SUMO did not finish this file{f' ({error})' if error else ''}: is the disk full?")
+    return RunFailed(f"{path}: SUMO did not finish this file ({error}): is the disk full?")

@@ -19,6 +19,7 @@ from nmfd.errors import InputError
 from nmfd.runs import files
 
 STREAM = 7102  # keeps these random numbers apart from others of the same seed
+JITTER_S = 10.0  # departures are moved by up to this, either way, by a seed other than 0
 MESOSCOPIC = {"mesosim": "true", "meso-junction-control": "true"}  # options of SUMO
 PUBLIC = frozenset("bus coach tram rail rail_urban rail_electric rail_fast subway cable_car ship".split())
 # Vehicle classes that keep to their lines, or do not use the road as cars do.

@@ -11,8 +11,8 @@ from cosim.sumo.session import Phase
 from cosim.sumo.xml_files import attribute, read_xml
 
 GREEN = frozenset("Gg")
-FIXED, ACTUATED = "static", ("actuated", "delay_based")  # SUMO's types of programmes; those timed by detectors
-HELD = (FIXED, *ACTUATED)  # types that always show one of their phases, so that green can be taken away
+STATIC = "static"  # SUMO's type of fixed-time programmes
+HELD = (STATIC, "actuated", "delay_based")  # types that always show one of their phases: green can be taken away
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +55,7 @@ def is_stage(state: str) -> bool:
 
 
 def read_signals(
-    city: City, additional: Iterable[Path] = (), kinds: Collection[str] = (FIXED,)
+    city: City, additional: Iterable[Path] = (), kinds: Collection[str] = (STATIC,)
 ) -> tuple[list[Signal], list[str]]:
     """Return the simple signals of the city, and the names of all others, which keep their programmes.
 
@@ -87,7 +87,7 @@ def phases_of(logic: ElementTree.Element) -> tuple[Phase, ...]:
 def _simple(
     logic: ElementTree.Element, links: Iterable[Link], others: Iterable[Link], kinds: Collection[str]
 ) -> Signal | None:
-    ordered = logic.get("type", FIXED) in kinds and not any(row.get("next") for row in logic.iter("phase"))
+    ordered = logic.get("type", STATIC) in kinds and not any(row.get("next") for row in logic.iter("phase"))
     if not ordered or not links:
         return None
     name, offset, phases = attribute(logic, "id"), float(logic.get("offset", 0.0)), phases_of(logic)

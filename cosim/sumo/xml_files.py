@@ -16,12 +16,6 @@ BROKEN = (OSError, EOFError, zlib.error, ElementTree.ParseError, LookupError, Ty
 MAX_INCLUDE_DEPTH = 20  # of files that include each other
 
 
-def opened(path: Path) -> io.BufferedIOBase:
-    """Return a binary stream of a file, unzipped if its name ends in .gz. Raises one of BROKEN."""
-    check_file(path)
-    return gzip.open(path, "rb") if path.suffix == ".gz" else path.open("rb")
-
-
 def attribute(element: ElementTree.Element, name: str) -> str:
     """Return the text of a required attribute. Raises ValueError, one of BROKEN."""
     value = element.get(name)
@@ -55,9 +49,10 @@ def read_xml(path: Path, depth: int = 0) -> ElementTree.Element:
 def stream_of(
     path: Path, kind: str = "an XML file that SUMO could read", remedy: str = "correct or replace it"
 ) -> Iterator[io.BufferedIOBase]:
-    """Yield a stream of a file, unzipped. Raises InputError if it is missing, or for one of BROKEN in the block."""
+    """Yield a binary stream, unzipped if it is a .gz file. Raises InputError, for one of BROKEN in the block, too."""
+    check_file(path)
     try:
-        with opened(path) as stream:
+        with gzip.open(path, "rb") if path.suffix == ".gz" else path.open("rb") as stream:
             yield stream
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; give the path of an existing one") from None

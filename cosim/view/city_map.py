@@ -10,11 +10,12 @@ from bokeh.plotting import figure
 from bokeh.transform import linear_cmap
 
 from cosim.sumo.arrays import Points
+from cosim.sumo.net import JAM_SPACING
 from cosim.view import colours
 from cosim.view.picture import CityPicture, Frame, Gate
 
 DENSITY = "density [veh/km and lane]"
-JAM_DENSITY = 1000.0 / 7.5  # veh/km and lane
+DENSEST = 1000.0 / JAM_SPACING  # veh/km and lane
 LINE_OFFSET = 0.006  # of the map's width, by which the two directions of a street are drawn apart
 MAP_HEIGHT = 440  # pixels
 GATE_RADIUS = 6.0  # pixels
@@ -95,7 +96,7 @@ class CityMap:
             width=thin + per_lane * picture.lanes,
             **{label: values for label, (values, _) in self._totals.items()},
         )
-        self._add_layer(source, "density", DENSITY, JAM_DENSITY, [0.0, 50.0, 100.0])
+        self._add_layer(source, "density", DENSITY, DENSEST, [0.0, 50.0, 100.0])
         for label, (_, top) in self._totals.items():
             self._add_layer(source, label, label, top, [0.0, top / 2.0, top])
         return source
