@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from nmfd import faults
-from nmfd.arrays import PerPair
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
 from nmfd.tensors import one_thread
@@ -39,9 +38,7 @@ def run(
     sensors, random = faults.Sensors(scenario.ordered_faults), noise_of(seed)
 
     def observe() -> tuple[Observation, str]:
-        noise = scenario.measurement_std * random.standard_normal(network.adjacency.shape)
-        estimate = plant.observe()
-        return sensors.see(noisy(states[-1], noise) if estimate is None else estimate)
+        return sensors.see(measurement(plant, states[-1], scenario.measurement_std, random))
 
     states, controls, decision_time = [plant.reset(seed)], [], []
     observed, problem = observe()
@@ -97,9 +94,10 @@ def noise_of(seed: int) -> np.random.Generator:
     return np.random.default_rng([seed, 0x6E6F6973])
 
 
-def noisy(state: State, noise: PerPair) -> Observation:
-    """Return the measurement of the state with `noise` (R, R) [veh] on the accumulation."""
-    return Observation(
+def measurement(plant: Plant, state: State, std: float, random: np.random.Generator) -> Observation:
+    """Return the estimate of the plant's own instruments or, without any, the state with noise of `std` [veh]."""
+    noise = std * random.standard_normal(state.accumulation.shape)
+    return plant.observe() or Observation(
         step=state.step,
         time=state.time,
         accumulation=state.accumulation + noise,

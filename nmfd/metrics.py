@@ -59,10 +59,10 @@ def decision_ms(row: Mapping[str, float]) -> str:
     return " / ".join(f"{row[f'control_step_ms_{which}']:.3g}" for which in ("first", "median", "max"))
 
 
-def notes(result: Result, most: int = 3) -> str:
-    """Return the `most` frequent notes of decisions that were not OK, such as "2 x solver failed: ..."."""
+def notes(result: Result) -> str:
+    """Return the three most frequent notes of decisions that were not OK, such as "2 x solver failed: ..."."""
     counted = Counter(note for note, status in zip(result.note, result.status, strict=True) if status)
-    return "; ".join(f"{count} x {note}" for note, count in counted.most_common(most))
+    return "; ".join(f"{count} x {note}" for note, count in counted.most_common(3))
 
 
 def summary(result: Result) -> dict[str, float | int | str]:

@@ -29,7 +29,7 @@ from nmfd.errors import InputError, RunFailed
 from nmfd.model.plant import NmfdPlant
 from nmfd.runs import files
 from nmfd.runs import run_many as module
-from nmfd.runs.run_many import Run, raise_failures, read_manifest, run_many, run_name
+from nmfd.runs.run_many import Run, raise_failures, read_manifest, run_many
 from nmfd.types import VARIABLES, Controls, Result
 
 
@@ -152,7 +152,7 @@ def divide():
 
 def run_of(controller="no-control", seed=0, *, calls=None, scenario="s", policy="p", folder="", work=None):
     key = {"scenario_hash": scenario, "controller": {"policy_hash": policy}}
-    return Run(run_name(controller, seed), key, work or partial(job, controller, seed, calls), folder)
+    return Run(files.run_name(controller, seed), key, work or partial(job, controller, seed, calls), folder)
 
 
 def test_runs_are_done_once_and_come_in_the_order_asked_for(tmp_path):

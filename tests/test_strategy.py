@@ -38,7 +38,7 @@ def test_what_a_name_means(name, controller, city):
     strategy = parse(name)
     assert (strategy.name, strategy.controller.name) == (name, controller)
     assert strategy.city == {"gateways_fixed": controller != ALONE, **city}
-    assert strategy.metered == ("metering" in city) and hash(strategy) == hash(parse(name))
+    assert hash(strategy) == hash(parse(name))
 
 
 @pytest.mark.parametrize(

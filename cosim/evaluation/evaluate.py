@@ -8,7 +8,6 @@ A suite is a TOML file: `seeds = [2000, 2001]` and a table [scenarios] of demand
 """
 
 import random
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
@@ -95,7 +94,7 @@ def ranking(rows: pd.DataFrame) -> str:
 
 
 def check(runs: Sequence[Run], out: Path, number: int, *, workers: int = 1) -> list[str]:
-    """Do `number` random runs of a table again, and return a line per difference.
+    """Do `number` runs of a table again, by a fixed draw, and return a line per difference.
 
     out: folder with runs.csv and manifest.json, with or without the results
     """
@@ -109,10 +108,9 @@ def check(runs: Sequence[Run], out: Path, number: int, *, workers: int = 1) -> l
         for name, value in run.key.items()
         if name != "controller" and keys.get(run.folder, {}).get(name) != value
     ]
-    with tempfile.TemporaryDirectory() as folder:
-        again = run_many(chosen, folder, workers=workers)
-        again.to_csv(Path(folder, TABLE), index=False)  # as the kept table went through a file
-        again = pd.read_csv(Path(folder, TABLE))
+    with files.temporary_folder() as folder:
+        run_many(chosen, folder, workers=workers)
+        again = pd.read_csv(folder / TABLE)  # as the kept table went through a file
     own = {*HOST_TIMES, "evaluation_time_s", "wall_time_s"}.union(name for name in again if "_ms" in name)
     for row in again.to_dict("records"):
         old = rows.get((row.get("folder", ""), row["controller"], row["seed"]), {})

@@ -90,7 +90,7 @@ def _reasons(level: Level, scenario: Scenario, name: str, against: str, *, gains
     limit = network.u_max - OPEN_SHARE * (network.u_max - network.u_min)
     held = float(np.mean([(run.perimeter[:, network.adjacency] < limit).mean() for run in runs]))
     guided = sum(run.guided.sum() for run in runs) / trips
-    metered = strategy.metered or level.key["sumo"].get("metering", False)
+    metered = strategy.city.get("metering") or level.key["sumo"].get("metering")
     waited = sum(run.backlog[1:].sum() * run.step for run in runs) / trips if metered else 0.0
     deeds = {
         f"it holds vehicles back in {held:.0%} of its commands": held >= SMALL_SHARE,

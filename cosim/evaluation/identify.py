@@ -25,7 +25,6 @@ from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
 from nmfd.metrics import largest_accumulation
 from nmfd.model import authority, identification, mfd
-from nmfd.model.identification import observed_split_ratios
 from nmfd.model.planning import GUIDED, GUIDING
 from nmfd.model.regional_model import RegionalModel, network_toml
 from nmfd.model.scenario import Scenario
@@ -54,7 +53,7 @@ def identify(
     city: str | None = None,
     network: Path | None = None,
     protect: bool = False,
-    iterations: int = 600,
+    iterations: int = identification.ITERATIONS,
     workers: int = 1,
     out: Path | None = None,
 ) -> str:
@@ -220,7 +219,7 @@ def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool)
     if guided:  # the reference of theta stays that of the plant (cosim.plant.guidance)
         return network
     crossings = sum(result["crossings"].sum(axis=0) for result in results)
-    return replace(network, observed_split_ratios=observed_split_ratios(network, crossings))
+    return replace(network, observed_split_ratios=identification.observed_split_ratios(network, crossings))
 
 
 def as_it_was(network: RegionalModel, model: RegionalModel, regions: Sequence[int]) -> RegionalModel:

@@ -10,8 +10,8 @@ from cosim.sumo.net import City, city_files, city_of
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
-from nmfd.runs.files import file_hash
-from nmfd.runs.run_many import TABLE, read_manifest, run_name
+from nmfd.runs.files import file_hash, run_name
+from nmfd.runs.run_many import TABLE, read_manifest
 from nmfd.types import Result
 
 

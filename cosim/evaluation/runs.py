@@ -17,8 +17,8 @@ from cosim.sumo.signals import HELD, read_signals
 from cosim.sumo.xml_files import read_xml
 from nmfd.controllers.strategy import Strategy
 from nmfd.model.scenario import Scenario, with_demand
-from nmfd.runs.files import file_hash
-from nmfd.runs.run_many import Run, run_name
+from nmfd.runs.files import file_hash, run_name
+from nmfd.runs.run_many import Run
 
 SECONDS_PER_TRIP = 0.006  # wall time, in the committed results of grid7 and cities
 

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from cosim.importing.quality import CONTROLLED, Tables
 from cosim.importing.streets import Streets
 from cosim.sumo.arrays import EdgeNumbers, Points
+from cosim.sumo.net import points_along
 from nmfd.arrays import Positions
 
 CELLS = 160  # along the longer side of the raster for outlines
@@ -73,13 +74,12 @@ def rings_round(shapes: Sequence[Points], regions: EdgeNumbers, blocks: float) -
 
 def _sampled(shapes: Sequence[Points]) -> tuple[np.ndarray, np.ndarray]:
     """Return points (n, 2) along the shapes of the edges, and the edge (n,) of each point."""
-    points, of = [], []
-    for n, shape in enumerate(shapes):
-        along = np.append(0.0, np.cumsum(np.hypot(*np.diff(shape, axis=0).T)))
-        marks = np.linspace(0.0, along[-1], max(2, int(along[-1] / POINT_SPACING_M) + 1))
-        points.append(np.stack([np.interp(marks, along, shape[:, axis]) for axis in (0, 1)], axis=1))
-        of.append(np.full(len(marks), n))
-    return np.concatenate(points), np.concatenate(of)
+
+    def marks(length: float) -> np.ndarray:
+        return np.linspace(0.0, length, max(2, int(length / POINT_SPACING_M) + 1))
+
+    points = [points_along(shape, marks) for shape in shapes]
+    return np.concatenate(points), np.arange(len(shapes)).repeat([*map(len, points)])
 
 
 def _area(ring: Points) -> float:

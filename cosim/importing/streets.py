@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 
 from cosim.importing.case import seconds
 from cosim.sumo.arrays import EdgeMask, EdgeNumbers, PerEdge, Points
-from cosim.sumo.net import NORMAL, for_cars, size
+from cosim.sumo.net import NORMAL, for_cars, points_along, size
 from cosim.sumo.xml_files import attribute, network_root, read_xml
 from nmfd.errors import InputError
 
@@ -131,7 +131,7 @@ def read_streets(net: Path, additional: Iterable[Path] = ()) -> Streets:
         lanes=np.array([len(rows[edge].cars) for edge in edges]),
         speed=np.array([rows[edge].speed for edge in edges]),
         shapes=tuple(rows[edge].shape for edge in edges),
-        centre=np.array([_middle(rows[edge].shape) for edge in edges]),
+        centre=np.array([points_along(rows[edge].shape, lambda length: length / 2) for edge in edges]),
         junctions=np.unique(ends, return_inverse=True)[1].reshape(-1, 2),
         links=np.array(cars, dtype=int).reshape(-1, 2),
         all_links=np.array(sorted(every), dtype=int).reshape(-1, 2),
@@ -164,10 +164,3 @@ def _logic(element: ElementTree.Element, path: Path) -> Logic:
         kind = "branching"
     cycle = sum(seconds(phase.get("duration", "0"), where) for phase in phases)
     return Logic(programme=element.get("programID", "0"), kind=kind, cycle=cycle)
-
-
-def _middle(shape: Points) -> Float[np.ndarray, " 2"]:
-    """Return the point half way along a line (n, 2)."""
-    steps = np.hypot(*np.diff(shape, axis=0).T) if len(shape) > 1 else np.zeros(0)
-    along = np.concatenate([[0.0], np.cumsum(steps)])
-    return np.array([np.interp(along[-1] / 2, along, shape[:, axis]) for axis in (0, 1)]) if along[-1] else shape[0]

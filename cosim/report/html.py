@@ -4,7 +4,6 @@ import base64
 import json
 import math
 import re
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -160,10 +159,10 @@ def _level(run: Finished, level: Level) -> dict:
 def _pictures(draw: Callable[[Path], None], captions: dict[str, str]) -> list[tuple[str, str]]:
     """Return data URI and caption of the pictures that `draw` writes into a folder."""
     pictures = []
-    with tempfile.TemporaryDirectory() as folder:
-        draw(Path(folder))
+    with files.temporary_folder() as folder:
+        draw(folder)
         for name, caption in captions.items():
-            if (file := Path(folder) / f"{name}.png").is_file():
+            if (file := folder / f"{name}.png").is_file():
                 encoded = base64.b64encode(file.read_bytes()).decode()
                 pictures.append((f"data:image/png;base64,{encoded}", caption))
     return pictures

@@ -3,7 +3,7 @@
 import csv
 import math
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -11,6 +11,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from cosim.sumo.arrays import PerEdge, Points
 from cosim.sumo.xml_files import attribute, network_root
@@ -230,6 +231,13 @@ def edge_shapes(city: City) -> list[Points]:
                 same = len(lanes[0]) == len(lanes[-1])
                 shapes[attribute(edge, "id")] = (lanes[0] + lanes[-1]) / 2 if same else lanes[0]
     return [shapes[edge] for edge in city.edges]
+
+
+def points_along(shape: Points, marks: Callable[[float], ArrayLike]) -> Float[np.ndarray, "*n 2"]:
+    """Return points (..., 2) [m] on a line (n, 2) [m]; marks: its length [m] -> their distances from its beginning."""
+    along = np.append(0.0, np.cumsum(np.hypot(*np.diff(shape, axis=0).T)))
+    at = marks(float(along[-1]))
+    return np.stack([np.interp(at, along, axis) for axis in shape.T], axis=-1)
 
 
 def _read_net(path: Path) -> tuple[dict[str, list[_Lane]], dict[str, tuple[float, float]], list[_Connection]]:

@@ -9,7 +9,7 @@ import numpy as np
 from cosim.evaluation.simulate import regional_outflow
 from cosim.importing.maps import rings_round
 from cosim.sumo.arrays import EdgeNumbers, PerEdge, PerGateway, Points
-from cosim.sumo.net import City, edge_shapes
+from cosim.sumo.net import City, edge_shapes, points_along
 from nmfd.arrays import PerPair, PerRegion
 from nmfd.model.scenario import Scenario
 from nmfd.types import Controls, State
@@ -222,8 +222,7 @@ def _gates(city: City, shapes: Mapping[str, Points]) -> tuple[Gate, ...]:
     setback = GATE_SETBACK * float(np.ptp(np.concatenate(list(shapes.values())), axis=0).max())
     gates = []
     for (edge, target), numbers in members.items():
-        along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(shapes[edge], axis=0).T))])
-        x, y = (np.interp(max(along[-1] - setback, 0.5 * along[-1]), along, values) for values in shapes[edge].T)
+        x, y = points_along(shapes[edge], lambda length: max(length - setback, 0.5 * length))
         gates.append(
             Gate(
                 source=city.gateways[numbers[0]].source,

@@ -130,10 +130,6 @@ class Strategy:
         """True if routes may be guided, by the controller or by travel times."""
         return bool(self.city.get("guided")) or self.controller.guides
 
-    @property
-    def metered(self) -> bool:
-        return bool(self.city.get("metering"))
-
     def regional(self) -> "Strategy":
         """Return the strategy itself. Raise InputError if it has words for a city in SUMO."""
         if self.words:

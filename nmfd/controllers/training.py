@@ -66,8 +66,8 @@ def settings(scenario: Scenario, strategy: Strategy, steps: int | None = None) -
     return setup if steps is None else setup.changed(steps=steps)
 
 
-def check(scenario: Scenario, strategy: Strategy) -> RegionalModel:
-    """Return the model to train on. Raise InputError without gateways, or for placeholder MFDs."""
+def check(scenario: Scenario, strategy: Strategy) -> None:
+    """Raise InputError without gateways, or for placeholder MFDs of the model to train on."""
     city, believed = scenario.network, strategy.planning(scenario).network
     still = "nmfd.train(..., anyway=True) trains all the same"
     if city.controllable is not None and not city.controllable.any():
@@ -76,7 +76,6 @@ def check(scenario: Scenario, strategy: Strategy) -> RegionalModel:
         guess = "is true: its MFDs are guesses from lanes and speed limits"
         remedy = f"run 'cosim identify {city.folder}' or put in your own"
         raise InputError(f"{_file(believed)}: placeholder: {guess}; {remedy}; {still}")
-    return believed
 
 
 def _file(network: RegionalModel) -> Path | str:

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from pettingzoo import ParallelEnv
 
 from nmfd.arrays import PerPair, PerRegion
-from nmfd.closed_loop import noise_of, noisy
+from nmfd.closed_loop import measurement, noise_of
 from nmfd.errors import InputError
 from nmfd.model.plant import NmfdPlant
 from nmfd.model.regional_model import RegionalModel
@@ -44,20 +44,19 @@ class Interface:
         self._turns = np.nonzero(choice) if guidance else None
         self._gates = len(self._boundaries[0])
         self.action_size = self._gates + (0 if self._turns is None else len(self._turns[0]))
-        self.observation_size = len(self._own) * (network.regions + 1) + (0 if self._all else network.regions)
         self._open = np.where(network.adjacency, network.u_max, 0.0)
         # Split ratios of these regions without a choice.
         self._fixed = np.where(network.split_mask & ~choice & own[:, None, None], network.nominal_splits, 0.0)
 
     def vector(self, accumulation: PerPair, backlog: PerPair) -> Vector:
-        """Return the observation (observation_size,) of accumulation and backlog (R, R) [veh]."""
+        """Return the observation (N,) of accumulation and backlog (R, R) [veh]."""
         critical = self._network.critical
         own = (accumulation / critical[:, None])[self._own].ravel(), (backlog.sum(axis=1) / critical)[self._own]
         other = () if self._all else (accumulation.sum(axis=1) / critical,)
         return np.concatenate([*own, *other], dtype=np.float32)
 
     def observed(self, observation: Observation) -> Vector:
-        """Return the observation (observation_size,) of what a controller receives."""
+        """Return the observation (N,) of what a controller receives."""
         return self.vector(observation.accumulation, observation.backlog)
 
     def observation_space(self, scenario: Scenario) -> Box:
@@ -146,9 +145,7 @@ class RegionalEnv(gymnasium.Env):
         getattr(self.plant, "close", lambda: None)()
 
     def _observe(self) -> Observation:
-        noise = self.scenario.measurement_std * self._random.standard_normal(self._state.accumulation.shape)
-        own = self.plant.observe()
-        return noisy(self._state, noise) if own is None else own
+        return measurement(self.plant, self._state, self.scenario.measurement_std, self._random)
 
     def _clipped(self, observation: Observation) -> Vector:
         return np.clip(self.interface.observed(observation), self.observation_space.low, self.observation_space.high)

@@ -37,7 +37,6 @@ from filelock import FileLock, Timeout
 from nmfd import __version__
 from nmfd.errors import InputError, RunFailed, need, uninterrupted
 from nmfd.metrics import summary
-from nmfd.runs.files import run_name as run_name
 from nmfd.runs.files import write_table, write_text
 from nmfd.runs.progress import Progress, watched
 from nmfd.types import Result
@@ -58,7 +57,7 @@ PACKAGES = ("numpy", "torch", "casadi", "libsumo")  # whose versions are in the 
 class Run:
     """A run to do.
 
-    name: stem of its file (`run_name`)
+    name: stem of its file (`files.run_name`)
     key: everything the result depends on, as JSON types: hashes, settings, versions. Its item "controller" holds what
         only runs of this controller depend on; all else is the same for all runs of a folder
     job: a picklable function without arguments that returns the Result, or the reason why there is none; `processes`

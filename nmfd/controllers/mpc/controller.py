@@ -72,9 +72,9 @@ class Admissible:
     def project(self, plan: Plan) -> Plan:
         """Return the nearest admissible plan."""
         perimeter = np.clip(plan[:, : self._edges], self._network.u_min, self._network.u_max)
-        if not self._guidance:
-            return np.concatenate([perimeter, np.broadcast_to(self._model.own, plan[:, self._edges :].shape)], axis=1)
-        return np.concatenate([perimeter, self._simplices(plan[:, self._edges :])], axis=1)
+        splits = plan[:, self._edges :]
+        splits = self._simplices(splits) if self._guidance else np.broadcast_to(self._model.own, splits.shape)
+        return np.concatenate([perimeter, splits], axis=1)
 
     def _simplices(self, splits: np.ndarray) -> np.ndarray:
         """Return the nearest shares (K, V) >= 0 with sum 1 over the turns of every cell (Michelot, 1986)."""
