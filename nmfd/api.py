@@ -347,7 +347,7 @@ def check_policies(policies: Mapping[str, Path], strategies: Sequence[Strategy])
 def _check_plant(plant: str | Plant) -> None:
     lacking = [method for method in ("reset", "step", "observe") if not callable(getattr(plant, method, None))]
     if lacking and not isinstance(plant, str):
-        raise InputError(f"plant: {type(plant).__name__} has no {lacking[0]}; nmfd.Plant says what it does")
+        raise InputError(f"plant: {type(plant).__name__} has no {lacking[0]}; see nmfd.Plant")
     if isinstance(plant, str) and plant not in PLANTS:
         raise InputError(f"plant {plant!r} is unknown{did_you_mean(plant, PLANTS)}; choose from {', '.join(PLANTS)}")
 

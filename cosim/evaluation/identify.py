@@ -223,7 +223,7 @@ def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool)
 
 
 def as_it_was(network: RegionalModel, model: RegionalModel, regions: Sequence[int]) -> RegionalModel:
-    """Return `model` with some regions as in `network`: a fit to hardly any vehicles says nothing of more."""
+    """Return `model` with some regions as in `network`, because a fit to few vehicles does not extend to more."""
     alone = np.isin(np.arange(model.regions), regions)
     mfds = tuple((network if alone[n] else model).mfds[n] for n in range(model.regions))
     rates = np.where(alone[:, None], 1.0, model.exit_rates)

@@ -35,7 +35,7 @@ CAPTION = (
 
 
 def observed(result: Result) -> Observed:
-    """Return a run as identification sees it; demand is what entered the streets."""
+    """Return the data of a run for identification; its demand is the departures."""
     return Observed(
         accumulation=result.accumulation,
         demand=result["departures"] / result.step,

@@ -18,7 +18,7 @@ SERVER_TIME_LIMIT_S = 60.0  # without a byte
 
 @cache
 def published() -> Mapping[str, Mapping[str, str]]:
-    """Return the cities of cities.toml, which says what is what, by name."""
+    """Return name -> entry of cities.toml, whose comments explain the fields."""
     return config.read(Path(__file__).with_name("cities.toml"))
 
 

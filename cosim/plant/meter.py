@@ -1,6 +1,6 @@
 """The exact vehicle ledger of a run: accumulations x_ij, and every crossing of a boundary.
 
-SUMO's tripinfo says what became of vehicles that have left (cosim.sumo.outputs): an arrival at the last edge of the
+SUMO's tripinfo has the outcome of vehicles that have left (cosim.sumo.outputs): an arrival at the last edge of the
 final route, else a removal.
 """
 

@@ -31,7 +31,7 @@ GUIDANCE = 0x67756964  # keeps the random numbers of the guided drivers apart fr
 
 
 class Observer:
-    """Observer of a run, which only reads; it may hold up the run, and its exceptions end the run. This one is idle."""
+    """Base class of observers, which read a run and may delay it; an exception of theirs ends the run."""
 
     def began(self, city: City, state: State) -> None:
         """Take the initial state."""

@@ -169,7 +169,7 @@ class Reporter(Observer):
         parent, held = multiprocessing.parent_process(), True
         while held:
             if parent is not None and not parent.is_alive():
-                self._messages.cancel_join_thread()  # nobody reads them
+                self._messages.cancel_join_thread()  # the page does not read them any more
                 raise RunFailed("the page was closed")
             held = not self._going.wait(HOLD_PERIOD_S)
 

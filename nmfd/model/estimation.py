@@ -111,7 +111,7 @@ class Estimator:
         self._boundaries = np.argwhere(network.adjacency)
         sizes = (2 * regions, regions, cells, regions, len(self._boundaries), cells, cells)
         ends = np.cumsum(sizes)
-        (self._factors, self._expansion, self._x, self._mean, self._crossings, self._probes, self._departures) = (
+        (_, self._expansion, self._x, self._mean, self._crossings, self._probes, self._departures) = (
             slice(int(end - size), int(end)) for end, size in zip(ends, sizes, strict=True)
         )
         self._states, self._size = int(ends[2]), int(ends[-1])

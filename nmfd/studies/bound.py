@@ -208,7 +208,7 @@ def lower_bound(scenario: Scenario, *, guidance: bool) -> float:
     limits = {"A_ub": lp.upper, "b_ub": lp.most, "A_eq": lp.equal, "b_eq": lp.given}
     answer = linprog(lp.cost, **limits, bounds=(0.0, 1.0), method="highs-ipm")
     if answer.status:
-        raise InputError(f"{scenario.where}: no lower bound, the solver says {answer.message}; change the scenario")
+        raise InputError(f"{scenario.where}: no lower bound, the solver reports: {answer.message}; change the scenario")
     limit, balance = np.minimum(answer.ineqlin.marginals, 0.0), answer.eqlin.marginals
     reduced = lp.cost - limit @ lp.upper - balance @ lp.equal
     dual = limit @ lp.most + balance @ lp.given + np.minimum(reduced, 0.0).sum()

@@ -147,9 +147,7 @@ def _boundary(model: Turns, wish: PerEdge, perimeter: PerEdge, accumulation: Per
     return share, of_ratio / limit, of_limit * open_capacity * room, of_limit * of_ahead
 
 
-def pull_derivative(
-    model: Turns, adjoint: PerCell, perimeter: PerEdge, splits: PerTurn, record: tuple
-) -> tuple[PerCell, PerEdge, PerTurn]:
+def pull_derivative(model: Turns, adjoint: PerCell, splits: PerTurn, record: tuple) -> tuple[PerCell, PerEdge, PerTurn]:
     """Return the gradients by x (C,), perimeter (E,) and splits (V,), if that by dx/dt is `adjoint` (C,)."""
     x, leaving, q, change_of_q, wish, share, boundary = record
     regions, edges = len(model.mfd.jam), len(model.edges)
@@ -177,15 +175,13 @@ def advance(model: Turns, x: PerCell, demand: PerCell, perimeter: PerEdge, split
     return x + step * total, records
 
 
-def pull_advance(
-    model: Turns, adjoint: PerCell, perimeter: PerEdge, splits: PerTurn, records: list
-) -> tuple[PerCell, Decision]:
+def pull_advance(model: Turns, adjoint: PerCell, splits: PerTurn, records: list) -> tuple[PerCell, Decision]:
     """Return the gradients by x (C,) and decision (E + V,) before a step, if that by x after it is `adjoint`."""
-    of_x, of_decision, of_node = adjoint, np.zeros(len(perimeter) + len(splits)), np.zeros_like(adjoint)
+    of_x, of_decision, of_node = adjoint, np.zeros(len(model.edges) + len(splits)), np.zeros_like(adjoint)
     step, ahead = model.step / model.substeps, 0.0  # ahead: from the node before to this one (s)
     for record, weight, place in reversed(list(zip(records, *SCHEMES[model.integrator], strict=True))):
         of_slope = step * weight * adjoint + ahead * of_node
-        of_node, *more = pull_derivative(model, of_slope, perimeter, splits, record)
+        of_node, *more = pull_derivative(model, of_slope, splits, record)
         of_x, of_decision, ahead = of_x + of_node, of_decision + np.concatenate(more), step * place
     return of_x, of_decision
 
@@ -223,7 +219,7 @@ def vehicle_steps(
         if step % model.substeps == 0:
             adjoint = adjoint + 1.0
         k, records = tape[step - 1]
-        adjoint, of_decision = pull_advance(model, adjoint, plan[k, :edges], plan[k, edges:], records)
+        adjoint, of_decision = pull_advance(model, adjoint, plan[k, edges:], records)
         of_plan[k] += of_decision
     return total, of_plan
 
