@@ -22,8 +22,7 @@ class NoControl:
     name = "no-control"
 
     def __init__(self, planning: PlanningModel):
-        network = planning.network
-        self._controls = Controls(perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=None)
+        self._controls = Controls(perimeter=planning.network.open_perimeter, splits=None)
 
     def reset(self, seed: int = 0) -> None:
         pass
@@ -97,7 +96,7 @@ class PiGating:
             setup.set_point or [network.mfds[region].reaching(setup.outflow_share) for region in self.regions]
         )
         self._kp, self._ki = setup.kp, setup.ki * planning.step
-        self._open = np.where(network.adjacency, network.u_max, 0.0)
+        self._open = network.open_perimeter
         self._entries = network.adjacency[:, self.regions]
         self._bounds = network.u_min, network.u_max
         self.reset()
@@ -132,7 +131,7 @@ class Greedy:
         network = planning.network
         self._critical = network.critical
         self._jam = np.array([mfd.jam for mfd in network.mfds])
-        self._open = np.where(network.adjacency, network.u_max, 0.0)
+        self._open = network.open_perimeter
         self._closed = np.where(network.adjacency, network.u_min, 0.0)
 
     def reset(self, seed: int = 0) -> None:
@@ -164,7 +163,7 @@ class Probing:
             gating = replace(planning, controller_options={PiGating.name: {"set_point": list(middle)}})
             self._gating = PiGating(gating)
             self._gating.critical = np.array(middle)
-        self._open = np.where(planning.network.adjacency, planning.network.u_max, 0.0)
+        self._open = planning.network.open_perimeter
         self.reset()
 
     def reset(self, seed: int = 0) -> None:

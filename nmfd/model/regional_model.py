@@ -122,6 +122,11 @@ class RegionalModel:
         return theta
 
     @property
+    def open_perimeter(self) -> PerPair:
+        """Perimeter control without a closed gate (R, R) [-]: u_max at every boundary."""
+        return np.where(self.adjacency, self.u_max, 0.0)
+
+    @property
     def open_capacity(self) -> PerPair | None:
         """`capacity` for u = 1 (R, R) [veh/s]."""
         return None if self.capacity is None else self.capacity / self.u_max

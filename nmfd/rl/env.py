@@ -44,7 +44,7 @@ class Interface:
         self._turns = np.nonzero(choice) if guidance else None
         self._gates = len(self._boundaries[0])
         self.action_size = self._gates + (0 if self._turns is None else len(self._turns[0]))
-        self._open = np.where(network.adjacency, network.u_max, 0.0)
+        self._open = network.open_perimeter
         # Split ratios of these regions without a choice.
         self._fixed = np.where(network.split_mask & ~choice & own[:, None, None], network.nominal_splits, 0.0)
 
@@ -194,7 +194,7 @@ class RegionsEnv(ParallelEnv):
     def step(self, actions: dict) -> tuple[dict, dict, dict, dict, dict]:
         """Advance by one control interval; the region of an agent without an action is open."""
         network = self._env.scenario.network
-        perimeter, splits = np.where(network.adjacency, network.u_max, 0.0), network.nominal_splits.copy()
+        perimeter, splits = network.open_perimeter, network.nominal_splits.copy()
         for agent, action in actions.items():
             region, where = self.possible_agents.index(agent), f"{agent}: interval {self._env._k}: "
             controls = self.interfaces[agent].controls(action, where)

@@ -108,7 +108,7 @@ class Admissible:
 
     def controls(self, decision: Decision) -> tuple[PerPair, PerTurn | None]:
         """Return perimeter (R, R) and splits (R, R, R), or None, of one interval (E + V,) of a plan."""
-        perimeter = np.where(self._network.adjacency, self._network.u_max, 0.0)
+        perimeter = self._network.open_perimeter
         perimeter[tuple(self._model.edges.T)] = decision[: self._edges]
         if not self._guidance:
             return perimeter, None
