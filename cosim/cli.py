@@ -31,17 +31,17 @@ CONTROLLER = click.option(
     "--controller",
     required=True,
     metavar="NAME[+...]",
-    help="Controller of `nmfd show` or FILE:Class, and what else the city does, joined by +: actuated or max-pressure "
-    "signals, rerouting-N, guided, compliance-N (percent of drivers), guidance-period-N (s), "
+    help="Controller from `nmfd show` or FILE:Class, and options of the city, joined by +: actuated or max-pressure "
+    "(signals), rerouting-N and compliance-N (percent of drivers), guided, guidance-period-N (s), "
     "metering, estimate.",
 )
-AGAINST = click.option("--against", metavar="NAME[+...]", help="Second controller, on the same trips.")
-STEPS = click.option("--steps", type=COUNT, help="Control intervals. [default: the scenario's]")
-DEMAND = click.option("--demand", type=LEVEL, default=1.0, help="Factor on the demand.")
+AGAINST = click.option("--against", metavar="NAME[+...]", help="Second controller, run on the same trips.")
+STEPS = click.option("--steps", type=COUNT, help="Number of control intervals. [default: as in the scenario]")
+DEMAND = click.option("--demand", type=LEVEL, default=1.0, help="Factor that multiplies the demand.")
 WORKERS = click.option(
-    "--workers", type=COUNT, default=lambda: os.cpu_count() or 1, show_default="one per core", help="Runs at a time."
+    "--workers", type=COUNT, default=lambda: os.cpu_count() or 1, show_default="one per core", help="Parallel runs."
 )
-LEVELS = click.option("--demand", "levels", type=listed(LEVEL), default="1", help="Factors on the demand.")
+LEVELS = click.option("--demand", "levels", type=listed(LEVEL), default="1", help="Factors that multiply the demand.")
 
 
 def span(text: str) -> tuple[float, float]:
@@ -69,7 +69,7 @@ def main() -> None:
 @main.command()
 @click.option("--out", type=FOLDER, default="runs/demo", metavar="DIR", help="Run folder.")
 def demo(out: Path) -> None:
-    """Run a small city with and without gates; write a page.
+    """Run a small city with and without gating; write a page.
 
     Takes half a minute and opens the page in a browser, if there is a screen.
 
@@ -92,7 +92,7 @@ def demo(out: Path) -> None:
 def run(scenario: Path, controller: str, against: str | None, **options: Any) -> None:
     """Run one controller, or two on the same trips.
 
-    SCENARIO is a name of `nmfd show`, or a folder with a scenario.toml, whose network has a SUMO city.
+    SCENARIO is a name that `nmfd show` lists, or a folder with a scenario.toml; its network must name a SUMO city.
     Prints a table and writes results, tables and figures.
 
     \b
@@ -109,12 +109,12 @@ def run(scenario: Path, controller: str, against: str | None, **options: Any) ->
 @AGAINST
 @seed_option("Seed of trips, drivers and guidance.")
 @DEMAND
-@click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port of the page; 0: any that is free.")
+@click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port of the page; 0: any free port.")
 @click.option("--gui", is_flag=True, help="Open sumo-gui instead of a page, with one run.")
 def watch(scenario: Path, controller: str, against: str | None, gui: bool, **options: Any) -> None:
     """Watch runs on a live page with map and curves.
 
-    The page pauses the runs and sets their pace. Nothing is written.
+    Buttons on the page pause the runs and set their speed. No files are written.
 
     \b
     Example:
@@ -129,19 +129,19 @@ def watch(scenario: Path, controller: str, against: str | None, gui: bool, **opt
 @SCENARIO
 @CONTROLLERS
 @click.option("--seeds", type=COUNT, default=10, help="Runs per controller and demand level.")
-@click.option("--first-seed", type=SEED, default=2000, help="Development uses seeds below 2000.")
+@click.option("--first-seed", type=SEED, default=2000, help="First seed; seeds below 2000 are for development.")
 @LEVELS
 @STEPS
 @POLICIES
 @WORKERS
-@click.option("--scheduler", metavar="ADDRESS", help="Dask scheduler that does the runs, such as tls://host:8786.")
-@click.option("--check", type=COUNT, metavar="N", help="Do N random runs of --out again instead, and compare.")
+@click.option("--scheduler", metavar="ADDRESS", help="Dask scheduler for the runs, such as tls://host:8786.")
+@click.option("--check", type=COUNT, metavar="N", help="Only repeat N random runs of --out, and compare.")
 @out_option("runs/SCENARIO-evaluate")
 def evaluate(scenario: Path, controllers: tuple[str, ...], seeds: int, first_seed: int, **options: Any) -> None:
     """Compare controllers over seeds and demand levels.
 
-    Writes tables and figures; several demand levels give the frontier up to which every controller serves all trips.
-    With the same --out, only runs that are not in it yet are done. SCENARIO may be a suite, a TOML file with
+    Writes tables and figures; with several demand levels, also up to which level each controller serves all trips.
+    If --out is an existing run folder, only missing runs are done. SCENARIO may be a suite: a TOML file with
     seeds = [2000, 2001] and a table [scenarios] of demand levels, such as grid7_peak = [0.8, 1.0].
 
     \b
@@ -158,7 +158,7 @@ def compare(folder: Path) -> None:
     """Compare finished runs with the regional model.
 
     RUN is a folder of `cosim run` or `cosim evaluate`. The regional model gets the recorded departures and controls.
-    A table of all runs, and a figure of the first run of every controller, go into RUN.
+    Writes a table of all runs, and a figure of the first run of every controller, into RUN.
 
     \b
     Example:
@@ -169,12 +169,12 @@ def compare(folder: Path) -> None:
 
 @main.command()
 @click.argument("folders", type=FOLDER, metavar="RUN...", nargs=-1, required=True)
-@click.option("--seed", type=SEED, help="Seed of the runs on the map. [default: the first of both]")
+@click.option("--seed", type=SEED, help="Seed of the runs on the map. [default: the first that both have]")
 @click.option("--out", type=FILE, metavar="FILE", help="Page. [default: report.html in the first RUN]")
 def report(folders: tuple[Path, ...], **options: Any) -> None:
     """Write one HTML page about finished runs.
 
-    RUN is a folder of `cosim run` or `cosim evaluate`. The page needs no network.
+    RUN is a folder of `cosim run` or `cosim evaluate`. The page works offline.
 
     \b
     Example:
@@ -195,7 +195,7 @@ def report(folders: tuple[Path, ...], **options: Any) -> None:
     callback=parsed("KEY=LOW:HIGH, such as kp=0.1:10", span),
     help="Option of the controller and its range; KEY[0], KEY[1] for numbers of a list. May be repeated.",
 )
-@click.option("--candidates", "trials", type=COUNT, default=40, help="Candidates, the scenario's own first.")
+@click.option("--candidates", "trials", type=COUNT, default=40, help="Candidates; the first has the scenario's values.")
 @click.option("--seeds", type=COUNT, default=2, help="Runs per candidate and level, from seed 1000.")
 @LEVELS
 @WORKERS
@@ -204,7 +204,7 @@ def tune(scenario: Path, controller: str, **how: Any) -> None:
     """Search the options of a controller by CMA-ES.
 
     Minimises the geometric mean of the total time spent over seeds and demand levels. Writes tune.csv, and tune.toml
-    with the best options. The same command continues, also with more --candidates.
+    with the best options. The same command continues the search, also with more --candidates.
 
     \b
     Example:
@@ -229,22 +229,22 @@ def get(name: str | None) -> None:
 
 @main.command(name="import")
 @click.argument("source", type=FILE, required=False, metavar="SUMOCFG|NET|OSM")
-@click.option("--bbox", metavar="W,S,E,N", help="Box of OpenStreetMap in degrees to download, instead of a file.")
+@click.option("--bbox", metavar="W,S,E,N", help="Box in degrees to download from OpenStreetMap, instead of a file.")
 @click.option("--regions", required=True, metavar="N|CSV", help="Number of regions to find, or a table edge,region.")
-@click.option("--routes", type=FILE, multiple=True, metavar="FILE", help="Vehicles, trips or flows. May be repeated.")
+@click.option("--routes", type=FILE, multiple=True, metavar="FILE", help="File of vehicles or flows. May be repeated.")
 @click.option("--demand", type=click.Choice(["peak"]), help="Generate a morning peak for a city without demand.")
-@click.option("--level", type=LEVEL, default=1.0, help="Factor on the vehicles, or on the peak.")
+@click.option("--level", type=LEVEL, default=1.0, help="Factor that multiplies the vehicles, or the peak.")
 @click.option("--mesoscopic", is_flag=True, help="Simulate with SUMO's queue model.")
-@click.option("--begin", metavar="TIME", help="Start in s or h:m:s. [default: the sumocfg's]")
-@click.option("--end", metavar="TIME", help="End of departures in s or h:m:s. [default: the sumocfg's]")
+@click.option("--begin", metavar="TIME", help="Start in s or h:m:s. [default: as in the sumocfg]")
+@click.option("--end", metavar="TIME", help="End of departures in s or h:m:s. [default: as in the sumocfg]")
 @seed_option()
-@click.option("--seeds", type=COUNT, default=3, help="Runs without control, to average densities.")
+@click.option("--seeds", type=COUNT, default=3, help="Runs without control, whose densities are averaged.")
 @click.option("--out", type=FOLDER, required=True, metavar="DIR", help="New folder, such as networks/mycity.")
 def import_(source: Path | None, bbox: str | None, **options: Any) -> None:
     """Make a network and a scenario of any SUMO city.
 
     Finds regions and gateways and counts demand by pair of regions. Vehicles keep routes, departures and types. The
-    scenario goes to scenarios/NAME beside the folder of networks.
+    scenario goes to scenarios/NAME, beside the folder networks.
 
     \b
     Examples:
@@ -259,19 +259,19 @@ def import_(source: Path | None, bbox: str | None, **options: Any) -> None:
 
 @main.command()
 @SCENARIO
-@click.option("--levels", type=listed(LEVEL), default="0.6,0.8,1", help="Factors on the demand.")
+@click.option("--levels", type=listed(LEVEL), default="0.6,0.8,1", help="Factors that multiply the demand.")
 @click.option("--seeds", type=COUNT, default=2, help="Loading runs per level, from seed 1000.")
-@click.option("--with", "city", metavar="A+...", help="Words for the city, or own. [default: own, then guided]")
-@click.option("--network", type=FOLDER, metavar="DIR", help="Folder of the model. [default: the scenario's network]")
+@click.option("--with", "city", metavar="A+...", help="Options of the city; own: none. [default: own, then guided]")
+@click.option("--network", type=FOLDER, metavar="DIR", help="Folder for the model. [default: the scenario's network]")
 @click.option("--protect", is_flag=True, help="Write the regions to protect into the scenario.")
 @WORKERS
 @out_option("runs/SCENARIO-identify", "Folder of loading runs, samples and figures.")
 def identify(scenario: Path, **options: Any) -> None:
     """Fit the regional model of a SUMO city.
 
-    Loads the city with multiples of its demand, without control and with probing gates, and writes network.toml.
-    Without --with it fits two models: with drivers on their own ways, then guided ones. Says which regions to protect.
-    Policies trained on the network before do not fit the new one. SCENARIO may be the folder of an imported network.
+    Loads the city with multiples of its demand, without control and with random gating, and writes network.toml.
+    Without --with it fits two models: drivers on their own routes, then guided drivers. Proposes regions to protect.
+    Policies trained on the old model do not fit the new one. SCENARIO may be the folder of an imported network.
 
     \b
     Example:

@@ -161,7 +161,7 @@ POLICIES = click.option(
     callback=parsed("NAME=FILE, such as dpc-pc=mine.pt", Path),
     help="Policy or plan file of a controller. May be repeated. [default: SCENARIO/NAME.pt or .npz]",
 )
-WORKERS = click.option("--workers", type=COUNT, default=1, help="Runs at a time.")
+WORKERS = click.option("--workers", type=COUNT, default=1, help="Number of parallel runs.")
 TRY = "; try it: nmfd benchmark {0} --controllers no-control,{1} --policy {1}={2}"
 
 
@@ -170,7 +170,7 @@ def seed_option(text: str = "Random seed.") -> Callable:
     return click.option("--seed", type=SEED, default=0, help=text)
 
 
-def out_option(default: str, text: str = "Run folder; finished runs in it are kept.") -> Callable:
+def out_option(default: str, text: str = "Run folder; finished runs in it are not repeated.") -> Callable:
     """Return the option --out of a folder; `default` says where results go without it."""
     return click.option("--out", type=FOLDER, metavar="DIR", help=f"{text} [default: {default}]")
 
@@ -204,7 +204,7 @@ def main() -> None:
 def show(scenario: Path | None, settings: dict, out: Path | None) -> None:
     """Draw a scenario; without SCENARIO list what is shipped.
 
-    Draws demand, region map and MFDs. The list names scenarios, networks, policies and controllers.
+    Draws demand, region map and MFDs. The list contains scenarios, networks, policies and controllers.
 
     \b
     Examples:
@@ -228,8 +228,8 @@ def show(scenario: Path | None, settings: dict, out: Path | None) -> None:
 def benchmark(scenario: Path, settings: dict, out: Path | None, **options: Any) -> None:
     """Run controllers on a regional model and compare them.
 
-    SCENARIO is a name of `nmfd show` or a folder with a scenario.toml. The run folder holds tables, results and
-    figures; with the same --out, only runs that are not in it yet are done.
+    SCENARIO is a name that `nmfd show` lists, or a folder with a scenario.toml. The run folder holds tables, results
+    and figures; if --out is an existing run folder, only missing runs are done.
 
     \b
     Example:
@@ -252,14 +252,14 @@ def benchmark(scenario: Path, settings: dict, out: Path | None, **options: Any) 
     help="What differs from the scenario.",
 )
 @click.option("--sigmas", type=listed(Number(0.0)), help="Noise (veh/s) or spread (-). [default: 0,...,5 or 0,...,0.4]")
-@click.option("--scenarios", type=COUNT, default=20, help="Draws for every sigma.")
+@click.option("--scenarios", type=COUNT, default=20, help="Random scenarios per sigma.")
 @WORKERS
 @out_option("runs/SCENARIO-TIME")
 def robustness(scenario: Path, settings: dict, out: Path | None, **options: Any) -> None:
     """Run controllers under unexpected demand or MFDs.
 
-    demand: plus noise for every pair of regions and control interval; demand-total: then scaled to the same trips;
-    others: MFDs or trip lengths times a random factor per region. Prints and draws the improvement over no-control.
+    demand adds noise per pair of regions and control interval; demand-total then restores the number of trips; other
+    kinds multiply MFDs or trip lengths by a random factor per region. Prints and draws the gain over no-control.
 
     \b
     Example:
@@ -276,14 +276,14 @@ def robustness(scenario: Path, settings: dict, out: Path | None, **options: Any)
 @SCENARIO
 @click.option("--controller", required=True, metavar="NAME", help="dpc-pc or dpc-pcrg.")
 @seed_option("Seed of the initial weights and the training states.")
-@click.option("--steps", type=COUNT, help="Adam steps. [default: the scenario's, else 400]")
+@click.option("--steps", type=COUNT, help="Adam steps. [default: as in scenario.toml, else 400]")
 @click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True)
 @click.option("--resume", is_flag=True, help="Continue an interrupted training.")
 @click.option("--out", type=FILE, metavar="FILE", help="Policy file. [default: SCENARIO/NAME.pt]")
 def train(scenario: Path, settings: dict, controller: str, **options: Any) -> None:
     """Train a DPC policy on a scenario.
 
-    The policy file always holds the policy that is best in validation; Ctrl-C keeps it, and --resume continues.
+    The policy file always holds the policy that is best in validation. After Ctrl-C, --resume continues the training.
 
     \b
     Example:
@@ -300,8 +300,8 @@ def train(scenario: Path, settings: dict, controller: str, **options: Any) -> No
 def bound(scenario: Path, settings: dict, controller: str, **options: Any) -> None:
     """Find the best plan for known demand, and a lower bound.
 
-    `nmfd benchmark --controllers bound-pc,bound-pcrg` replays the plan; its table says how far controllers are at most
-    above the optimum.
+    `nmfd benchmark --controllers bound-pc,bound-pcrg` replays the plans; its table shows by how much each controller
+    exceeds the lower bound.
 
     \b
     Example:
@@ -316,7 +316,7 @@ def bound(scenario: Path, settings: dict, controller: str, **options: Any) -> No
 def new_controller(file: Path) -> None:
     """Write a commented template of a controller.
 
-    Every command takes it as FILE:Class.
+    Commands accept it as a controller named FILE:Class.
 
     \b
     Example:
@@ -341,13 +341,13 @@ def new_controller(file: Path) -> None:
     metavar="CSV",
     help="Table: detid, length (km), lanes, linkid, pos, long and lat or x and y, region.",
 )
-@click.option("--regions", type=FILE, metavar="CSV", help="Table detid,region, if no other table has the region.")
+@click.option("--regions", type=FILE, metavar="CSV", help="Table detid,region, unless another table has regions.")
 @click.option("--about", type=FILE, metavar="CSV", help="Table of regions: region, lane_km, trip_length, x, y (m).")
 @click.option("--adjacency", type=FILE, metavar="CSV", help="Table region,neighbour. [default: by position]")
 @click.option("--trip-length", type=float, metavar="M", help="Mean trip length in a region. [default: from its size]")
-@click.option("--city", metavar="NAME", help="City, if the tables hold several.")
-@click.option("--skip-bad", is_flag=True, help="Leave out doubled rows and impossible numbers, and count them.")
-@click.option("--out", type=FOLDER, required=True, metavar="DIR", help="Folder of the network, a new one.")
+@click.option("--city", metavar="NAME", help="City to use, if the tables hold several.")
+@click.option("--skip-bad", is_flag=True, help="Leave out and count rows that are doubled or have impossible numbers.")
+@click.option("--out", type=FOLDER, required=True, metavar="DIR", help="New folder for the network.")
 def identify(counts: Path, out: Path, **options: Any) -> None:
     """Fit a network to counts and occupancies of detectors.
 
