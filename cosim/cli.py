@@ -98,7 +98,7 @@ def run(scenario: Path, controller: str, against: str | None, **options: Any) ->
     \b
     Examples:
       cosim run grid7_peak --controller dpc-pcrg --against no-control
-      cosim run grid7_peak --controller pi-gating --set controllers.pi-gating.kp=2 --set sumo.min_green=8
+      cosim run grid7_peak --controller pi-gating --set controllers.pi-gating.kp=2 --set sumo.chain_limit=0.4
     """
     click.echo(cosim.api.run_controllers(scenario, list(filter(None, (controller, against))), **options))
 
