@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from nmfd.studies.measured import Identified
     from nmfd.types import Controller, Controls, Observation, Plant, Result, State, Status
 
-__version__ = "0.1.0"  # of the package perimeter-cosim, nmfd and cosim alike
+__version__ = "0.2.0"  # of the package perimeter-cosim, nmfd and cosim alike
 _MODULES = {
     "api": ("benchmark", "controller", "identify", "load_scenario", "run", "train"),
     "controllers.dpc.policy": ("ModuleController", "PerimeterLayer", "SplitsLayer"),
