@@ -28,13 +28,13 @@ class CityMap:
     layers: label -> what shows the streets by this quantity; all but the first, DENSITY, are hidden
     """
 
-    def __init__(self, picture: CityPicture, title: str, totals: Mapping[str, tuple], *other: "CityMap"):
-        """totals: label -> values (E,) of other layers, and the upper end of their scale; other: map to move with"""
+    def __init__(self, picture: CityPicture, title: str, totals: Mapping[str, tuple], beside: "CityMap | None" = None):
+        """totals: label -> values (E,) of other layers, and the upper end of their scale; beside: map to move with"""
         self._picture, self._totals = picture, totals
         self.layers: dict[str, list[Any]] = {}
         size = {"height": MAP_HEIGHT, "sizing_mode": "stretch_width", "match_aspect": True, "lod_threshold": None}
         bare = {"tools": "pan,wheel_zoom,reset", "toolbar_location": None, "outline_line_color": None}
-        common = {axis: getattr(one.plot, axis) for one in other for axis in ("x_range", "y_range")}
+        common = {axis: getattr(beside.plot, axis) for axis in ("x_range", "y_range")} if beside else {}
         self.plot: Any = figure(title=title, active_scroll="wheel_zoom", **size, **bare, **common)
         self.plot.axis.visible = self.plot.grid.visible = False
         self.regions = self._add_regions()

@@ -42,7 +42,7 @@ class Page:
         self.maps: list[CityMap] = []
         for n, name in enumerate(titles):
             layers = {label: (values[n], tops[label]) for label, values in totals.items()}
-            self.maps.append(CityMap(picture, name, layers, *self.maps[:1]))
+            self.maps.append(CityMap(picture, name, layers, self.maps[0] if n else None))
         parts_of = [[label, parts] for one in self.maps for label, parts in one.layers.items()]
         labels = list(self.maps[0].layers)
         self.streets = Select(title="Streets by", name="streets", width=150, value=labels[0], options=labels)

@@ -40,8 +40,7 @@ class RandomPrices:
         if observation.step % HOLD == 0:
             priced = self._random.random(self._network.regions) < 0.5
             self._prices = priced * self._random.uniform(0.0, MOST_PRICE, self._network.regions)
-        perimeter = self._network.u_max * self._network.adjacency
-        return Controls(perimeter=perimeter, splits=None, prices=self._prices)
+        return Controls(perimeter=self._network.open_perimeter, splits=None, prices=self._prices)
 
 
 def likelihood(runs: list[Result], answer: Answer, dispersion: float) -> tuple[float, float]:
