@@ -70,6 +70,7 @@ def seen(
     return StreetMeans(
         duration=duration,
         vehicles=on,
+        timed=on,
         speed=mean,
         accumulation=np.zeros(1),
         production=np.zeros(1),

@@ -48,6 +48,15 @@ def run(scenario):
     return drive(scenario, measurement="estimate")
 
 
+def test_travel_times_come_from_probes(scenario):
+    with closing(SumoPlant(scenario, settings=Settings(measurement="estimate"))) as plant:
+        plant.reset(3)
+        plant.step(Controls(perimeter=scenario.network.open_perimeter, splits=None))
+        streets = plant._streets
+    assert 0.05 < streets.timed.sum() / streets.vehicles.sum() < 0.2
+    assert (np.isfinite(streets.speed) == (streets.timed > 0.0)).all() and np.nanmin(streets.speed) > 0.0
+
+
 def test_layout(city):
     few, many = lay_out(city, 0.1), lay_out(city, 0.3)
     assert set(few.edges) < set(many.edges) and lay_out(city, 0.3).positions == many.positions
@@ -86,9 +95,10 @@ def test_all_links_and_all_probes_see_everything(scenario):
         plant._estimation.readings = lambda: (seen.append(readings()), seen[-1])[1]
         for _ in range(scenario.steps):
             before, state = state, plant.step(controller.act(plant.observe()))
-        estimate = plant.observe()
+        estimate, streets = plant.observe(), plant._streets
         crossings = plant.record()["crossings"][-1].sum(axis=2)
     assert (seen[-1].probes == state.accumulation).all()
+    assert (streets.timed == streets.vehicles).all() and streets.crossing.sum() > 1.0
     assert np.abs(estimate.accumulation - state.accumulation).max() < 3.0
     assert (estimate.backlog == state.backlog).all()
     mean = 0.5 * (before.accumulation + state.accumulation).sum()

@@ -96,7 +96,7 @@ class SumoPlant:
         self._estimation = None
         if estimated:
             self._estimation = Estimation(session, city, self._layout, meter, self._instruments, self._planning)
-        self._sampler = StreetSampler(session, city)
+        self._sampler = StreetSampler(session, city, known if estimated else None)
         self._streets: StreetMeans | None = None
         self._guide = Guide(
             session,

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-from cosim.plant.sampling import StreetMeans
+from cosim.plant.sampling import STANDING_M_S, StreetMeans
 from cosim.sumo.arrays import EdgeMask, GatewayMask, MoveEnds, PerEdge, PerGateway, PerMove
 from cosim.sumo.net import City
 
@@ -20,7 +20,6 @@ MESO_SMOOTHING = 0.5  # weight of the newest control interval in the mesoscopic 
 WINDOW_S = 300.0  # after which an observation counts a third
 EMPTY_WEIGHT = 0.5  # of earlier observations after a control interval without vehicles
 PRIOR_VEH_S = 3.0  # at the speed limit, which count besides
-STANDING_M_S = 0.1  # lowest speed of a travel time
 FAR_S = 1e9  # longer than any way
 MOST_NODES = 20_000_000  # of the searches that are kept, of 12 bytes each
 FEWEST_TREES = 8  # that are kept, however large the city: one decision needs as many
@@ -57,7 +56,7 @@ class TravelTimes:
             now = np.where(np.isnan(seen.speed), self.free, self._length / np.maximum(seen.speed, STANDING_M_S))
             self.edges = self.edges + MESO_SMOOTHING * (np.maximum(now, self.free) - self.edges)
             return
-        kept, spent = math.exp(-seen.duration / WINDOW_S), seen.vehicles * seen.duration
+        kept, spent = math.exp(-seen.duration / WINDOW_S), seen.timed * seen.duration
         used = spent > 0.0
         kept_here = np.where(used, kept, min(kept, EMPTY_WEIGHT))
         self._spent = kept_here * self._spent + spent

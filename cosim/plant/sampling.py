@@ -11,6 +11,7 @@ from cosim.sumo.session import Session
 from nmfd.arrays import PerRegion
 
 SAMPLE_PERIOD_S = 10.0
+STANDING_M_S = 0.1  # lowest speed of a travel time
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,6 +20,7 @@ class StreetMeans:
 
     duration: [s], of the interval; vehicles: (E,) [veh]
     speed: (E,) [m/s], that routing goes by (`Session.speeds`); NaN without vehicles, 0 on closed streets
+    timed: (E,) [veh], of which `speed` is the mean: all or, as `crossing` and `crossed`, probes
     accumulation: (R,) [veh]; production: (R,) [veh m/s]
     queue, queue_max: (G,) [veh] halting on the edge before a gateway, mean and largest
     crossing: (I,) [veh] on the internal edges of `City.inside`; crossed: (I,) [veh/s] that got over them
@@ -27,6 +29,7 @@ class StreetMeans:
     duration: float
     vehicles: PerEdge
     speed: PerEdge
+    timed: PerEdge
     accumulation: PerRegion
     production: PerRegion
     queue: PerGateway
@@ -42,7 +45,9 @@ class StreetSampler:
     longest_queue: (E,) [veh] halting, the most in all samples so far
     """
 
-    def __init__(self, session: Session, city: City):
+    def __init__(self, session: Session, city: City, probes: frozenset[str] | None = None):
+        """probes: vehicles that travel times come from; all if None"""
+        self._probes = probes
         self._session, self._city = session, city
         self._inside = {edge: n for n, edge in enumerate(city.inside)}
         self._upstream = sorted({g.from_edge for g in city.gateways})  # gateways may share the edge before them
@@ -53,8 +58,8 @@ class StreetSampler:
 
     def _begin(self) -> None:
         self._start = self._session.time
-        # Sums over the samples: n, n v, and n times the speed that routing goes by.
-        self._vehicles, self._metres, self._routed = np.zeros((3, len(self._city.edges)))
+        # Sums over the samples: n, n v; of the vehicles that routing goes by n, and n times their speed.
+        self._vehicles, self._metres, self._timed, self._routed = np.zeros((4, len(self._city.edges)))
         self._crossing, self._crossed = np.zeros((2, len(self._inside)))
         self._queues: list[list[int]] = []
 
@@ -68,13 +73,20 @@ class StreetSampler:
         self.last = counts, speeds
         for n in np.flatnonzero(counts > self.longest_queue):  # only these can have a longer queue
             self.longest_queue[n] = max(self.longest_queue[n], session.halting(edges[n]))
-        for edge in crossed:
-            if count := session.vehicle_count(edge):
-                n, (speed, _) = self._inside[edge], session.speeds(edge)
-                self._crossing[n] += count
-                self._crossed[n] += count * speed / self._city.inside[edge]
         self._vehicles, self._metres = self._vehicles + counts, self._metres + counts * speeds
-        self._routed += counts * routing
+        if self._probes is None:
+            self._timed, self._routed = self._timed + counts, self._routed + counts * routing
+            for edge in crossed:
+                if count := session.vehicle_count(edge):
+                    self._cross(edge, count, session.speeds(edge)[0])
+        else:
+            for vehicle in filter(self._probes.__contains__, session.running()):
+                road, speed = session.road(vehicle), session.vehicle_speed(vehicle)
+                if road in self._inside:
+                    self._cross(road, 1, speed)
+                elif road in self._city.number:
+                    self._timed[self._city.number[road]] += 1.0
+                    self._routed[self._city.number[road]] += max(speed, STANDING_M_S)  # 0 is for closed streets
         self._queues.append([session.halting(edge) for edge in self._upstream])
 
     def finish(self, closed: EdgeMask) -> StreetMeans:
@@ -82,12 +94,13 @@ class StreetSampler:
         samples = len(self._queues)
         queues = np.array(self._queues).reshape(samples, len(self._upstream))[:, self._upstream_of]
         with np.errstate(invalid="ignore"):
-            speed = self._routed / self._vehicles
+            speed = self._routed / self._timed
         speed[closed] = 0.0  # so that guidance does not take an empty street for a free one
         means = StreetMeans(
             duration=self._session.time - self._start,
             vehicles=self._vehicles / samples,
             speed=speed,
+            timed=self._timed / samples,
             accumulation=np.bincount(self._city.edge_region, self._vehicles, self._city.regions) / samples,
             production=np.bincount(self._city.edge_region, self._metres, self._city.regions) / samples,
             queue=queues.mean(axis=0),
@@ -97,6 +110,11 @@ class StreetSampler:
         )
         self._begin()
         return means
+
+    def _cross(self, edge: str, count: int, speed: float) -> None:
+        n = self._inside[edge]
+        self._crossing[n] += count
+        self._crossed[n] += count * speed / self._city.inside[edge]
 
     def _travelled(self) -> tuple[list[int], list[str]]:
         """Return edges (numbers) and internal edges that hold all vehicles: a large city has more edges than these."""

@@ -51,7 +51,7 @@ class Settings(config.Settings):
         "critical accumulations in a region above which trips wait outside; 0: never", 0.0, unit="-", ge=0.0, le=10.0
     )
     measurement: Literal["exact", "estimate"] = setting(
-        "what controllers see; estimate: by detectors and probes", EXACT
+        "what controllers and guidance see; estimate: by detectors and probes", EXACT
     )
     detector_share: Share = setting("share of the links with loop detectors", 0.3)
     probe_share: Share = setting("share of the vehicles that are probes", 0.1)

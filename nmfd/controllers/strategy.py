@@ -98,7 +98,7 @@ CITY_WORDS: Mapping[str, tuple[str, Any, str]] = {
     "webster": ("signals", "webster", "fixed-time signals, optimised for the scenario's demand"),
     "actuated": ("signals", "actuated", "signals that extend green while vehicles arrive"),
     "max-pressure": ("signals", "max-pressure", "max-pressure control of all signals"),
-    "estimate": ("measurement", "estimate", "the controller sees estimates from detectors and probe vehicles"),
+    "estimate": ("measurement", "estimate", "controller and guidance see what detectors and probe vehicles tell"),
     "metering": ("metering", 1.2, "trips wait outside while their region is full, or as the controller commands"),
     "guided": ("guided", True, "drivers are guided by travel times"),
 }
