@@ -18,6 +18,7 @@ from nmfd.cli import (
     SEED,
     VERSION,
     Commands,
+    ControllerName,
     Number,
     listed,
     out_option,
@@ -29,6 +30,7 @@ from nmfd.errors import InputError
 LEVEL = Number(0.0, 10.0, min_open=True)
 CONTROLLER = click.option(
     "--controller",
+    type=ControllerName(),
     required=True,
     metavar="NAME[+...]",
     help="Controller from `nmfd show` or FILE:Class, and options of the city, joined by +: actuated or max-pressure "

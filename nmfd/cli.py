@@ -93,6 +93,13 @@ def combined(*decorators: Callable) -> Callable:
     return decorate
 
 
+class ControllerName(click.types.StringParamType):
+    """Name of a controller; the error without one says where they are listed."""
+
+    def get_missing_message(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
+        return "Name one, such as pi-gating or dpc-pc; `nmfd show` lists them."
+
+
 def listed(kind: click.ParamType) -> Callable[[str], tuple]:
     """Return a parser of values of a kind that are separated by commas."""
 
@@ -274,7 +281,7 @@ def robustness(scenario: Path, settings: dict, out: Path | None, **options: Any)
 
 @main.command()
 @SCENARIO
-@click.option("--controller", required=True, metavar="NAME", help="dpc-pc or dpc-pcrg.")
+@click.option("--controller", type=ControllerName(), required=True, metavar="NAME", help="dpc-pc or dpc-pcrg.")
 @seed_option("Seed of the initial weights and the training states.")
 @click.option("--steps", type=COUNT, help="Adam steps. [default: as in scenario.toml, else 400]")
 @click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True)
@@ -295,7 +302,7 @@ def train(scenario: Path, settings: dict, controller: str, **options: Any) -> No
 
 @main.command()
 @SCENARIO
-@click.option("--controller", required=True, metavar="NAME", help="bound-pc or bound-pcrg.")
+@click.option("--controller", type=ControllerName(), required=True, metavar="NAME", help="bound-pc or bound-pcrg.")
 @click.option("--out", type=FILE, metavar="FILE", help="Plan file. [default: SCENARIO/NAME.npz]")
 def bound(scenario: Path, settings: dict, controller: str, **options: Any) -> None:
     """Find the best plan for known demand, and a lower bound.

@@ -125,7 +125,7 @@ IMPORT = ("import", "--out", "{tmp}/out/city")
         (("identify", "grid8"), "no scenario or network of that name comes with the package"),
         ((*RUN, "--policy", "x.pt"), "reads no policy"),
         (("run", "{small}", "--controller", "nobody"), "'nobody' is unknown; choose from no-control"),
-        (("run", "{small}"), "Missing option '--controller'"),
+        (("run", "{small}"), "`nmfd show` lists them"),
         (("run", "{tmp}/none", "--controller", "no-control"), "scenario.toml: no such file"),
         ((*EVALUATE, "no-control,nobody"), "'nobody' is unknown"),
         ((*EVALUATE, "no-control,no-control"), "expected distinct values"),

@@ -9,13 +9,14 @@ import torch
 from commands import good, nmfd
 
 from nmfd import closed_loop
-from nmfd.api import load_scenario
+from nmfd.api import load_scenario, run
 from nmfd.controllers.dpc.policy import Architecture, Policy
 from nmfd.controllers.dpc.rollout import Rollout
 from nmfd.controllers.strategy import parse
 from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
 from nmfd.studies.benchmark import lower_bound
+from nmfd.types import Observation
 
 
 def test_every_decoder_descends_the_total_time_spent():
@@ -60,3 +61,13 @@ def test_the_lower_bound_without_metering_is_not_that_of_a_policy_that_meters():
     assert lower_bound(scenario, strategy, "nmfd") > 4e7
     metered = replace(scenario, controller_options={"dpc-pcrg": {"metering": True}})
     assert np.isnan(lower_bound(metered, strategy, "nmfd"))
+
+
+def test_mpc_of_grid7_has_the_outputs_of_the_policy():
+    """The script decides within its bounds, prices the filling centre most, and lets fewest trips begin there."""
+    scenario = replace(load_scenario("grid7_peak", {"demand_factor": 2.0}), steps=12)
+    strategy = parse(f"{scenario.folder}/price_mpc.py:PriceMpc+max-pressure+guidance-period-60+metering")
+    x = run(scenario, "no-control").accumulation[12]
+    controls = strategy.make(scenario).act(Observation(step=12, time=1080.0, accumulation=x, backlog=0.0 * x))
+    assert controls.prices.argmax() == 3 and controls.prices[3] > 0.5
+    assert controls.metering[3] < 3.0 < controls.metering[2]

@@ -41,14 +41,13 @@ class StreetMeans:
 class StreetSampler:
     """Sums over the samples of one control interval.
 
+    probes: vehicles that travel times come from; all if None
     last: vehicles (E,) and their mean speed (E,) [m/s] in the last sample
     longest_queue: (E,) [veh] halting, the most in all samples so far
     """
 
     def __init__(self, session: Session, city: City, probes: frozenset[str] | None = None):
-        """probes: vehicles that travel times come from; all if None"""
-        self._probes = probes
-        self._session, self._city = session, city
+        self._session, self._city, self._probes = session, city, probes
         self._inside = {edge: n for n, edge in enumerate(city.inside)}
         self._upstream = sorted({g.from_edge for g in city.gateways})  # gateways may share the edge before them
         self._upstream_of = np.array([self._upstream.index(g.from_edge) for g in city.gateways], dtype=int)

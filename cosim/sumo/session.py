@@ -121,8 +121,7 @@ class Session:
         # Vehicles now: on the road, without teleporting ones; all that are loaded and have not arrived; due to depart.
         self.running, self.known = vehicle.getIDList, vehicle.getLoadedIDList
         self.pending = simulation.getPendingVehicles
-        # One vehicle: its edge, normal or internal; its route; its place on it; speed [m/s]; time since it stopped [s];
-        # length [m].
+        # One vehicle: edge, normal or internal; route; place on it; speed [m/s]; time since it stopped [s]; length [m].
         self.road, self.route, self.route_index = vehicle.getRoadID, vehicle.getRoute, vehicle.getRouteIndex
         self.vehicle_speed = vehicle.getSpeed
         self.standing_time, self.vehicle_length = vehicle.getWaitingTime, vehicle.getLength

@@ -45,7 +45,7 @@ class Page:
             self.maps.append(CityMap(picture, name, layers, self.maps[0] if n else None))
         parts_of = [[label, parts] for one in self.maps for label, parts in one.layers.items()]
         labels = list(self.maps[0].layers)
-        self.streets = Select(title="Streets by", name="streets", width=150, value=labels[0], options=labels)
+        self.streets = Select(title="Streets by", name="streets", width=210, value=labels[0], options=labels)
         self.streets.js_on_change("value", CustomJS.from_file(HERE / "layers.js", layers=parts_of))
         self.loads = [Load(picture, f"{name}: load") for name in titles]
         self.curves = Curves(picture, dict(zip(titles, tones.values(), strict=True)))
