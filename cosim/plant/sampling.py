@@ -20,7 +20,7 @@ class StreetMeans:
 
     duration: [s], of the interval; vehicles: (E,) [veh]
     speed: (E,) [m/s], that routing goes by (`Session.speeds`); NaN without vehicles, 0 on closed streets
-    timed: (E,) [veh], of which `speed` is the mean: all or, as `crossing` and `crossed`, probes
+    timed: (E,) [veh], of which `speed` is the mean: all or, without `crossing` and `crossed`, probes
     accumulation: (R,) [veh]; production: (R,) [veh m/s]
     queue, queue_max: (G,) [veh] halting on the edge before a gateway, mean and largest
     crossing: (I,) [veh] on the internal edges of `City.inside`; crossed: (I,) [veh/s] that got over them
@@ -77,15 +77,14 @@ class StreetSampler:
             self._timed, self._routed = self._timed + counts, self._routed + counts * routing
             for edge in crossed:
                 if count := session.vehicle_count(edge):
-                    self._cross(edge, count, session.speeds(edge)[0])
-        else:
+                    n, (speed, _) = self._inside[edge], session.speeds(edge)
+                    self._crossing[n] += count
+                    self._crossed[n] += count * speed / self._city.inside[edge]
+        else:  # on junctions there are too few
             for vehicle in filter(self._probes.__contains__, session.running()):
-                road, speed = session.road(vehicle), session.vehicle_speed(vehicle)
-                if road in self._inside:
-                    self._cross(road, 1, speed)
-                elif road in self._city.number:
-                    self._timed[self._city.number[road]] += 1.0
-                    self._routed[self._city.number[road]] += max(speed, STANDING_M_S)  # 0 is for closed streets
+                if (n := self._city.number.get(session.road(vehicle))) is not None:
+                    self._timed[n] += 1.0
+                    self._routed[n] += max(session.vehicle_speed(vehicle), STANDING_M_S)  # 0 is for closed streets
         self._queues.append([session.halting(edge) for edge in self._upstream])
 
     def finish(self, closed: EdgeMask) -> StreetMeans:
@@ -109,11 +108,6 @@ class StreetSampler:
         )
         self._begin()
         return means
-
-    def _cross(self, edge: str, count: int, speed: float) -> None:
-        n = self._inside[edge]
-        self._crossing[n] += count
-        self._crossed[n] += count * speed / self._city.inside[edge]
 
     def _travelled(self) -> tuple[list[int], list[str]]:
         """Return edges (numbers) and internal edges that hold all vehicles: a large city has more edges than these."""
