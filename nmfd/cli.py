@@ -94,10 +94,13 @@ def combined(*decorators: Callable) -> Callable:
 
 
 class ControllerName(click.types.StringParamType):
-    """Name of a controller; the error without one says where they are listed."""
+    """Name of a controller; the error without one names `examples`."""
+
+    def __init__(self, examples: str = "pi-gating or dpc-pc"):
+        self.examples = examples
 
     def get_missing_message(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
-        return "Name one, such as pi-gating or dpc-pc; `nmfd show` lists them."
+        return f"Name one, such as {self.examples}; `nmfd show` lists them."
 
 
 def listed(kind: click.ParamType) -> Callable[[str], tuple]:
@@ -281,7 +284,7 @@ def robustness(scenario: Path, settings: dict, out: Path | None, **options: Any)
 
 @main.command()
 @SCENARIO
-@click.option("--controller", type=ControllerName(), required=True, metavar="NAME", help="dpc-pc or dpc-pcrg.")
+@click.option("--controller", type=ControllerName("dpc-pc"), required=True, metavar="NAME", help="dpc-pc or dpc-pcrg.")
 @seed_option("Seed of the initial weights and the training states.")
 @click.option("--steps", type=COUNT, help="Adam steps. [default: as in scenario.toml, else 400]")
 @click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True)
@@ -302,7 +305,9 @@ def train(scenario: Path, settings: dict, controller: str, **options: Any) -> No
 
 @main.command()
 @SCENARIO
-@click.option("--controller", type=ControllerName(), required=True, metavar="NAME", help="bound-pc or bound-pcrg.")
+@click.option(
+    "--controller", type=ControllerName("bound-pc"), required=True, metavar="NAME", help="bound-pc or bound-pcrg."
+)
 @click.option("--out", type=FILE, metavar="FILE", help="Plan file. [default: SCENARIO/NAME.npz]")
 def bound(scenario: Path, settings: dict, controller: str, **options: Any) -> None:
     """Find the best plan for known demand, and a lower bound.

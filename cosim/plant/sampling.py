@@ -20,7 +20,7 @@ class StreetMeans:
 
     duration: [s], of the interval; vehicles: (E,) [veh]
     speed: (E,) [m/s], that routing goes by (`Session.speeds`); NaN without vehicles, 0 on closed streets
-    timed: (E,) [veh], of which `speed` is the mean: all or, without `crossing` and `crossed`, probes
+    timed: (E,) [veh], whose mean is `speed`: all vehicles, or probes, which leave `crossing` and `crossed` at 0
     accumulation: (R,) [veh]; production: (R,) [veh m/s]
     queue, queue_max: (G,) [veh] halting on the edge before a gateway, mean and largest
     crossing: (I,) [veh] on the internal edges of `City.inside`; crossed: (I,) [veh/s] that got over them
@@ -57,7 +57,7 @@ class StreetSampler:
 
     def _begin(self) -> None:
         self._start = self._session.time
-        # Sums over the samples: n, n v; of the vehicles that routing goes by n, and n times their speed.
+        # Sums over the samples: vehicles, and times their speed; timed vehicles, and times their routing speed.
         self._vehicles, self._metres, self._timed, self._routed = np.zeros((4, len(self._city.edges)))
         self._crossing, self._crossed = np.zeros((2, len(self._inside)))
         self._queues: list[list[int]] = []

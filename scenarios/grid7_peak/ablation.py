@@ -2,8 +2,8 @@
 
     python scenarios/grid7_peak/ablation.py runs/ablation --demand 1.6,2 --first-seed 3400 --seeds 2
 
-Prices and metering of the pricing rule and of DPC, and the tuned PI gate, are numbers of one form
-(nmfd/controllers/dpc/compact.py), so that every combination is a rule with other numbers. Every row of CELLS is one
+The pricing rule, DPC and the tuned PI gate can be written in the same numbers (nmfd/controllers/dpc/compact.py), so
+that every combination is a rule with other numbers. Every row of CELLS is one
 `cosim evaluate` with a run folder of its own; ablation.csv has the runs of all.
 """
 
@@ -14,21 +14,31 @@ from pathlib import Path
 import click
 import pandas as pd
 
+import nmfd
+from nmfd.controllers.dpc.compact import Numbers
+
 OVER = "+max-pressure+guidance-period-60"
-RULE, DPC = [7.63, 0.465, 0.67, 0.985], [2.2994, 0.1366, 0.3757, 0.6303]  # price, price_from, elsewhere, elsewhere_from
-OPEN, PI = [9.0, 1.0, 0.0], [0.870, 1.375, 0.0]  # set_point, gain, relief; PI: 426 veh, kp 1.1 over u from 0.1 to 0.9
-INTEGRAL = 0.4725  # ki 0.0042 in intervals of 90 s
-LEVEL = 1.3  # critical accumulations above which trips wait
+SCENARIO, MODEL = nmfd.load_scenario("grid7_peak"), nmfd.load_network("grid7_max_pressure")
+RULE = Numbers(*SCENARIO.controller_options[f"pricing-rule{OVER}+metering"]["numbers"])  # its gate is open
+TRAINED = nmfd.controller(f"dpc-pcrg{OVER}+metering", SCENARIO).policy.numbers.tolist()
+DPC = Numbers(*(round(number, 4) for number in TRAINED))._replace(**dict(zip(Numbers._fields[:3], RULE, strict=False)))
+TUNED, SPAN = SCENARIO.controller_options[f"pi-gating+guided{OVER}"], MODEL.u_max - MODEL.u_min
+PI = {  # the same gate in units of a rule
+    "set_point": round(TUNED["set_point"][0] / MODEL.mfds[SCENARIO.protected[0]].critical, 3),
+    "gain": round(TUNED["kp"] / SPAN, 4),
+    "relief": 0.0,
+    "integral": round(TUNED["ki"] * SCENARIO.step / SPAN, 4),
+}
 CELLS = {  # name: (strategy, numbers or None)
     "metering": (f"route-guidance{OVER}+metering", None),
     "gate": (f"pi-gating+guided{OVER}", None),
     "gate-metering": (f"pi-gating+guided{OVER}+metering", None),
-    "rule": (f"pricing-rule{OVER}", [*OPEN, *RULE, LEVEL]),
-    "rule-metering": (f"pricing-rule{OVER}+metering", [*OPEN, *RULE, LEVEL]),
-    "rule-gate-metering": (f"pricing-rule{OVER}+metering", [*PI, *RULE, LEVEL, INTEGRAL]),
-    "dpc": (f"pricing-rule{OVER}", [*OPEN, *DPC, 1.2]),
+    "rule": (f"pricing-rule{OVER}", RULE),
+    "rule-metering": (f"pricing-rule{OVER}+metering", None),
+    "rule-gate-metering": (f"pricing-rule{OVER}+metering", RULE._replace(**PI)),
+    "dpc": (f"pricing-rule{OVER}", DPC),
     "dpc-metering": (f"dpc-pcrg{OVER}+metering", None),
-    "dpc-gate-metering": (f"pricing-rule{OVER}+metering", [*PI, *DPC, 1.2, INTEGRAL]),
+    "dpc-gate-metering": (f"pricing-rule{OVER}+metering", DPC._replace(**PI)),
     "no-guidance-metering": ("max-pressure+metering", None),
     "rerouting-metering": ("rerouting-30+max-pressure+metering", None),
     **{
@@ -54,7 +64,7 @@ def main(out: Path, cells: str, demand: str, first_seed: int, seeds: int, worker
         command += ["--demand", demand, "--first-seed", str(first_seed), "--seeds", str(seeds)]
         command += ["--workers", str(workers), "--out", str(out / cell)]
         if numbers is not None:
-            command += ["--set", f'controllers."{strategy}".numbers={numbers}']
+            command += ["--set", f'controllers."{strategy}".numbers={list(numbers)}']
         subprocess.run(command, check=True)
     runs = [pd.read_csv(table).assign(cell=table.parent.name) for table in sorted(out.glob("*/runs.csv"))]
     pd.concat(runs).to_csv(out / "ablation.csv", index=False)

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from nmfd.controllers.dpc.compact import Numbers
 from nmfd.controllers.dpc.policy import FILL_TIME_S
 from nmfd.controllers.dpc.rollout import Rollout
 from nmfd.model.answer import Answer
@@ -24,7 +25,7 @@ from nmfd.types import Controls, Observation
 HORIZON, MODELS, ITERATIONS = 20, 4, 10
 PRICE_RATE, GATE_RATE = 0.3, 0.1  # steps of Adam
 START, HIGHEST = 0.2, 10.0  # prices
-COSTS = {"detour_cost": 100.0, "holding_cost": 600.0}  # s, as of DPC
+COSTS = {"detour_cost": 100.0, "holding_cost": 600.0}  # s, options of DPC, too
 
 
 class Held(nn.Module):
@@ -34,7 +35,7 @@ class Held(nn.Module):
         super().__init__()
         network = planning.network
         self.answer, self.bounds = Answer(network), (network.u_min, network.u_max)
-        self.most = level * torch.tensor([mfd.critical for mfd in network.mfds])
+        self.most = level * torch.tensor(network.critical, dtype=torch.float32)
         self.allowed = torch.tensor(network.adjacency).float()
         self.u = nn.Parameter(network.u_max * self.allowed)
         self.prices = nn.Parameter(torch.full((network.regions,), START))
@@ -63,11 +64,11 @@ class PriceMpc:
         self.reset()
 
     def reset(self, seed: int = 0):
-        self.policy = Held(self.planning, self.setup["numbers"][7])
+        self.policy = Held(self.planning, Numbers(*self.setup["numbers"]).metering)
 
     def act(self, observation: Observation) -> Controls:
         begin, k, policy = time.perf_counter(), observation.step, self.policy
-        demand = torch.cat([self.rollout.demand[k:], torch.zeros_like(self.rollout.demand)])[:HORIZON].clone()
+        demand = torch.cat([self.rollout.demand[k:], torch.zeros_like(self.rollout.demand)])[:HORIZON]
         demand[0] += torch.tensor(observation.backlog, dtype=demand.dtype) / self.planning.step
         x = torch.tensor(observation.accumulation, dtype=demand.dtype).clamp(min=0.0)
         batch = x.expand(MODELS, -1, -1), demand.unsqueeze(1).expand(-1, MODELS, -1, -1)
