@@ -1,15 +1,26 @@
 """Size and style of the house against its budget, and its picture.
 
-python .ci/house.py            print the figures; exit 1 if one is beyond its budget or the picture is out of date
+python .ci/house.py            print the figures; exit 1 if one is beyond its limit
 python .ci/house.py --draw     draw .ci/house.svg from the imports
+
+A limit is a thermometer, not a goal. Lines do not count.
+
+token: a name, operator, number or string, as tokenize gives them
+tokens per code line: without strings over several lines, over the lines that hold a token
+decisions in expressions: conditional expressions, comprehensions, assignments by :=
+decisions in statements: if, while, for, try
+tuple assignment: `a, b = x, y`
 """
 
 import ast
+import io
 import re
 import subprocess
 import sys
+import tokenize
 import tomllib
-from collections import defaultdict
+from collections import Counter, defaultdict
+from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
 
@@ -19,59 +30,102 @@ from pydantic import BaseModel
 
 ROOT = Path(__file__).parents[1]
 PICTURE = Path(__file__).with_name("house.svg")
-LINES, MODULES, TEST_LINES, WORDS, WORDS_OF_A_PAGE, COMMANDS, PARAMETERS, SETTINGS = (
-    20_000, 140, 14_000, 12_000, 900, 17, 110, 120,
-)  # fmt: skip
-LONG_PAGES = {"scenarios/settings.md"}
+TOKENS = 175_000
+TEST_TOKENS = 140_000
+TOKENS_PER_LINE = 9.5
+DECISIONS_IN_EXPRESSIONS = 0.65
+TUPLES_PER_1000_LINES = 4
+MODULES = 150
+COMMANDS = 20
+PARAMETERS = 125
+SETTINGS = 120
+WORDS_OF_A_README = 900
+DOCSTRING_LINE = 72
 ODD = re.compile(r"(Of|What|Whether|Who|Where|As|The same)\b")
+TOKEN_TYPES = (tokenize.NAME, tokenize.OP, tokenize.NUMBER, tokenize.STRING)
+EXPRESSIONS = (
+    ast.IfExp,
+    ast.NamedExpr,
+    ast.ListComp,
+    ast.SetComp,
+    ast.DictComp,
+    ast.GeneratorExp,
+)
+STATEMENTS = (ast.If, ast.While, ast.For, ast.Try)
+DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
 
 def main() -> None:
     if "--draw" in sys.argv:
         PICTURE.write_text(drawn(), encoding="utf-8")
         return
-    figures = measured()
-    for name, (value, limit) in figures.items():
-        print(f"{name:45} {value:8,} of {limit:,}")
-    problems = [
-        f"{name}: {value:,} is more than {limit:,}" for name, (value, limit) in figures.items() if value > limit
-    ]
-    problems += odd_docstrings() + long_pages()
+    problems = []
+    for name, value, limit in measured():
+        print(f"{name:45} {value:10,.6g} of {limit:,.6g}")
+        if value > limit:
+            problems.append(f"{name}: {value:,.6g} is more than {limit:,.6g}")
+    problems += odd_docstrings()
+    problems += long_pages()
     if not PICTURE.is_file() or edges_in(PICTURE.read_text(encoding="utf-8")) != arrows():
         problems.append(f"{PICTURE.name}: is out of date; run python .ci/house.py --draw")
     sys.exit("\n".join(problems) or None)
 
 
+def tracked(*patterns: str) -> list[Path]:
+    """Return the files that git tracks and that match the patterns."""
+    listed = subprocess.run(
+        ["git", "ls-files", *patterns], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    return [ROOT / name for name in listed.stdout.splitlines()]
+
+
 def sources(*folders: str) -> list[Path]:
     """Return the Python files that git tracks in these folders."""
-    listed = subprocess.run(["git", "ls-files", *folders], cwd=ROOT, capture_output=True, text=True, check=True)
-    return [ROOT / name for name in listed.stdout.split() if name.endswith(".py")]
+    return tracked(*(f"{folder}/*.py" for folder in folders))
 
 
-def measured() -> dict[str, tuple[int, int]]:
-    """Return each figure of the house with its limit."""
-    code, tests = sources("nmfd", "cosim"), sources("tests")
+def measured() -> Iterator[tuple[str, float, float]]:
+    """Yield the name, value and limit of every figure."""
+    code = sources("nmfd", "cosim")
+    counts = counted(code)
     commands = shown_commands()
-    return {
-        "lines outside the tests": (lines(code), LINES),
-        "modules outside the tests": (len(code), MODULES),
-        "lines of tests": (lines(tests), TEST_LINES),
-        "words of pages": (sum(words().values()), WORDS),
-        "commands": (len(commands), COMMANDS),
-        "parameters of all commands": (sum(len(command.params) for command in commands), PARAMETERS),
-        "declared settings": (sum(len(kind.model_fields) for kind in settings()), SETTINGS),
-    }
+    yield "tokens outside the tests", counts["tokens"], TOKENS
+    yield "tokens of tests", counted(sources("tests"))["tokens"], TEST_TOKENS
+    yield "tokens per code line", counts["dense"] / counts["code lines"], TOKENS_PER_LINE
+    decisions = counts["in expressions"] / counts["in statements"]
+    yield "decisions in expressions per one in statements", decisions, DECISIONS_IN_EXPRESSIONS
+    tuples = 1000 * counts["tuples"] / counts["lines"]
+    yield "tuple assignments per 1,000 lines", tuples, TUPLES_PER_1000_LINES
+    yield "modules outside the tests", len(code), MODULES
+    yield "commands", len(commands), COMMANDS
+    yield "parameters of all commands", sum(len(one.params) for one in commands), PARAMETERS
+    yield "declared settings", sum(len(kind.model_fields) for kind in settings()), SETTINGS
 
 
-def lines(files: list[Path]) -> int:
-    """Return the number of lines in `files`."""
-    return sum(len(file.read_text(encoding="utf-8").splitlines()) for file in files)
-
-
-def words() -> dict[str, int]:
-    """Return the number of words of every page that git tracks."""
-    listed = subprocess.run(["git", "ls-files", "*.md"], cwd=ROOT, capture_output=True, text=True, check=True)
-    return {name: len((ROOT / name).read_text(encoding="utf-8").split()) for name in listed.stdout.split()}
+def counted(files: list[Path]) -> Counter:
+    """Return counts of tokens, lines and idioms in Python files."""
+    counts: Counter = Counter()
+    for file in files:
+        text = file.read_text(encoding="utf-8")
+        counts["lines"] += len(text.splitlines())
+        code_lines = set()
+        for token in tokenize.generate_tokens(io.StringIO(text).readline):
+            if token.type not in TOKEN_TYPES:
+                continue
+            counts["tokens"] += 1
+            on_one_line = token.start[0] == token.end[0]
+            if on_one_line or token.type != tokenize.STRING:
+                counts["dense"] += 1
+                code_lines.add(token.start[0])
+        counts["code lines"] += len(code_lines)
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, EXPRESSIONS):
+                counts["in expressions"] += 1
+            elif isinstance(node, STATEMENTS):
+                counts["in statements"] += 1
+            elif isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Tuple):
+                counts["tuples"] += isinstance(node.value, ast.Tuple)
+    return counts
 
 
 def shown_commands() -> list:
@@ -83,7 +137,8 @@ def shown_commands() -> list:
 
 
 def settings() -> list[type[BaseModel]]:
-    """Return every pydantic model of the house once; a field that a subclass inherits counts there only."""
+    """Return every pydantic model of the house once; a field that a subclass inherits counts there
+    only."""
     graph = grimp.build_graph("nmfd", "cosim", cache_dir=None)
     for module in graph.modules:
         __import__(module) if not module.endswith("__main__") else None
@@ -95,26 +150,30 @@ def settings() -> list[type[BaseModel]]:
 
 
 def odd_docstrings() -> list[str]:
-    """Return the docstrings that begin with a word that no verb or noun follows."""
+    """Return the docstrings whose first line is long, or begins without a verb or noun."""
     problems = []
     for file in sources("nmfd", "cosim"):
-        tree = ast.parse(file.read_text(encoding="utf-8"))
-        kinds = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
-        for node in (node for node in ast.walk(tree) if isinstance(node, kinds)):
-            text = ast.get_docstring(node) or ""
-            if ODD.match(text):
-                line = getattr(node, "lineno", 1)
-                problems.append(f"{file.relative_to(ROOT)}:{line}: begins with {ODD.match(text)[0]!r}")
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            text = ast.get_docstring(node) if isinstance(node, DOCUMENTED) else None
+            if not text:
+                continue
+            where = f"{file.relative_to(ROOT)}:{getattr(node, 'lineno', 1)}"
+            first = text.splitlines()[0]
+            if ODD.match(first):
+                problems.append(f"{where}: begins with {ODD.match(first)[0]!r}")
+            if len(first) > DOCSTRING_LINE:
+                problems.append(f"{where}: first line of {len(first)} characters")
     return problems
 
 
 def long_pages() -> list[str]:
-    """Return the pages that have more words than a page may have."""
-    return [
-        f"{name}: {count} words, more than {WORDS_OF_A_PAGE}"
-        for name, count in words().items()
-        if count > WORDS_OF_A_PAGE and name not in LONG_PAGES
-    ]
+    """Return the READMEs of packages and folders that have too many words."""
+    problems = []
+    for page in tracked("*README.md"):
+        count = len(page.read_text(encoding="utf-8").split())
+        if count > WORDS_OF_A_README and page.parent.name != "reference":
+            problems.append(f"{page.relative_to(ROOT)}: {count} words of {WORDS_OF_A_README}")
+    return problems
 
 
 def room(module: str) -> str:
@@ -123,7 +182,8 @@ def room(module: str) -> str:
 
 
 def arrows() -> set[tuple[str, str]]:
-    """Return the imports between rooms, without those that a longer way implies (the transitive reduction)."""
+    """Return the imports between rooms, without those that a longer way implies (the transitive
+    reduction)."""
     graph = grimp.build_graph("nmfd", "cosim", exclude_type_checking_imports=True, cache_dir=None)
     inside, below = floors(), defaultdict(set)
     for one in graph.modules:
@@ -147,10 +207,15 @@ def floors() -> dict[str, int]:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     contracts = project["tool"]["importlinter"]["contracts"]
     layers = [contract["layers"] for contract in contracts if contract["type"] == "layers"]
-    ordered = [re.split(r"\s*[|:]\s*", layer) for layer in chain.from_iterable(reversed(layers[::-1][::-1]))]
+    ordered = [
+        re.split(r"\s*[|:]\s*", layer)
+        for layer in chain.from_iterable(reversed(layers[::-1][::-1]))
+    ]
     cosim = [layer for layer in ordered if layer[0].startswith("cosim")]
     nmfd = [layer for layer in ordered if layer[0].startswith("nmfd")]
-    return {name: floor for floor, layer in enumerate([*nmfd[::-1], *cosim[::-1]]) for name in layer}
+    return {
+        name: floor for floor, layer in enumerate([*nmfd[::-1], *cosim[::-1]]) for name in layer
+    }
 
 
 def edges_in(picture: str) -> set[tuple[str, str]]:
@@ -169,10 +234,17 @@ def drawn() -> str:
             position[name] = ((index + 1) / (len(rooms) + 1), floor)
             colour = "#dbe9f6" if name.startswith("nmfd") else "#fde5cc"
             box = {"boxstyle": "round,pad=0.35", "facecolor": colour, "edgecolor": "#555555"}
-            axes.text(*position[name], name, ha="center", va="center", fontsize=9, bbox=box, zorder=3)
+            axes.text(
+                *position[name], name, ha="center", va="center", fontsize=9, bbox=box, zorder=3
+            )
     for index, (one, other) in enumerate(sorted(arrows())):
         bend = 0.05 * (-1) ** index * min(abs(place[one] - place[other]) - 1, 4)
-        style = {"arrowstyle": "->", "color": "#888888", "lw": 0.9, "connectionstyle": f"arc3,rad={bend}"}
+        style = {
+            "arrowstyle": "->",
+            "color": "#888888",
+            "lw": 0.9,
+            "connectionstyle": f"arc3,rad={bend}",
+        }
         arrow = axes.annotate("", position[other], position[one], arrowprops=style, zorder=1)
         arrow.arrow_patch.set_gid(f"arrow {one} {other}")
     axes.set(xlim=(0, 1), ylim=(-0.7, max(place.values()) + 0.7))

@@ -1,9 +1,10 @@
-"""The mutation score of the modules that [tool.mutmut] in pyproject.toml names, from a seeded sample of their mutants.
+"""The mutation score of the modules that [tool.mutmut] in pyproject.toml names, from a seeded
+sample of their mutants.
 
     python .ci/mutation.py [--sample 20] [--seed 0] [--least 0.8] [MODULE ...]
 
-A mutant counts as noticed if a test fails or runs into the time limit. `mutmut show NAME` shows one that was not.
-`mutmut run` runs all of them, for hours.
+A mutant counts as noticed if a test fails or runs into the time limit. `mutmut show NAME` shows one
+that was not. `mutmut run` runs all of them, for hours.
 """
 
 import argparse
@@ -28,11 +29,17 @@ def mutants(module: Path) -> list[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("modules", nargs="*", metavar="MODULE", help="such as guidance; by default all")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "modules", nargs="*", metavar="MODULE", help="such as guidance; by default all"
+    )
     parser.add_argument("--sample", type=int, default=20, help="mutants of each module")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--least", type=float, default=0.8, help="the score that each module must have")
+    parser.add_argument(
+        "--least", type=float, default=0.8, help="the score that each module must have"
+    )
     order = parser.parse_args()
     project = tomllib.loads(Path("pyproject.toml").read_text(encoding="utf-8"))
     every = [Path(file) for file in project["tool"]["mutmut"]["only_mutate"]]
@@ -40,18 +47,30 @@ def main() -> None:
     drawn = {}
     for module in modules:
         names = mutants(module)
-        drawn[module] = random.Random(f"{order.seed} {module}").sample(names, min(order.sample, len(names)))
+        drawn[module] = random.Random(f"{order.seed} {module}").sample(
+            names, min(order.sample, len(names))
+        )
     shutil.rmtree("mutants", ignore_errors=True)
-    command = ["mutmut", "run", "--max-children", "2", *(name for names in drawn.values() for name in names)]
+    command = [
+        "mutmut",
+        "run",
+        "--max-children",
+        "2",
+        *(name for names in drawn.values() for name in names),
+    ]
     with open("mutation.log", "wb") as log:  # its progress would fill the screen
         if subprocess.run(command, stdout=log, stderr=subprocess.STDOUT).returncode:
             sys.exit(f"mutmut failed: see {log.name}")
     weak = []
     for module, names in drawn.items():
-        codes = json.loads(Path(f"mutants/{module}.meta").read_text(encoding="utf-8"))["exit_code_by_key"]
+        codes = json.loads(Path(f"mutants/{module}.meta").read_text(encoding="utf-8"))[
+            "exit_code_by_key"
+        ]
         missed = [name for name in names if codes[name] == SURVIVED or codes[name] in NO_TESTS]
         score = 1.0 - len(missed) / len(names)
-        print(f"{score:4.0%} of {len(names)} mutants noticed: {module}", *sorted(missed), sep="\n    ")
+        print(
+            f"{score:4.0%} of {len(names)} mutants noticed: {module}", *sorted(missed), sep="\n    "
+        )
         weak += [module.stem] * (score < order.least)
     if weak:
         sys.exit(f"fewer than {order.least:.0%} of the mutants were noticed in {', '.join(weak)}")

@@ -1,4 +1,5 @@
-"""Page of all settings, from their declarations: python .ci/settings.py writes scenarios/settings.md."""
+"""Page of all settings, from their declarations: python .ci/settings.py writes
+scenarios/settings.md."""
 
 from pathlib import Path
 from typing import Any
@@ -44,7 +45,12 @@ def section(kind: type[BaseModel], name: str) -> list[str]:
     parts = [rows(schema, f"`[{name}]`" if name else "Top level")]
     for key, value in schema["properties"].items():
         inner = value.get("items", {}).get("$ref") or next(
-            (part.get("items", {}).get("$ref") for part in value.get("anyOf", []) if "items" in part), None
+            (
+                part.get("items", {}).get("$ref")
+                for part in value.get("anyOf", [])
+                if "items" in part
+            ),
+            None,
         )
         if reference := inner or value.get("$ref"):
             title = f"`[[{key}]]`" if inner else f"`[{key}]`"
@@ -54,16 +60,27 @@ def section(kind: type[BaseModel], name: str) -> list[str]:
 
 def rows(schema: dict[str, Any], title: str) -> list[str]:
     """Return a heading and one row per key."""
-    lines = ["", f"### {title}", "", "| key | default | unit, range | meaning |", "|---|---|---|---|"]
+    lines = [
+        "",
+        f"### {title}",
+        "",
+        "| key | default | unit, range | meaning |",
+        "|---|---|---|---|",
+    ]
     for key, value in schema.get("properties", {}).items():
-        default = "**required**" if key in schema.get("required", ()) else f"`{value.get('default')}`"
+        default = (
+            "**required**" if key in schema.get("required", ()) else f"`{value.get('default')}`"
+        )
         lines.append(f"| `{key}` | {default} | {limits(value)} | {value.get('description', '')} |")
     return lines
 
 
 def limits(value: dict[str, Any]) -> str:
     """Return unit and range of a setting."""
-    value = {**value, **next((part for part in value.get("anyOf", []) if part.get("type") != "null"), {})}
+    value = {
+        **value,
+        **next((part for part in value.get("anyOf", []) if part.get("type") != "null"), {}),
+    }
     if "enum" in value:
         return ", ".join(value["enum"])
     low = value.get("minimum", value.get("exclusiveMinimum"))

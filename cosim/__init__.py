@@ -5,8 +5,9 @@
     >>> result.accumulation.shape  # states, regions, destinations; as a table: result.data.accumulation.to_dataframe()
     (3, 5, 5)
 
-`run` is one closed loop in SUMO, `read_run` reads one of a run folder, `City` shows a city, `list` what is shipped.
-Names here are imported at their first use; `cosim.api` has a function for every command.
+`run` is one closed loop in SUMO, `read_run` reads one of a run folder, `City` shows a city, `list`
+what is shipped. Names here are imported at their first use; `cosim.api` has a function for every
+command.
 """
 
 from collections.abc import Iterable
@@ -22,7 +23,18 @@ if TYPE_CHECKING:
     from cosim.report.city import City
     from nmfd.types import Result
 
-__all__ = ["City", "Result", "Settings", "SumoPlant", "evaluate", "list", "read_run", "run", "settings", "tune"]
+__all__ = [
+    "City",
+    "Result",
+    "Settings",
+    "SumoPlant",
+    "evaluate",
+    "list",
+    "read_run",
+    "run",
+    "settings",
+    "tune",
+]
 _PLACES = {
     **dict.fromkeys(("evaluate", "run", "tune"), "cosim.api"),
     "read_run": "cosim.evaluation.results",

@@ -58,8 +58,10 @@ def run(
     tripinfo: file for SUMO's own output of trips; all others are options of SUMO in [sumo.options]
     progress: None for a bar, False for none, or a function of done and total control intervals
 
-    The result has the arrays of cosim.plant.record.RECORD, and the facts of cosim.evaluation.simulate as attributes.
-    Raises: InputError for a wrong name, file or value, RuntimeError if another simulation is open in this process
+    The result has the arrays of cosim.plant.record.RECORD, and the facts of
+    cosim.evaluation.simulate as attributes.
+    Raises: InputError for a wrong name, file or value, RuntimeError if another simulation is open
+    in this process
 
         >>> result = cosim.run("grid7_peak", "pi-gating+rerouting-30", seed=3, steps=2)
         >>> result.accumulation.shape, result.crossings.shape
@@ -71,7 +73,9 @@ def run(
         raise InputError(f"demand: expected a number above 0 up to 10, got {demand:g} instead")
     policy, tripinfo = (None if file is None else Path(file) for file in (policy, tripinfo))
     with watched(strategy.name, progress) as show:
-        job = Simulation(with_demand(scenario, steps=steps), strategy, seed, demand, policy, tripinfo)
+        job = Simulation(
+            with_demand(scenario, steps=steps), strategy, seed, demand, policy, tripinfo
+        )
         return simulate(job, progress=show)
 
 
@@ -109,7 +113,13 @@ def run_controllers(
         for run in there
         if run.signal_violations
     ]
-    return "\n".join([statistics.text(finished.rows), *wrong, f"Written to {out}; a page about it: cosim report {out}"])
+    return "\n".join(
+        [
+            statistics.text(finished.rows),
+            *wrong,
+            f"Written to {out}; a page about it: cosim report {out}",
+        ]
+    )
 
 
 def demo(out: Path, *, seed: int = 1000) -> str:
@@ -128,7 +138,9 @@ def demo(out: Path, *, seed: int = 1000) -> str:
         page = html.write_page(out / "report.html", [results.read(out)], seed=seed).resolve()
     if _has_screen():
         webbrowser.open(page.as_uri())
-    return "\n".join([*lines, f"Both side by side: {page}; next: cosim watch {DEMO} --controller pi-gating"])
+    return "\n".join(
+        [*lines, f"Both side by side: {page}; next: cosim watch {DEMO} --controller pi-gating"]
+    )
 
 
 def watch(
@@ -141,14 +153,17 @@ def watch(
     port: int = 0,
     gui: bool = False,
 ) -> str:
-    """Show runs on a live page, or one run in sumo-gui, until they end and the page is closed; return their outcomes.
+    """Show runs on a live page, or one run in sumo-gui, until they end and the page is closed;
+    return their outcomes.
 
     port: of the page, any that is free if 0; the other arguments as in `run_controllers`
     """
     from cosim.view import live
 
     loaded = load_scenario(scenario, settings)
-    jobs = [Simulation(loaded, strategy, seed, demand) for strategy in _reference_first(controllers)]
+    jobs = [
+        Simulation(loaded, strategy, seed, demand) for strategy in _reference_first(controllers)
+    ]
     if gui:
         try:
             with watched("watch", None) as show:
@@ -179,9 +194,11 @@ def evaluate(
     check: int | None = None,
     out: Path | None = None,
 ) -> str:
-    """Run controllers x seeds x demand levels in SUMO, write tables and figures, and return the tables as text.
+    """Run controllers x seeds x demand levels in SUMO, write tables and figures, and return the
+    tables as text.
 
-    scenario: a scenario, or the file of a suite (cosim.evaluation.evaluate), which has its own seeds and levels
+    scenario: a scenario, or the file of a suite (cosim.evaluation.evaluate), which has its own
+        seeds and levels
     controllers: strategies, or patterns such as "dpc-*"
     seeds: 2000 to 2009 if None
     settings: see nmfd.load_scenario; of every scenario of a suite
@@ -206,7 +223,9 @@ def evaluate(
     runs = evaluation.plan(chosen, strategies, seeds, policies)
     if check is not None:
         lines = evaluation.check(runs, out, check, workers=workers)
-        return "\n".join(lines) or f"{min(check, len(runs))} runs of {out} done again: no difference"
+        return (
+            "\n".join(lines) or f"{min(check, len(runs))} runs of {out} done again: no difference"
+        )
     with locked(out):
         rows = evaluation.evaluate(runs, out, workers=workers, scheduler=scheduler)
         text = []
@@ -215,11 +234,14 @@ def evaluate(
             figures.draw_all(finished)
             text += [each] * (len(chosen) > 1) + [statistics.text(finished.rows)]
     raise_failures(rows)
-    return "\n".join([*text, f"Written to {out}: see evaluate.md and the figures; a page: cosim report {out}"])
+    return "\n".join(
+        [*text, f"Written to {out}: see evaluate.md and the figures; a page: cosim report {out}"]
+    )
 
 
 def compare(folder: Path) -> str:
-    """Compare finished runs with what the regional model predicts; write a table and figures beside them."""
+    """Compare finished runs with what the regional model predicts; write a table and figures beside
+    them."""
     finished = results.read(folder)
     with locked(folder):
         rows = model_validation.compare(finished)
@@ -260,24 +282,32 @@ def tune(
     loaded = with_demand(load_scenario(scenario, settings), steps=steps)
     numbers = range(1000, 1000 + seeds) if isinstance(seeds, int) else list(seeds)
     out = out or Path("runs") / f"{file_name(loaded.name)}-tune"
-    order = tuning.Tuning(scenario=loaded, strategy=parse(controller), options=options, seeds=numbers, out=out, **how)
+    order = tuning.Tuning(
+        scenario=loaded, strategy=parse(controller), options=options, seeds=numbers, out=out, **how
+    )
     tuning.tune(order, workers=workers)
     best = (out / "tune.toml").read_text(encoding="utf-8")
     return f"{best}Written to {out}: see tune.csv; to use the options, copy tune.toml into the scenario.toml"
 
 
 def get(name: str | None, out: Path | None = None) -> str:
-    """Download a published city to a folder, cities/NAME if None; without a name list the cities."""
+    """Download a published city to a folder, cities/NAME if None; without a name list the
+    cities."""
     return cities.listed() if name is None else cities.get(name, out or Path("cities") / name)
 
 
 def _reference_first(controllers: Sequence[str]) -> list[Strategy]:
-    """Return the strategies, first no control, else the last one: the others are compared with it."""
+    """Return the strategies, first no control, else the last one: the others are compared with
+    it."""
     strategies = [parse(name) for name in reversed(dict.fromkeys(controllers))]
     return sorted(strategies, key=lambda strategy: strategy.name != REFERENCE)
 
 
 def _has_screen() -> bool:
     """Return True if a browser may be opened: there is a screen and a terminal."""
-    screen = not sys.platform.startswith("linux") or "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
+    screen = (
+        not sys.platform.startswith("linux")
+        or "DISPLAY" in os.environ
+        or "WAYLAND_DISPLAY" in os.environ
+    )
     return screen and sys.stdout.isatty()

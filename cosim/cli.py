@@ -37,13 +37,25 @@ CONTROLLER = click.option(
     "(signals), rerouting-N and compliance-N (percent of drivers), guided, guidance-period-N (s), "
     "metering, estimate.",
 )
-AGAINST = click.option("--against", metavar="NAME[+...]", help="Second controller, run on the same trips.")
-STEPS = click.option("--steps", type=COUNT, help="Number of control intervals. [default: as in the scenario]")
-DEMAND = click.option("--demand", type=LEVEL, default=1.0, help="Factor that multiplies the demand.")
-WORKERS = click.option(
-    "--workers", type=COUNT, default=lambda: os.cpu_count() or 1, show_default="one per core", help="Parallel runs."
+AGAINST = click.option(
+    "--against", metavar="NAME[+...]", help="Second controller, run on the same trips."
 )
-LEVELS = click.option("--demand", "levels", type=listed(LEVEL), default="1", help="Factors that multiply the demand.")
+STEPS = click.option(
+    "--steps", type=COUNT, help="Number of control intervals. [default: as in the scenario]"
+)
+DEMAND = click.option(
+    "--demand", type=LEVEL, default=1.0, help="Factor that multiplies the demand."
+)
+WORKERS = click.option(
+    "--workers",
+    type=COUNT,
+    default=lambda: os.cpu_count() or 1,
+    show_default="one per core",
+    help="Parallel runs.",
+)
+LEVELS = click.option(
+    "--demand", "levels", type=listed(LEVEL), default="1", help="Factors that multiply the demand."
+)
 
 
 def span(text: str) -> tuple[float, float]:
@@ -89,20 +101,27 @@ def demo(out: Path) -> None:
 @seed_option("Seed of trips, drivers and guidance.")
 @STEPS
 @DEMAND
-@click.option("--policy", type=FILE, metavar="FILE", help="Policy file of --controller. [default: SCENARIO/NAME.pt]")
+@click.option(
+    "--policy",
+    type=FILE,
+    metavar="FILE",
+    help="Policy file of --controller. [default: SCENARIO/NAME.pt]",
+)
 @out_option("runs/SCENARIO-TIME")
 def run(scenario: Path, controller: str, against: str | None, **options: Any) -> None:
     """Run one controller, or two on the same trips.
 
-    SCENARIO is a name that `nmfd show` lists, or a folder with a scenario.toml; its network must name a SUMO city.
-    Prints a table and writes results, tables and figures.
+    SCENARIO is a name that `nmfd show` lists, or a folder with a scenario.toml; its network must
+    name a SUMO city. Prints a table and writes results, tables and figures.
 
     \b
     Examples:
       cosim run grid7_peak --controller dpc-pcrg --against no-control
       cosim run grid7_peak --controller pi-gating --set controllers.pi-gating.kp=2 --set sumo.chain_limit=0.4
     """
-    click.echo(cosim.api.run_controllers(scenario, list(filter(None, (controller, against))), **options))
+    click.echo(
+        cosim.api.run_controllers(scenario, list(filter(None, (controller, against))), **options)
+    )
 
 
 @main.command()
@@ -111,7 +130,9 @@ def run(scenario: Path, controller: str, against: str | None, **options: Any) ->
 @AGAINST
 @seed_option("Seed of trips, drivers and guidance.")
 @DEMAND
-@click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port of the page; 0: any free port.")
+@click.option(
+    "--port", type=click.IntRange(0, 65535), default=0, help="Port of the page; 0: any free port."
+)
 @click.option("--gui", is_flag=True, help="Open sumo-gui instead of a page, with one run.")
 def watch(scenario: Path, controller: str, against: str | None, gui: bool, **options: Any) -> None:
     """Watch runs on a live page with map and curves.
@@ -124,34 +145,52 @@ def watch(scenario: Path, controller: str, against: str | None, gui: bool, **opt
     """
     if gui and against:
         raise InputError("--gui: shows one run; omit --against")
-    click.echo(cosim.api.watch(scenario, list(filter(None, (controller, against))), gui=gui, **options))
+    click.echo(
+        cosim.api.watch(scenario, list(filter(None, (controller, against))), gui=gui, **options)
+    )
 
 
 @main.command()
 @SCENARIO
 @CONTROLLERS
 @click.option("--seeds", type=COUNT, default=10, help="Runs per controller and demand level.")
-@click.option("--first-seed", type=SEED, default=2000, help="First seed; seeds below 2000 are for development.")
+@click.option(
+    "--first-seed",
+    type=SEED,
+    default=2000,
+    help="First seed; seeds below 2000 are for development.",
+)
 @LEVELS
 @STEPS
 @POLICIES
 @WORKERS
-@click.option("--scheduler", metavar="ADDRESS", help="Dask scheduler for the runs, such as tls://host:8786.")
-@click.option("--check", type=COUNT, metavar="N", help="Only repeat N random runs of --out, and compare.")
+@click.option(
+    "--scheduler", metavar="ADDRESS", help="Dask scheduler for the runs, such as tls://host:8786."
+)
+@click.option(
+    "--check", type=COUNT, metavar="N", help="Only repeat N random runs of --out, and compare."
+)
 @out_option("runs/SCENARIO-evaluate")
-def evaluate(scenario: Path, controllers: tuple[str, ...], seeds: int, first_seed: int, **options: Any) -> None:
+def evaluate(
+    scenario: Path, controllers: tuple[str, ...], seeds: int, first_seed: int, **options: Any
+) -> None:
     """Compare controllers over seeds and demand levels.
 
-    Writes tables and figures; with several demand levels, also up to which level each controller serves all trips.
-    If --out is an existing run folder, only missing runs are done. SCENARIO may be a suite: a TOML file with
-    seeds = [2000, 2001] and a table [scenarios] of demand levels, such as grid7_peak = [0.8, 1.0].
+    Writes tables and figures; with several demand levels, also up to which level each controller
+    serves all trips. If --out is an existing run folder, only missing runs are done. SCENARIO may
+    be a suite: a TOML file with seeds = [2000, 2001] and a table [scenarios] of demand levels, such
+    as grid7_peak = [0.8, 1.0].
 
     \b
     Examples:
       cosim evaluate grid7_peak --controllers no-control,pi-gating,dpc-pc --workers 4
       cosim evaluate grid7_peak --controllers no-control,dpc-pc --demand 0.8,1.0,1.3 --out runs/levels
     """
-    click.echo(cosim.api.evaluate(scenario, controllers, seeds=range(first_seed, first_seed + seeds), **options))
+    click.echo(
+        cosim.api.evaluate(
+            scenario, controllers, seeds=range(first_seed, first_seed + seeds), **options
+        )
+    )
 
 
 @main.command()
@@ -159,8 +198,9 @@ def evaluate(scenario: Path, controllers: tuple[str, ...], seeds: int, first_see
 def compare(folder: Path) -> None:
     """Compare finished runs with the regional model.
 
-    RUN is a folder of `cosim run` or `cosim evaluate`. The regional model gets the recorded departures and controls.
-    Writes a table of all runs, and a figure of the first run of every controller, into RUN.
+    RUN is a folder of `cosim run` or `cosim evaluate`. The regional model gets the recorded
+    departures and controls. Writes a table of all runs, and a figure of the first run of every
+    controller, into RUN.
 
     \b
     Example:
@@ -171,8 +211,12 @@ def compare(folder: Path) -> None:
 
 @main.command()
 @click.argument("folders", type=FOLDER, metavar="RUN...", nargs=-1, required=True)
-@click.option("--seed", type=SEED, help="Seed of the runs on the map. [default: the first that both have]")
-@click.option("--out", type=FILE, metavar="FILE", help="Page. [default: report.html in the first RUN]")
+@click.option(
+    "--seed", type=SEED, help="Seed of the runs on the map. [default: the first that both have]"
+)
+@click.option(
+    "--out", type=FILE, metavar="FILE", help="Page. [default: report.html in the first RUN]"
+)
 def report(folders: tuple[Path, ...], **options: Any) -> None:
     """Write one HTML page about finished runs.
 
@@ -197,16 +241,25 @@ def report(folders: tuple[Path, ...], **options: Any) -> None:
     callback=parsed("KEY=LOW:HIGH, such as kp=0.1:10", span),
     help="Option of the controller and its range; KEY[0], KEY[1] for numbers of a list. May be repeated.",
 )
-@click.option("--candidates", "trials", type=COUNT, default=40, help="Candidates; the first has the scenario's values.")
-@click.option("--seeds", type=COUNT, default=2, help="Runs per candidate and level, from seed 1000.")
+@click.option(
+    "--candidates",
+    "trials",
+    type=COUNT,
+    default=40,
+    help="Candidates; the first has the scenario's values.",
+)
+@click.option(
+    "--seeds", type=COUNT, default=2, help="Runs per candidate and level, from seed 1000."
+)
 @LEVELS
 @WORKERS
 @out_option("runs/SCENARIO-tune")
 def tune(scenario: Path, controller: str, **how: Any) -> None:
     """Search the options of a controller by CMA-ES.
 
-    Minimises the geometric mean of the total time spent over seeds and demand levels. Writes tune.csv, and tune.toml
-    with the best options. The same command continues the search, also with more --candidates.
+    Minimises the geometric mean of the total time spent over seeds and demand levels. Writes
+    tune.csv, and tune.toml with the best options. The same command continues the search, also with
+    more --candidates.
 
     \b
     Example:
@@ -231,22 +284,49 @@ def get(name: str | None) -> None:
 
 @main.command(name="import")
 @click.argument("source", type=FILE, required=False, metavar="SUMOCFG|NET|OSM")
-@click.option("--bbox", metavar="W,S,E,N", help="Box in degrees to download from OpenStreetMap, instead of a file.")
-@click.option("--regions", required=True, metavar="N|CSV", help="Number of regions to find, or a table edge,region.")
-@click.option("--routes", type=FILE, multiple=True, metavar="FILE", help="File of vehicles or flows. May be repeated.")
-@click.option("--demand", type=click.Choice(["peak"]), help="Generate a morning peak for a city without demand.")
-@click.option("--level", type=LEVEL, default=1.0, help="Factor that multiplies the vehicles, or the peak.")
+@click.option(
+    "--bbox",
+    metavar="W,S,E,N",
+    help="Box in degrees to download from OpenStreetMap, instead of a file.",
+)
+@click.option(
+    "--regions",
+    required=True,
+    metavar="N|CSV",
+    help="Number of regions to find, or a table edge,region.",
+)
+@click.option(
+    "--routes",
+    type=FILE,
+    multiple=True,
+    metavar="FILE",
+    help="File of vehicles or flows. May be repeated.",
+)
+@click.option(
+    "--demand",
+    type=click.Choice(["peak"]),
+    help="Generate a morning peak for a city without demand.",
+)
+@click.option(
+    "--level", type=LEVEL, default=1.0, help="Factor that multiplies the vehicles, or the peak."
+)
 @click.option("--mesoscopic", is_flag=True, help="Simulate with SUMO's queue model.")
 @click.option("--begin", metavar="TIME", help="Start in s or h:m:s. [default: as in the sumocfg]")
-@click.option("--end", metavar="TIME", help="End of departures in s or h:m:s. [default: as in the sumocfg]")
+@click.option(
+    "--end", metavar="TIME", help="End of departures in s or h:m:s. [default: as in the sumocfg]"
+)
 @seed_option()
-@click.option("--seeds", type=COUNT, default=3, help="Runs without control, whose densities are averaged.")
-@click.option("--out", type=FOLDER, required=True, metavar="DIR", help="New folder, such as networks/mycity.")
+@click.option(
+    "--seeds", type=COUNT, default=3, help="Runs without control, whose densities are averaged."
+)
+@click.option(
+    "--out", type=FOLDER, required=True, metavar="DIR", help="New folder, such as networks/mycity."
+)
 def import_(source: Path | None, bbox: str | None, **options: Any) -> None:
     """Make a network and a scenario of any SUMO city.
 
-    Finds regions and gateways and counts demand by pair of regions. Vehicles keep routes, departures and types. The
-    scenario goes to scenarios/NAME, beside the folder networks.
+    Finds regions and gateways and counts demand by pair of regions. Vehicles keep routes,
+    departures and types. The scenario goes to scenarios/NAME, beside the folder networks.
 
     \b
     Examples:
@@ -261,19 +341,32 @@ def import_(source: Path | None, bbox: str | None, **options: Any) -> None:
 
 @main.command()
 @SCENARIO
-@click.option("--levels", type=listed(LEVEL), default="0.6,0.8,1", help="Factors that multiply the demand.")
+@click.option(
+    "--levels", type=listed(LEVEL), default="0.6,0.8,1", help="Factors that multiply the demand."
+)
 @click.option("--seeds", type=COUNT, default=2, help="Loading runs per level, from seed 1000.")
-@click.option("--with", "city", metavar="A+...", help="Options of the city; own: none. [default: own, then guided]")
-@click.option("--network", type=FOLDER, metavar="DIR", help="Folder for the model. [default: the scenario's network]")
+@click.option(
+    "--with",
+    "city",
+    metavar="A+...",
+    help="Options of the city; own: none. [default: own, then guided]",
+)
+@click.option(
+    "--network",
+    type=FOLDER,
+    metavar="DIR",
+    help="Folder for the model. [default: the scenario's network]",
+)
 @click.option("--protect", is_flag=True, help="Write the regions to protect into the scenario.")
 @WORKERS
 @out_option("runs/SCENARIO-identify", "Folder of loading runs, samples and figures.")
 def identify(scenario: Path, **options: Any) -> None:
     """Fit the regional model of a SUMO city.
 
-    Loads the city with multiples of its demand, without control and with random gating, and writes network.toml.
-    Without --with it fits two models: drivers on their own routes, then guided drivers. Proposes regions to protect.
-    Policies trained on the old model do not fit the new one. SCENARIO may be the folder of an imported network.
+    Loads the city with multiples of its demand, without control and with random gating, and writes
+    network.toml. Without --with it fits two models: drivers on their own routes, then guided
+    drivers. Proposes regions to protect. Policies trained on the old model do not fit the new one.
+    SCENARIO may be the folder of an imported network.
 
     \b
     Example:

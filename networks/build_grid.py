@@ -2,7 +2,8 @@
 
     python networks/build_grid.py networks/grid7
 
-city.toml -> plain XML -> netconvert -> city.net.xml and regions.csv beside it, the same bytes for the same recipe.
+city.toml -> plain XML -> netconvert -> city.net.xml and regions.csv beside it, the same bytes for
+the same recipe.
 """
 
 import re
@@ -18,7 +19,8 @@ from nmfd.runs.files import temporary_folder
 
 YELLOW_S, ALL_RED_S, LEFT_GREEN_S = 3, 0, 6  # of the signals; the last one of protected left turns
 JUNCTION_RADIUS_M = 10.0  # that netconvert cuts off a street
-# (lanes, movements, every movement has lanes of its own) -> lanes of each movement, numbered from the right
+# (lanes, movements, every movement has lanes of its own) -> lanes of each movement, numbered from
+# the right
 LANES = {
     (4, "rsl", True): {"r": [0], "s": [1, 2], "l": [3]},
     (3, "rsl", True): {"r": [0], "s": [1], "l": [2]},
@@ -46,21 +48,27 @@ def main(folder: Path) -> None:
 
 
 def read_nodes(table: dict) -> dict[str, SimpleNamespace]:
-    """Return the junctions at (x, y) [m] by name, of the fine grid (centre) or the lattice around it."""
+    """Return the junctions at (x, y) [m] by name, of the fine grid (centre) or the lattice around
+    it."""
     centre, outer, nodes = table["centre"], table["outer"], {}
     for i, x in enumerate(centre["x"]):
         for j, y in enumerate(centre["y"]):
-            nodes[f"c{i}{j}"] = SimpleNamespace(id=f"c{i}{j}", x=x, y=y, region=centre["region"], centre=True)
+            nodes[f"c{i}{j}"] = SimpleNamespace(
+                id=f"c{i}{j}", x=x, y=y, region=centre["region"], centre=True
+            )
     picture = [line.split() for line in outer["regions"].splitlines() if line.strip()][::-1]
     for j, y in enumerate(outer["y"]):
         for i, x in enumerate(outer["x"]):
             if picture[j][i] != ".":
-                nodes[f"o{i}{j}"] = SimpleNamespace(id=f"o{i}{j}", x=x, y=y, region=int(picture[j][i]), centre=False)
+                nodes[f"o{i}{j}"] = SimpleNamespace(
+                    id=f"o{i}{j}", x=x, y=y, region=int(picture[j][i]), centre=False
+                )
     return nodes
 
 
 def streets_of(nodes: dict) -> list[tuple[str, str]]:
-    """Return both directions between neighbours; lines of the lattice may go on as streets of the centre."""
+    """Return both directions between neighbours; lines of the lattice may go on as streets of the
+    centre."""
     streets = []
     for along, across in (("x", "y"), ("y", "x")):
         lines: dict[float, list] = {}
@@ -82,7 +90,8 @@ class Grid:
 
     def movements(self, start: str, end: str) -> dict[str, str]:
         """Return {"r", "s" or "l": next node} at the end of a street, without turning back."""
-        # A radial is entered straight ahead only, so that no queue before it stands on the ring round the centre.
+        # A radial is entered straight ahead only, so that no queue before it stands on the ring
+        # round the centre.
         nodes, turns = self.nodes, {}
         heading = _heading(nodes[start], nodes[end])
         for a, b in self.streets:
@@ -104,7 +113,13 @@ class Grid:
         nodes, centre = self.nodes, self.table["centre"]
         legs = {name: sum(a == name for a, _ in self.streets) for name in nodes}
         node_rows = [
-            _row("node", id=n.id, x=float(n.x), y=float(n.y), type="traffic_light" if legs[n.id] > 2 else "priority")
+            _row(
+                "node",
+                id=n.id,
+                x=float(n.x),
+                y=float(n.y),
+                type="traffic_light" if legs[n.id] > 2 else "priority",
+            )
             for n in nodes.values()
         ]
         edge_rows, connection_rows, region_of, first, last, lanes = [], [], {}, {}, {}, {}
@@ -124,7 +139,11 @@ class Grid:
             else:
                 pieces = [(name, a, b, 4 if self.leads_in(a, b) else 3)]
             for piece, begin, finish, count in pieces:
-                edge_rows.append(_row("edge", id=piece, **{"from": begin}, to=finish, numLanes=count, speed=speed))
+                edge_rows.append(
+                    _row(
+                        "edge", id=piece, **{"from": begin}, to=finish, numLanes=count, speed=speed
+                    )
+                )
                 region_of[piece] = end.region if start.centre and not end.centre else start.region
                 lanes[piece] = count
             first[a, b], last[a, b] = pieces[0][0], pieces[-1][0]
@@ -133,10 +152,14 @@ class Grid:
             own = self.leads_in(a, b) or (nodes[b].centre and not nodes[a].centre)
             for turn, lanes_of_turn in LANES[lanes[source], "".join(turns), own].items():
                 target = first[b, turns[turn]]
-                for lane, into in zip(lanes_of_turn, _into(turn, len(lanes_of_turn), lanes[target]), strict=True):
+                for lane, into in zip(
+                    lanes_of_turn, _into(turn, len(lanes_of_turn), lanes[target]), strict=True
+                ):
                     connection_rows += [_link(source, target, lane, number) for number in into]
         tables = {"node": node_rows, "edge": edge_rows, "connection": connection_rows}
-        return {kind: f"<{kind}s>\n{''.join(rows)}</{kind}s>\n" for kind, rows in tables.items()}, region_of
+        return {
+            kind: f"<{kind}s>\n{''.join(rows)}</{kind}s>\n" for kind, rows in tables.items()
+        }, region_of
 
 
 def _heading(a: SimpleNamespace, b: SimpleNamespace) -> tuple[int, int]:
@@ -144,7 +167,8 @@ def _heading(a: SimpleNamespace, b: SimpleNamespace) -> tuple[int, int]:
 
 
 def _into(turn: str, lanes: int, target_lanes: int) -> list[range]:
-    """Return the lanes that each lane of a movement leads into: one each, or all for a single lane that turns."""
+    """Return the lanes that each lane of a movement leads into: one each, or all for a single lane
+    that turns."""
     # Two vehicles in a queue that want each other's lane would wait forever.
     if turn == "s" or lanes > 1:
         cuts = [target_lanes * n // lanes for n in range(lanes + 1)]
@@ -177,7 +201,9 @@ def build(table: dict, where: str) -> tuple[bytes, bytes]:
             options[f"{kind}-files"] = folder / f"{kind}.xml"
         run_sumo("netconvert", options, where=where)
         net = (folder / "net.xml").read_bytes()
-    regions = "".join(["edge,region\n", *(f"{edge},{region}\n" for edge, region in sorted(region_of.items()))])
+    regions = "".join(
+        ["edge,region\n", *(f"{edge},{region}\n" for edge, region in sorted(region_of.items()))]
+    )
     # The comment holds the date and the temporary folder.
     return re.sub(rb"<!--.*?-->\s*", b"", net, count=1, flags=re.DOTALL), regions.encode()
 

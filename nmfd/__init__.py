@@ -6,9 +6,9 @@
     >>> print(f"{nmfd.summary(result)['total_time_spent_veh_s']:.3g} veh s")
     5.52e+07 veh s
 
-`run` is one closed loop, `benchmark` many with a run folder; `train` makes a DPC policy, `controller` a controller by
-name. Any object with `reset` and `act` is a controller (see `Controller`; `nmfd new-controller` writes a template).
-Names here are imported at their first use.
+`run` is one closed loop, `benchmark` many with a run folder; `train` makes a DPC policy,
+`controller` a controller by name. Any object with `reset` and `act` is a controller (see
+`Controller`; `nmfd new-controller` writes a template). Names here are imported at their first use.
 """
 
 import sys
@@ -67,7 +67,8 @@ def _register(gymnasium: Any) -> None:
 
 
 class _Finder:
-    """Import hook that registers the environments with gymnasium, which has no plug-ins since 1.0."""
+    """Import hook that registers the environments with gymnasium, which has no plug-ins since
+    1.0."""
 
     @classmethod
     def find_spec(cls, name: str, *rest: Any) -> Any:

@@ -12,7 +12,14 @@ from typing import TYPE_CHECKING, Any
 from nmfd import closed_loop
 from nmfd.controllers import open_loop, training
 from nmfd.controllers.dpc import rollout
-from nmfd.controllers.strategy import CONTROLLERS, Strategy, check_tables, city_words, parse, parse_many
+from nmfd.controllers.strategy import (
+    CONTROLLERS,
+    Strategy,
+    check_tables,
+    city_words,
+    parse,
+    parse_many,
+)
 from nmfd.errors import InputError, did_you_mean
 from nmfd.model.scenario import Scenario, read_scenario, with_demand
 from nmfd.runs import shipped
@@ -22,7 +29,15 @@ from nmfd.runs.run_many import Run, locked, run_many
 from nmfd.runs.run_many import raise_failures as raise_failures
 from nmfd.studies import benchmark as benchmark_study
 from nmfd.studies import bound as bound_study
-from nmfd.studies.benchmark import PLANTS, REFERENCE, SIGMAS_VEH_S, SPREADS, closed_loop_of, key_of, workers_for
+from nmfd.studies.benchmark import (
+    PLANTS,
+    REFERENCE,
+    SIGMAS_VEH_S,
+    SPREADS,
+    closed_loop_of,
+    key_of,
+    workers_for,
+)
 from nmfd.studies.benchmark import improvement_table as improvement_table
 from nmfd.studies.benchmark import summary_table as summary_table
 from nmfd.studies.measured import identify as identify
@@ -42,7 +57,8 @@ def load_scenario(folder: Path | str, settings: Mapping[str, Any] | None = None)
         >>> nmfd.load_scenario("economic_mpc").network.region_names
         ('north-west', 'north-east', 'west', 'centre', 'east', 'south-west', 'south-east')
 
-    folder: folder of a scenario.toml, or the name of one (`nmfd show`), or of a network with a scenario of its name
+    folder: folder of a scenario.toml, or the name of one (`nmfd show`), or of a network with a
+        scenario of its name
     settings: changes by dotted key, such as {"steps": 12, "controllers.pi-gating.kp": 2.0}
     Raises: InputError if a file, key or value is wrong
     """
@@ -54,7 +70,9 @@ def load_scenario(folder: Path | str, settings: Mapping[str, Any] | None = None)
     return scenario
 
 
-def controller(name: str, scenario: Scenario | Path | str, *, policy: Path | str | None = None) -> Controller:
+def controller(
+    name: str, scenario: Scenario | Path | str, *, policy: Path | str | None = None
+) -> Controller:
     """Return the controller `name` for `scenario`, with `reset` and `act`.
 
     name: as on the command line: "pi-gating", "dpc-pcrg", ..., or "path/to/file.py:Class"
@@ -63,7 +81,8 @@ def controller(name: str, scenario: Scenario | Path | str, *, policy: Path | str
         >>> nmfd.controller("pi-gating", "economic_mpc").regions  # protected ones
         array([3])
 
-    Raises: InputError for an unknown name, a wrong option, or a policy that is missing or made for another network
+    Raises: InputError for an unknown name, a wrong option, or a policy that is missing or made for
+    another network
     """
     return parse(name).make(_loaded(scenario), None if policy is None else Path(policy))
 
@@ -92,14 +111,18 @@ def run(
     plant: "nmfd", "acyclic", or an object with `reset`, `step` and `observe` as in nmfd.Plant
     steps: control intervals; the scenario's if None
     policy: as in `nmfd.controller`
-    progress: None for a bar on a terminal or in a notebook, False for none, or a function of the steps done and all
-        steps
+    progress: None for a bar on a terminal or in a notebook, False for none, or a function of the
+        steps done and all steps
 
-    The same seed gives the same result but for wall times (Result.without_times). Raises InputError.
+    The same seed gives the same result but for wall times (Result.without_times). Raises
+    InputError.
     """
     strategy, scenario = parse(controller).regional(), with_demand(_loaded(scenario), steps=steps)
     _check_plant(plant)
-    acting, name = strategy.make(scenario, None if policy is None else Path(policy)), type(plant).__name__
+    acting, name = (
+        strategy.make(scenario, None if policy is None else Path(policy)),
+        type(plant).__name__,
+    )
     if isinstance(plant, str):
         name, plant = plant, PLANTS[plant](scenario)
     with watched(strategy.name, progress) as show:
@@ -124,17 +147,22 @@ def benchmark(
         >>> rows.groupby("controller")["completed_veh"].mean().round(-2).to_dict()
         {'dpc-pc': 31600.0, 'dpc-pcrg': 31700.0, 'no-control': 6200.0}
 
-    controllers: a name, several, or patterns, which stand for the controllers that can be made for this scenario
+    controllers: a name, several, or patterns, which stand for the controllers that can be made for
+        this scenario
     seeds: how many, from 0, or which
     out: the run folder, runs/<scenario>-<time> if None; finished runs in it are kept
     policies: controller -> file, if not SCENARIO/NAME.pt
     workers: runs at a time
     progress: as in `nmfd.run`; your own is called as progress(done, runs, name)
 
-    The column `failure` is "" of a finished run, else its reason; `lower_bound_veh_s` is that of the total time spent
-    with the same controls, where `nmfd bound` has found one. Raises InputError.
+    The column `failure` is "" of a finished run, else its reason; `lower_bound_veh_s` is that of
+    the total time spent with the same controls, where `nmfd bound` has found one. Raises
+    InputError.
     """
-    scenario, files = _loaded(scenario), {name: Path(file) for name, file in (policies or {}).items()}
+    scenario, files = (
+        _loaded(scenario),
+        {name: Path(file) for name, file in (policies or {}).items()},
+    )
     _check_plant(plant)
     strategies = parse_many(controllers, scenario, regional=True)
     check_policies(files, strategies)
@@ -143,20 +171,35 @@ def benchmark(
         Run(
             run_name(strategy.name, seed),
             key(strategy.name),
-            partial(closed_loop_of, strategy, seed, scenario=scenario, plant=plant, policy=files.get(strategy.name)),
+            partial(
+                closed_loop_of,
+                strategy,
+                seed,
+                scenario=scenario,
+                plant=plant,
+                policy=files.get(strategy.name),
+            ),
         )
         for seed in (range(seeds) if isinstance(seeds, int) else seeds)
         for strategy in strategies
     ]
     out = default_folder(scenario.name) if out is None else Path(out)
-    lower = {strategy.name: benchmark_study.lower_bound(scenario, strategy, plant) for strategy in strategies}
+    lower = {
+        strategy.name: benchmark_study.lower_bound(scenario, strategy, plant)
+        for strategy in strategies
+    }
     with locked(out):
         rows = run_many(runs, out, workers=workers_for(strategies, workers), progress=progress)
         rows["lower_bound_veh_s"] = rows["controller"].map(lower)
         done = rows[rows["failure"] == ""]
-        names = [run_name(name, seed) for name, seed in zip(done["controller"], done["seed"], strict=True)]
+        names = [
+            run_name(name, seed)
+            for name, seed in zip(done["controller"], done["seed"], strict=True)
+        ]
         if names:
-            benchmark_study.draw_accumulations(out, scenario, [Result.read(out / f"{name}.nc") for name in names])
+            benchmark_study.draw_accumulations(
+                out, scenario, [Result.read(out / f"{name}.nc") for name in names]
+            )
             benchmark_study.draw_scenario(out, scenario)
     return rows
 
@@ -172,22 +215,34 @@ def robustness(
     workers: int = 1,
     progress: Progress = None,
 ) -> "pd.DataFrame":
-    """Run controllers, and no control, in perturbed scenarios in a folder, draw the improvement; return the runs.
+    """Run controllers, and no control, in perturbed scenarios in a folder, draw the improvement;
+    return the runs.
 
-    kind: "demand", "demand-total", "mfd-scale", "mfd-axis" or "trip-lengths" (nmfd.model.scenario.perturbed)
-    sigmas: standard deviations of the demand noise (veh/s), or of the logarithms of MFDs or trip lengths (-)
+    kind: "demand", "demand-total", "mfd-scale", "mfd-axis" or "trip-lengths"
+        (nmfd.model.scenario.perturbed)
+    sigmas: standard deviations of the demand noise (veh/s), or of the logarithms of MFDs or trip
+        lengths (-)
     scenarios: draws for every sigma
     out, workers, progress: see `benchmark`
     """
     scenario = _loaded(scenario)
-    others = [one for one in parse_many(controllers, scenario, regional=True) if one.name != REFERENCE]
+    others = [
+        one for one in parse_many(controllers, scenario, regional=True) if one.name != REFERENCE
+    ]
     strategies = [parse(REFERENCE), *others]
     key = key_of(scenario, strategies, benchmark_study.PERTURBED_PLANT, {})
     runs = [
         Run(
             run_name(strategy.name, number),
             {**key(strategy.name), "kind": kind, "sigma": sigma},
-            partial(benchmark_study.run_perturbed, strategy, number, scenario=scenario, sigma=sigma, kind=kind),
+            partial(
+                benchmark_study.run_perturbed,
+                strategy,
+                number,
+                scenario=scenario,
+                sigma=sigma,
+                kind=kind,
+            ),
             folder=f"{kind}-{sigma:g}",
         )
         for sigma in sigmas or (SIGMAS_VEH_S if kind.startswith("demand") else SPREADS)
@@ -221,10 +276,13 @@ def train(
     """Train a DPC policy and return its file; or a module of your own, which is returned.
 
     controller: its name; with `policy` the one whose settings and planning model are used
-    policy: module as in nmfd.ModuleController, admissible by nmfd.PerimeterLayer and nmfd.SplitsLayer; trained in place
+    policy: module as in nmfd.ModuleController, admissible by nmfd.PerimeterLayer and
+        nmfd.SplitsLayer; trained in place
     cost: differentiable function, nmfd.Trajectories -> (B,); by default the total time spent
-    sample: (torch.Generator, B) -> initial states (veh, (B, R, R)) and demand (veh/s, (T, B, R, R)); by default random
-    constraints: pairs of a function, nmfd.Trajectories -> penalty >= 0 (B,), and its weight; their means are added
+    sample: (torch.Generator, B) -> initial states (veh, (B, R, R)) and demand (veh/s, (T, B, R,
+        R)); by default random
+    constraints: pairs of a function, nmfd.Trajectories -> penalty >= 0 (B,), and its weight; their
+        means are added
     out: policy file, SCENARIO/NAME.pt if None
     steps: Adam steps; those of scenario.toml, else 400, if None
     device: "cpu", which gives the same weights every time, "cuda" or "auto"
@@ -234,15 +292,25 @@ def train(
     """
     scenario, strategy = _loaded(scenario), parse(controller)
     if policy is not None and (out or resume):
-        raise InputError("policy: a module is returned, not written; omit out and resume, keep its state_dict()")
+        raise InputError(
+            "policy: a module is returned, not written; omit out and resume, keep its state_dict()"
+        )
     task = training.Task(cost=cost, sample=sample, constraints=constraints)
-    options: dict[str, Any] = {"seed": seed, "steps": steps, "device": training.available(device), "resume": resume}
+    options: dict[str, Any] = {
+        "seed": seed,
+        "steps": steps,
+        "device": training.available(device),
+        "resume": resume,
+    }
     chosen = training.settings(scenario, strategy, steps)
     file = _file(scenario, f"{controller}.pt", out) if policy is None else None
     believed = strategy.planning(scenario).network
     for region, doubts in zip(believed.region_names, believed.doubts, strict=False):
         if doubts:
-            print(f"nmfd: the model of region {region} is doubtful: {'; '.join(doubts)}", file=sys.stderr)
+            print(
+                f"nmfd: the model of region {region} is doubtful: {'; '.join(doubts)}",
+                file=sys.stderr,
+            )
     worth = policy is None and chosen.steps >= training.WORTH_COMPILING
     options |= {"compiled": worth and rollout.can_compile(options["device"])}
     options |= {"module": policy, "task": task, "anyway": anyway}
@@ -252,7 +320,9 @@ def train(
     except KeyboardInterrupt:
         if file is None:
             raise
-        raise KeyboardInterrupt(f"the best policy so far, if any, is {file}; add --resume to continue") from None
+        raise KeyboardInterrupt(
+            f"the best policy so far, if any, is {file}; add --resume to continue"
+        ) from None
 
 
 def bound(
@@ -263,7 +333,8 @@ def bound(
     iterations: int = bound_study.ITERATIONS,
     progress: Progress = None,
 ) -> str:
-    """Find the best plan "bound-pc" or "bound-pcrg" for known demand, and a lower bound; return a report.
+    """Find the best plan "bound-pc" or "bound-pcrg" for known demand, and a lower bound; return a
+    report.
 
     out: plan file, SCENARIO/NAME.npz if None
     iterations: Adam steps
@@ -274,7 +345,10 @@ def bound(
         plan = bound_study.compute(scenario, controller, iterations=iterations, progress=show)
     open_loop.write(plan, scenario, file)
     totals = sorted(plan.totals.items(), key=lambda item: item[1])
-    lines = [f"from {name}: {total:.5g} veh s" + (" (kept)" if name == plan.start else "") for name, total in totals]
+    lines = [
+        f"from {name}: {total:.5g} veh s" + (" (kept)" if name == plan.start else "")
+        for name, total in totals
+    ]
     lines += [f"lower bound: {plan.lower:.5g} veh s"]
     if plan.lower > 0:
         above = benchmark_study.percent_change(totals[0][1], plan.lower)
@@ -301,29 +375,46 @@ def catalogue() -> str:
     """List the shipped scenarios, networks and policies, and all controllers, one line each."""
     scenarios, networks = shipped.folders(shipped.SCENARIO), shipped.folders(shipped.NETWORK)
     sections = {
-        "Scenarios": {folder.name: _first_sentence(folder / "scenario.toml") for folder in scenarios},
+        "Scenarios": {
+            folder.name: _first_sentence(folder / "scenario.toml") for folder in scenarios
+        },
         "Networks": {folder.name: _first_sentence(folder / "network.toml") for folder in networks},
         "Policies": {
-            f"{folder.name}/{file.name}": "" for folder in scenarios for file in sorted(folder.glob("dpc-*.pt"))
+            f"{folder.name}/{file.name}": ""
+            for folder in scenarios
+            for file in sorted(folder.glob("dpc-*.pt"))
         },
         "Controllers": {kind.name: kind.text for kind in CONTROLLERS.values()},
         "Words for a city in SUMO, behind a controller": dict(city_words()),
     }
     return "\n\n".join(
-        "\n".join([title, *(f"  {name:{max(map(len, rows))}}  {text}".rstrip() for name, text in rows.items())])
+        "\n".join(
+            [
+                title,
+                *(
+                    f"  {name:{max(map(len, rows))}}  {text}".rstrip()
+                    for name, text in rows.items()
+                ),
+            ]
+        )
         for title, rows in sections.items()
     )
 
 
 def _first_sentence(file: Path) -> str:
     """Return the first sentence of the comment at the top of a TOML file."""
-    lines = takewhile(lambda line: line.startswith("#"), file.read_text(encoding="utf-8").splitlines())
+    lines = takewhile(
+        lambda line: line.startswith("#"), file.read_text(encoding="utf-8").splitlines()
+    )
     words = " ".join(line.lstrip("# ") for line in lines if not line.startswith("#:"))
-    return textwrap.shorten(re.split(r"\.\s+(?=[A-Z\d])", words)[0].rstrip("."), 90, placeholder=" ...")
+    return textwrap.shorten(
+        re.split(r"\.\s+(?=[A-Z\d])", words)[0].rstrip("."), 90, placeholder=" ..."
+    )
 
 
 def _file(scenario: Scenario, name: str, out: Path | str | None) -> Path:
-    """Return the file that `out` names, or `name` in the scenario's folder; check that its folder exists."""
+    """Return the file that `out` names, or `name` in the scenario's folder; check that its folder
+    exists."""
     if out is not None:
         file = Path(out)
     elif scenario.folder is not None:
@@ -341,15 +432,23 @@ def check_policies(policies: Mapping[str, Path], strategies: Sequence[Strategy])
     for name in policies:
         if name not in known:
             near = did_you_mean(name, known)
-            raise InputError(f"--policy: {name!r} is not among {', '.join(known)}{near}; add it there")
+            raise InputError(
+                f"--policy: {name!r} is not among {', '.join(known)}{near}; add it there"
+            )
 
 
 def _check_plant(plant: str | Plant) -> None:
-    lacking = [method for method in ("reset", "step", "observe") if not callable(getattr(plant, method, None))]
+    lacking = [
+        method
+        for method in ("reset", "step", "observe")
+        if not callable(getattr(plant, method, None))
+    ]
     if lacking and not isinstance(plant, str):
         raise InputError(f"plant: {type(plant).__name__} has no {lacking[0]}; see nmfd.Plant")
     if isinstance(plant, str) and plant not in PLANTS:
-        raise InputError(f"plant {plant!r} is unknown{did_you_mean(plant, PLANTS)}; choose from {', '.join(PLANTS)}")
+        raise InputError(
+            f"plant {plant!r} is unknown{did_you_mean(plant, PLANTS)}; choose from {', '.join(PLANTS)}"
+        )
 
 
 def _loaded(scenario: Scenario | Path | str) -> Scenario:

@@ -1,4 +1,5 @@
-"""Command line `nmfd`: it parses options and calls nmfd.api; cosim.cli takes the shared options from here."""
+"""Command line `nmfd`: it parses options and calls nmfd.api; cosim.cli takes the shared options
+from here."""
 
 import os
 import shlex
@@ -25,15 +26,24 @@ SEED = click.IntRange(0, 2**31 - 1)  # SUMO's seeds have 32 bits
 class Number(click.FloatRange):
     """Number in a range; NaN is in none."""
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
         number = super().convert(value, param, ctx)
         return number if number == number else self.fail(f"{value!r} is not a number.", param, ctx)
 
 
 class Commands(click.Group):
-    """Command group with sections in its help that ends user errors and Ctrl-C in one line on stderr."""
+    """Command group with sections in its help that ends user errors and Ctrl-C in one line on
+    stderr."""
 
-    def __init__(self, *args: Any, sections: Mapping[str, Sequence[str]], elsewhere: Mapping[str, str], **options: Any):
+    def __init__(
+        self,
+        *args: Any,
+        sections: Mapping[str, Sequence[str]],
+        elsewhere: Mapping[str, str],
+        **options: Any,
+    ):
         """elsewhere: a command of the other program -> its name"""
         super().__init__(*args, **options)
         self.sections, self.elsewhere = sections, elsewhere
@@ -49,11 +59,15 @@ class Commands(click.Group):
         width = max(map(len, self.commands))
         for title, names in self.sections.items():
             with formatter.section(title):
-                rows = [(f"{name:{width}}", self.commands[name].get_short_help_str(60)) for name in names]
+                rows = [
+                    (f"{name:{width}}", self.commands[name].get_short_help_str(60))
+                    for name in names
+                ]
                 formatter.write_dl(rows)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run a command; exit with 2 after a user error, 1 after failed runs, 130 after Ctrl-C or SIGTERM."""
+        """Run a command; exit with 2 after a user error, 1 after failed runs, 130 after Ctrl-C or
+        SIGTERM."""
         stops = []
 
         def stop(*_: object) -> NoReturn:
@@ -74,7 +88,9 @@ class Commands(click.Group):
             if stops or isinstance(error, KeyboardInterrupt):
                 told = str(error) if isinstance(error, KeyboardInterrupt) else ""
                 text, status = ": ".join(filter(None, ["interrupted", told])), 130
-            elif isinstance(error, BrokenPipeError) or not isinstance(error, (RunFailed, InputError, OSError)):
+            elif isinstance(error, BrokenPipeError) or not isinstance(
+                error, (RunFailed, InputError, OSError)
+            ):
                 raise  # click ends without a word if nobody reads on
             else:
                 text, status = f"error: {error}", 1 if isinstance(error, RunFailed) else 2
@@ -109,7 +125,9 @@ def listed(kind: click.ParamType) -> Callable[[str], tuple]:
     def parse(text: str) -> tuple:
         values = tuple(kind.convert(word.strip(), None, None) for word in text.split(","))
         if len(set(values)) < len(values):
-            raise click.BadParameter(f"expected distinct values separated by commas, got {text!r} instead")
+            raise click.BadParameter(
+                f"expected distinct values separated by commas, got {text!r} instead"
+            )
         return values
 
     parse.__name__ = "A,B,..."
@@ -117,9 +135,12 @@ def listed(kind: click.ParamType) -> Callable[[str], tuple]:
 
 
 def parsed(form: str, convert: Callable[[str], Any]) -> Callable:
-    """Return the callback of a repeated option KEY=VALUE, which gives a dict; `form` begins with its metavar."""
+    """Return the callback of a repeated option KEY=VALUE, which gives a dict; `form` begins with
+    its metavar."""
 
-    def parse(_ctx: click.Context, _param: click.Parameter, values: Sequence[str]) -> dict[str, Any]:
+    def parse(
+        _ctx: click.Context, _param: click.Parameter, values: Sequence[str]
+    ) -> dict[str, Any]:
         result = {}
         for text in values:
             key, _, value = text.partition("=")
@@ -145,7 +166,12 @@ def toml_or_text(value: str) -> Any:
 CITATION = resources.files("nmfd").joinpath("CITATION.cff").read_text(encoding="utf-8")
 VERSION = combined(
     click.version_option(nmfd.__version__),
-    click.version_option(nmfd.__version__, "--cite", message=f"{CITATION}version: %(version)s", help="How to cite it."),
+    click.version_option(
+        nmfd.__version__,
+        "--cite",
+        message=f"{CITATION}version: %(version)s",
+        help="How to cite it.",
+    ),
 )
 SET = click.option(
     "--set",
@@ -180,7 +206,9 @@ def seed_option(text: str = "Random seed.") -> Callable:
     return click.option("--seed", type=SEED, default=0, help=text)
 
 
-def out_option(default: str, text: str = "Run folder; finished runs in it are not repeated.") -> Callable:
+def out_option(
+    default: str, text: str = "Run folder; finished runs in it are not repeated."
+) -> Callable:
     """Return the option --out of a folder; `default` says where results go without it."""
     return click.option("--out", type=FOLDER, metavar="DIR", help=f"{text} [default: {default}]")
 
@@ -195,7 +223,10 @@ def out_option(default: str, text: str = "Run folder; finished runs in it are no
         "Networks from measured data": ("identify",),
     },
     elsewhere={"list": "nmfd show", "run": "nmfd benchmark` or, in SUMO, `cosim run"}
-    | {name: f"cosim {name}" for name in ("demo", "watch", "evaluate", "report", "compare", "tune", "get", "import")},
+    | {
+        name: f"cosim {name}"
+        for name in ("demo", "watch", "evaluate", "report", "compare", "tune", "get", "import")
+    },
 )
 @VERSION
 def main() -> None:
@@ -214,7 +245,8 @@ def main() -> None:
 def show(scenario: Path | None, settings: dict, out: Path | None) -> None:
     """Draw a scenario; without SCENARIO list what is shipped.
 
-    Draws demand, region map and MFDs. The list contains scenarios, networks, policies and controllers.
+    Draws demand, region map and MFDs. The list contains scenarios, networks, policies and
+    controllers.
 
     \b
     Examples:
@@ -231,15 +263,18 @@ def show(scenario: Path | None, settings: dict, out: Path | None) -> None:
 @SCENARIO
 @CONTROLLERS
 @click.option("--seeds", type=COUNT, default=1, help="Runs with seeds 0 to N - 1.")
-@click.option("--plant", type=click.Choice(["nmfd", "acyclic"]), default="nmfd", help="Plant model.")
+@click.option(
+    "--plant", type=click.Choice(["nmfd", "acyclic"]), default="nmfd", help="Plant model."
+)
 @POLICIES
 @WORKERS
 @out_option("runs/SCENARIO-TIME")
 def benchmark(scenario: Path, settings: dict, out: Path | None, **options: Any) -> None:
     """Run controllers on a regional model and compare them.
 
-    SCENARIO is a name that `nmfd show` lists, or a folder with a scenario.toml. The run folder holds tables, results
-    and figures; if --out is an existing run folder, only missing runs are done.
+    SCENARIO is a name that `nmfd show` lists, or a folder with a scenario.toml. The run folder
+    holds tables, results and figures; if --out is an existing run folder, only missing runs are
+    done.
 
     \b
     Example:
@@ -248,7 +283,9 @@ def benchmark(scenario: Path, settings: dict, out: Path | None, **options: Any) 
     loaded = nmfd.load_scenario(scenario, settings)
     out = out or nmfd.api.default_folder(loaded.name)
     rows = nmfd.api.benchmark(loaded, out=out, **options)
-    click.echo(f"{nmfd.api.summary_table(rows)}\nWritten to {out}: see the figures; more seeds: --seeds N --out {out}")
+    click.echo(
+        f"{nmfd.api.summary_table(rows)}\nWritten to {out}: see the figures; more seeds: --seeds N --out {out}"
+    )
     nmfd.api.raise_failures(rows)
 
 
@@ -261,15 +298,20 @@ def benchmark(scenario: Path, settings: dict, out: Path | None, **options: Any) 
     default="demand",
     help="What differs from the scenario.",
 )
-@click.option("--sigmas", type=listed(Number(0.0)), help="Noise (veh/s) or spread (-). [default: 0,...,5 or 0,...,0.4]")
+@click.option(
+    "--sigmas",
+    type=listed(Number(0.0)),
+    help="Noise (veh/s) or spread (-). [default: 0,...,5 or 0,...,0.4]",
+)
 @click.option("--scenarios", type=COUNT, default=20, help="Random scenarios per sigma.")
 @WORKERS
 @out_option("runs/SCENARIO-TIME")
 def robustness(scenario: Path, settings: dict, out: Path | None, **options: Any) -> None:
     """Run controllers under unexpected demand or MFDs.
 
-    demand adds noise per pair of regions and control interval; demand-total then restores the number of trips; other
-    kinds multiply MFDs or trip lengths by a random factor per region. Prints and draws the gain over no-control.
+    demand adds noise per pair of regions and control interval; demand-total then restores the
+    number of trips; other kinds multiply MFDs or trip lengths by a random factor per region. Prints
+    and draws the gain over no-control.
 
     \b
     Example:
@@ -278,22 +320,33 @@ def robustness(scenario: Path, settings: dict, out: Path | None, **options: Any)
     loaded = nmfd.load_scenario(scenario, settings)
     out = out or nmfd.api.default_folder(loaded.name)
     rows = nmfd.api.robustness(loaded, out=out, **options)
-    click.echo(f"{nmfd.api.improvement_table(rows)}\nWritten to {out}: see runs.csv and robustness.png")
+    click.echo(
+        f"{nmfd.api.improvement_table(rows)}\nWritten to {out}: see runs.csv and robustness.png"
+    )
     nmfd.api.raise_failures(rows)
 
 
 @main.command()
 @SCENARIO
-@click.option("--controller", type=ControllerName("dpc-pc"), required=True, metavar="NAME", help="dpc-pc or dpc-pcrg.")
+@click.option(
+    "--controller",
+    type=ControllerName("dpc-pc"),
+    required=True,
+    metavar="NAME",
+    help="dpc-pc or dpc-pcrg.",
+)
 @seed_option("Seed of the initial weights and the training states.")
 @click.option("--steps", type=COUNT, help="Adam steps. [default: as in scenario.toml, else 400]")
-@click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True)
+@click.option(
+    "--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True
+)
 @click.option("--resume", is_flag=True, help="Continue an interrupted training.")
 @click.option("--out", type=FILE, metavar="FILE", help="Policy file. [default: SCENARIO/NAME.pt]")
 def train(scenario: Path, settings: dict, controller: str, **options: Any) -> None:
     """Train a DPC policy on a scenario.
 
-    The policy file always holds the policy that is best in validation. After Ctrl-C, --resume continues the training.
+    The policy file always holds the policy that is best in validation. After Ctrl-C, --resume
+    continues the training.
 
     \b
     Example:
@@ -306,21 +359,27 @@ def train(scenario: Path, settings: dict, controller: str, **options: Any) -> No
 @main.command()
 @SCENARIO
 @click.option(
-    "--controller", type=ControllerName("bound-pc"), required=True, metavar="NAME", help="bound-pc or bound-pcrg."
+    "--controller",
+    type=ControllerName("bound-pc"),
+    required=True,
+    metavar="NAME",
+    help="bound-pc or bound-pcrg.",
 )
 @click.option("--out", type=FILE, metavar="FILE", help="Plan file. [default: SCENARIO/NAME.npz]")
 def bound(scenario: Path, settings: dict, controller: str, **options: Any) -> None:
     """Find the best plan for known demand, and a lower bound.
 
-    `nmfd benchmark --controllers bound-pc,bound-pcrg` replays the plans; its table shows by how much each controller
-    exceeds the lower bound.
+    `nmfd benchmark --controllers bound-pc,bound-pcrg` replays the plans; its table shows by how
+    much each controller exceeds the lower bound.
 
     \b
     Example:
       nmfd bound economic_mpc --controller bound-pcrg
     """
     text = nmfd.api.bound(nmfd.load_scenario(scenario, settings), controller, **options)
-    click.echo(text + TRY.format(scenario, controller, options["out"] or f"{scenario}/{controller}.npz"))
+    click.echo(
+        text + TRY.format(scenario, controller, options["out"] or f"{scenario}/{controller}.npz")
+    )
 
 
 @main.command(name="new-controller")
@@ -336,13 +395,17 @@ def new_controller(file: Path) -> None:
       nmfd benchmark economic_mpc --controllers no-control,mine.py:MyController
     """
     if file.suffix != ".py":
-        raise InputError(f"{file}: expected a name that ends in .py, such as {file.with_suffix('.py')}")
+        raise InputError(
+            f"{file}: expected a name that ends in .py, such as {file.with_suffix('.py')}"
+        )
     if file.exists():
         raise InputError(f"{file}: exists; choose another name")
     text = resources.files("nmfd.controllers").joinpath("template.py").read_text(encoding="utf-8")
     file.write_text(text.replace("FILE", str(file)), encoding="utf-8")
     own = f"{shlex.quote(str(file))}:MyController"
-    click.echo(f"Written to {file}; try it: nmfd benchmark economic_mpc --controllers no-control,{own}")
+    click.echo(
+        f"Written to {file}; try it: nmfd benchmark economic_mpc --controllers no-control,{own}"
+    )
 
 
 @main.command()
@@ -353,22 +416,48 @@ def new_controller(file: Path) -> None:
     metavar="CSV",
     help="Table: detid, length (km), lanes, linkid, pos, long and lat or x and y, region.",
 )
-@click.option("--regions", type=FILE, metavar="CSV", help="Table detid,region, unless another table has regions.")
-@click.option("--about", type=FILE, metavar="CSV", help="Table of regions: region, lane_km, trip_length, x, y (m).")
-@click.option("--adjacency", type=FILE, metavar="CSV", help="Table region,neighbour. [default: by position]")
-@click.option("--trip-length", type=float, metavar="M", help="Mean trip length in a region. [default: from its size]")
+@click.option(
+    "--regions",
+    type=FILE,
+    metavar="CSV",
+    help="Table detid,region, unless another table has regions.",
+)
+@click.option(
+    "--about",
+    type=FILE,
+    metavar="CSV",
+    help="Table of regions: region, lane_km, trip_length, x, y (m).",
+)
+@click.option(
+    "--adjacency", type=FILE, metavar="CSV", help="Table region,neighbour. [default: by position]"
+)
+@click.option(
+    "--trip-length",
+    type=float,
+    metavar="M",
+    help="Mean trip length in a region. [default: from its size]",
+)
 @click.option("--city", metavar="NAME", help="City to use, if the tables hold several.")
-@click.option("--skip-bad", is_flag=True, help="Leave out and count rows that are doubled or have impossible numbers.")
-@click.option("--out", type=FOLDER, required=True, metavar="DIR", help="New folder for the network.")
+@click.option(
+    "--skip-bad",
+    is_flag=True,
+    help="Leave out and count rows that are doubled or have impossible numbers.",
+)
+@click.option(
+    "--out", type=FOLDER, required=True, metavar="DIR", help="New folder for the network."
+)
 def identify(counts: Path, out: Path, **options: Any) -> None:
     """Fit a network to counts and occupancies of detectors.
 
-    COUNTS has the columns of UTD19 (utd19.ethz.ch): day, interval (s since midnight), detid, flow (veh/h per lane), occ
-    (share of the time); error, city, region if known. Writes network.toml, and mfd.png and identify.txt about the fit.
+    COUNTS has the columns of UTD19 (utd19.ethz.ch): day, interval (s since midnight), detid, flow
+    (veh/h per lane), occ (share of the time); error, city, region if known. Writes network.toml,
+    and mfd.png and identify.txt about the fit.
 
     \b
     Example:
       nmfd identify counts.csv --detectors detectors.csv --regions regions.csv --trip-length 1500 --out networks/mine
     """
     click.echo(nmfd.api.identify(counts, out=out, **options).text)
-    click.echo(f'Written to {out}: see mfd.png and identify.txt; next: a scenario.toml with network = "{out}"')
+    click.echo(
+        f'Written to {out}: see mfd.png and identify.txt; next: a scenario.toml with network = "{out}"'
+    )

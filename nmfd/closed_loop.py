@@ -25,10 +25,10 @@ def run(
 ) -> Result:
     """Drive `plant` with `controller` for `scenario.steps` control intervals.
 
-    The controller gets the estimate of the plant's own instruments, or, without any, every x_ij with Gaussian noise of
-    `scenario.measurement_std`, drawn from `seed`, with the faults of the scenario (nmfd.faults). Observations and
-    controls are copied: a controller may write into either. A decision is late after the control interval or the
-    controller's own `deadline` (s).
+    The controller gets the estimate of the plant's own instruments, or, without any, every x_ij
+    with Gaussian noise of `scenario.measurement_std`, drawn from `seed`, with the faults of the
+    scenario (nmfd.faults). Observations and controls are copied: a controller may write into
+    either. A decision is late after the control interval or the controller's own `deadline` (s).
 
     progress: is called with the intervals done and `scenario.steps` after every interval
     Raises: InputError if a number of a command is not finite
@@ -57,10 +57,14 @@ def run(
         if problem:
             command = _with_status(command, Status.SENSOR_FAULT, problem, command.note)
         if late:
-            command = _with_status(command, Status.LATE, command.note, f"later than its deadline of {deadline:g} s")
+            command = _with_status(
+                command, Status.LATE, command.note, f"later than its deadline of {deadline:g} s"
+            )
         states.append(plant.step(command))
         fault = states[-1].problem
-        controls.append(_with_status(command, Status.PLANT_FAULT, command.note, fault) if fault else command)
+        controls.append(
+            _with_status(command, Status.PLANT_FAULT, command.note, fault) if fault else command
+        )
         observed, problem = observe()
         observations.append(observed)
         if progress:
@@ -80,12 +84,18 @@ def run(
         observed=np.stack([o.accumulation for o in observations]),
         observed_backlog=np.stack([o.backlog for o in observations]),
         perimeter=np.stack([c.perimeter for c in controls]),
-        splits=np.stack([network.nominal_splits if c.splits is None else c.splits for c in controls]),
+        splits=np.stack(
+            [network.nominal_splits if c.splits is None else c.splits for c in controls]
+        ),
         decision_time=np.array(decision_time),
         status=np.array([c.status.value for c in controls]),
         note=np.array([c.note for c in controls]),
-        removed=np.stack([np.zeros_like(s.backlog) if s.removed is None else s.removed for s in states]),
-        prices=np.stack([np.zeros(network.regions) if c.prices is None else c.prices for c in controls]),
+        removed=np.stack(
+            [np.zeros_like(s.backlog) if s.removed is None else s.removed for s in states]
+        ),
+        prices=np.stack(
+            [np.zeros(network.regions) if c.prices is None else c.prices for c in controls]
+        ),
     )
 
 
@@ -95,7 +105,8 @@ def noise_of(seed: int) -> np.random.Generator:
 
 
 def measurement(plant: Plant, state: State, std: float, random: np.random.Generator) -> Observation:
-    """Return the estimate of the plant's own instruments or, without any, the state with noise of `std` [veh]."""
+    """Return the estimate of the plant's own instruments or, without any, the state with noise of
+    `std` [veh]."""
     noise = std * random.standard_normal(state.accumulation.shape)
     return plant.observe() or Observation(
         step=state.step,
@@ -107,7 +118,8 @@ def measurement(plant: Plant, state: State, std: float, random: np.random.Genera
 
 
 def _checked(controls: Controls, where: str) -> Controls:
-    """Return controls with copied arrays, into which no controller writes; raise InputError if one is not finite."""
+    """Return controls with copied arrays, into which no controller writes; raise InputError if one
+    is not finite."""
     arrays = {}
     for name in ("perimeter", "splits", "prices", "metering"):
         if (values := getattr(controls, name)) is not None:

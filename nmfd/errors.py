@@ -11,8 +11,8 @@ from importlib.util import find_spec
 class InputError(ValueError):
     """A mistake in a file, key, value or command line.
 
-    The message is one line that names the file, the key, the value, what is allowed and the remedy; the command
-    lines print it and exit with status 2.
+    The message is one line that names the file, the key, the value, what is allowed and the remedy;
+    the command lines print it and exit with status 2.
     """
 
 
@@ -27,7 +27,8 @@ def did_you_mean(word: str, choices: Iterable[str]) -> str:
 
 
 def need(what: str, extra: str, *modules: str) -> None:
-    """Check that the `modules` of an extra of pyproject.toml, which `what` needs, are installed. Raises InputError."""
+    """Check that the `modules` of an extra of pyproject.toml, which `what` needs, are installed.
+    Raises InputError."""
     if missing := [module for module in modules if find_spec(module) is None]:
         raise InputError(
             f"{what}: needs {', '.join(missing)}; install the extra {extra} with: pip install -e '.[{extra}]'"
@@ -36,10 +37,18 @@ def need(what: str, extra: str, *modules: str) -> None:
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Delay Ctrl-C and SIGTERM until the end of the block, for code that they would leave with a lock held."""
+    """Delay Ctrl-C and SIGTERM until the end of the block, for code that they would leave with a
+    lock held."""
     held: list[int] = []
-    numbers = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
-    before = {number: signal.signal(number, lambda received, _: held.append(received)) for number in numbers}
+    numbers = (
+        (signal.SIGINT, signal.SIGTERM)
+        if threading.current_thread() is threading.main_thread()
+        else ()
+    )
+    before = {
+        number: signal.signal(number, lambda received, _: held.append(received))
+        for number in numbers
+    }
     try:
         yield
     finally:

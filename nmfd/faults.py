@@ -1,7 +1,8 @@
 """Faults of a run: sensors that freeze, lag or fail, closed streets, signals that do not obey.
 
-A fault is a text KIND[:VALUE][@FROM-TO] in the list `faults` of scenario.toml. FROM and TO are control intervals, TO
-excluded; without them the fault lasts for the whole run. Every decision under a fault carries it in its status.
+A fault is a text KIND[:VALUE][@FROM-TO] in the list `faults` of scenario.toml. FROM and TO are
+control intervals, TO excluded; without them the fault lasts for the whole run. Every decision under
+a fault carries it in its status.
 """
 
 import re
@@ -14,14 +15,17 @@ from nmfd.errors import InputError
 from nmfd.types import Observation
 
 FORMS = "frozen, delayed:INTERVALS, missing:REGION, closed:EDGE or signal:SIGNAL, with @FROM-TO for some intervals only"
-FORM = re.compile(r"(frozen|(?:delayed|missing):\d{1,3}|(?:closed|signal):[^@]+)(?:@(\d{1,6})-(\d{1,6}))?")
+FORM = re.compile(
+    r"(frozen|(?:delayed|missing):\d{1,3}|(?:closed|signal):[^@]+)(?:@(\d{1,6})-(\d{1,6}))?"
+)
 CITY = ("closed", "signal")
 FOREVER = 10**9
 
 
 @dataclass(frozen=True, kw_only=True)
 class Fault:
-    """A fault: kind, value as text, and control intervals begin <= k < end in which it is active."""
+    """A fault: kind, value as text, and control intervals begin <= k < end in which it is
+    active."""
 
     kind: str
     value: str = ""
@@ -52,7 +56,8 @@ class Sensors:
         self._last: np.ndarray | None = None
 
     def see(self, observation: Observation) -> tuple[Observation, str]:
-        """Return the observation as it arrives, and a text that names the faults, "" if there are none."""
+        """Return the observation as it arrives, and a text that names the faults, "" if there are
+        none."""
         problems, k = [], observation.step
         self._seen.append(observation)
         for number, fault in enumerate(self._faults):
@@ -75,5 +80,7 @@ class Sensors:
             observation = replace(observation, accumulation=np.where(np.isfinite(x), x, last))
             problems.append(f"{missing} of {x.size} entries missing, last ones used")
         self._last = observation.accumulation
-        observation = replace(observation, realised=self._seen[-1].realised)  # which no sensor measures
+        observation = replace(
+            observation, realised=self._seen[-1].realised
+        )  # which no sensor measures
         return observation, f"measurement {', '.join(problems)}" if problems else ""

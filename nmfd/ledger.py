@@ -9,10 +9,13 @@ class LedgerError(RuntimeError):
     """Vehicles appeared or vanished: the run stops."""
 
 
-def check(step: int, time: float, *, entered: float, ended: float, inside: float, least: float = 0.0) -> None:
+def check(
+    step: int, time: float, *, entered: float, ended: float, inside: float, least: float = 0.0
+) -> None:
     """Raise LedgerError unless entered = ended + inside [veh] and no accumulation is negative.
 
-    step: control step; time: at its end (s); ended: an independent count; least: smallest accumulation of any region
+    step: control step; time: at its end (s); ended: an independent count; least: smallest
+        accumulation of any region
     and destination [veh]
     """
     surplus, allowed = inside + ended - entered, TOLERANCE_VEH + TOLERANCE_SHARE * entered

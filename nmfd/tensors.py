@@ -19,8 +19,8 @@ PerTurn = Float[torch.Tensor, "*#B R R R"]
 def one_thread() -> Iterator[None]:
     """Compute on one thread within the block, or, as a decorator, within the function.
 
-    The matrices here are small: on a busy machine more threads wait for one another twenty times longer than they
-    compute. Afterwards torch has its number of threads back.
+    The matrices here are small: on a busy machine more threads wait for one another twenty times
+    longer than they compute. Afterwards torch has its number of threads back.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(1)

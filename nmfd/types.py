@@ -23,7 +23,8 @@ class Status(Flag):
     FALLBACK: the controls are those of a fallback, not of the controller
     SENSOR_FAULT: the observation was wrong, late or incomplete
     PLANT_FAULT: the city could not execute the command, or was not whole, during the interval
-    LATE: the decision took longer than the control interval, or than the controller's own `deadline` (s)
+    LATE: the decision took longer than the control interval, or than the controller's own
+        `deadline` (s)
 
         >>> Status.FALLBACK in (Status.SOLVER_FAILURE | Status.FALLBACK)
         True
@@ -39,18 +40,20 @@ class Status(Flag):
 
 @dataclass(frozen=True, kw_only=True)
 class State:
-    """True state of a plant at the start of control interval `step`; controllers get an Observation instead.
+    """True state of a plant at the start of control interval `step`; controllers get an Observation
+    instead.
 
     step: k = 0, 1, ...
     time: since the start (s)
     accumulation: (R, R) [veh], [i, j] = in region i bound for j
-    backlog: (R, R) [veh], [i, j] = waiting outside the network to enter region i, bound for j; zero in the NMFD
+    backlog: (R, R) [veh], [i, j] = waiting outside the network to enter region i, bound for j; zero
+        in the NMFD
     completed: completed trips since the start [veh]
-    removed: (R, R) [veh], [i, j] = removed from the simulation in i, or before they entered it, on their way to j,
-        since the start; None for zero, as in the NMFD
+    removed: (R, R) [veh], [i, j] = removed from the simulation in i, or before they entered it, on
+        their way to j, since the start; None for zero, as in the NMFD
     problem: the part of the last command that the plant could not execute, "" if none
-    realised: (R, R) [-], u that passed in the last interval, where that may differ from the command; None before the
-        first one, and in regional plants, which do what is commanded
+    realised: (R, R) [-], u that passed in the last interval, where that may differ from the
+        command; None before the first one, and in regional plants, which do what is commanded
     """
 
     step: int
@@ -64,14 +67,16 @@ class State:
 
     @property
     def unfinished(self) -> PerPair:
-        """Return the vehicles (R, R) that spend time: running, waiting to enter, and removed (nmfd.metrics)."""
+        """Return the vehicles (R, R) that spend time: running, waiting to enter, and removed
+        (nmfd.metrics)."""
         spending = self.accumulation + self.backlog
         return spending if self.removed is None else spending + self.removed
 
 
 @dataclass(frozen=True, kw_only=True)
 class Observation:
-    """Input of a controller at the start of control interval `step`: with noise, with faults, or an estimate.
+    """Input of a controller at the start of control interval `step`: with noise, with faults, or an
+    estimate.
 
     step, time: those of the State
     accumulation: (R, R) [veh], [i, j] = in region i bound for j
@@ -90,15 +95,16 @@ class Observation:
 class Controls:
     """Command of a controller for one control interval.
 
-    perimeter: (R, R) [-], [i, h] = u_ih, share of the desired transfer flow from i to h that may pass;
-        ignored where h is not adjacent to i
-    splits: (R, R, R) [-], [i, h, j] = theta_ihj, share of the vehicles in i bound for j that head for h;
-        None without route guidance: drivers keep their routes (in the regional model the nominal splits)
-    prices: (R,) [-], added share of the travel time through region i that guided drivers bound for other regions see:
-        1 for twice as long. In a city, guidance by these travel times replaces `splits`; the regional model takes
-        `splits`. None: no prices
-    metering: (R,) [veh/s], largest rate of trips that may begin in region i; further trips wait outside, in the
-        backlog. Only cities with `+metering` obey it. None: no limit
+    perimeter: (R, R) [-], [i, h] = u_ih, share of the desired transfer flow from i to h that may
+        pass; ignored where h is not adjacent to i
+    splits: (R, R, R) [-], [i, h, j] = theta_ihj, share of the vehicles in i bound for j that head
+        for h; None without route guidance: drivers keep their routes (in the regional model the
+        nominal splits)
+    prices: (R,) [-], added share of the travel time through region i that guided drivers bound for
+        other regions see: 1 for twice as long. In a city, guidance by these travel times replaces
+        `splits`; the regional model takes `splits`. None: no prices
+    metering: (R,) [veh/s], largest rate of trips that may begin in region i; further trips wait
+        outside, in the backlog. Only cities with `+metering` obey it. None: no limit
     status: OK, or the reasons why these are other controls; note: the same in words, "" if OK
     """
 
@@ -112,7 +118,8 @@ class Controls:
 
 @runtime_checkable
 class Plant(Protocol):
-    """City, regional or microscopic. `step` is one control interval. A method `close` releases what it holds."""
+    """City, regional or microscopic. `step` is one control interval. A method `close` releases what
+    it holds."""
 
     def reset(self, seed: int) -> State:
         """Start again from the beginning."""
@@ -121,7 +128,8 @@ class Plant(Protocol):
         """Apply `controls` for one control interval; return the state at its end."""
 
     def observe(self) -> Observation | None:
-        """Return the estimate of the plant's own instruments; None without any: the state is measured with noise."""
+        """Return the estimate of the plant's own instruments; None without any: the state is
+        measured with noise."""
 
 
 @runtime_checkable
@@ -134,7 +142,8 @@ class Controller(Protocol):
         """Start a new run; all random draws of the controller follow from `seed`."""
 
     def act(self, observation: Observation) -> Controls:
-        """Return the controls of the interval that begins now; `observation` is the controller's own copy."""
+        """Return the controls of the interval that begins now; `observation` is the controller's
+        own copy."""
 
 
 class Quantity(NamedTuple):
@@ -147,8 +156,14 @@ class Quantity(NamedTuple):
     def variable(self, values: Any) -> tuple:
         """Return `values` as xarray.Dataset takes them: dimensions, array and attributes."""
         array = np.asarray(values)
-        array = array.astype(object) if array.dtype.kind == "U" else array  # as netCDF returns texts
-        return self.dimensions, array, {"long_name": self.text} | ({"units": self.unit} if self.unit else {})
+        array = (
+            array.astype(object) if array.dtype.kind == "U" else array
+        )  # as netCDF returns texts
+        return (
+            self.dimensions,
+            array,
+            {"long_name": self.text} | ({"units": self.unit} if self.unit else {}),
+        )
 
 
 _PAIRS = ("time", "region", "destination")
@@ -159,27 +174,43 @@ VARIABLES: dict[str, Quantity] = {
     "completed": Quantity(("time",), "veh", "completed trips, cumulative"),
     "removed": Quantity(_PAIRS, "veh", "vehicles removed on their way, cumulative"),
     "observed": Quantity(_PAIRS, "veh", "vehicles inside as observed by the controller"),
-    "observed_backlog": Quantity(_PAIRS, "veh", "vehicles waiting to enter as observed by the controller"),
-    "perimeter": Quantity(_TURNS[:3], "1", "share of the desired transfer flow that may pass; 0 if not adjacent"),
-    "splits": Quantity(_TURNS, "1", "share of vehicles that heads for the next region; nominal without guidance"),
-    "prices": Quantity(("interval", "region"), "1", "added share of the travel time through the region"),
+    "observed_backlog": Quantity(
+        _PAIRS, "veh", "vehicles waiting to enter as observed by the controller"
+    ),
+    "perimeter": Quantity(
+        _TURNS[:3], "1", "share of the desired transfer flow that may pass; 0 if not adjacent"
+    ),
+    "splits": Quantity(
+        _TURNS, "1", "share of vehicles that heads for the next region; nominal without guidance"
+    ),
+    "prices": Quantity(
+        ("interval", "region"), "1", "added share of the travel time through the region"
+    ),
     "status": Quantity(("interval",), "1", "status of the decision, 0 if OK (nmfd.types.Status)"),
     "note": Quantity(("interval",), "", "the status in words"),
-    "decision_time": Quantity(("interval",), "s", "processor time of Controller.act, of all threads of the process"),
+    "decision_time": Quantity(
+        ("interval",), "s", "processor time of Controller.act, of all threads of the process"
+    ),
 }
-HOST_TIMES = ("decision_time", "wall_time", "sumo_time_s", "setup_time_s", "overhead_share")  # differ between two runs
+HOST_TIMES = (
+    "decision_time",
+    "wall_time",
+    "sumo_time_s",
+    "setup_time_s",
+    "overhead_share",
+)  # differ between two runs
 
 
 @dataclass(frozen=True, eq=False)
 class Result:
     """One closed-loop run of T control intervals, as a Dataset.
 
-    data: variables over time (T+1 states), interval (T decisions), region, next_region and destination; in SUMO over
-        gateway and edge, too. Attributes: controller, plant, seed, step (s), estimated (0 or 1), wall_time (s), and all
-        scalar facts of the run
+    data: variables over time (T+1 states), interval (T decisions), region, next_region and
+        destination; in SUMO over gateway and edge, too. Attributes: controller, plant, seed, step
+        (s), estimated (0 or 1), wall_time (s), and all scalar facts of the run
 
-    `result.accumulation` is the array of that variable, `result.controller` the attribute of that name; a variable
-    comes before an attribute of the same name.
+    `result.accumulation` is the array of that variable, `result.controller` the attribute of that
+    name; a variable comes before an attribute of the same name.
     """
 
     data: "xarray.Dataset"
@@ -192,7 +223,11 @@ class Result:
         times = attrs["step"] * np.arange(len(arrays["accumulation"]))
         coordinates = {
             "time": ("time", times, {"long_name": "time since the start", "units": "s"}),
-            "interval": ("interval", times[:-1], {"long_name": "beginning of the interval", "units": "s"}),
+            "interval": (
+                "interval",
+                times[:-1],
+                {"long_name": "beginning of the interval", "units": "s"},
+            ),
         }
         variables = {name: about.variable(arrays[name]) for name, about in VARIABLES.items()}
         return cls(xarray.Dataset(variables, coordinates, dict(attrs)))
@@ -207,19 +242,26 @@ class Result:
 
         try:
             with uninterrupted():
-                data = xarray.load_dataset(path, engine="netcdf4", decode_times=False, mask_and_scale=False)
+                data = xarray.load_dataset(
+                    path, engine="netcdf4", decode_times=False, mask_and_scale=False
+                )
         except FileNotFoundError:
             raise InputError(f"{path}: no such run") from None
         except Exception as error:
             reason = str(error).partition("\n")[0]
             raise InputError(f"{path}: is no run ({reason}); delete it and run again") from None
-        data.attrs = {name: v.item() if isinstance(v, np.generic) else v for name, v in data.attrs.items()}
+        data.attrs = {
+            name: v.item() if isinstance(v, np.generic) else v for name, v in data.attrs.items()
+        }
         return cls(data)
 
     def write(self, path: Path | str) -> None:
         """Write the Dataset to the netCDF file `path`, whole or not at all."""
         data = self.data.copy()
-        data.attrs = {name: int(value) if isinstance(value, bool) else value for name, value in data.attrs.items()}
+        data.attrs = {
+            name: int(value) if isinstance(value, bool) else value
+            for name, value in data.attrs.items()
+        }
         for name, variable in data.variables.items():
             if variable.dtype == np.float16:  # netCDF has no such type
                 data[name] = variable.astype(np.float32)
@@ -264,15 +306,25 @@ class Result:
                 data.attrs[name] = value
         return Result(data)
 
-    def add(self, attrs: Mapping[str, Any], about: Mapping[str, Quantity] = {}, **arrays: np.ndarray) -> "Result":
-        """Return the result with more attributes, and the `arrays` that are described in `about`."""
-        variables = {name: quantity.variable(arrays[name]) for name, quantity in about.items() if name in arrays}
+    def add(
+        self, attrs: Mapping[str, Any], about: Mapping[str, Quantity] = {}, **arrays: np.ndarray
+    ) -> "Result":
+        """Return the result with more attributes, and the `arrays` that are described in
+        `about`."""
+        variables = {
+            name: quantity.variable(arrays[name])
+            for name, quantity in about.items()
+            if name in arrays
+        }
         return Result(self.data.assign(variables).assign_attrs(attrs))
 
     def without_times(self) -> "xarray.Dataset":
-        """Return the Dataset without wall times and key: the same for every run of the same seed."""
+        """Return the Dataset without wall times and key: the same for every run of the same
+        seed."""
         data = self.data.drop_vars(HOST_TIMES, errors="ignore")
-        data.attrs = {name: value for name, value in data.attrs.items() if name not in (*HOST_TIMES, "key")}
+        data.attrs = {
+            name: value for name, value in data.attrs.items() if name not in (*HOST_TIMES, "key")
+        }
         return data
 
     def _repr_html_(self) -> str:

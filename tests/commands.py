@@ -39,5 +39,7 @@ def error_line(result: Result, program: str = "cosim") -> str:
     """Return the line that a command ended with: ours alone, or the last one of click."""
     assert result.exit_code == 2, result.output + repr(result.exception)
     *others, line = result.stderr.splitlines()
-    assert line.startswith("Error: ") or (line.startswith(f"{program}: error: ") and not others), result.stderr
+    assert line.startswith("Error: ") or (line.startswith(f"{program}: error: ") and not others), (
+        result.stderr
+    )
     return line

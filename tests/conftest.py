@@ -1,4 +1,5 @@
-"""What every test shares: one thread per process, and no skipped test where `--no-skips` forbids it."""
+"""What every test shares: one thread per process, and no skipped test where `--no-skips` forbids
+it."""
 
 import gc
 import os
@@ -8,11 +9,24 @@ import pytest
 from jaxtyping import config, install_import_hook
 from xdist.workermanage import NodeManager
 
-sys.dont_write_bytecode = False  # else every process rewrites the asserts of all files anew, for 6 s
-# Here and in the commands that tests call: workers must not fight for cores. Torch reads it when it is imported.
-os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
-# Where arrays have shapes; of the other modules, many functions are called for every vehicle or line of a file.
-SHAPED = ["cosim.evaluation", "cosim.importing", "cosim.plant", "cosim.report", "cosim.sumo.net", "cosim.sumo.trips"]
+sys.dont_write_bytecode = (
+    False  # else every process rewrites the asserts of all files anew, for 6 s
+)
+# Here and in the commands that tests call: workers must not fight for cores. Torch reads it when it
+# is imported.
+os.environ.update(
+    dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+)
+# Where arrays have shapes; of the other modules, many functions are called for every vehicle or
+# line of a file.
+SHAPED = [
+    "cosim.evaluation",
+    "cosim.importing",
+    "cosim.plant",
+    "cosim.report",
+    "cosim.sumo.net",
+    "cosim.sumo.trips",
+]
 
 # Reasons for which a test may be skipped all the same; benchmarks run when they are asked for.
 ALLOWED = ("no GPU", "no real city", "no neuromancer", "--benchmark-skip active")
@@ -20,10 +34,16 @@ ALLOWED = ("no GPU", "no real city", "no neuromancer", "--benchmark-skip active"
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
-        "--no-skips", action="store_true", help="a skipped test fails, unless a GPU or a real city is missing"
+        "--no-skips",
+        action="store_true",
+        help="a skipped test fails, unless a GPU or a real city is missing",
     )
     parser.addoption(
-        "--may-skip", action="append", default=[*ALLOWED], metavar="REASON", help="nor does it fail for this reason"
+        "--may-skip",
+        action="append",
+        default=[*ALLOWED],
+        metavar="REASON",
+        help="nor does it fail for this reason",
     )
     parser.addoption(
         "--annotations",
@@ -43,7 +63,8 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection():
-    """Nothing of what collection makes is garbage until the end: looking for it takes a fifth of that time."""
+    """Nothing of what collection makes is garbage until the end: looking for it takes a fifth of
+    that time."""
     gc.disable()
     try:
         return (yield)
@@ -53,10 +74,14 @@ def pytest_collection():
 
 
 def pytest_keyboard_interrupt() -> None:
-    NodeManager.EXIT_TIMEOUT = 0.1  # s, that workers have to end: they are in the middle of a test; usually it is 10 s
+    NodeManager.EXIT_TIMEOUT = (
+        0.1  # s, that workers have to end: they are in the middle of a test; usually it is 10 s
+    )
 
 
-def _fail_if_skipped(report: pytest.TestReport | pytest.CollectReport, config: pytest.Config) -> None:
+def _fail_if_skipped(
+    report: pytest.TestReport | pytest.CollectReport, config: pytest.Config
+) -> None:
     if config.getoption("no_skips") and report.skipped and not hasattr(report, "wasxfail"):
         reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else str(report.longrepr)
         if not any(allowed in reason for allowed in config.getoption("may_skip")):
@@ -80,7 +105,8 @@ def scenario(folder):
 
 @pytest.fixture
 def plant_of(scenario):
-    """Plants of a module's scenario that are closed in any case: SUMO allows one session per process."""
+    """Plants of a module's scenario that are closed in any case: SUMO allows one session per
+    process."""
     from cosim.plant.plant import SumoPlant  # not before annotations are checked
     from cosim.plant.settings import Settings
 
@@ -97,7 +123,8 @@ def plant_of(scenario):
 
 @pytest.fixture
 def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No check of annotations: for tests of what users are told who give something of a wrong type."""
+    """No check of annotations: for tests of what users are told who give something of a wrong
+    type."""
     monkeypatch.setattr(config, "jaxtyping_disable", True)
 
 

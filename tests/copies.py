@@ -13,9 +13,12 @@ def grid7(folder: Path) -> None:
 
 
 def peak(folder: Path) -> Path:
-    """The scenario grid7_peak in `folder`, with its network and models and without the reference results."""
+    """The scenario grid7_peak in `folder`, with its network and models and without the reference
+    results."""
     grid7(folder)
     shutil.copytree(
-        ROOT / "scenarios" / "grid7_peak", folder / "scenarios" / "peak", ignore=shutil.ignore_patterns("reference")
+        ROOT / "scenarios" / "grid7_peak",
+        folder / "scenarios" / "peak",
+        ignore=shutil.ignore_patterns("reference"),
     )
     return folder / "scenarios" / "peak"

@@ -22,7 +22,8 @@ def kind(value: str) -> str:
 
 
 def assignments(text: str) -> list[tuple[int, str, str, str]]:
-    """Return (line, table, key, value) of every key in its first table, except for texts of several lines."""
+    """Return (line, table, key, value) of every key in its first table, except for texts of several
+    lines."""
     table, keys, inside = "", {}, False
     for number, line in enumerate(text.splitlines()):
         if '"""' in line:
@@ -42,7 +43,8 @@ def with_line(text: str, number: int, line: str | None) -> str:
 
 
 def wrong_files(text: str, required: tuple = ()) -> Iterator[tuple[str, str]]:
-    """Yield (problem, file): every key with wrong values, twice and misspelt; without each of the `required` keys."""
+    """Yield (problem, file): every key with wrong values, twice and misspelt; without each of the
+    `required` keys."""
     for number, table, key, value in assignments(text):
         for wrong in WRONG[kind(value)]:
             yield f"{table}.{key} = {wrong[:20]}", with_line(text, number, f"{key} = {wrong}")

@@ -1,4 +1,5 @@
-"""What the READMEs and the notebooks of the tutorials say: their links, names in backticks, and commands."""
+"""What the READMEs and the notebooks of the tutorials say: their links, names in backticks, and
+commands."""
 
 import ast
 import json
@@ -24,12 +25,26 @@ FILES = [
     ),
 ]
 NOTEBOOKS = [file for file in FILES if file.suffix == ".ipynb"]
-PROGRAMS = "nmfd cosim python python3 pip pytest dask pdoc jupyter . netgenerate openssl".split()
+PROGRAMS = [
+    "nmfd",
+    "cosim",
+    "python",
+    "python3",
+    "pip",
+    "pytest",
+    "dask",
+    "pdoc",
+    "jupyter",
+    ".",
+    "netgenerate",
+    "openssl",
+]
 
 
 @dataclass(frozen=True)
 class Document:
-    """links: targets of links and pictures; names: what stands in backticks; headings: their anchors;
+    """links: targets of links and pictures; names: what stands in backticks; headings: their
+    anchors;
     blocks: of code; commands: their lines, and those that a notebook calls, as lists of words."""
 
     file: Path
@@ -60,7 +75,12 @@ def read(file: Path) -> Document:
                 names.append(part.content)
     lines = [line for block in blocks if kind(block) == "shell" for line in _lines(block)]
     return Document(
-        file, links, names, headings, blocks, [words for line in (*lines, *called) for words in _words(line) if words]
+        file,
+        links,
+        names,
+        headings,
+        blocks,
+        [words for line in (*lines, *called) for words in _words(line) if words],
     )
 
 
@@ -69,7 +89,10 @@ def kind(block: str) -> str:
     lines = _lines(block)
     if lines and all(line.split()[0] in PROGRAMS for line in lines):
         return "shell"
-    for name, parse, errors in (("toml", tomllib.loads, tomllib.TOMLDecodeError), ("python", ast.parse, SyntaxError)):
+    for name, parse, errors in (
+        ("toml", tomllib.loads, tomllib.TOMLDecodeError),
+        ("python", ast.parse, SyntaxError),
+    ):
         try:
             parse(block)
         except errors:
@@ -80,7 +103,11 @@ def kind(block: str) -> str:
 
 def _lines(block: str) -> list[str]:
     whole = re.sub(r"\\\n\s*", "", block)
-    return [line.strip() for line in whole.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    return [
+        line.strip()
+        for line in whole.splitlines()
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
 
 
 def _words(line: str) -> Iterator[list[str]]:
@@ -95,18 +122,25 @@ def _words(line: str) -> Iterator[list[str]]:
 
 
 def _called(sources: list[str]) -> Iterator[str]:
-    """The first argument of every call of `command` in the cells of a notebook. {NAME} in it is what NAME = QUICK-value
-    if QUICK else VALUE gives to whoever runs it whole."""
-    nodes = [node for source in sources if not source.startswith("%%") for node in ast.walk(ast.parse(source))]
+    """The first argument of every call of `command` in the cells of a notebook. {NAME} in it is
+    what NAME = QUICK-value if QUICK else VALUE gives to whoever runs it whole."""
+    nodes = [
+        node
+        for source in sources
+        if not source.startswith("%%")
+        for node in ast.walk(ast.parse(source))
+    ]
     values = {
         node.targets[0].id: node.value.orelse.value
         for node in nodes
-        if isinstance(node, ast.Assign) and isinstance(getattr(node.value, "orelse", None), ast.Constant)
+        if isinstance(node, ast.Assign)
+        and isinstance(getattr(node.value, "orelse", None), ast.Constant)
     }
     for node in nodes:
         if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "command":
             given = node.args[0]
             parts = given.values if isinstance(given, ast.JoinedStr) else [given]
             yield "".join(
-                str(part.value if isinstance(part, ast.Constant) else values[part.value.id]) for part in parts
+                str(part.value if isinstance(part, ast.Constant) else values[part.value.id])
+                for part in parts
             )

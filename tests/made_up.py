@@ -1,4 +1,5 @@
-"""Made-up runs on grid7_peak in real folders: nothing is simulated, everything is drawn from the seed."""
+"""Made-up runs on grid7_peak in real folders: nothing is simulated, everything is drawn from the
+seed."""
 
 from functools import partial
 from pathlib import Path
@@ -24,7 +25,8 @@ SHARE = {"no-control": 1.0, "pi-gating": 0.8, "dpc-pcrg": 0.5}  # of the vehicle
 
 
 def instead_of_sumo(patch, result) -> None:
-    """Let `result(scenario, strategy, seed=, demand=)` make every run of `run_many`: a Result, or why it failed."""
+    """Let `result(scenario, strategy, seed=, demand=)` make every run of `run_many`: a Result, or
+    why it failed."""
 
     def outcomes(todo, *_):
         for run in todo:
@@ -39,9 +41,15 @@ def result(scenario, strategy, *, seed, demand, city) -> Result:
     regions, random = network.regions, np.random.default_rng([seed, len(strategy.name)])
     size = 40.0 * demand * SHARE[strategy.name]
     shape = np.minimum(np.arange(steps + 1), steps - np.arange(steps + 1)) + 0.0
-    accumulation = size * shape[:, None, None] * random.uniform(0.9, 1.1, (steps + 1, regions, regions))
+    accumulation = (
+        size * shape[:, None, None] * random.uniform(0.9, 1.1, (steps + 1, regions, regions))
+    )
     acts, guides = strategy.name != "no-control", "rg" in strategy.name
-    perimeter = random.uniform(0.3, 0.9, (steps, regions, regions)) if acts else np.full((steps, regions, regions), 0.9)
+    perimeter = (
+        random.uniform(0.3, 0.9, (steps, regions, regions))
+        if acts
+        else np.full((steps, regions, regions), 0.9)
+    )
     crossings = random.integers(0, 9, (steps, regions, regions, regions)) * network.split_mask
     trajectory = trajectories.made(
         controller=strategy.name,
@@ -61,7 +69,10 @@ def result(scenario, strategy, *, seed, demand, city) -> Result:
         "departures": random.integers(0, 9, (steps, regions, regions)),
         "crossings": crossings,
         "arrivals": random.integers(0, 50, (steps, regions)),
-        **{name: np.zeros((steps, regions, regions), dtype=int) for name in ("removals", "given_up")},
+        **{
+            name: np.zeros((steps, regions, regions), dtype=int)
+            for name in ("removals", "given_up")
+        },
         **{name: np.zeros((steps, *[regions] * 3), dtype=int) for name in ("jumps", "redirected")},
         "edge_vehicles": random.uniform(0.0, 20.0, (steps, edges)).astype(np.float16),
         "gateway_green": original * (0.7 if acts else 1.0),
@@ -76,7 +87,9 @@ def result(scenario, strategy, *, seed, demand, city) -> Result:
         "guided": crossings * guides,
         "co2": random.uniform(0.0, 90.0, edges).astype(np.float32),
         "queue_max": random.integers(0, 30, edges),
-        "trip_time_by_origin": np.where(np.arange(regions) == 2, 1300.0, 900.0) if guides else np.full(regions, 1000.0),
+        "trip_time_by_origin": np.where(np.arange(regions) == 2, 1300.0, 900.0)
+        if guides
+        else np.full(regions, 1000.0),
     }
     facts = {name: random.uniform(0.1, 100.0) for name in FACTS} | {
         "scenario": scenario.name,
@@ -103,8 +116,11 @@ def folder(out: Path, *, controllers=tuple(SHARE), seeds=(2000, 2001), levels=(1
 
 def rows_of(values: dict[tuple[float, str], dict[int, float]]) -> pd.DataFrame:
     """(level, controller) -> seed -> TTS; everything else is 1 or empty."""
-    figures = ("completed_veh", *(f"control_step_ms_{which}" for which in ("first", "median", "max")))
-    blank = {name: 1.0 for name in (*figures, *FACTS)} | dict.fromkeys(("teleports", *COUNTED), 0)
+    figures = (
+        "completed_veh",
+        *(f"control_step_ms_{which}" for which in ("first", "median", "max")),
+    )
+    blank = dict.fromkeys((*figures, *FACTS), 1.0) | dict.fromkeys(("teleports", *COUNTED), 0)
     return pd.DataFrame(
         [
             blank | {"demand": level, "controller": name, "seed": seed, statistics.TTS: tts}

@@ -1,4 +1,5 @@
-"""What the signals of a junction must keep to under any command, and two programmes to try it on."""
+"""What the signals of a junction must keep to under any command, and two programmes to try it
+on."""
 
 import itertools
 from collections import defaultdict
@@ -10,9 +11,17 @@ from cosim.sumo.signals import Link, Signal
 
 MIN_GREEN = 5.0
 
-# Two crossing streets with a left-turn tail; link 1 is a gateway in both phases of its street, link 3 turns on a g that
-# never ends, and the green of link 4 runs over the end of the cycle.
-PHASES = [("GGrgG", 30), ("yGrgG", 3), ("rGrgy", 6), ("ryrgr", 3), ("rrGgr", 40), ("rrygr", 3), ("rrrgG", 5)]
+# Two crossing streets with a left-turn tail; link 1 is a gateway in both phases of its street, link
+# 3 turns on a g that never ends, and the green of link 4 runs over the end of the cycle.
+PHASES = [
+    ("GGrgG", 30),
+    ("yGrgG", 3),
+    ("rGrgy", 6),
+    ("ryrgr", 3),
+    ("rrGgr", 40),
+    ("rrygr", 3),
+    ("rrrgG", 5),
+]
 SINGLE = [("Gr", 42), ("yr", 3), ("rG", 4), ("rG", 38), ("ry", 3)]
 # Link 2 is a crossing of the street of link 1.
 WALK = [("GrG", 20), ("Grr", 4), ("yrr", 4), ("rrr", 1), ("rGr", 3), ("ryr", 2), ("rrr", 2)]
@@ -20,14 +29,22 @@ CROSS = [("Gr", 30), ("yr", 3), ("rG", 30), ("ry", 3)]
 
 
 def signal(phases, links=(), name="s"):
-    return Signal(id=name, offset=0.0, phases=tuple(Phase(duration=d, state=s) for s, d in phases), links=tuple(links))
+    return Signal(
+        id=name,
+        offset=0.0,
+        phases=tuple(Phase(duration=d, state=s) for s, d in phases),
+        links=tuple(links),
+    )
 
 
 def cross(name="s"):
     """Two streets, one lane each."""
     return signal(
         CROSS,
-        (Link(index=0, from_edge="a", lane=0, to_edge="b"), Link(index=1, from_edge="c", lane=0, to_edge="d")),
+        (
+            Link(index=0, from_edge="a", lane=0, to_edge="b"),
+            Link(index=1, from_edge="c", lane=0, to_edge="d"),
+        ),
         name,
     )
 
@@ -61,6 +78,8 @@ def rules(phases, crossings=()):
 
 def check(states, phases):
     """What must hold under any command; states: one per second."""
-    changes = [(float(n), state) for n, state in enumerate(states) if not n or state != states[n - 1]]
+    changes = [
+        (float(n), state) for n, state in enumerate(states) if not n or state != states[n - 1]
+    ]
     row = rules(phases).judge(changes, float(len(states)))
     assert not any(row[-len(VIOLATIONS) :]), row

@@ -13,12 +13,17 @@ from cosim.sumo.net import City, Gateway
 MANY = 1e5  # veh: so many that nothing else counts
 
 
-def city(region_of: Mapping[str, int], successors: Mapping[str, Sequence[str]], **others: Any) -> City:
-    """Return a city with these edges, 10 m long, and a gateway wherever a move leads into another region."""
+def city(
+    region_of: Mapping[str, int], successors: Mapping[str, Sequence[str]], **others: Any
+) -> City:
+    """Return a city with these edges, 10 m long, and a gateway wherever a move leads into another
+    region."""
     edges = tuple(edge for edge in sorted(region_of) if edge in successors)
     moves = [(e, f) for e in edges for f in successors[e]]
     gateways = [
-        Gateway(source=region_of[e], target=region_of[f], from_edge=e, to_edge=f, signal=None, links=())
+        Gateway(
+            source=region_of[e], target=region_of[f], from_edge=e, to_edge=f, signal=None, links=()
+        )
         for e, f in moves
         if region_of[e] != region_of[f]
     ]
@@ -42,7 +47,8 @@ def city(region_of: Mapping[str, int], successors: Mapping[str, Sequence[str]], 
 
 
 def session(routes: dict[str, tuple[str, ...]], **others: Any) -> SimpleNamespace:
-    """Return a session of drivers on the first edges of their `routes`, none of whom is near the end of a lane."""
+    """Return a session of drivers on the first edges of their `routes`, none of whom is near the
+    end of a lane."""
     calls = {
         "road": lambda vehicle: routes[vehicle][0],
         "route": routes.get,
@@ -66,7 +72,9 @@ def seen(
 ) -> StreetMeans:
     """Speeds [m/s] by edge, NaN where nobody was; vehicles [veh]: MANY if not given."""
     mean = np.array(speed, dtype=float)
-    on = np.where(np.isnan(mean), 0.0, MANY) if vehicles is None else np.array(vehicles, dtype=float)
+    on = (
+        np.where(np.isnan(mean), 0.0, MANY) if vehicles is None else np.array(vehicles, dtype=float)
+    )
     return StreetMeans(
         duration=duration,
         vehicles=on,

@@ -1,4 +1,5 @@
-"""Perimeter commands on signals: yellow, minimum green, no new conflicts, the original programme at u_max."""
+"""Perimeter commands on signals: yellow, minimum green, no new conflicts, the original programme at
+u_max."""
 
 import numpy as np
 import pytest
@@ -10,14 +11,19 @@ from cosim.sumo.session import Phase, Programme
 
 def programme(phases, position=0.0):
     return Programme(
-        signal="s", phases=tuple(Phase(duration=d, state=s) for s, d in phases), position=position, static=True
+        signal="s",
+        phases=tuple(Phase(duration=d, state=s) for s, d in phases),
+        position=position,
+        static=True,
     )
 
 
 def gateway_signal(phases, movements, position=0.0):
     """A fixed-time signal, and the states that it will show."""
     shown = []
-    signal = GatewaySignal(programme(phases, position), movements, start=0.0, show=lambda _, state: shown.append(state))
+    signal = GatewaySignal(
+        programme(phases, position), movements, start=0.0, show=lambda _, state: shown.append(state)
+    )
     return signal, shown
 
 
@@ -35,7 +41,7 @@ def play(phases, movements, commands, *, position=0.0, interval=90):
 
 @pytest.mark.parametrize("phases", [PHASES, SINGLE])
 def test_u_max_is_the_original_programme(phases):
-    movements = {link: 0 for link in range(1, len(phases[0][0]))}
+    movements = dict.fromkeys(range(1, len(phases[0][0])), 0)
     states = play(phases, movements, [np.ones(1)] * 4, position=17.0)
     original = [s for s, d in phases for _ in range(int(d))]
     assert states == [original[(second + 17) % 90] for second in range(360)]
@@ -63,8 +69,11 @@ def test_green_falls_from_the_original_to_the_minimum():
     for share in np.linspace(0.0, 1.0, 11):
         states = play(PHASES, {0: 0}, [np.full(1, share)] * 3)
         green.append(sum(s[0] in "Gg" for s in states[90:180]))
-    assert green[0] == MIN_GREEN and green[-1] == 30
-    assert green[2] == 10 and green[4] == 15 and green[6] == 20  # 5 s and so much of the other 25 s
+    assert green[0] == MIN_GREEN
+    assert green[-1] == 30
+    assert green[2] == 10
+    assert green[4] == 15
+    assert green[6] == 20
     assert (np.diff(green) >= 2).all()
 
 
@@ -79,7 +88,9 @@ def test_a_link_that_is_never_red_is_held_once_per_cycle(position):
     """Its window is the cycle; the one that had begun before the simulation is left whole."""
     states = play(PHASES, {3: 0}, [np.full(1, 0.4)] * 4, position=position)
     first = round(90 - position) if position else 90
-    assert "".join(state[3] for state in states[first : first + 180]) == 2 * (39 * "g" + 3 * "y" + 48 * "r")
+    assert "".join(state[3] for state in states[first : first + 180]) == 2 * (
+        39 * "g" + 3 * "y" + 48 * "r"
+    )
     assert {state[3] for state in states[: round(90 - position)]} == {"g"}
 
 
@@ -126,7 +137,11 @@ def lit(*spans):
     return "".join(int(span[:-1]) * span[-1] for span in spans)
 
 
-USUAL, TWICE, ALWAYS = 2 * lit("30G", "3y", "27r"), lit("10G", "3y", "7r", "20G", "3y", "17r"), lit("130G")
+USUAL, TWICE, ALWAYS = (
+    2 * lit("30G", "3y", "27r"),
+    lit("10G", "3y", "7r", "20G", "3y", "17r"),
+    lit("130G"),
+)
 
 
 @pytest.mark.parametrize(
@@ -136,16 +151,32 @@ USUAL, TWICE, ALWAYS = 2 * lit("30G", "3y", "27r"), lit("10G", "3y", "7r", "20G"
         (USUAL, 0.4, 30.0, 2 * lit("15G", "3y", "42r")),  # 5 s and two fifths of the other 25 s
         (USUAL, 0.0, 4.0, 2 * lit("4G", "3y", "53r")),  # less than the minimum green to begin with
         (TWICE, 0.4, 30.0, lit("10G", "3y", "7r", "5G", "3y", "32r")),
-        (TWICE, 0.3, 30.0, lit("10G", "3y", "47r")),  # the remaining 2.5 s are below the minimum green
-        (lit("8G", "3y", "49G"), 0.2, 30.0, lit("8G", "3y", "49r")),  # 2 s are left after the yellow of the programme
+        (
+            TWICE,
+            0.3,
+            30.0,
+            lit("10G", "3y", "47r"),
+        ),  # the remaining 2.5 s are below the minimum green
+        (
+            lit("8G", "3y", "49G"),
+            0.2,
+            30.0,
+            lit("8G", "3y", "49r"),
+        ),  # 2 s are left after the yellow of the programme
         (lit("8G", "3y", "49G"), 0.4, 30.0, lit("8G", "3y", "7G", "3y", "39r")),
         (lit("20r", "40G"), 0.4, 30.0, lit("20r", "15G", "3y", "22r")),
         (ALWAYS, 0.4, None, lit("27G", "3y", "30r", "27G", "3y", "30r", "10G")),
-        (ALWAYS, 53 / 55, None, lit("58G", "3y", "58G", "3y", "8G")),  # a yellow ends before the next green begins
+        (
+            ALWAYS,
+            53 / 55,
+            None,
+            lit("58G", "3y", "58G", "3y", "8G"),
+        ),  # a yellow ends before the next green begins
     ],
 )
 def test_a_ration_of_green_is_spent_in_every_cycle(lights, share, full, expected):
-    """Compare each second with the green worked out by hand; `show` is called only when the ration asks for it."""
+    """Compare each second with the green worked out by hand; `show` is called only when the ration
+    asks for it."""
     ration, shown, again = Ration(0, cycle=60.0, yellow=3.0, start=0.0, full=full), "", 0.0
     ration.share = share
     for second, light in enumerate(lights):
@@ -153,5 +184,6 @@ def test_a_ration_of_green_is_spent_in_every_cycle(lights, share, full, expected
             last, again = ration.show(light, float(second))
         shown += last
         assert ration.opened(second) == (last == "G" and shown[-2:-1] != "G")
-    assert shown == expected and ration.green_time(float(len(lights))) == shown.count("G")
+    assert shown == expected
+    assert ration.green_time(float(len(lights))) == shown.count("G")
     assert ration.limited == (share < 1.0)

@@ -7,7 +7,9 @@ from jaxtyping import TypeCheckError
 from cosim.evaluation.model_validation import held_up
 from nmfd.types import State
 
-pytestmark = pytest.mark.skipif("config.getoption('annotations') == 'off'", reason="--annotations=off")
+pytestmark = pytest.mark.skipif(
+    "config.getoption('annotations') == 'off'", reason="--annotations=off"
+)
 
 
 def test_a_wrong_shape_is_noticed():

@@ -1,4 +1,5 @@
-"""The packages as libraries: the Python of the READMEs, lazy imports, help, and agreement with the command line."""
+"""The packages as libraries: the Python of the READMEs, lazy imports, help, and agreement with the
+command line."""
 
 import json
 import pydoc
@@ -23,7 +24,9 @@ from nmfd.studies.benchmark import summary_table
 @pytest.mark.parametrize("package", ["nmfd", "cosim"])
 def test_the_python_of_the_readmes(package, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    blocks = [block for block in read(ROOT / package / "README.md").blocks if kind(block) == "python"]
+    blocks = [
+        block for block in read(ROOT / package / "README.md").blocks if kind(block) == "python"
+    ]
     for block in blocks:
         exec(block.replace("seed=1)", "seed=1, steps=3)"), {})
     assert blocks
@@ -51,26 +54,35 @@ def test_every_public_name_is_there_with_help_and_types(package):
 def test_run_and_benchmark_agree_with_the_command_line(tmp_path):
     folder, out = tiny.write(tmp_path), tmp_path / "out"
     done = CliRunner().invoke(
-        main, ["benchmark", str(folder), "--controllers", "pi-gating", "--seeds", "2", "--out", str(out)]
+        main,
+        ["benchmark", str(folder), "--controllers", "pi-gating", "--seeds", "2", "--out", str(out)],
     )
     assert done.exit_code == 0, done.output
     trajectory = nmfd.run(folder, "pi-gating", seed=1)
-    assert trajectory.without_times().identical(nmfd.Result.read(out / "pi-gating-1.nc").without_times())
+    assert trajectory.without_times().identical(
+        nmfd.Result.read(out / "pi-gating-1.nc").without_times()
+    )
     rows = nmfd.benchmark(folder, ["pi-gating"], seeds=2, out=out)
-    assert len(rows) == 2 and summary_table(rows) in done.output
+    assert len(rows) == 2
+    assert summary_table(rows) in done.output
 
 
-HALF = tiny.Acting(lambda seen: nmfd.Controls(perimeter=np.full(seen.accumulation.shape, 0.5), splits=None), "half")
+HALF = tiny.Acting(
+    lambda seen: nmfd.Controls(perimeter=np.full(seen.accumulation.shape, 0.5), splits=None), "half"
+)
 
 
 def test_a_controller_and_a_plant_as_objects(tmp_path):
     scenario = nmfd.load_scenario(tiny.write(tmp_path))
     inner = nmfd.NmfdPlant(scenario)
-    own = SimpleNamespace(reset=inner.reset, step=inner.step, observe=inner.observe)  # all that the docstring asks for
+    own = SimpleNamespace(
+        reset=inner.reset, step=inner.step, observe=inner.observe
+    )  # all that the docstring asks for
     trajectory = nmfd.run(scenario, HALF, steps=5, plant=own)
     assert (trajectory.controller, trajectory.plant) == ("half", "SimpleNamespace")
     assert (trajectory.accumulation == nmfd.run(scenario, HALF, steps=5).accumulation).all()
-    assert trajectory.perimeter.shape == (5, 2, 2) and (trajectory.perimeter == 0.5).all()
+    assert trajectory.perimeter.shape == (5, 2, 2)
+    assert (trajectory.perimeter == 0.5).all()
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,5 @@
-"""The reference of the Python interface is built without a warning, and examples in docstrings are true."""
+"""The reference of the Python interface is built without a warning, and examples in docstrings are
+true."""
 
 import ast
 import doctest
@@ -17,14 +18,17 @@ import nmfd
 ROOT = Path(__file__).parents[1]
 SLOW = ("cosim", "cosim.api", "nmfd.rl.env")  # SUMO
 FILES = {
-    ".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): file.read_text(encoding="utf-8")
+    ".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(
+        ".__init__"
+    ): file.read_text(encoding="utf-8")
     for folder in ("nmfd", "cosim")
     for file in sorted((ROOT / folder).rglob("*.py"))
 }
 EXAMPLES = [
     pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name
     for name, text in FILES.items()
-    if ">>> " in text and name != "nmfd.studies.measured"  # test_measured.py has the tables that it reads
+    if ">>> " in text
+    and name != "nmfd.studies.measured"  # test_measured.py has the tables that it reads
 ]
 
 
@@ -33,7 +37,9 @@ def test_the_reference_is_built_without_warnings(tmp_path):
     pytest.importorskip("pdoc")
     pytest.importorskip("gymnasium", reason="no extra rl")
     done = subprocess.run(
-        [sys.executable, str(ROOT / ".ci" / "reference.py"), str(tmp_path)], capture_output=True, text=True
+        [sys.executable, str(ROOT / ".ci" / "reference.py"), str(tmp_path)],
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == 0, done.stderr
     for package in (nmfd, cosim):
@@ -59,9 +65,14 @@ def test_every_example_in_a_docstring_has_its_prompts():
     for name, text in FILES.items():
         kinds = (ast.Module, ast.ClassDef, ast.FunctionDef)
         for node in (node for node in ast.walk(ast.parse(text)) if isinstance(node, kinds)):
-            for block in re.findall(r"(?:^    .*\n?)+", ast.get_docstring(node) or "", flags=re.MULTILINE):
+            for block in re.findall(
+                r"(?:^    .*\n?)+", ast.get_docstring(node) or "", flags=re.MULTILINE
+            ):
                 try:
                     inside = [*ast.walk(ast.parse(textwrap.dedent(block)))]
                 except SyntaxError:
                     continue
-                assert not any(isinstance(each, ast.Call | ast.Import) for each in inside), (name, block)
+                assert not any(isinstance(each, ast.Call | ast.Import) for each in inside), (
+                    name,
+                    block,
+                )

@@ -1,4 +1,5 @@
-"""Hundreds of inputs with one thing wrong each: one clear line, exit status 2, no traceback, nothing left behind."""
+"""Hundreds of inputs with one thing wrong each: one clear line, exit status 2, no traceback,
+nothing left behind."""
 
 import gzip
 import io
@@ -47,7 +48,10 @@ def problem(read, *arguments) -> str:
 
 
 def params(cases):
-    return [pytest.param(content, id=re.sub(r"[^!-~]+", " ", what)[:60].strip()) for what, content in cases]
+    return [
+        pytest.param(content, id=re.sub(r"[^!-~]+", " ", what)[:60].strip())
+        for what, content in cases
+    ]
 
 
 @pytest.mark.parametrize("text", params(corruptions.wrong_files(SCENARIO_TEXT, SCENARIO_KEYS)))
@@ -62,7 +66,9 @@ def test_every_key_of_a_network(tmp_path, text):
     assert "network.toml: " in problem(load_network, tmp_path)
 
 
-@pytest.mark.parametrize("text", params(c for c in corruptions.wrong_files(CITY_TEXT) if c[0].startswith("sumo.")))
+@pytest.mark.parametrize(
+    "text", params(c for c in corruptions.wrong_files(CITY_TEXT) if c[0].startswith("sumo."))
+)
 def test_every_key_of_a_sumo_table(tmp_path, text):
     (tmp_path / "scenario.toml").write_text(text)
     assert "scenario.toml: " in problem(lambda folder: settings(load_scenario(folder)), tmp_path)
@@ -72,8 +78,16 @@ ROW = tiny.row_network()
 FILES = {
     "step too long": (tiny.SCENARIO.replace("step = 30.0", "step = 300.0"), ROW, "at most 238 s"),
     "own neighbour": (tiny.SCENARIO, ROW.replace("[0]", "[0, 1]"), "regions[1].adjacent: "),
-    "controller": (tiny.SCENARIO + "\n[controllers.pi-gatin]\nkp = 1\n", ROW, "did you mean pi-gating?"),
-    "option": (tiny.SCENARIO + "\n[controllers.dpc-pc]\nwidht = 1\n", ROW, "controllers.dpc-pc.widht: unknown key"),
+    "controller": (
+        tiny.SCENARIO + "\n[controllers.pi-gatin]\nkp = 1\n",
+        ROW,
+        "did you mean pi-gating?",
+    ),
+    "option": (
+        tiny.SCENARIO + "\n[controllers.dpc-pc]\nwidht = 1\n",
+        ROW,
+        "controllers.dpc-pc.widht: unknown key",
+    ),
 }
 
 
@@ -82,7 +96,11 @@ FILES = {
 def test_files_that_do_not_fit_together(tmp_path, case, command):
     scenario, network, expected = FILES[case]
     folder, out = tiny.write(tmp_path, scenario=scenario, network=network), tmp_path / "out"
-    options = {"benchmark": ["--controllers", "no-control"], "train": ["--controller", "dpc-pc"], "show": []}
+    options = {
+        "benchmark": ["--controllers", "no-control"],
+        "train": ["--controller", "dpc-pc"],
+        "show": [],
+    }
     assert expected in error_line(nmfd(command, folder, *options[command], "--out", out), "nmfd")
     assert not out.exists()
 
@@ -111,7 +129,10 @@ def policy(tmp_path_factory):
     """Return the content of a policy for tiny's network, and that of one for three regions."""
     contents = []
     for regions in (2, 3):
-        folder = tiny.write(tmp_path_factory.mktemp("policy"), network=tiny.row_network(regions)).parent / "network"
+        folder = (
+            tiny.write(tmp_path_factory.mktemp("policy"), network=tiny.row_network(regions)).parent
+            / "network"
+        )
         network = load_network(folder)
         contents.append(checkpoint(Policy(network, Architecture(width=4)), network, {}))
     return contents
@@ -124,13 +145,17 @@ POLICIES = {
     "text": lambda own, other: b"no policy",
     "of another network": lambda own, other: saved(other),
     "pickled code": lambda own, other: pickle.dumps(Evil()),
-    "pickled code in torch's format": lambda own, other: saved({**own, "weights": {"scale": Evil()}}),
+    "pickled code in torch's format": lambda own, other: saved(
+        {**own, "weights": {"scale": Evil()}}
+    ),
     "a plan": lambda own, other: npz(perimeter=np.zeros(3)),
     "cut": lambda own, other: saved(own)[:1000],
     "a list": lambda own, other: saved([1, 2]),
     "no weights": lambda own, other: saved({key: own[key] for key in own if key != "weights"}),
     "no numbers": lambda own, other: saved({**own, "weights": None}),
-    "another shape": lambda own, other: saved({**own, "weights": {**own["weights"], WEIGHT: torch.zeros(3)}}),
+    "another shape": lambda own, other: saved(
+        {**own, "weights": {**own["weights"], WEIGHT: torch.zeros(3)}}
+    ),
 }
 
 
@@ -140,30 +165,54 @@ def test_policies(tmp_path, policy, monkeypatch, name):
     scenario = tiny.write(tmp_path)
     if (content := POLICIES[name](*policy)) is not None:
         Path("p.pt").write_bytes(content)
-    command = ("benchmark", scenario, "--controllers", "dpc-pc", "--out", "out", "--policy", "dpc-pc=p.pt")
+    command = (
+        "benchmark",
+        scenario,
+        "--controllers",
+        "dpc-pc",
+        "--out",
+        "out",
+        "--policy",
+        "dpc-pc=p.pt",
+    )
     assert "p.pt: " in error_line(nmfd(*command), "nmfd")
-    assert not Path("executed").exists() and not Path("out").exists()
+    assert not Path("executed").exists()
+    assert not Path("out").exists()
 
 
 @pytest.mark.parametrize(
     "content",
-    params([("empty", b""), ("text", b"x"), ("other arrays", npz(a=np.zeros(3))), ("pickle", pickle.dumps(Evil()))]),
+    params(
+        [
+            ("empty", b""),
+            ("text", b"x"),
+            ("other arrays", npz(a=np.zeros(3))),
+            ("pickle", pickle.dumps(Evil())),
+        ]
+    ),
 )
 def test_plans(tmp_path, content):
     scenario = tiny.write(tmp_path)
     (scenario / "bound-pc.npz").write_bytes(content)
     command = ("benchmark", scenario, "--controllers", "bound-pc", "--out", tmp_path / "out")
-    assert "bound-pc.npz: " in error_line(nmfd(*command), "nmfd") and not (tmp_path / "out").exists()
+    assert "bound-pc.npz: " in error_line(nmfd(*command), "nmfd")
+    assert not (tmp_path / "out").exists()
 
 
 HEAD = "interval,from,to,veh_s\n"
-DEMANDS = ("", "k,i,j,q\n0,0,1,1\n", *(HEAD + row for row in ("a,b,c,d", "0,0,1", "0,0,1,-1", "0,0,1,nan", "0,0,9,1")))
+DEMANDS = (
+    "",
+    "k,i,j,q\n0,0,1,1\n",
+    *(HEAD + row for row in ("a,b,c,d", "0,0,1", "0,0,1,-1", "0,0,1,nan", "0,0,9,1")),
+)
 
 
 @pytest.mark.parametrize("content", DEMANDS)
 def test_demand_files(tmp_path, content):
     scenario = tiny.write(tmp_path)
-    (scenario / "scenario.toml").write_text('demand_file = "demand.csv"\n' + tiny.SCENARIO.split("[[demand]]")[0])
+    (scenario / "scenario.toml").write_text(
+        'demand_file = "demand.csv"\n' + tiny.SCENARIO.split("[[demand]]")[0]
+    )
     (scenario / "demand.csv").write_text(content)
     assert "demand.csv: " in problem(load_scenario, scenario)
 
@@ -171,7 +220,10 @@ def test_demand_files(tmp_path, content):
 @pytest.fixture(scope="module")
 def city(tmp_path_factory):
     """Return the folder of an imported network and its scenario."""
-    config, project = tiny_city.city(tmp_path_factory.mktemp("city")), tmp_path_factory.mktemp("project")
+    config, project = (
+        tiny_city.city(tmp_path_factory.mktemp("city")),
+        tmp_path_factory.mktemp("project"),
+    )
     good(cosim("import", config, "--regions", 3, "--out", project / "networks" / "tiny"))
     return project
 
@@ -218,17 +270,31 @@ def test_files_of_a_city(city, tmp_path, file, name):
     shutil.copytree(city, tmp_path / "project")
     path, out = tmp_path / "project" / file, tmp_path / "out"
     packed = path.suffix == ".gz"
-    text = DAMAGES[file][name](gzip.decompress(path.read_bytes()).decode() if packed else path.read_text())
+    text = DAMAGES[file][name](
+        gzip.decompress(path.read_bytes()).decode() if packed else path.read_text()
+    )
     path.write_bytes(gzip.compress(text.encode()) if packed else text.encode())
-    command = ("run", tmp_path / "project" / "scenarios" / "tiny", "--controller", "no-control", "--set", "steps=1")
+    command = (
+        "run",
+        tmp_path / "project" / "scenarios" / "tiny",
+        "--controller",
+        "no-control",
+        "--set",
+        "steps=1",
+    )
     line = error_line(cosim(*command, "--out", out))
     assert path.name in line or "nowhere" in line or "has no region" in line
     assert not out.exists()
 
 
 def test_unsorted_routes_are_sorted(city, tmp_path):
-    root = gzip.decompress((city / "scenarios" / "tiny" / "vehicles.rou.xml.gz").read_bytes()).decode()
-    vehicles = [ElementTree.tostring(vehicle, encoding="unicode") for vehicle in ElementTree.fromstring(root)]
+    root = gzip.decompress(
+        (city / "scenarios" / "tiny" / "vehicles.rou.xml.gz").read_bytes()
+    ).decode()
+    vehicles = [
+        ElementTree.tostring(vehicle, encoding="unicode")
+        for vehicle in ElementTree.fromstring(root)
+    ]
     (tmp_path / "r.rou.xml").write_text(f"<routes>{''.join(reversed(vehicles))}</routes>")
     assert (np.diff(read_recorded_trips([tmp_path / "r.rou.xml"]).depart) >= 0).all()
 

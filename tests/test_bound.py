@@ -1,4 +1,5 @@
-"""Best plans: admissible, below closed loops. Lower bounds: relaxations that all trajectories meet. The command."""
+"""Best plans: admissible, below closed loops. Lower bounds: relaxations that all trajectories meet.
+The command."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -30,21 +31,29 @@ def closed(scenario, controller):
 def test_where_nothing_congests_the_bound_is_an_open_perimeter(scenario):
     free = replace(scenario, demand=0.01 * scenario.demand, protected=())
     plan = bound.compute(free, "bound-pc", iterations=100)
-    assert plan.perimeter[:8, 0, 1].min() > 0.85  # later intervals move vehicles that the horizon does not count
+    assert (
+        plan.perimeter[:8, 0, 1].min() > 0.85
+    )  # later intervals move vehicles that the horizon does not count
     uncontrolled = closed(free, NoControl(planning_model(free)))
     assert closed(free, plan) == pytest.approx(uncontrolled, rel=1e-3)
 
 
 @pytest.mark.parametrize("name", bound.NAMES)
 def test_plans_are_admissible_and_replayed_exactly(name):
-    scenario = replace(with_demand(load_scenario(ECONOMIC), steps=40), folder=None)  # without its policies
+    scenario = replace(
+        with_demand(load_scenario(ECONOMIC), steps=40), folder=None
+    )  # without its policies
     plan = bound.compute(scenario, name, iterations=20)
     network = scenario.network
     u = plan.perimeter[:, network.adjacency]
-    assert u.min() >= network.u_min and u.max() <= network.u_max and (plan.perimeter[:, ~network.adjacency] == 0).all()
+    assert u.min() >= network.u_min
+    assert u.max() <= network.u_max
+    assert (plan.perimeter[:, ~network.adjacency] == 0).all()
     if plan.splits is not None:
         assert (plan.splits[:, ~network.split_mask] == 0.0).all()
-        np.testing.assert_allclose(plan.splits.sum(axis=2), [1.0 - np.eye(7)] * 40, rtol=0.0, atol=1e-12)
+        np.testing.assert_allclose(
+            plan.splits.sum(axis=2), [1.0 - np.eye(7)] * 40, rtol=0.0, atol=1e-12
+        )
     assert closed(scenario, plan) == pytest.approx(plan.totals[plan.start], rel=1e-12)
     assert plan.totals[plan.start] == min(plan.totals.values())
     assert set(plan.totals) == {"open", "middle", "pi-gating"}
@@ -54,7 +63,9 @@ def test_the_bound_is_not_above_the_closed_loop_it_started_from(scenario):
     crowded = replace(scenario, demand=3.0 * scenario.demand)
     plan = bound.compute(crowded, "bound-pc", iterations=200)
     # A sigmoid never quite reaches the bounds of u.
-    assert plan.totals[plan.start] <= (1.0 + 1e-4) * closed(crowded, PiGating(planning_model(crowded)))
+    assert plan.totals[plan.start] <= (1.0 + 1e-4) * closed(
+        crowded, PiGating(planning_model(crowded))
+    )
 
 
 def test_an_interrupted_descent_keeps_the_best_so_far(scenario):
@@ -70,24 +81,35 @@ def test_an_interrupted_descent_keeps_the_best_so_far(scenario):
 
 def test_a_plan_that_benchmark_replays(folder, tmp_path):
     text = api.bound(folder, "bound-pcrg", iterations=20)
-    assert "(kept)" in text and "from pi-gating:" in text and "the best plan is at most" in text
-    text = good(nmfd("benchmark", folder, "--controllers", "no-control,bound-pcrg", "--out", tmp_path / "out"))
-    assert (
-        "above the optimum" in text
-        and "≤ " in text
-        and any(line.startswith("bound-pcrg ") for line in text.splitlines())
+    assert "(kept)" in text
+    assert "from pi-gating:" in text
+    assert "the best plan is at most" in text
+    text = good(
+        nmfd(
+            "benchmark", folder, "--controllers", "no-control,bound-pcrg", "--out", tmp_path / "out"
+        )
     )
+    assert "above the optimum" in text
+    assert "≤ " in text
+    assert any(line.startswith("bound-pcrg ") for line in text.splitlines())
 
 
 def test_wrong_names(scenario):
-    with pytest.raises(InputError, match="'dpc-pc' is no bound; choose one of bound-pc, bound-pcrg"):
+    with pytest.raises(
+        InputError, match="'dpc-pc' is no bound; choose one of bound-pc, bound-pcrg"
+    ):
         bound.compute(scenario, "dpc-pc")
 
 
 def test_files_that_do_not_fit(scenario, tmp_path):
-    path, start = tmp_path / "p.npz", bound.neutral_starts(scenario.network, scenario.steps, guidance=False)
+    path, start = (
+        tmp_path / "p.npz",
+        bound.neutral_starts(scenario.network, scenario.steps, guidance=False),
+    )
     open_loop.write(bound.solve(scenario, start, guidance=False, iterations=1), scenario, path)
-    assert open_loop.read(path, replace(scenario, measurement_std=9.0), guidance=False).start in start
+    assert (
+        open_loop.read(path, replace(scenario, measurement_std=9.0), guidance=False).start in start
+    )
     with pytest.raises(InputError, match="another demand or network"):
         open_loop.read(path, replace(scenario, demand=2.0 * scenario.demand), guidance=False)
     with pytest.raises(InputError, match="is a plan of bound-pc"):
@@ -98,7 +120,8 @@ def test_files_that_do_not_fit(scenario, tmp_path):
 
 
 def unit_vector(lp, scenario, controls):
-    """The variables of `lp` along the plant's trajectory under controls (T, R, R), (T, R, R, R), and its TTS."""
+    """The variables of `lp` along the plant's trajectory under controls (T, R, R), (T, R, R, R),
+    and its TTS."""
     p, x = dynamics.parameters(scenario.network), torch.from_numpy(scenario.start)
     weights, places = dynamics.SCHEMES[scenario.integrator]
     here, onward, to = lp.turns.T
@@ -109,11 +132,17 @@ def unit_vector(lp, scenario, controls):
             total, slope = 0.0 * x, 0.0 * x
             for weight, place in zip(weights, places, strict=True):
                 at = x + place * lp.step * slope
-                slope = dynamics.derivative(p, at, torch.from_numpy(scenario.demand[k]), u, theta)[0]
+                slope = dynamics.derivative(p, at, torch.from_numpy(scenario.demand[k]), u, theta)[
+                    0
+                ]
                 total = total + weight * slope
                 leaving = dynamics.rate(p, at.sum(-1)).unsqueeze(-1) * at
                 states.append(at.numpy()[*lp.pairs.T])
-                outflows.append((leaving if p.exit_rates is None else leaving * p.exit_rates).numpy()[*lp.pairs.T])
+                outflows.append(
+                    (leaving if p.exit_rates is None else leaving * p.exit_rates).numpy()[
+                        *lp.pairs.T
+                    ]
+                )
                 transfers.append(dynamics.flows(p, at, u, theta)[1].numpy()[here, onward, to])
                 if k + 1 == scenario.steps:
                     break
@@ -135,7 +164,8 @@ def random_controls(network, steps, random, *, guidance):
 @pytest.mark.parametrize("guidance", [False, True])
 @pytest.mark.parametrize("variant", ["euler", "substeps", "rk4", "exit rates", "capacity"])
 def test_every_trajectory_meets_the_relaxation(variant, guidance):
-    """Random, neutral and greedy controls, into gridlock; and the optimum is below what they spend."""
+    """Random, neutral and greedy controls, into gridlock; and the optimum is below what they
+    spend."""
     scenario = replace(with_demand(load_scenario(ECONOMIC), steps=12), initial=np.zeros((7, 7)))
     scenario.initial[3], scenario.initial[0] = 2500.0, 200.0
     network, random = scenario.network, np.random.default_rng(5)
@@ -145,15 +175,20 @@ def test_every_trajectory_meets_the_relaxation(variant, guidance):
         network = replace(network, capacity=1.5 * network.adjacency, storage=np.full(7, 9000.0))
     changes = {"substeps": {"substeps": 3}, "rk4": {"integrator": "rk4"}}.get(variant, {})
     scenario = replace(scenario, network=network, **changes)
-    lp, bounded = bound.relaxation(scenario, guidance=guidance), bound.lower_bound(scenario, guidance=guidance)
+    lp, bounded = (
+        bound.relaxation(scenario, guidance=guidance),
+        bound.lower_bound(scenario, guidance=guidance),
+    )
     runs = list(bound.neutral_starts(network, 12, guidance=guidance).values())
     runs += [random_controls(network, 12, random, guidance=guidance) for _ in range(5)]
     for controls in runs:
         z, spent = unit_vector(lp, scenario, tuple(map(np.array, controls)))
-        assert z.min() >= 0.0 and z.max() <= 1.0
+        assert z.min() >= 0.0
+        assert z.max() <= 1.0
         np.testing.assert_allclose(lp.equal @ z, lp.given, rtol=0.0, atol=1e-12)
         assert (lp.upper @ z - lp.most).max() <= 1e-12
-        assert scenario.step * lp.vehicles * (lp.cost @ z) == pytest.approx(spent, rel=1e-12) and bounded <= spent
+        assert scenario.step * lp.vehicles * (lp.cost @ z) == pytest.approx(spent, rel=1e-12)
+        assert bounded <= spent
     z[lp.cost > 0] *= 0.99  # vehicles that vanish
     assert abs(lp.equal @ z - lp.given).max() > 1e-6
 

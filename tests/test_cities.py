@@ -1,4 +1,5 @@
-"""Cities that are not ours: the demos that come with SUMO, and real ones if they lie beside the project or in $CITIES.
+"""Cities that are not ours: the demos that come with SUMO, and real ones if they lie beside the
+project or in $CITIES.
 
 Each must give a network and a scenario that run, or one clear line.
 """
@@ -31,7 +32,8 @@ COMMITTED = sorted(notice.parent.name for notice in (ROOT / "networks").glob("*/
 
 
 def check(folder: Path, name: str, intervals: int) -> None:
-    """Every edge in one region, all connected; vehicles enter, and the ledger, checked in every interval, is exact."""
+    """Every edge in one region, all connected; vehicles enter, and the ledger, checked in every
+    interval, is exact."""
     network = folder / "networks" / name
     streets = read_streets(network / "city.net.xml.gz")
     table = pd.read_csv(network / "regions.csv", dtype={"edge": str})
@@ -39,7 +41,9 @@ def check(folder: Path, name: str, intervals: int) -> None:
     regions = table["region"].to_numpy()
     for region in range(regions.max() + 1):
         assert pieces(streets, streets.main_part & (regions == region)) == 1
-    _, departed, arrived, inside, _ = driven(load_scenario(folder / "scenarios" / name), intervals, 0.3)
+    _, departed, arrived, inside, _ = driven(
+        load_scenario(folder / "scenarios" / name), intervals, 0.3
+    )
     assert departed > 0
     assert departed - arrived == inside
 
@@ -57,13 +61,18 @@ def check(folder: Path, name: str, intervals: int) -> None:
     ],
 )
 def test_demos_of_sumo(tmp_path, name, expected):
-    result = cosim("import", GAMES / f"{name}.sumocfg", "--regions", 3, "--out", tmp_path / "networks" / name)
+    result = cosim(
+        "import", GAMES / f"{name}.sumocfg", "--regions", 3, "--out", tmp_path / "networks" / name
+    )
     if expected is None:
         good(result)
         check(tmp_path, name, 2)
     else:
-        assert result.exit_code == 2 and expected in result.stderr and result.stderr.count("\n") == 1
-        assert not list((tmp_path / "networks").glob("*")) and not list((tmp_path / "scenarios").glob("*"))
+        assert result.exit_code == 2
+        assert expected in result.stderr
+        assert result.stderr.count("\n") == 1
+        assert not list((tmp_path / "networks").glob("*"))
+        assert not list((tmp_path / "scenarios").glob("*"))
 
 
 @pytest.mark.slow
@@ -90,7 +99,11 @@ def test_max_pressure_takes_no_longer_than_fixed_time(tmp_path, name, level):
     good(cosim("import", config, "--regions", 3, "--out", tmp_path / "networks" / name))
     spent = {}
     for signals in ("no-control", "max-pressure"):
-        run = simulate(Simulation(load_scenario(tmp_path / "scenarios" / name), parse(signals), seed=1, demand=level))
+        run = simulate(
+            Simulation(
+                load_scenario(tmp_path / "scenarios" / name), parse(signals), seed=1, demand=level
+            )
+        )
         spent[signals] = total_time_spent(run)
         assert run.completed_veh == run.trips, signals
     assert max(spent, key=spent.get) == "no-control", spent
@@ -103,8 +116,12 @@ def test_committed_cities_are_small_and_need_nothing_else(name):
     size = 0
     for folder in (ROOT / "networks" / name, ROOT / "scenarios" / name):
         assert (folder / "NOTICE.txt").is_file()
-        for file in (file for file in folder.rglob("*") if file.is_file() and "reference" not in file.parts):
-            content = gzip.decompress(file.read_bytes()) if file.suffix == ".gz" else file.read_bytes()
+        for file in (
+            file for file in folder.rglob("*") if file.is_file() and "reference" not in file.parts
+        ):
+            content = (
+                gzip.decompress(file.read_bytes()) if file.suffix == ".gz" else file.read_bytes()
+            )
             assert b"/work/" not in content and b"shared/cities" not in content, file
             size += file.stat().st_size
     assert size < 5e6
@@ -115,4 +132,15 @@ def test_committed_cities_are_small_and_need_nothing_else(name):
 def test_committed_cities_run_under_their_policies(tmp_path, name):
     scenario = ROOT / "scenarios" / name
     for strategy in ("route-guidance", *(policy.stem for policy in scenario.glob("*.pt"))):
-        good(cosim("run", scenario, "--controller", strategy, "--steps", 2, "--out", tmp_path / strategy))
+        good(
+            cosim(
+                "run",
+                scenario,
+                "--controller",
+                strategy,
+                "--steps",
+                2,
+                "--out",
+                tmp_path / strategy,
+            )
+        )

@@ -22,7 +22,8 @@ def test_the_recipe_makes_the_shipped_network(name):
     folder = GRID7.parent / name
     table = tomllib.loads((folder / "city.toml").read_text(encoding="utf-8"))
     net, regions = runpy.run_path(str(GRID7.parent / "build_grid.py"))["build"](table, name)
-    assert net == (folder / "city.net.xml").read_bytes() and regions == (folder / "regions.csv").read_bytes()
+    assert net == (folder / "city.net.xml").read_bytes()
+    assert regions == (folder / "regions.csv").read_bytes()
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +57,8 @@ def test_gateway_links_are_those_of_their_movement(files, city):
     for gateway in city.gateways:
         assert city.region_of[gateway.from_edge] == gateway.source != gateway.target
         assert city.region_of[gateway.to_edge] == gateway.target
-        assert gateway.signal and gateway.links
+        assert gateway.signal
+        assert gateway.links
         for link in gateway.links:
             assert movement[gateway.signal, link] == (gateway.from_edge, gateway.to_edge)
 
@@ -73,8 +75,14 @@ def test_lanes_into_the_centre_lead_only_there(city):
     [
         (lambda text: text.replace("edge,region", "edge;region"), "line 1: expected edge,region"),
         (lambda text: text + "nowhere,3\n", "edge nowhere is not in"),
-        (lambda text: text.replace("c00-c01,3\n", ""), r"edge c00-c01 has no region \(1 such edges\)"),
-        (lambda text: text.replace("c00-c01,3", "c00-c01,7"), "an edge and a region from 0 to 6, got c00-c01,7"),
+        (
+            lambda text: text.replace("c00-c01,3\n", ""),
+            r"edge c00-c01 has no region \(1 such edges\)",
+        ),
+        (
+            lambda text: text.replace("c00-c01,3", "c00-c01,7"),
+            "an edge and a region from 0 to 6, got c00-c01,7",
+        ),
         (lambda text: text + "c00-c01,3\n", "edge c00-c01 appears twice"),
         (lambda text: re.sub(r",6\n", ",5\n", text), "region 6 has no edges"),
     ],

@@ -1,4 +1,5 @@
-"""The command line `nmfd`: what its commands write, quick help, --set, and one line for Ctrl-C and failures."""
+"""The command line `nmfd`: what its commands write, quick help, --set, and one line for Ctrl-C and
+failures."""
 
 import os
 import subprocess
@@ -20,7 +21,16 @@ HEAVY = ("pydantic", "torch", "casadi", "libsumo", "numpy", "pandas", "matplotli
 
 @pytest.fixture
 def both(folder, tmp_path):
-    return ["benchmark", folder, "--controllers", "no-control,pi-gating", "--seeds", 2, "--out", tmp_path / "out"]
+    return [
+        "benchmark",
+        folder,
+        "--controllers",
+        "no-control,pi-gating",
+        "--seeds",
+        2,
+        "--out",
+        tmp_path / "out",
+    ]
 
 
 @pytest.fixture
@@ -36,32 +46,57 @@ def in_process(monkeypatch):
 @pytest.mark.parametrize("package", MAINS)
 def test_help_is_quick_fits_a_screen_and_shows_examples(package):
     begin, main = time.process_time(), MAINS[package]
-    assert sorted(name for names in main.sections.values() for name in names) == sorted(main.commands)
+    assert sorted(name for names in main.sections.values() for name in names) == sorted(
+        main.commands
+    )
     for name in main.commands:
         text = good(call(package, name, "--help"))
         assert "Example" in text and f"{package} {name}" in text, name
     assert time.process_time() - begin < 2.0
-    alone = {name: value for name, value in os.environ.items() if not name.startswith("COV")}  # not traced
+    alone = {
+        name: value for name, value in os.environ.items() if not name.startswith("COV")
+    }  # not traced
     code = f"import sys, {package}.cli; print(*[name for name in {HEAVY} if name in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=alone)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=alone
+    )
     assert done.stdout == "\n"
-    done = subprocess.run([sys.executable, "-m", package], capture_output=True, text=True, env=alone)
+    done = subprocess.run(
+        [sys.executable, "-m", package], capture_output=True, text=True, env=alone
+    )
     lines = (done.stdout + done.stderr).splitlines()  # without arguments, the help is shown
-    assert lines[0].startswith("Usage: ") and len(lines) <= 24 and max(map(len, lines)) <= 80
+    assert lines[0].startswith("Usage: ")
+    assert len(lines) <= 24
+    assert max(map(len, lines)) <= 80
     assert f"Begin with `{package}" in " ".join(lines)
 
 
 def test_benchmark_writes_a_run_folder(both, tmp_path):
     lines = good(nmfd(*both)).splitlines()
-    assert lines[1].split()[:2] == ["no-control", "2"] and lines[2].split()[:2] == ["pi-gating", "2"]
-    assert "±" in lines[2] and lines[-1].startswith(f"Written to {tmp_path / 'out'}: see ")
+    assert lines[1].split()[:2] == ["no-control", "2"]
+    assert lines[2].split()[:2] == [
+        "pi-gating",
+        "2",
+    ]
+    assert "±" in lines[2]
+    assert lines[-1].startswith(f"Written to {tmp_path / 'out'}: see ")
     names = {f"{name}-{seed}.nc" for name in ("no-control", "pi-gating") for seed in (0, 1)}
-    assert names | {"runs.csv", "manifest.json", "mfd.png"} <= {path.name for path in (tmp_path / "out").iterdir()}
+    assert names | {"runs.csv", "manifest.json", "mfd.png"} <= {
+        path.name for path in (tmp_path / "out").iterdir()
+    }
 
 
 def test_settings(folder, tmp_path):
     """--set changes a key, in a nested table too, and mistakes name the key."""
-    command = ("benchmark", folder, "--controllers", "pi-gating", "--out", tmp_path / "out", "--set")
+    command = (
+        "benchmark",
+        folder,
+        "--controllers",
+        "pi-gating",
+        "--out",
+        tmp_path / "out",
+        "--set",
+    )
     good(nmfd(*command, "steps=3", "--set", "controllers.pi-gating.kp=2.5"))
     assert Result.read(tmp_path / "out" / "pi-gating-0.nc").accumulation.shape[0] == 4
     for text, problem in (
@@ -73,10 +108,13 @@ def test_settings(folder, tmp_path):
         assert problem in error_line(nmfd(*command, text), "nmfd")
 
 
-def test_a_failing_controller_names_itself_and_the_others_are_kept(both, tmp_path, monkeypatch, in_process):
+def test_a_failing_controller_names_itself_and_the_others_are_kept(
+    both, tmp_path, monkeypatch, in_process
+):
     monkeypatch.setattr(PiGating, "act", lambda self, measurement: 1 / 0)
     result = nmfd(*both)
-    assert result.exit_code == 1 and result.stderr.count("\n") == 1
+    assert result.exit_code == 1
+    assert result.stderr.count("\n") == 1
     assert "pi-gating, seed 0: ZeroDivisionError: division by zero (test_cli.py:" in result.stderr
     assert set(runs(tmp_path / "out")) == {"no-control-0.nc", "no-control-1.nc"}
 
@@ -93,7 +131,8 @@ def test_an_interrupted_benchmark_continues(both, tmp_path, monkeypatch, in_proc
 
     monkeypatch.setattr(closed_loop, "run", stopped)
     result = nmfd(*both)
-    assert result.exit_code == 130 and result.stderr.count("\n") == 1
+    assert result.exit_code == 130
+    assert result.stderr.count("\n") == 1
     assert result.stderr.startswith("nmfd: interrupted: finished runs are in ")
     assert len(runs(tmp_path / "out")) == 2
     good(nmfd(*both))
@@ -114,7 +153,8 @@ def test_training_can_be_interrupted_and_resumed(folder, monkeypatch):
     monkeypatch.setattr(torch.nn.utils, "clip_grad_norm_", stopped)
     command = ["train", folder, "--controller", "dpc-pc", "--steps", 4]
     result = nmfd(*command)
-    assert result.exit_code == 130 and result.stderr.count("\n") == 1
+    assert result.exit_code == 130
+    assert result.stderr.count("\n") == 1
     assert result.stderr.endswith(f"is {folder / 'dpc-pc.pt'}; add --resume to continue\n")
     assert (folder / "dpc-pc.pt").is_file()
     good(nmfd(*command, "--resume"))
@@ -139,13 +179,34 @@ def test_a_gpu_that_is_not_there_is_one_line(folder, monkeypatch):
 
 
 def test_show_draws_the_scenario(folder, tmp_path):
-    assert "2 regions, 360 trips between 1 pairs" in good(nmfd("show", folder, "--out", tmp_path / "figures"))
-    assert {path.name for path in (tmp_path / "figures").iterdir()} == {"spawn_matrix.png", "region_map.png", "mfd.png"}
+    assert "2 regions, 360 trips between 1 pairs" in good(
+        nmfd("show", folder, "--out", tmp_path / "figures")
+    )
+    assert {path.name for path in (tmp_path / "figures").iterdir()} == {
+        "spawn_matrix.png",
+        "region_map.png",
+        "mfd.png",
+    }
 
 
 def test_a_new_controller_runs(folder, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert "nmfd benchmark economic_mpc" in good(nmfd("new-controller", "mine.py"))
-    good(nmfd("benchmark", folder, "--controllers", "mine.py:MyController", "--set", "steps=2", "--out", "out"))
-    for name, problem in (("mine.py", "exists; choose another"), ("mine.txt", "ends in .py"), ("no/x.py", "No such")):
+    good(
+        nmfd(
+            "benchmark",
+            folder,
+            "--controllers",
+            "mine.py:MyController",
+            "--set",
+            "steps=2",
+            "--out",
+            "out",
+        )
+    )
+    for name, problem in (
+        ("mine.py", "exists; choose another"),
+        ("mine.txt", "ends in .py"),
+        ("no/x.py", "No such"),
+    ):
         assert problem in error_line(nmfd("new-controller", name), "nmfd")

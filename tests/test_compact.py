@@ -22,7 +22,14 @@ from nmfd.model.planning import planning_model
 from nmfd.types import Observation
 
 NUMBERS = Numbers(
-    set_point=1.1, gain=2.0, relief=0.5, price=3.0, price_from=0.7, elsewhere=0.4, elsewhere_from=1.2, metering=1.3
+    set_point=1.1,
+    gain=2.0,
+    relief=0.5,
+    price=3.0,
+    price_from=0.7,
+    elsewhere=0.4,
+    elsewhere_from=1.2,
+    metering=1.3,
 )
 CENTRE = 3
 TABLE = """
@@ -44,7 +51,9 @@ def network():
 
 
 def policy(network, numbers=NUMBERS, guidance=True, metering=False):
-    made = CompactPolicy(network, Architecture(guidance=guidance, compact=(CENTRE,), metering=metering))
+    made = CompactPolicy(
+        network, Architecture(guidance=guidance, compact=(CENTRE,), metering=metering)
+    )
     with torch.no_grad():
         made.numbers.copy_(torch.tensor(numbers))
     return made
@@ -68,14 +77,17 @@ def test_gates_and_prices_are_those_of_the_formula(network):
         expected = network.u_min + (network.u_max - network.u_min) * share
         assert controls.perimeter[i, h] == pytest.approx(expected, abs=1e-5)
     expected = np.where(
-        np.arange(network.regions) == CENTRE, 3.0 * np.maximum(full - 0.7, 0.0), 0.4 * np.maximum(full - 1.2, 0.0)
+        np.arange(network.regions) == CENTRE,
+        3.0 * np.maximum(full - 0.7, 0.0),
+        0.4 * np.maximum(full - 1.2, 0.0),
     )
     np.testing.assert_allclose(controls.prices, expected, atol=1e-5)
     assert controls.metering is None
     controls = DpcController(policy(network, metering=True)).act(seen)
     expected = np.maximum(1.3 - full, 0.0) * network.critical / FILL_TIME_S
     np.testing.assert_allclose(controls.metering, expected, rtol=1e-5, atol=1e-5)
-    assert (controls.prices > 0.0).any() and (controls.prices == 0.0).any()
+    assert (controls.prices > 0.0).any()
+    assert (controls.prices == 0.0).any()
 
 
 def test_trips_wait_for_the_protected_regions_wherever_they_begin(network):
@@ -104,7 +116,8 @@ def test_with_an_integral_it_contains_the_pi_gate_and_relief_comes_on_top(networ
     gate = PiGating(planning)
     numbers = Numbers(set_point=0.8, gain=1.2 / span, integral=ki * planning.step / span)
     alone, relieved = (
-        DpcController(policy(network, numbers._replace(relief=relief), guidance=False)) for relief in (0.0, 0.25)
+        DpcController(policy(network, numbers._replace(relief=relief), guidance=False))
+        for relief in (0.0, 0.25)
     )
     before = int(np.flatnonzero(network.adjacency[:, CENTRE])[0])
     x, seen = np.zeros((network.regions,) * 2), []
@@ -115,18 +128,26 @@ def test_with_an_integral_it_contains_the_pi_gate_and_relief_comes_on_top(networ
         for k, full in enumerate((0.2, 0.7, 0.9, 1.0, 0.8, 0.8, 0.4, 3.2, 3.0, 0.7)):
             x[CENTRE, CENTRE] = full * critical
             expected, found, more = (
-                controller.act(Observation(step=k, time=0.0, accumulation=x, backlog=0.0 * x)).perimeter
+                controller.act(
+                    Observation(step=k, time=0.0, accumulation=x, backlog=0.0 * x)
+                ).perimeter
                 for controller in (gate, alone, relieved)
             )
             np.testing.assert_allclose(found, expected, atol=1e-5)
-            np.testing.assert_allclose(np.delete(more, before, axis=0), np.delete(expected, before, axis=0), atol=1e-5)
+            np.testing.assert_allclose(
+                np.delete(more, before, axis=0), np.delete(expected, before, axis=0), atol=1e-5
+            )
             relieved_u = min(expected[before, CENTRE] + 0.25 * 0.4 * span, network.u_max)
             assert more[before, CENTRE] == pytest.approx(relieved_u, abs=1e-5)
             seen.append(expected[before, CENTRE])
-    assert max(seen) == network.u_max and min(seen) == network.u_min and len(set(seen)) >= 5
+    assert max(seen) == network.u_max
+    assert min(seen) == network.u_min
+    assert len(set(seen)) >= 5
 
 
-def test_the_regional_model_sends_fewer_through_a_dear_region_and_nobody_where_there_is_no_way(network):
+def test_the_regional_model_sends_fewer_through_a_dear_region_and_nobody_where_there_is_no_way(
+    network,
+):
     x = torch.from_numpy(crowded(network)).float()
     own = network.nominal_splits
     free = policy(network, NUMBERS._replace(price=0.0, elsewhere=0.0))(x)[1].detach().numpy()
@@ -136,9 +157,14 @@ def test_the_regional_model_sends_fewer_through_a_dear_region_and_nobody_where_t
     np.testing.assert_allclose(splits.sum(axis=1), own.sum(axis=1), atol=1e-6)
     assert (splits[~network.split_mask] == 0.0).all()
     others = [j for j in range(network.regions) if j != CENTRE]
-    through = np.array([[splits[i, CENTRE, j] - own[i, CENTRE, j] for j in others if j != i] for i in others])
-    assert (through < 1e-6).all() and through.min() < -0.05
-    np.testing.assert_allclose(splits[:, :, CENTRE], own[:, :, CENTRE], atol=1e-6)  # a price is paid on any way there
+    through = np.array(
+        [[splits[i, CENTRE, j] - own[i, CENTRE, j] for j in others if j != i] for i in others]
+    )
+    assert (through < 1e-6).all()
+    assert through.min() < -0.05
+    np.testing.assert_allclose(
+        splits[:, :, CENTRE], own[:, :, CENTRE], atol=1e-6
+    )  # a price is paid on any way there
 
 
 def test_every_number_has_a_gradient_and_perimeter_control_alone_has_no_prices(network):
@@ -151,7 +177,8 @@ def test_every_number_has_a_gradient_and_perimeter_control_alone_has_no_prices(n
     assert grad.integral == 0.0  # which no rollout has
     assert min(grad._replace(integral=1.0)) > 0.0
     alone = policy(network, guidance=False)
-    assert alone.prices(x) is None and alone(x)[1] is None
+    assert alone.prices(x) is None
+    assert alone(x)[1] is None
 
 
 def test_it_is_trained_and_kept_in_a_file(tmp_path):
@@ -161,13 +188,27 @@ def test_it_is_trained_and_kept_in_a_file(tmp_path):
     loaded = load_scenario(scenario)
     trained, content = load_policy(scenario / "dpc-pcrg.pt", loaded.network)
     rule = parse("gating-rule").make(loaded)
-    assert rule.policy.numbers.tolist() == pytest.approx([1.0, 2.0, 0.0, 0.0, 0.6, 0.0, 0.6, 1.5, 0.0, 0.0, 1.0])
-    assert isinstance(trained, CompactPolicy) and (trained.numbers != rule.policy.numbers).any()
+    assert rule.policy.numbers.tolist() == pytest.approx(
+        [1.0, 2.0, 0.0, 0.0, 0.6, 0.0, 0.6, 1.5, 0.0, 0.0, 1.0]
+    )
+    assert isinstance(trained, CompactPolicy)
+    assert (trained.numbers != rule.policy.numbers).any()
     assert trained.numbers[1] == rule.policy.numbers[1]  # kept
     setup = training.settings(loaded, parse("dpc-pcrg"))
-    untrained = training.validate(rule.policy, Rollout(planning_model(loaded, "dpc-pcrg")), 0, setup)
+    untrained = training.validate(
+        rule.policy, Rollout(planning_model(loaded, "dpc-pcrg")), 0, setup
+    )
     assert content["configuration"]["validation_veh_s"] < untrained
-    good(nmfd("benchmark", scenario, "--controllers", "dpc-pcrg,gating-rule", "--out", tmp_path / "out"))
+    good(
+        nmfd(
+            "benchmark",
+            scenario,
+            "--controllers",
+            "dpc-pcrg,gating-rule",
+            "--out",
+            tmp_path / "out",
+        )
+    )
 
 
 @pytest.mark.parametrize(
@@ -177,6 +218,8 @@ def test_it_is_trained_and_kept_in_a_file(tmp_path):
 )  # fmt: skip
 def test_wrong_numbers_of_a_rule(numbers, protected, problem):
     options = {"pricing-rule": {"numbers": numbers}}
-    scenario = replace(load_scenario("economic_mpc"), protected=protected, controller_options=options)
+    scenario = replace(
+        load_scenario("economic_mpc"), protected=protected, controller_options=options
+    )
     with pytest.raises(InputError, match=f"controllers.pricing-rule.{problem}"):
         parse("pricing-rule").make(scenario)

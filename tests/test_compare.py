@@ -1,4 +1,5 @@
-"""Comparison and identification on records whose truth is known: made by the regional model itself."""
+"""Comparison and identification on records whose truth is known: made by the regional model
+itself."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -28,15 +29,20 @@ def scenario():
 
 @pytest.fixture(scope="module")
 def result(scenario):
-    """A run of the regional model under random controls, recorded as if it were the microsimulation."""
+    """A run of the regional model under random controls, recorded as if it were the
+    microsimulation."""
     random, network = np.random.default_rng(0), scenario.network
     p, x = dynamics.parameters(network), torch.zeros((7, 7), dtype=torch.float64)
     states, perimeter, crossings, arrivals = [x.numpy()], [], [], []
     splits = torch.from_numpy(network.nominal_splits)
     for k in range(scenario.steps):
-        u = random.uniform(network.u_min, network.u_max, 7)[:, None] * network.adjacency  # one u per region, see below
+        u = (
+            random.uniform(network.u_min, network.u_max, 7)[:, None] * network.adjacency
+        )  # one u per region, see below
         completions, transfers = dynamics.flows(p, x, torch.from_numpy(u), splits)
-        x = dynamics.advance(p, x, torch.from_numpy(scenario.demand[k]), torch.from_numpy(u), splits, scenario.step)
+        x = dynamics.advance(
+            p, x, torch.from_numpy(scenario.demand[k]), torch.from_numpy(u), splits, scenario.step
+        )
         states.append(x.numpy())
         perimeter.append(u)
         crossings.append(scenario.step * transfers.numpy())
@@ -52,8 +58,14 @@ def result(scenario):
         perimeter=np.stack(perimeter),
         splits=np.repeat(network.nominal_splits[None], scenario.steps, axis=0),
     )
-    record = {"departures": scenario.step * scenario.demand, "crossings": crossings, "arrivals": arrivals}
-    return trajectories.recorded(trajectory, {name: np.stack(values) for name, values in record.items()}, {})
+    record = {
+        "departures": scenario.step * scenario.demand,
+        "crossings": crossings,
+        "arrivals": arrivals,
+    }
+    return trajectories.recorded(
+        trajectory, {name: np.stack(values) for name, values in record.items()}, {}
+    )
 
 
 def test_a_perfect_model_has_no_error(scenario, result):
@@ -95,14 +107,21 @@ def test_outflow_samples_lie_on_the_mfd(scenario, result):
         points = np.concatenate(list(cloud.values()))
         expected = scenario.network.mfds[region].outflow(points[:, 0])
         # The samples are taken at the middle of an interval, the flows at its beginning.
-        assert np.abs(points[:, 1] - expected).mean() < 0.03 * scenario.network.mfds[region].capacity
+        assert (
+            np.abs(points[:, 1] - expected).mean() < 0.03 * scenario.network.mfds[region].capacity
+        )
         fitted = mfd.fit(points[:, 0], points[:, 1])
         seen = np.linspace(0.0, fitted.jam, 50)
         assert fitted.problem() is None
-        assert np.abs(fitted.outflow(seen) - scenario.network.mfds[region].outflow(seen)).max() < 0.08 * 6.3
+        assert (
+            np.abs(fitted.outflow(seen) - scenario.network.mfds[region].outflow(seen)).max()
+            < 0.08 * 6.3
+        )
 
 
-def test_own_splits_are_the_crossings_shares_and_the_network_file_comes_back(scenario, result, tmp_path):
+def test_own_splits_are_the_crossings_shares_and_the_network_file_comes_back(
+    scenario, result, tmp_path
+):
     network = scenario.network
     crossings = result["crossings"].sum(axis=0)
     assert observed_split_ratios(network, crossings)[0, 6] == {3: 1.0}
@@ -129,7 +148,8 @@ def test_fit_is_safe_and_close(jam):
     x = random.uniform(0.0, jam, 400)
     fitted = mfd.fit(x, truth.outflow(x) + random.normal(0.0, 0.2, x.size))
     grid = np.linspace(0.0, 3.0 * jam, 1000)
-    assert (fitted.outflow(grid)[1:] > 0).all() and (np.diff(fitted.rate(grid)) <= 1e-12).all()
+    assert (fitted.outflow(grid)[1:] > 0).all()
+    assert (np.diff(fitted.rate(grid)) <= 1e-12).all()
     inside = grid[grid <= jam]
     assert np.abs(fitted.outflow(inside) - truth.outflow(inside)).max() < 0.3
 
@@ -137,10 +157,16 @@ def test_fit_is_safe_and_close(jam):
 def test_held_up_is_who_collapsed_later():
     """Regions 0-1-2 in a row; 1 collapses at k = 2, 0 at k = 3, and 2 never; then 1 recovers."""
     adjacency = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]], dtype=bool)
-    accumulation = np.array([[10, 10, 10], [20, 20, 20], [30, 30, 20], [40, 30, 20], [50, 20, 20]], dtype=float)
+    accumulation = np.array(
+        [[10, 10, 10], [20, 20, 20], [30, 30, 20], [40, 30, 20], [50, 20, 20]], dtype=float
+    )
     outflow = np.array([[1, 1, 1], [2, 2, 2], [2, 1, 2], [1, 1, 2], [1, 2, 2]], dtype=float)
     found = held_up(accumulation, outflow, adjacency)
-    assert found.T.tolist() == [[False, False, True, True, False], [False] * 5, [False, False, True, True, False]]
+    assert found.T.tolist() == [
+        [False, False, True, True, False],
+        [False] * 5,
+        [False, False, True, True, False],
+    ]
 
 
 def test_regions_that_no_loading_run_filled_are_named(scenario):
@@ -155,19 +181,28 @@ def test_regions_that_no_loading_run_filled_are_named(scenario):
         {n: state[2, n, n] for n in (0, 1, 2, 5)}
     )  # at 1.3 times it has fallen by 5 %
     blank = with_guesses(network, empty, lanes, [state])
-    assert set(blank.critical_above) == set(range(7)) and blank.mfds == network.mfds
+    assert set(blank.critical_above) == set(range(7))
+    assert blank.mfds == network.mfds
 
 
 def test_beyond_the_data_a_guess_from_lanes_is_for_control(scenario):
-    """Region 1 was seen up to 900 vehicles, on 20 lane-km: its guess is above that, and as fast as was measured."""
+    """Region 1 was seen up to 900 vehicles, on 20 lane-km: its guess is above that, and as fast as
+    was measured."""
     network = replace(scenario.network, exit_rates=np.ones((7, 7)), storage=np.full(7, 500.0))
     full = [{"loading": np.stack([np.linspace(1.0, 9e3, 20)] * 2, axis=1)}] * 7
     state = np.repeat(np.diag([9000.0, 900.0, *[9000.0] * 5])[None], 2, axis=0)
     model = with_guesses(network, full, np.full(7, 20.0), [state], fastest=1.0 / 30.0)
-    assert model.critical_above == {1: 900.0} and np.isnan(model.seen_critical).tolist() == [False, True, *[False] * 5]
-    assert 900.0 <= model.critical[1] < 920.0 and model.storage[1] == model.mfds[1].jam > 2000.0
+    assert model.critical_above == {1: 900.0}
+    assert np.isnan(model.seen_critical).tolist() == [
+        False,
+        True,
+        *[False] * 5,
+    ]
+    assert 900.0 <= model.critical[1] < 920.0
+    assert model.storage[1] == model.mfds[1].jam > 2000.0
     assert model.mfds[1].outflow(900.0) == pytest.approx(network.mfds[1].outflow(900.0))
-    assert model.mfds[0] == network.mfds[0] and model.mfds[1].problem() is None
+    assert model.mfds[0] == network.mfds[0]
+    assert model.mfds[1].problem() is None
     slow = with_guesses(network, full, np.full(7, 20.0), [state], fastest=1.0 / 300.0)
     assert slow.mfds[1].c == pytest.approx(1.0 / 300.0)
 
@@ -175,18 +210,24 @@ def test_beyond_the_data_a_guess_from_lanes_is_for_control(scenario):
 def test_an_empty_region_keeps_its_model_in_identification(scenario, result):
     """Nobody is ever in region 0: all others are fitted, and 0 stays as it was."""
     network = scenario.network
-    alone = result.assign(**{name: result[name].copy() for name in ("accumulation", "crossings", "arrivals")})
+    alone = result.assign(
+        **{name: result[name].copy() for name in ("accumulation", "crossings", "arrivals")}
+    )
     alone.accumulation[:, 0], alone.crossings[:, 0], alone.arrivals[:, 0] = 0.0, 0.0, 0.0
     static = static_model(scenario, [alone], guided=False)
-    assert static.mfds[0] == network.mfds[0] and static.mfds[3] != network.mfds[3]
+    assert static.mfds[0] == network.mfds[0]
+    assert static.mfds[3] != network.mfds[3]
     samples = outflow_samples(network, [alone])
-    assert 0 in nearly_empty(samples) and 3 not in nearly_empty(samples)
+    assert 0 in nearly_empty(samples)
+    assert 3 not in nearly_empty(samples)
     table = fit_table(static, region_fits(static, samples))
     assert "few samples" in table
     fitted = replace(static, exit_rates=np.full((7, 7), 2.0), storage=np.full(7, 10.0))
     kept = as_it_was(static, fitted, [0])
-    assert (kept.exit_rates[0] == 1.0).all() and kept.storage[0] == network.mfds[0].jam
-    assert (kept.exit_rates[1:] == 2.0).all() and (kept.storage[1:] == 10.0).all()
+    assert (kept.exit_rates[0] == 1.0).all()
+    assert kept.storage[0] == network.mfds[0].jam
+    assert (kept.exit_rates[1:] == 2.0).all()
+    assert (kept.storage[1:] == 10.0).all()
 
 
 def test_the_regions_to_protect_are_proposed_and_written(tmp_path):
@@ -195,7 +236,8 @@ def test_the_regions_to_protect_are_proposed_and_written(tmp_path):
     assert _protected(loaded, (), write=True) == _protected(loaded, (1,), write=True) == []
     before = file.read_text()
     (line,) = _protected(loaded, (0, 2), write=False)
-    assert "protected = [0, 2] instead of [1] in" in line and file.read_text() == before
+    assert "protected = [0, 2] instead of [1] in" in line
+    assert file.read_text() == before
     _protected(loaded, (0, 2), write=True)
     assert file.read_text() == before.replace("protected = [1]", "protected = [0, 2]")
     file.write_text(before.replace("protected = [1]\n", ""))

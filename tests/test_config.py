@@ -8,7 +8,18 @@ from pydantic import model_validator
 
 from nmfd.errors import InputError
 from nmfd.runs import config
-from nmfd.runs.config import Numbers, PositiveNumbers, Problem, Rows, Settings, Share, Text, Texts, setting, whole
+from nmfd.runs.config import (
+    Numbers,
+    PositiveNumbers,
+    Problem,
+    Rows,
+    Settings,
+    Share,
+    Text,
+    Texts,
+    setting,
+    whole,
+)
 
 
 class Row(Settings):
@@ -50,9 +61,18 @@ class Table(Settings):
         ({"rows": [{"speed": 1}, {"speed": 0}]}, "rows[1].speed: should be greater than 0, got 0"),
         ({"rows": [{}]}, "rows[0].speed: missing; add it"),
         ({"rows": [3]}, "rows[0]: should be a valid table, got 3"),
-        ({"rows": [{"sped": 3.0}]}, "rows[0].sped: unknown key; did you mean speed?; allowed here: speed; remove or "),
-        ({"table": {"sped": 3.0}}, "table.sped: unknown key; did you mean speed?; allowed here: speed; remove or "),
-        ({"quux": 3}, "quux: unknown key; allowed here: share, count, flag, name, names, numbers, gains, rows, table"),
+        (
+            {"rows": [{"sped": 3.0}]},
+            "rows[0].sped: unknown key; did you mean speed?; allowed here: speed; remove or ",
+        ),
+        (
+            {"table": {"sped": 3.0}},
+            "table.sped: unknown key; did you mean speed?; allowed here: speed; remove or ",
+        ),
+        (
+            {"quux": 3},
+            "quux: unknown key; allowed here: share, count, flag, name, names, numbers, gains, rows, table",
+        ),
         ({"count": 7}, "a.b: takes both; omit one"),
     ],
     ids=lambda value: value[:40] if isinstance(value, str) else "",
@@ -60,14 +80,25 @@ class Table(Settings):
 def test_mistakes(values, message):
     with pytest.raises(InputError) as caught:
         config.checked(Table, values, "file.toml", "sumo.")
-    assert str(caught.value).startswith(f"file.toml: sumo.{message}") and "\n" not in str(caught.value)
+    assert str(caught.value).startswith(f"file.toml: sumo.{message}")
+    assert "\n" not in str(caught.value)
 
 
 def test_valid_values_and_changes():
-    table = config.checked(Table, {"share": 1, "numbers": [1, 2.5], "rows": [{"speed": 3}]}, "file.toml")
-    assert (table.share, table.numbers, table.rows[0].speed, table.count) == (1.0, (1.0, 2.5), 3.0, 3)
-    assert isinstance(table.share, float) and table.changed(count=4).count == 4
-    with pytest.raises(InputError, match="settings: count: should be less than or equal to 10, got 11"):
+    table = config.checked(
+        Table, {"share": 1, "numbers": [1, 2.5], "rows": [{"speed": 3}]}, "file.toml"
+    )
+    assert (table.share, table.numbers, table.rows[0].speed, table.count) == (
+        1.0,
+        (1.0, 2.5),
+        3.0,
+        3,
+    )
+    assert isinstance(table.share, float)
+    assert table.changed(count=4).count == 4
+    with pytest.raises(
+        InputError, match="settings: count: should be less than or equal to 10, got 11"
+    ):
         Table().changed(count=11)
 
 
@@ -90,4 +121,5 @@ def test_files(tmp_path, content, message):
         file.write_bytes(content)
     with pytest.raises(InputError) as caught:
         config.read(file)
-    assert str(caught.value).startswith(f"{file}: {message}") and "\n" not in str(caught.value)
+    assert str(caught.value).startswith(f"{file}: {message}")
+    assert "\n" not in str(caught.value)

@@ -1,4 +1,5 @@
-"""The command line `cosim`: run, compare and identify on a few control intervals, and its error lines."""
+"""The command line `cosim`: run, compare and identify on a few control intervals, and its error
+lines."""
 
 import re
 import shutil
@@ -46,21 +47,40 @@ def small(tmp_path_factory):
 
 @pytest.mark.parametrize(
     "controller",
-    ["no-control", "mpc-pcrg", "dpc-pcrg", *(pytest.param(o, marks=pytest.mark.slow) for o in ("pi-gating", "mpc-pc"))],
+    [
+        "no-control",
+        "mpc-pcrg",
+        "dpc-pcrg",
+        *(pytest.param(o, marks=pytest.mark.slow) for o in ("pi-gating", "mpc-pc")),
+    ],
 )
 def test_every_controller_runs(small, tmp_path, controller):
     out = tmp_path / "run"
     text = good(cosim("run", small, "--controller", controller, "--steps", STEPS, "--out", out))
     result = Result.read(out / f"{controller}-0.nc")
-    assert controller in text and result.controller == controller and result.plant == "sumo"
-    assert len(result.accumulation) == 4 and result.accumulation[-1].sum() > 0
+    assert controller in text
+    assert result.controller == controller
+    assert result.plant == "sumo"
+    assert len(result.accumulation) == 4
+    assert result.accumulation[-1].sum() > 0
     assert (out / "total_accumulation.png").stat().st_size > 10_000
 
 
 @pytest.mark.slow
 def test_strategies_are_filed_under_their_names(small, tmp_path):
     out, names = tmp_path / "run", ("pi-gating+max-pressure+rerouting-30", "actuated")
-    command = ("run", small, "--controller", names[0], "--against", names[1], "--steps", STEPS, "--out", out)
+    command = (
+        "run",
+        small,
+        "--controller",
+        names[0],
+        "--against",
+        names[1],
+        "--steps",
+        STEPS,
+        "--out",
+        out,
+    )
     text = good(cosim(*command))
     assert all(name in text and (out / f"{name}-0.nc").is_file() for name in names)
     before = {file.name: file.stat().st_mtime_ns for file in out.glob("*.nc")}
@@ -71,35 +91,62 @@ def test_strategies_are_filed_under_their_names(small, tmp_path):
 @pytest.mark.slow
 def test_compare(small, tmp_path):
     out = tmp_path / "run"
-    good(cosim("run", small, "--controller", "pi-gating", "--against", "no-control", "--steps", STEPS, "--out", out))
+    good(
+        cosim(
+            "run",
+            small,
+            "--controller",
+            "pi-gating",
+            "--against",
+            "no-control",
+            "--steps",
+            STEPS,
+            "--out",
+            out,
+        )
+    )
     assert "whole run" in good(cosim("compare", out))
     rows = pd.read_csv(out / "foresight.csv")
-    assert set(rows["controller"]) == {"no-control", "pi-gating"} and (rows["runs"] == 1).all()
-    own = rows[rows["controller"] == "pi-gating"][["next_interval_rmse_share", "whole_run_rmse_share"]].to_numpy()
-    assert own.shape == (7, 2) and (out / "compare-pi-gating-0-region_accumulation.png").stat().st_size > 10_000
+    assert set(rows["controller"]) == {"no-control", "pi-gating"}
+    assert (rows["runs"] == 1).all()
+    own = rows[rows["controller"] == "pi-gating"][
+        ["next_interval_rmse_share", "whole_run_rmse_share"]
+    ].to_numpy()
+    assert own.shape == (7, 2)
+    assert (out / "compare-pi-gating-0-region_accumulation.png").stat().st_size > 10_000
     run, scenario = Result.read(out / "pi-gating-0.nc"), load_scenario(small)
     off = predict(scenario, run).accumulation.sum(axis=2) - run.accumulation.sum(axis=2)
-    np.testing.assert_allclose(own[:, 1], np.sqrt((off**2).mean(axis=0)) / scenario.network.seen_critical, rtol=1e-3)
+    np.testing.assert_allclose(
+        own[:, 1], np.sqrt((off**2).mean(axis=0)) / scenario.network.seen_critical, rtol=1e-3
+    )
 
 
 @pytest.mark.slow
 def test_identify_writes_a_network_that_loads(small, tmp_path):
     shutil.copytree(small.parent.parent, tmp_path / "city")
-    scenario, network = tmp_path / "city" / "scenarios" / "small", tmp_path / "city" / "networks" / "grid7"
+    scenario, network = (
+        tmp_path / "city" / "scenarios" / "small",
+        tmp_path / "city" / "networks" / "grid7",
+    )
     before, out = load_network(network), tmp_path / "identify"
     options = {"levels": [1.0], "seeds": 2, "settings": {"steps": 7}, "out": out}
     api.identify(scenario, iterations=5, **options)
     after = load_network(network)
-    assert after.hash != before.hash and (after.adjacency == before.adjacency).all()
-    assert after.observed_split_ratios and all(mfd.problem() is None for mfd in after.mfds)
-    assert len(pd.read_csv(out / "samples.csv")) > 40 and (out / "mfd.png").is_file()
+    assert after.hash != before.hash
+    assert (after.adjacency == before.adjacency).all()
+    assert after.observed_split_ratios
+    assert all(mfd.problem() is None for mfd in after.mfds)
+    assert len(pd.read_csv(out / "samples.csv")) > 40
+    assert (out / "mfd.png").is_file()
 
 
 @pytest.mark.slow
 def test_outputs_of_sumo_agree_with_ours(small, tmp_path):
     """Trips, and any other of its outputs by its own option."""
     options = {"sumo.options.summary-output": str(tmp_path / "summary.xml")}
-    result = api.run(load_scenario(small, options), "pi-gating", steps=4, tripinfo=tmp_path / "trips.xml")
+    result = api.run(
+        load_scenario(small, options), "pi-gating", steps=4, tripinfo=tmp_path / "trips.xml"
+    )
     trips = ElementTree.parse(tmp_path / "trips.xml").getroot()
     assert sum(float(trip.get("depart")) >= 0 for trip in trips) == result.departed_veh > 0
     last = ElementTree.parse(tmp_path / "summary.xml").getroot()[-1]
@@ -114,28 +161,55 @@ IMPORT = ("import", "--out", "{tmp}/out/city")
 @pytest.mark.parametrize(
     "arguments, expected",
     [
-        ((*RUN, "--set", "sumo.complience=1"), "sumo.complience: unknown key; did you mean compliance?"),
-        ((*RUN, "--set", "sumo.compliance=2.0"), "sumo.compliance: should be less than or equal to 1, got 2.0"),
-        ((*RUN, "--set", "sumo.measurement=all"), "sumo.measurement: should be 'exact' or 'estimate', got 'all'"),
-        ((*RUN, "--set", "sumo.step_length=0.7"), "sumo.step_length: expected a divisor of the control interval"),
+        (
+            (*RUN, "--set", "sumo.complience=1"),
+            "sumo.complience: unknown key; did you mean compliance?",
+        ),
+        (
+            (*RUN, "--set", "sumo.compliance=2.0"),
+            "sumo.compliance: should be less than or equal to 1, got 2.0",
+        ),
+        (
+            (*RUN, "--set", "sumo.measurement=all"),
+            "sumo.measurement: should be 'exact' or 'estimate', got 'all'",
+        ),
+        (
+            (*RUN, "--set", "sumo.step_length=0.7"),
+            "sumo.step_length: expected a divisor of the control interval",
+        ),
         ((*RUN, "--set", "steps=0"), "steps: should be greater than or equal to 1, got 0"),
         ((*RUN, "--set", "network=../../networks/none"), "network.toml: no such file"),
         ((*RUN, "--set", f"network={ROOT / 'networks' / 'hexagon7'}"), "sumo"),
         ((*RUN, "--demand", "nan"), "Invalid value for '--demand': 'nan' is not a number"),
         (("identify", "grid8"), "no scenario or network of that name comes with the package"),
         ((*RUN, "--policy", "x.pt"), "reads no policy"),
-        (("run", "{small}", "--controller", "nobody"), "'nobody' is unknown; choose from no-control"),
+        (
+            ("run", "{small}", "--controller", "nobody"),
+            "'nobody' is unknown; choose from no-control",
+        ),
         (("run", "{small}"), "`nmfd show` lists them"),
         (("run", "{tmp}/none", "--controller", "no-control"), "scenario.toml: no such file"),
         ((*EVALUATE, "no-control,nobody"), "'nobody' is unknown"),
         ((*EVALUATE, "no-control,no-control"), "expected distinct values"),
-        ((*EVALUATE, "no-control", "--policy", "dpc-pc=x.pt"), "--policy: 'dpc-pc' is not among no-control; add it"),
+        (
+            (*EVALUATE, "no-control", "--policy", "dpc-pc=x.pt"),
+            "--policy: 'dpc-pc' is not among no-control; add it",
+        ),
         (("compare", "{tmp}"), "holds no finished runs"),
-        (("identify", "{small}", "--levels", "0,1"), "'--levels': 0.0 is not in the range 0.0<x<=10.0"),
-        (("watch", "{small}", "--controller", "no-control", "--against", "x", "--gui"), "omit --against"),
+        (
+            ("identify", "{small}", "--levels", "0,1"),
+            "'--levels': 0.0 is not in the range 0.0<x<=10.0",
+        ),
+        (
+            ("watch", "{small}", "--controller", "no-control", "--against", "x", "--gui"),
+            "omit --against",
+        ),
         (("tune", "{small}", "--controller", "pi-gating", "--option", "kp"), "--option"),
         ((*IMPORT, "--regions", "3"), "expected either a file or --bbox"),
-        ((*IMPORT, "{tmp}/none.sumocfg", "--regions", "1"), "--regions: expected 2 or more regions"),
+        (
+            (*IMPORT, "{tmp}/none.sumocfg", "--regions", "1"),
+            "--regions: expected 2 or more regions",
+        ),
         ((*IMPORT, "{tmp}/none.sumocfg", "--regions", "3"), "none.sumocfg"),
         (("drive",), "No such command 'drive'"),
         (("list",), "No such command 'list': it is `nmfd show`"),

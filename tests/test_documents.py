@@ -1,4 +1,5 @@
-"""Every link, every name of a file or module, and every command in every README and notebook is right."""
+"""Every link, every name of a file or module, and every command in every README and notebook is
+right."""
 
 import importlib
 import re
@@ -13,11 +14,35 @@ from documents import FILES, ROOT, kind, read
 from nmfd.controllers.strategy import parse
 from nmfd.runs import shipped
 
-# What a reader replaces, and files and folders that are not kept here: a path that begins so need not exist.
+# What a reader replaces, and files and folders that are not kept here: a path that begins so need
+# not exist.
 PLACEHOLDERS = tuple(
-    "runs networks/mycity scenarios/mycity mycity city. mine scenarios/mine networks/mine counts.csv detectors.csv "
-    "regions.csv about.csv dpc-pcrg.onnx bologna/ ingolstadt21/ cologne8/ luxembourg/ networks/ingolstadt "
-    "networks/cologne FILE NAME build/ SCENARIO DIR".split()
+    [
+        "runs",
+        "networks/mycity",
+        "scenarios/mycity",
+        "mycity",
+        "city.",
+        "mine",
+        "scenarios/mine",
+        "networks/mine",
+        "counts.csv",
+        "detectors.csv",
+        "regions.csv",
+        "about.csv",
+        "dpc-pcrg.onnx",
+        "bologna/",
+        "ingolstadt21/",
+        "cologne8/",
+        "luxembourg/",
+        "networks/ingolstadt",
+        "networks/cologne",
+        "FILE",
+        "NAME",
+        "build/",
+        "SCENARIO",
+        "DIR",
+    ]
 )
 SUFFIXES = r"py|md|toml|csv|png|txt|json|nc|npz|pt|onnx|xml|gz|parquet|css|js|j2|ipynb|html|mp4|log|tmp|lock"
 PATH = re.compile(rf"(?:\.?[\w+=-]+/)*\.?[\w.+-]*\w\.(?:{SUFFIXES})|(?:\.?[\w+-]+/)+[\w+-]*")
@@ -38,11 +63,17 @@ def test_every_link_leads_somewhere(document):
         file = document.file.parent / target if target else document.file
         assert file.exists(), f"{link}: no such file"
         if anchor:
-            assert anchor in read(file / "README.md" if file.is_dir() else file).headings, f"{link}: no such heading"
+            assert anchor in read(file / "README.md" if file.is_dir() else file).headings, (
+                f"{link}: no such heading"
+            )
 
 
 def test_every_name_of_a_file_is_one(document):
-    paths = [name for name in document.names if PATH.fullmatch(name) and not name.startswith(PLACEHOLDERS)]
+    paths = [
+        name
+        for name in document.names
+        if PATH.fullmatch(name) and not name.startswith(PLACEHOLDERS)
+    ]
     wrong = [name for name in paths if not (_is_there(name, document) or _is_written(name))]
     assert not wrong, "no such files, and no code that writes them"
 
@@ -75,7 +106,9 @@ def test_every_command_is_valid(document, pytestconfig):
         elif program in ("python", "python3"):
             assert words[1] in ("-m", "-c") or (ROOT / words[1]).is_file(), words
         elif program == "pytest":
-            known, unknown = pytestconfig._parser.parse_known_and_unknown_args([w for w in words[1:] if w != "..."])
+            known, unknown = pytestconfig._parser.parse_known_and_unknown_args(
+                [w for w in words[1:] if w != "..."]
+            )
             assert not unknown, words
             assert all((ROOT / file).exists() for file in known.file_or_dir), words
         elif program == "pip":
@@ -85,32 +118,49 @@ def test_every_command_is_valid(document, pytestconfig):
                 assert not extra or re.search(rf"^{extra} = \[", project, re.MULTILINE), words
         elif program == "dask":
             module = pytest.importorskip(f"distributed.cli.dask_{words[1]}", reason="no extra dask")
-            known = {opt for param in module.main.params for opt in (*param.opts, *param.secondary_opts)}
-            assert {word for word in words if OPTION.match(word)} <= known, words  # the certificates are the reader's
+            known = {
+                opt for param in module.main.params for opt in (*param.opts, *param.secondary_opts)
+            }
+            assert {word for word in words if OPTION.match(word)} <= known, (
+                words
+            )  # the certificates are the reader's
 
 
 def _check_words(words: list[str], *, complete: bool) -> None:
     """A command of nmfd or cosim; one that is not complete may lack arguments."""
     group = MAINS[words[0]]
     if words[1].startswith("--") and not complete:
-        assert words[1] in {opt for param in group.get_params(click.Context(group)) for opt in param.opts}, words
+        assert words[1] in {
+            opt for param in group.get_params(click.Context(group)) for opt in param.opts
+        }, words
         return
     assert words[1] in group.commands, f"{words[0]} has no command {words[1]}"
     command = group.commands[words[1]]
     if not complete:
         own = {opt for param in command.params for opt in (*param.opts, *param.secondary_opts)}
-        assert {word.partition("=")[0] for word in words if OPTION.match(word)} <= {*own, "--help"}, words
+        assert {word.partition("=")[0] for word in words if OPTION.match(word)} <= {
+            *own,
+            "--help",
+        }, words
         return
-    context = command.make_context(words[1], words[2:])  # a usage error for what the command does not take
+    context = command.make_context(
+        words[1], words[2:]
+    )  # a usage error for what the command does not take
     for name, value in context.params.items():
         if name in ("controller", "controllers", "against", "reference") and value:
             for controller in value if isinstance(value, tuple) else value.split(","):
                 own = controller.partition(".py:")[0]
-                if set(controller) & set("*?[") or own != controller and own.startswith(PLACEHOLDERS):
+                if set(controller) & set("*?[") or (
+                    own != controller and own.startswith(PLACEHOLDERS)
+                ):
                     continue  # a pattern, or the reader's own
                 parse(controller)
         for path in value if isinstance(value, tuple) else [value]:
-            if isinstance(path, Path) and name not in ("out", "target", "scenario" if words[1] == "import" else ""):
+            if isinstance(path, Path) and name not in (
+                "out",
+                "target",
+                "scenario" if words[1] == "import" else "",
+            ):
                 _check_path(path, words)
         if name == "policies":
             for policy in value:
@@ -138,10 +188,16 @@ def _tree() -> tuple[set[str], str]:
 def _is_there(name: str, document) -> bool:
     folder = document.file.parent
     if "/" in name.rstrip("/"):
-        places = (folder, ROOT, ROOT / folder.relative_to(ROOT).parts[0] if folder != ROOT else ROOT)
+        places = (
+            folder,
+            ROOT,
+            ROOT / folder.relative_to(ROOT).parts[0] if folder != ROOT else ROOT,
+        )
         return any((place / name).exists() for place in places)
     if name.endswith(".py"):  # of the package that the page is about
-        return any(folder.rglob(name)) or any((place / name).is_file() for place in (*folder.parents, ROOT))
+        return any(folder.rglob(name)) or any(
+            (place / name).is_file() for place in (*folder.parents, ROOT)
+        )
     return (folder / name).exists() or (ROOT / name).exists() or name in _tree()[0]
 
 

@@ -1,4 +1,5 @@
-"""The estimator against cities whose truth is known: whole vehicles that move by chance as the regional model says."""
+"""The estimator against cities whose truth is known: whole vehicles that move by chance as the
+regional model says."""
 
 import sys
 from dataclasses import replace
@@ -15,9 +16,12 @@ from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
 from nmfd.types import Controls
 
-# With one curve per region, as published: what is tested here is the filter, not how good a model a city has.
+# With one curve per region, as published: what is tested here is the filter, not how good a model a
+# city has.
 _PEAK = load_scenario(Path(__file__).parents[1] / "scenarios" / "grid7_peak")
-SCENARIO = replace(_PEAK, network=replace(_PEAK.network, exit_rates=None, capacity=None, storage=None))
+SCENARIO = replace(
+    _PEAK, network=replace(_PEAK.network, exit_rates=None, capacity=None, storage=None)
+)
 NETWORK = SCENARIO.network
 REGIONS = NETWORK.regions
 OPEN = Controls(perimeter=np.where(NETWORK.adjacency, NETWORK.u_max, 0.0), splits=None)
@@ -37,12 +41,15 @@ def equipped(*, detectors=0.3, probes=0.1, error=0.15):
 
 def nothing():
     unknown = np.full((REGIONS, REGIONS), np.nan)
-    return Readings(accumulation=unknown[0], crossings=unknown, probes=unknown, probe_departures=unknown)
+    return Readings(
+        accumulation=unknown[0], crossings=unknown, probes=unknown, probe_departures=unknown
+    )
 
 
 class Crowd:
-    """Whole vehicles in the regional model, every one of which moves by chance, and instruments with the errors that
-    the estimator reckons with: of outflow, demand, single flows and detectors. wrong: times those of the model."""
+    """Whole vehicles in the regional model, every one of which moves by chance, and instruments
+    with the errors that the estimator reckons with: of outflow, demand, single flows and detectors.
+    wrong: times those of the model."""
 
     def __init__(self, seed, known, *, wrong=1.0):
         self._random, self._known, self._wrong = np.random.default_rng(seed), known, wrong
@@ -60,9 +67,15 @@ class Crowd:
         keep = np.exp(-SCENARIO.step / estimation.MEMORY)
         outflow, wish = np.clip(1.0 + 0.3 * self._wrong * self._factors, 0.0, 2.0)
         lasting = np.sqrt((1.0 + keep) / (1.0 - keep))
-        each = 1.0 + self._wrong * estimation.FLOW_ERROR * lasting * random.normal(size=(REGIONS,) * 3)
+        each = 1.0 + self._wrong * estimation.FLOW_ERROR * lasting * random.normal(
+            size=(REGIONS,) * 3
+        )
         each = np.clip(each, 0.0, 3.0)
-        mean, crossings, departures = np.zeros(REGIONS), np.zeros((REGIONS, REGIONS)), np.zeros((REGIONS, REGIONS))
+        mean, crossings, departures = (
+            np.zeros(REGIONS),
+            np.zeros((REGIONS, REGIONS)),
+            np.zeros((REGIONS, REGIONS)),
+        )
         shares = np.array([self._known.probe_share, 1.0 - self._known.probe_share])
         for _ in range(SCENARIO.substeps):
             x = self.accumulation
@@ -75,16 +88,22 @@ class Crowd:
                 ways[i] = step * outflow[i] * each[i, i, j] * ends[i] / x[i, j] if i == j else 0.0
                 ways /= max(1.0, ways.sum())
                 for group in (0, 1):
-                    moved = random.multinomial(self.groups[group, i, j], [*ways, max(0.0, 1.0 - ways.sum())])[:-1]
+                    moved = random.multinomial(
+                        self.groups[group, i, j], [*ways, max(0.0, 1.0 - ways.sum())]
+                    )[:-1]
                     change[group, i, j] -= moved.sum()
                     crossings[i] += np.where(np.arange(REGIONS) == i, 0, moved)
                     moved[i] = 0
                     change[group, :, j] += moved
-            entered = random.poisson(shares[:, None, None] * step * SCENARIO.demand[k] * wish[:, None])
+            entered = random.poisson(
+                shares[:, None, None] * step * SCENARIO.demand[k] * wish[:, None]
+            )
             departures += entered[0]
             self.groups += change + entered
             mean += 0.5 * (before + self.accumulation.sum(axis=1)) / SCENARIO.substeps
-        self._factors = keep * self._factors + np.sqrt(1.0 - keep**2) * random.normal(size=(2, REGIONS))
+        self._factors = keep * self._factors + np.sqrt(1.0 - keep**2) * random.normal(
+            size=(2, REGIONS)
+        )
         known = self._known
         slow = np.exp(-SCENARIO.step / estimation.EXPANSION_MEMORY)
         change = known.detector_error * random.normal(size=REGIONS)
@@ -92,7 +111,9 @@ class Crowd:
         sampled = mean * (1.0 - known.detector_share) / known.detector_share
         noise = random.normal(size=REGIONS) * np.sqrt(sampled + (known.detector_noise * mean) ** 2)
         share = np.where(NETWORK.adjacency, known.counted_share, 1.0)
-        spread = crossings / share + (estimation.COUNT_ERROR * crossings) ** 2 / np.maximum(known.counted_gateways, 1)
+        spread = crossings / share + (estimation.COUNT_ERROR * crossings) ** 2 / np.maximum(
+            known.counted_gateways, 1
+        )
         uneven = np.sqrt(np.maximum(1.0 - share, 0.0) * spread) * random.normal(size=share.shape)
         return Readings(
             accumulation=np.maximum((1.0 + self._expansion) * mean + noise, 0.0),
@@ -104,7 +125,11 @@ class Crowd:
 
 def watch(seed, known, *, steps=40, changed=lambda observation: observation, wrong=1.0):
     """Truth and estimate (steps, R, R), and what the detectors said (steps, R)."""
-    crowd, estimator, rows = Crowd(seed, known, wrong=wrong), Estimator(planning_model(SCENARIO), known), []
+    crowd, estimator, rows = (
+        Crowd(seed, known, wrong=wrong),
+        Estimator(planning_model(SCENARIO), known),
+        [],
+    )
     for k in range(steps):
         observation = crowd.step(k)
         estimate = estimator.step(OPEN, changed(observation))
@@ -120,18 +145,28 @@ def rmse(error):
 def runs():
     """Truth, estimates and detectors of six cities, with and without the readings."""
     known = equipped()
-    return [(*watch(seed, known), watch(seed, known, changed=lambda observation: nothing())[1]) for seed in range(6)]
+    return [
+        (*watch(seed, known), watch(seed, known, changed=lambda observation: nothing())[1])
+        for seed in range(6)
+    ]
 
 
 def test_beats_the_detectors_and_the_open_loop(runs):
     off = []
     for truth, estimate, detectors, open_loop in runs:
         total = truth.sum(axis=2)
-        off.append([rmse(guess - total) for guess in (estimate.sum(axis=2), detectors, open_loop.sum(axis=2))])
-        assert off[-1][0] < off[-1][1] and off[-1][0] < 0.5 * off[-1][2]
+        off.append(
+            [
+                rmse(guess - total)
+                for guess in (estimate.sum(axis=2), detectors, open_loop.sum(axis=2))
+            ]
+        )
+        assert off[-1][0] < off[-1][1]
+        assert off[-1][0] < 0.5 * off[-1][2]
         assert rmse(estimate - truth) < 0.5 * rmse(open_loop - truth)
     pooled = np.sqrt((np.array(off) ** 2).mean(axis=0))
-    assert pooled[0] < 0.5 * pooled[1] and pooled[0] < 0.1 * pooled[2]
+    assert pooled[0] < 0.5 * pooled[1]
+    assert pooled[0] < 0.1 * pooled[2]
 
 
 def test_the_whole_model_of_a_city_too(monkeypatch):
@@ -139,23 +174,29 @@ def test_the_whole_model_of_a_city_too(monkeypatch):
     here = sys.modules[__name__]
     monkeypatch.setattr(here, "SCENARIO", _PEAK)
     monkeypatch.setattr(here, "NETWORK", _PEAK.network)
-    assert NETWORK.exit_rates is not None and NETWORK.capacity is not None
+    assert NETWORK.exit_rates is not None
+    assert NETWORK.capacity is not None
     known = equipped()
     truth, estimate, detectors = watch(0, known)
     open_loop = watch(0, known, changed=lambda observation: nothing())[1]
     total, seen = truth.sum(axis=2), estimate.sum(axis=2)
-    assert rmse(seen - total) < 0.5 * min(rmse(detectors - total), rmse(open_loop.sum(axis=2) - total))
+    assert rmse(seen - total) < 0.5 * min(
+        rmse(detectors - total), rmse(open_loop.sum(axis=2) - total)
+    )
     assert rmse(estimate - truth) < rmse(open_loop - truth)
 
 
 def test_unbiased_and_consistent(runs):
-    """Over cities, the errors of the totals cancel, and the innovations are about as large as the covariances say: a
-    little smaller, since vehicles that leave by lot vary less than the Poisson flows that the estimator reckons with.
+    """Over cities, the errors of the totals cancel, and the innovations are about as large as the
+    covariances say: a little smaller, since vehicles that leave by lot vary less than the Poisson
+    flows that the estimator reckons with.
     """
     bias = [float((estimate - truth).sum(axis=(1, 2)).mean()) for truth, estimate, *_ in runs]
     scale = np.mean([rmse((estimate - truth).sum(axis=(1, 2))) for truth, estimate, *_ in runs])
     assert abs(np.mean(bias)) < 0.6 * scale
-    assert abs(np.mean(bias)) < 0.02 * np.mean([truth.sum(axis=(1, 2)).mean() for truth, *_ in runs])
+    assert abs(np.mean(bias)) < 0.02 * np.mean(
+        [truth.sum(axis=(1, 2)).mean() for truth, *_ in runs]
+    )
 
 
 def test_never_negative_nor_fewer_than_the_probes(runs):
@@ -167,17 +208,21 @@ def test_never_negative_nor_fewer_than_the_probes(runs):
         observation = Readings(
             accumulation=random.uniform(0.0, 300.0, REGIONS),
             probes=probes,
-            crossings=np.where(NETWORK.adjacency, random.uniform(0.0, 50.0, (REGIONS, REGIONS)), np.nan),
+            crossings=np.where(
+                NETWORK.adjacency, random.uniform(0.0, 50.0, (REGIONS, REGIONS)), np.nan
+            ),
             probe_departures=random.integers(0, 5, (REGIONS, REGIONS)).astype(float),
         )
         estimate = estimator.step(OPEN, observation)
-        assert np.isfinite(estimate).all() and (estimate >= probes - 1e-9).all()
+        assert np.isfinite(estimate).all()
+        assert (estimate >= probes - 1e-9).all()
 
 
 def test_everything_measured_is_the_state():
     known = equipped(detectors=1.0, probes=1.0, error=0.0)
     truth, estimate, *_ = watch(1, known, steps=20)
-    assert np.abs(estimate - truth).max() < 1.0 and rmse(estimate - truth) < 0.1
+    assert np.abs(estimate - truth).max() < 1.0
+    assert rmse(estimate - truth) < 0.1
 
 
 def test_without_readings_it_is_the_regional_model():
@@ -192,7 +237,8 @@ def test_without_readings_it_is_the_regional_model():
 
 
 def test_detectors_tell_the_total_and_probes_the_destinations():
-    """Demand and outflow are other than the model has them: either instrument notices, and only probes tell apart."""
+    """Demand and outflow are other than the model has them: either instrument notices, and only
+    probes tell apart."""
     off = {}
     for name, known, changed in (
         ("detectors", equipped(), lambda o: replace(nothing(), accumulation=o.accumulation)),
@@ -225,14 +271,19 @@ def test_a_region_without_its_detector_is_predicted_on(broken):
 def test_bounded_moves_what_correlates():
     """Two cells of a region whose total is known: what one is raised by, the other loses."""
     covariance = np.array([[1.0, -1.0], [-1.0, 1.0]])
-    np.testing.assert_allclose(bounded(np.array([-2.0, 12.0]), covariance, np.zeros(2)), [0.0, 10.0], atol=1e-3)
-    np.testing.assert_allclose(bounded(np.array([-2.0, 12.0]), np.eye(2), np.zeros(2)), [0.0, 12.0], atol=1e-3)
+    np.testing.assert_allclose(
+        bounded(np.array([-2.0, 12.0]), covariance, np.zeros(2)), [0.0, 10.0], atol=1e-3
+    )
+    np.testing.assert_allclose(
+        bounded(np.array([-2.0, 12.0]), np.eye(2), np.zeros(2)), [0.0, 12.0], atol=1e-3
+    )
     inside = np.array([3.0, 4.0])
     assert bounded(inside, covariance, np.zeros(2)) is inside
 
 
 def readings(known, *, mean=40.0, expansion=0.1, crossings=9.0, x=25.0, probes=10.0, leaving=2.0):
-    """Expectations and variances of the readings of one kind each, where all regions and boundaries are alike."""
+    """Expectations and variances of the readings of one kind each, where all regions and boundaries
+    are alike."""
     model = Estimator(planning_model(SCENARIO), known)
     z = np.zeros(model._size)
     z[model._expansion], z[model._x], z[model._mean] = expansion, x, mean
@@ -243,7 +294,9 @@ def readings(known, *, mean=40.0, expansion=0.1, crossings=9.0, x=25.0, probes=1
         probes=np.full((REGIONS, REGIONS), 3.0),
         probe_departures=np.full((REGIONS, REGIONS), 4.0),
     )
-    columns = model._readings(z, np.full(REGIONS**2, leaving), observation, observation.accumulation)
+    columns = model._readings(
+        z, np.full(REGIONS**2, leaving), observation, observation.accumulation
+    )
     ends = np.cumsum([REGIONS, len(model._boundaries), REGIONS**2, REGIONS**2])
     kinds = [np.split(column, ends) for column in columns]
     assert all(np.ptp(part) == 0 for kind in kinds for part in kind)
@@ -251,12 +304,17 @@ def readings(known, *, mean=40.0, expansion=0.1, crossings=9.0, x=25.0, probes=1
 
 
 def test_the_noise_of_every_kind_of_reading():
-    """Detectors on a share s of the links see a binomial part; so do counts, besides their own error; probes are seen
-    exactly; and are a binomial share of the vehicles, as long as the same ones are there."""
-    loops, counts, probes, departures, share = readings(equipped(detectors=0.25, probes=0.1, error=0.2))[2]
+    """Detectors on a share s of the links see a binomial part; so do counts, besides their own
+    error; probes are seen exactly; and are a binomial share of the vehicles, as long as the same
+    ones are there."""
+    loops, counts, probes, departures, share = readings(
+        equipped(detectors=0.25, probes=0.1, error=0.2)
+    )[2]
     floor = estimation.FLOOR
     assert loops == pytest.approx(40.0 * 3.0 + (0.2 * 40.0) ** 2 + floor)
-    assert counts == pytest.approx(0.75 * (9.0 / 0.25 + estimation.COUNT_ERROR**2 * 81.0 / 2.0) + floor)
+    assert counts == pytest.approx(
+        0.75 * (9.0 / 0.25 + estimation.COUNT_ERROR**2 * 81.0 / 2.0) + floor
+    )
     assert probes == departures == floor
     kept = np.exp(-max(2.0 / 25.0, SCENARIO.step / estimation.MEMORY))
     assert share == pytest.approx(0.1 * 0.9 * 25.0 * (1.0 + kept) / (1.0 - kept) + floor)
@@ -288,29 +346,50 @@ def test_the_covariance_of_one_step_by_finite_differences():
         return model.belief
 
     plain = stepped()
-    for error, sigma, memory in ((0, 0.3, 900.0), (REGIONS, 0.3, 900.0), (2 * REGIONS, 0.15, 3600.0)):
+    for error, sigma, memory in (
+        (0, 0.3, 900.0),
+        (REGIONS, 0.3, 900.0),
+        (2 * REGIONS, 0.15, 3600.0),
+    ):
         moved, kept = stepped([error]), np.exp(-SCENARIO.step / memory)
-        np.testing.assert_allclose([moved.mean[error], plain.covariance[error, error]], [1e-4 * kept, sigma**2])
+        np.testing.assert_allclose(
+            [moved.mean[error], plain.covariance[error, error]], [1e-4 * kept, sigma**2]
+        )
         slope = (moved.mean - plain.mean)[model._x] / 1e-4
-        np.testing.assert_allclose(plain.covariance[error, model._x], kept * sigma**2 * slope, rtol=1e-3, atol=1e-3)
+        np.testing.assert_allclose(
+            plain.covariance[error, model._x], kept * sigma**2 * slope, rtol=1e-3, atol=1e-3
+        )
         assert (np.abs(slope).max() > 1.0) == (error < 2 * REGIONS)
 
 
 def test_the_noise_of_one_flow_by_hand():
-    """9 vehicles cross, a quarter of them probes: half of each counts in the mean, its square by a third."""
+    """9 vehicles cross, a quarter of them probes: half of each counts in the mean, its square by a
+    third."""
     model = Estimator(planning_model(SCENARIO), equipped())
     moves = torch.zeros(len(model._turns) + REGIONS + REGIONS**2, dtype=torch.float64)
     here, onward, bound = (int(n) for n in model._turns[0])
     crossing = int(np.flatnonzero((model._boundaries == [here, onward]).all(axis=1))[0])
     moves[0], left, before = 9.0, REGIONS * here + bound, REGIONS**2 + here
-    came, after, passed = REGIONS * onward + bound, REGIONS**2 + onward, REGIONS**2 + REGIONS + crossing
+    came, after, passed = (
+        REGIONS * onward + bound,
+        REGIONS**2 + onward,
+        REGIONS**2 + REGIONS + crossing,
+    )
     probe, kept = REGIONS**2 + REGIONS + len(model._boundaries), np.exp(-SCENARIO.step / 900.0)
     for leaving in (0.0, 50.0):  # turns stray by a share of what leaves the cell
-        out = torch.zeros(REGIONS**2, dtype=torch.float64).index_fill(0, torch.tensor([left]), leaving)
+        out = torch.zeros(REGIONS**2, dtype=torch.float64).index_fill(
+            0, torch.tensor([left]), leaving
+        )
         wrong = (1.0 + kept) / (1.0 - kept) * (0.2 * 9.0 + 0.02 * leaving) ** 2
         noise = model._flow_noise(model.belief, moves, 0.25 * moves, out).numpy()
-        np.testing.assert_allclose(noise[came, [came, left, passed]], [9.0 + wrong, -9.0 - wrong, 9.0 + wrong])
-        np.testing.assert_allclose(noise[after, [after, before]], [3.0 + wrong / 4, -2.25 - wrong / 4])
-        np.testing.assert_allclose(noise[came, [probe + came, after]], [2.25 + wrong / 4, 4.5 + wrong / 2])
+        np.testing.assert_allclose(
+            noise[came, [came, left, passed]], [9.0 + wrong, -9.0 - wrong, 9.0 + wrong]
+        )
+        np.testing.assert_allclose(
+            noise[after, [after, before]], [3.0 + wrong / 4, -2.25 - wrong / 4]
+        )
+        np.testing.assert_allclose(
+            noise[came, [probe + came, after]], [2.25 + wrong / 4, 4.5 + wrong / 2]
+        )
         np.testing.assert_allclose(noise[probe + came, probe + came], 2.25 + wrong / 16)
         assert (noise == noise.T).all()

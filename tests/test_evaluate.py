@@ -1,4 +1,5 @@
-"""cosim evaluate: order of the runs, what is kept and what is done again, failures, suites, --check."""
+"""cosim evaluate: order of the runs, what is kept and what is done again, failures, suites,
+--check."""
 
 import re
 from functools import partial
@@ -42,13 +43,17 @@ def ran(monkeypatch):
 
     def made(scenario, strategy, *, seed, demand):
         done.append((strategy.name, seed, demand))
-        return trajectories.in_city(scenario, strategy, seed, demand, tts=900.0, trips=9, completed=9)
+        return trajectories.in_city(
+            scenario, strategy, seed, demand, tts=900.0, trips=9, completed=9
+        )
 
     made_up.instead_of_sumo(monkeypatch, made)
     return done
 
 
-def evaluated(city, tmp_path, *, controllers=("no-control", "pi-gating"), seeds=(2000, 2001), levels=(1.0,)):
+def evaluated(
+    city, tmp_path, *, controllers=("no-control", "pi-gating"), seeds=(2000, 2001), levels=(1.0,)
+):
     scenario = with_demand(load_scenario(city), steps=STEPS)
     strategies = [parse(name) for name in controllers]
     runs = evaluate.plan([(scenario, levels)], strategies, seeds)
@@ -80,16 +85,25 @@ def test_the_folder_is_held_until_its_figures_are_drawn(city, tmp_path, ran, mon
             FileLock(tmp_path / "out" / ".lock", timeout=0).acquire()
 
     monkeypatch.setattr("cosim.report.figures.draw_all", draw)
-    good(cosim("evaluate", city, "--controllers", "no-control", "--seeds", 1, "--out", tmp_path / "out"))
+    good(
+        cosim(
+            "evaluate", city, "--controllers", "no-control", "--seeds", 1, "--out", tmp_path / "out"
+        )
+    )
 
 
 def test_runs_come_seed_by_seed_and_are_kept(city, tmp_path, ran):
     rows = evaluated(city, tmp_path, levels=(0.8, 1.0))
-    assert len(rows) == 8 and (rows["failure"] == "").all()
-    assert ran[:4] == [(name, 2000, level) for level in (0.8, 1.0) for name in ("no-control", "pi-gating")]
+    assert len(rows) == 8
+    assert (rows["failure"] == "").all()
+    assert ran[:4] == [
+        (name, 2000, level) for level in (0.8, 1.0) for name in ("no-control", "pi-gating")
+    ]
     assert [seed for _, seed, _ in ran] == [2000] * 4 + [2001] * 4
     ran.clear()
-    evaluated(city, tmp_path, seeds=(2000, 2001, 2002), controllers=("mpc-pc", "no-control", "pi-gating"))
+    evaluated(
+        city, tmp_path, seeds=(2000, 2001, 2002), controllers=("mpc-pc", "no-control", "pi-gating")
+    )
     expected = [("mpc-pc", 2000, 1.0), ("mpc-pc", 2001, 1.0)]
     assert ran == expected + [(name, 2002, 1.0) for name in ("mpc-pc", "no-control", "pi-gating")]
     assert [level.demand for level in results.read(tmp_path / "out").levels] == [0.8, 1.0]
@@ -104,7 +118,9 @@ def test_runs_come_seed_by_seed_and_are_kept(city, tmp_path, ran):
         ("scenario.toml", r"compliance = [\d.]+", "compliance = 0.5", {"no-control", "pi-gating"}),
     ],
 )
-def test_only_runs_that_a_change_concerns_are_done_again(city, tmp_path, ran, file, old, new, again):
+def test_only_runs_that_a_change_concerns_are_done_again(
+    city, tmp_path, ran, file, old, new, again
+):
     evaluated(city, tmp_path)
     ran.clear()
     change(city / file, old, new)
@@ -119,8 +135,12 @@ def test_a_suite_is_one_ranked_table(city, tmp_path, ran):
     runs = evaluate.plan(chosen, [parse("no-control"), parse("pi-gating")], seeds)
     evaluate.evaluate(runs, tmp_path / "out", progress=False)
     text = (tmp_path / "out" / "evaluate.md").read_text()
-    assert "| 1 | no-control | +0.0 % | 3 |" in text and "# demo" in text
-    assert [level.demand for level in results.read(tmp_path / "out", "grid7_peak").levels] == [1.0, 1.2]
+    assert "| 1 | no-control | +0.0 % | 3 |" in text
+    assert "# demo" in text
+    assert [level.demand for level in results.read(tmp_path / "out", "grid7_peak").levels] == [
+        1.0,
+        1.2,
+    ]
     suite.write_text("seeds = []\n[scenarios]\ndemo = [1.0]\n")
     with pytest.raises(InputError, match="seeds: "):
         evaluate.read_suite(suite)
@@ -128,7 +148,11 @@ def test_a_suite_is_one_ranked_table(city, tmp_path, ran):
 
 def test_check_does_runs_again_and_names_what_differs(city, tmp_path, ran):
     evaluated(city, tmp_path)
-    runs = evaluate.plan([(with_demand(load_scenario(city), steps=STEPS), (1.0,))], [parse("pi-gating")], [2000, 2001])
+    runs = evaluate.plan(
+        [(with_demand(load_scenario(city), steps=STEPS), (1.0,))],
+        [parse("pi-gating")],
+        [2000, 2001],
+    )
     assert evaluate.check(runs, tmp_path / "out", 2) == []
     change(tmp_path / "out" / "runs.csv", r"pi-gating,2000,sumo,900.0", "pi-gating,2000,sumo,901.0")
     lines = evaluate.check(runs, tmp_path / "out", 2)
@@ -141,22 +165,46 @@ def test_a_small_evaluation_in_sumo(city, tmp_path):
     file.write_text(re.sub(r"ramp_up = [\d.]+", "ramp_up = 60.0", file.read_text()))
     change(file, r"outflow_share = [\d.]+", "set_point = [20.0]")
     out = tmp_path / "out"
-    arguments = ("evaluate", city, "--controllers", "no-control,pi-gating", "--seeds", 1, "--steps", 3, "--out", out)
+    arguments = (
+        "evaluate",
+        city,
+        "--controllers",
+        "no-control,pi-gating",
+        "--seeds",
+        1,
+        "--steps",
+        3,
+        "--out",
+        out,
+    )
     said = good(cosim(*arguments))
     rows = pd.read_csv(out / "runs.csv")
-    assert list(rows["seed"]) == [2000, 2000] and (rows["co2_kg"] > 0).all() and "teleports" in said
+    assert list(rows["seed"]) == [2000, 2000]
+    assert (rows["co2_kg"] > 0).all()
+    assert "teleports" in said
     for picture in ("total_accumulation", "region_accumulation", "mfd"):
         assert (out / "demand-1" / f"{picture}.png").stat().st_size > 10_000
     before = {path: path.read_bytes() for path in out.glob("*/*.nc")}
     good(cosim(*arguments))
-    assert before == {path: path.read_bytes() for path in out.glob("*/*.nc")} and len(before) == 2
+    assert before == {path: path.read_bytes() for path in out.glob("*/*.nc")}
+    assert len(before) == 2
     assert "no difference" in good(cosim(*arguments, "--check", 1))
 
 
 def test_cosim_run_compares_with_what_against_names(tmp_path, monkeypatch):
     city = made_up.city_of(load_scenario(made_up.SCENARIO).network)
     made_up.instead_of_sumo(monkeypatch, partial(made_up.result, city=city))
-    arguments = ("run", made_up.SCENARIO, "--controller", "dpc-pcrg", "--against", "pi-gating", "--steps", 5)
+    arguments = (
+        "run",
+        made_up.SCENARIO,
+        "--controller",
+        "dpc-pcrg",
+        "--against",
+        "pi-gating",
+        "--steps",
+        5,
+    )
     said = good(cosim(*arguments, "--out", tmp_path / "out"))
-    assert "against pi-gating" in said and re.search(r"^dpc-pcrg +1 +\S+ +-\d", said, re.M)
+    assert "against pi-gating" in said
+    assert re.search(r"^dpc-pcrg +1 +\S+ +-\d", said, re.M)
     assert (tmp_path / "out" / "total_accumulation.png").is_file()

@@ -1,4 +1,5 @@
-"""Faults of sensors, streets and signals: their effect, the status of the decisions under them, and wrong ones."""
+"""Faults of sensors, streets and signals: their effect, the status of the decisions under them, and
+wrong ones."""
 
 import itertools
 import re
@@ -30,7 +31,9 @@ STEPS = 8
 @pytest.fixture(scope="module")
 def scenario(tmp_path_factory):
     """Two regions, the second one congested."""
-    text = tiny.SCENARIO.replace("peak = 2.0", "peak = 4.0").replace("measurement_std = 0.5", "measurement_std = 0.0")
+    text = tiny.SCENARIO.replace("peak = 2.0", "peak = 4.0").replace(
+        "measurement_std = 0.5", "measurement_std = 0.0"
+    )
     return load_scenario(tiny.write(tmp_path_factory.mktemp("tiny"), scenario=text))
 
 
@@ -61,20 +64,24 @@ def check_notes(notes, begin, end, text):
 
 def test_frozen_measurements(scenario):
     exact, seen, notes = driven(scenario, "frozen@6-12")
-    assert (seen[6:12] == exact[6]).all() and (seen[12:] == exact[12:]).all() and (seen[:6] == exact[:6]).all()
+    assert (seen[6:12] == exact[6]).all()
+    assert (seen[12:] == exact[12:]).all()
+    assert (seen[:6] == exact[:6]).all()
     assert (exact[6] != exact[11]).any()
     check_notes(notes, 6, 12, "measurement frozen")
 
 
 def test_delayed_measurements(scenario):
     exact, seen, notes = driven(scenario, "delayed:3@5-20")
-    assert (seen[5:] == exact[2:-3]).all() and (seen[:5] == exact[:5]).all()
+    assert (seen[5:] == exact[2:-3]).all()
+    assert (seen[:5] == exact[:5]).all()
     check_notes(notes, 5, 20, "measurement 3 intervals late")
 
 
 def test_a_region_without_measurements(scenario):
     exact, seen, notes = driven(scenario, "missing:0@4-10")
-    assert (seen[4:10, 0] == exact[3, 0]).all() and (seen[4:10, 1] == exact[4:10, 1]).all()
+    assert (seen[4:10, 0] == exact[3, 0]).all()
+    assert (seen[4:10, 1] == exact[4:10, 1]).all()
     check_notes(notes, 4, 10, "measurement 2 of 4 entries missing, last ones used")
 
 
@@ -83,7 +90,11 @@ class Mad(NoControl):
 
     def act(self, measurement):
         shapes = {"perimeter": (2, 2), "splits": (2, 2, 2), "prices": (2,), "metering": (2,)}
-        arrays = {"perimeter": np.ones((2, 2)), "splits": None, self.wrong: np.ones(shapes[self.wrong])}
+        arrays = {
+            "perimeter": np.ones((2, 2)),
+            "splits": None,
+            self.wrong: np.ones(shapes[self.wrong]),
+        }
         if measurement.step == 3:
             arrays[self.wrong][self.at] = self.value
         return Controls(**arrays)
@@ -91,20 +102,34 @@ class Mad(NoControl):
 
 @pytest.mark.parametrize("plant", [NmfdPlant, AcyclicPlant])
 @pytest.mark.parametrize(
-    "wrong, at", [("perimeter", (0, 1)), ("splits", (1, 0, 0)), ("prices", (1,)), ("metering", (0,))]
+    "wrong, at",
+    [("perimeter", (0, 1)), ("splits", (1, 0, 0)), ("prices", (1,)), ("metering", (0,))],
 )
 @pytest.mark.parametrize("value", [np.nan, -np.inf])
 def test_a_number_that_is_not_finite_is_named(scenario, plant, wrong, at, value):
     controller = Mad(planning_model(scenario))
     controller.wrong, controller.at, controller.value = wrong, at, value
-    expected = f"no-control: interval 3: {wrong}{list(at)}: expected a finite number, got {value} instead"
+    expected = (
+        f"no-control: interval 3: {wrong}{list(at)}: expected a finite number, got {value} instead"
+    )
     with pytest.raises(InputError, match=f"^{re.escape(expected)}$"):
         run(plant(scenario), controller, scenario, seed=0)
 
 
 @pytest.mark.parametrize(
     "text",
-    ["", "frozen:3", "missing", "missing:2", "missing:x", "delayed:1.5", "frozen@5", "frozen@9-3", "closed", "signal:"],
+    [
+        "",
+        "frozen:3",
+        "missing",
+        "missing:2",
+        "missing:x",
+        "delayed:1.5",
+        "frozen@5",
+        "frozen@9-3",
+        "closed",
+        "signal:",
+    ],
 )
 def test_wrong_faults(tmp_path, text):
     with pytest.raises(InputError, match="expected frozen, delayed:INTERVALS"):
@@ -113,8 +138,11 @@ def test_wrong_faults(tmp_path, text):
 
 def test_faults_of_a_city_are_refused_on_the_regional_model(tmp_path):
     folder = tiny.write(tmp_path, scenario='faults = ["closed:x"]\n' + tiny.SCENARIO)
-    result = call("nmfd", "benchmark", folder, "--controllers", "no-control", "--out", tmp_path / "out")
-    assert result.exit_code == 2 and "closed is a fault of a city" in result.stderr
+    result = call(
+        "nmfd", "benchmark", folder, "--controllers", "no-control", "--out", tmp_path / "out"
+    )
+    assert result.exit_code == 2
+    assert "closed is a fault of a city" in result.stderr
 
 
 @pytest.fixture(scope="module")
@@ -127,10 +155,13 @@ def city(tmp_path_factory):
 
 
 def in_sumo(city, *ordered, perimeter=None, watch=None, **changed):
-    """The states and the record of a run with these faults; watch(plant) is called after the reset."""
+    """The states and the record of a run with these faults; watch(plant) is called after the
+    reset."""
     scenario = replace(city, faults=ordered)
     plant = SumoPlant(scenario, settings=settings(scenario).changed(**changed))
-    opened = np.where(city.network.adjacency, city.network.u_max if perimeter is None else perimeter, 0.0)
+    opened = np.where(
+        city.network.adjacency, city.network.u_max if perimeter is None else perimeter, 0.0
+    )
     try:
         states = [plant.reset(0)]
         if watch:
@@ -147,7 +178,9 @@ def test_a_closed_street(city):
     for ordered in ((), (f"closed:{edge}@2-5",)):
         states, records[ordered] = in_sumo(city, *ordered)
         problems = [state.problem for state in states[1:]]
-        assert problems == [f"edge {edge} closed" if ordered and 2 <= k < 5 else "" for k in range(STEPS)]
+        assert problems == [
+            f"edge {edge} closed" if ordered and 2 <= k < 5 else "" for k in range(STEPS)
+        ]
     free, shut = (record.edge_vehicles[:, n].astype(float) for record in records.values())
     assert shut[3:5].mean() > 2.0 * free[3:5].mean() + 1.0
     assert records[()].arrivals[2:5].sum() > records[(f"closed:{edge}@2-5",)].arrivals[2:5].sum()
@@ -160,20 +193,29 @@ def test_a_signal_that_does_not_obey_shows_its_own_green(city):
     _, free = in_sumo(city, perimeter=closed)
     states, record = in_sumo(city, f"signal:{signal}@3-6", perimeter=closed)
     problems = [state.problem for state in states[1:]]
-    assert problems == [f"signal {signal} took no programme" if 3 <= k < 6 else "" for k in range(STEPS)]
+    assert problems == [
+        f"signal {signal} took no programme" if 3 <= k < 6 else "" for k in range(STEPS)
+    ]
     own = [n for n, gateway in enumerate(gateways) if gateway.signal == signal]
-    assert own and (record.gateway_green[3:6, own] == record.gateway_original_green[3:6, own]).all()
+    assert own
+    assert (record.gateway_green[3:6, own] == record.gateway_original_green[3:6, own]).all()
     assert (free.gateway_green[3:6, own] < free.gateway_original_green[3:6, own]).any()
 
 
-@pytest.mark.parametrize("signals, gateway", [("fixed", True), ("max-pressure", True), ("max-pressure", False)])
+@pytest.mark.parametrize(
+    "signals, gateway", [("fixed", True), ("max-pressure", True), ("max-pressure", False)]
+)
 def test_a_signal_that_does_not_obey_is_safe(city, signals, gateway):
     """Second by second its own programme, with yellow before and after."""
     plant = SumoPlant(city)
     gateways = {gateway.signal for gateway in plant.city.gateways}
     name = next(one.id for one in plant.steered if (one.id in gateways) == gateway)
     plant.reset(0)
-    own = [phase.state for phase in plant.session.programme(name).phases for _ in range(round(phase.duration))]
+    own = [
+        phase.state
+        for phase in plant.session.programme(name).phases
+        for _ in range(round(phase.duration))
+    ]
     plant.close()
     shown = []
 
@@ -185,19 +227,29 @@ def test_a_signal_that_does_not_obey_is_safe(city, signals, gateway):
     interval = round(city.step)
     begin, end = 3 * interval + round(DEFAULT_YELLOW_S), 6 * interval
     cycles = [[own[(n + k) % len(own)] for k in range(end - begin)] for n in range(len(own))]
-    assert shown[begin:end] in cycles and shown[begin - interval : end - interval] not in cycles
+    assert shown[begin:end] in cycles
+    assert shown[begin - interval : end - interval] not in cycles
     assert shown[-len(own) :] not in [cycle[: len(own)] for cycle in cycles]
     for before, after in itertools.pairwise(shown):
-        assert not any(a in "Gg" and b == "r" for a, b in zip(before, after, strict=True)), (before, after)
+        assert not any(a in "Gg" and b == "r" for a, b in zip(before, after, strict=True)), (
+            before,
+            after,
+        )
 
 
-@pytest.mark.parametrize("ordered, problem", [("closed:no", "edge 'no' is not in"), ("signal:no", "'no' is no signal")])
+@pytest.mark.parametrize(
+    "ordered, problem", [("closed:no", "edge 'no' is not in"), ("signal:no", "'no' is no signal")]
+)
 def test_faults_that_the_city_does_not_have(city, tmp_path, ordered, problem):
     file = city.folder / "scenario.toml"
     text = file.read_text(encoding="utf-8")
     file.write_text(f'faults = ["{ordered}"]\n{text}', encoding="utf-8")
     try:
-        result = call("cosim", "run", city.folder, "--controller", "no-control", "--out", tmp_path / "out")
+        result = call(
+            "cosim", "run", city.folder, "--controller", "no-control", "--out", tmp_path / "out"
+        )
     finally:
         file.write_text(text, encoding="utf-8")
-    assert result.exit_code == 2 and problem in result.stderr and not (tmp_path / "out").exists()
+    assert result.exit_code == 2
+    assert problem in result.stderr
+    assert not (tmp_path / "out").exists()

@@ -19,13 +19,28 @@ def test_one_seed_is_shown_and_all_are_shaded():
 
 def test_the_frontier_has_the_share_of_due_trips_over_demand(tmp_path, monkeypatch):
     drawn = []
-    monkeypatch.setattr(plots, "save", lambda drawing, path: drawn.append((path.name, drawing.axes[0])))
+    monkeypatch.setattr(
+        plots, "save", lambda drawing, path: drawn.append((path.name, drawing.axes[0]))
+    )
     rows = pd.DataFrame(
         [
             (level, name, 1, 5.0, served, 100, 0)
-            for name, level, served in (("a", 1.0, 100), ("a", 2.0, 80), ("b", 1.0, 90), ("b", 2.0, 30))
+            for name, level, served in (
+                ("a", 1.0, 100),
+                ("a", 2.0, 80),
+                ("b", 1.0, 90),
+                ("b", 2.0, 30),
+            )
         ],
-        columns=["demand", "controller", "seed", "total_time_spent_veh_s", "completed_veh", "trips", "teleports"],
+        columns=[
+            "demand",
+            "controller",
+            "seed",
+            "total_time_spent_veh_s",
+            "completed_veh",
+            "trips",
+            "teleports",
+        ],
     )
     figures.draw_levels(tmp_path, rows)
     assert [name for name, _ in drawn] == ["frontier.png", "demand.png"]

@@ -24,7 +24,9 @@ def seen(vehicles, step=0):
     """A measurement with `vehicles` in the centre."""
     accumulation = np.zeros((7, 7))
     accumulation[CENTRE, 0] = vehicles
-    return Observation(step=step, time=30.0 * step, accumulation=accumulation, backlog=np.zeros((7, 7)))
+    return Observation(
+        step=step, time=30.0 * step, accumulation=accumulation, backlog=np.zeros((7, 7))
+    )
 
 
 def gate(controls):
@@ -55,7 +57,8 @@ def test_only_the_entries_are_metered_and_within_bounds():
         assert NETWORK.u_min <= gate(controls) <= NETWORK.u_max
         assert (controls.perimeter[others] == NETWORK.u_max).all()
         assert (controls.perimeter[~NETWORK.adjacency] == 0.0).all()
-        assert controls.splits is None and controls.status == Status.OK
+        assert controls.splits is None
+        assert controls.status == Status.OK
 
 
 @pytest.mark.parametrize("long, then, limit", [(0.0, 1.2, "u_max"), (3.0, 0.8, "u_min")])
@@ -104,22 +107,29 @@ def test_wrong_options(options, problem):
 
 
 def test_every_protected_region_is_held_at_its_set_point():
-    """The gates of both move by their own error; a boundary between them has one for each direction."""
+    """The gates of both move by their own error; a boundary between them has one for each
+    direction."""
     options = {"set_point": [1000.0, 3000.0], "kp": 0.0, "ki": 0.001}
     assert NETWORK.adjacency[5, 3]
     controller = PiGating(planning_model(replace(with_options(**options), protected=(5, 3))))
     accumulation = np.zeros((7, 7))
     accumulation[5, 0], accumulation[3, 1] = 1200.0, 3300.0
-    controls = controller.act(Observation(step=0, time=0.0, accumulation=accumulation, backlog=np.zeros((7, 7))))
+    controls = controller.act(
+        Observation(step=0, time=0.0, accumulation=accumulation, backlog=np.zeros((7, 7)))
+    )
     for region, error in ((5, 200.0), (3, 300.0)):
         entries = controls.perimeter[NETWORK.adjacency[:, region], region]
-        assert entries == pytest.approx(NETWORK.u_max - 0.03 * error / NETWORK.mfds[region].critical, rel=1e-12)
+        assert entries == pytest.approx(
+            NETWORK.u_max - 0.03 * error / NETWORK.mfds[region].critical, rel=1e-12
+        )
     others = np.delete(np.arange(7), [5, 3])
     assert (controls.perimeter[:, others][NETWORK.adjacency[:, others]] == NETWORK.u_max).all()
 
 
 def test_something_must_be_protected():
-    with pytest.raises(InputError, match="protected: pi-gating needs at least one protected region, got none"):
+    with pytest.raises(
+        InputError, match="protected: pi-gating needs at least one protected region, got none"
+    ):
         PiGating(planning_model(replace(SCENARIO, protected=())))
 
 
@@ -127,8 +137,11 @@ def test_the_set_point_by_a_share_of_the_maximum_outflow():
     mfd = NETWORK.mfds[3]
     for share in (0.5, 0.95, 1.0):
         (point,) = PiGating(planning_model(with_options(outflow_share=share))).set_point
-        assert point <= mfd.critical and mfd.outflow(point) == pytest.approx(share * mfd.capacity, rel=1e-3)
-    assert PiGating(planning_model(with_options(outflow_share=0.5, set_point=[3000.0]))).set_point == [3000.0]
+        assert point <= mfd.critical
+        assert mfd.outflow(point) == pytest.approx(share * mfd.capacity, rel=1e-3)
+    assert PiGating(
+        planning_model(with_options(outflow_share=0.5, set_point=[3000.0]))
+    ).set_point == [3000.0]
 
 
 def test_probing_moves_around_the_set_point_that_identification_gives():
@@ -136,4 +149,5 @@ def test_probing_moves_around_the_set_point_that_identification_gives():
     probing = Probing(planning_model(replace(SCENARIO, controller_options=options)), guidance=False)
     probing.reset(1)
     gates = [probing.act(seen(2000.0, k)).perimeter for k in range(20)]
-    assert len({u.tobytes() for u in gates}) > 1 and probing._gating.critical == [2000.0]
+    assert len({u.tobytes() for u in gates}) > 1
+    assert probing._gating.critical == [2000.0]

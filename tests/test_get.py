@@ -20,7 +20,9 @@ def zipped(files: dict[str, bytes]) -> bytes:
     return stream.getvalue()
 
 
-CONTENT = zipped({"top-1/city/a.sumocfg": b"city", "top-1/city/more/b.xml": b"more", "top-1/other.txt": b"other"})
+CONTENT = zipped(
+    {"top-1/city/a.sumocfg": b"city", "top-1/city/more/b.xml": b"more", "top-1/other.txt": b"other"}
+)
 
 
 @pytest.fixture
@@ -30,7 +32,9 @@ def publish(monkeypatch, tmp_path):
     def add(content: bytes = CONTENT, source: str | None = None):
         (tmp_path / "archive.zip").write_bytes(content)
         source = source or (tmp_path / "archive.zip").as_uri()
-        city = dict(about="a city", licence="MIT", source=source, folder="top-1/city", start="a.sumocfg")
+        city = dict(
+            about="a city", licence="MIT", source=source, folder="top-1/city", start="a.sumocfg"
+        )
         monkeypatch.setattr(get, "published", lambda: {"there": city})
 
     return add
@@ -40,8 +44,10 @@ def test_a_city_comes_with_its_licence(publish, tmp_path):
     publish()
     text = get.get("there", tmp_path / "mine" / "there")
     folder = tmp_path / "mine" / "there"
-    assert (folder / "a.sumocfg").read_bytes() == b"city" and (folder / "more" / "b.xml").read_bytes() == b"more"
-    assert "Licence: MIT" in text and "Licence: MIT" in (folder / "NOTICE.cosim.txt").read_text()
+    assert (folder / "a.sumocfg").read_bytes() == b"city"
+    assert (folder / "more" / "b.xml").read_bytes() == b"more"
+    assert "Licence: MIT" in text
+    assert "Licence: MIT" in (folder / "NOTICE.cosim.txt").read_text()
     assert f"cosim import {folder / 'a.sumocfg'} --out networks/there" in text
     assert [path.name for path in folder.parent.iterdir()] == ["there"]
     with pytest.raises(InputError, match="exists; choose another folder"):
@@ -52,7 +58,8 @@ def test_a_package_comes_from_pip(publish, tmp_path, monkeypatch):
     publish(source="package==1.0")
 
     def download(command, **_):
-        assert command[1:4] == ["-m", "pip", "download"] and command[-1] == "package==1.0"
+        assert command[1:4] == ["-m", "pip", "download"]
+        assert command[-1] == "package==1.0"
         (Path(command[-2]) / "package.whl").write_bytes(CONTENT)
 
     monkeypatch.setattr(subprocess, "run", download)
@@ -79,5 +86,6 @@ def test_one_line_and_nothing_left(publish, tmp_path, content, source, expected)
 def test_the_list_and_the_names():
     text = good(cosim("get"))
     for name, city in get.published().items():
-        assert name in text and city["licence"] in text
+        assert name in text
+        assert city["licence"] in text
     assert "did you mean cologne8?" in error_line(cosim("get", "colone8"))

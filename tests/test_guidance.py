@@ -23,7 +23,9 @@ EDGES, REGION = 40, np.repeat([0, 1, 2, 3], 10)
 def city():
     """Moves first -> second with the time of their turns, and the time of every edge."""
     random = np.random.default_rng(3)
-    pairs = sorted({(int(a), int(b)) for a, b in random.integers(EDGES, size=(160, 2)) if a != b and a != 39})
+    pairs = sorted(
+        {(int(a), int(b)) for a, b in random.integers(EDGES, size=(160, 2)) if a != b and a != 39}
+    )
     first, second = np.array(pairs).T
     return first, second, random.uniform(0.0, 3.0, len(pairs)), random.uniform(5.0, 60.0, EDGES)
 
@@ -32,7 +34,10 @@ def city():
 def ways(city, request):
     """Out of region 0, with all trees kept or hardly any."""
     first, second, turn, time = city
-    inside, back = (Moves(first, second, allowed=(REGION == 0) ^ outside, reverse=outside) for outside in (False, True))
+    inside, back = (
+        Moves(first, second, allowed=(REGION == 0) ^ outside, reverse=outside)
+        for outside in (False, True)
+    )
     gates = sorted(
         {
             (int(REGION[b]), int(a), int(b), n)
@@ -42,7 +47,9 @@ def ways(city, request):
     )
     following, gate, entry, move = np.array(gates).T
     searches = Searches(request.param)
-    everywhere = Trees(Moves(first, second, allowed=np.full(EDGES, True), reverse=False), time, turn, searches)
+    everywhere = Trees(
+        Moves(first, second, allowed=np.full(EDGES, True), reverse=False), time, turn, searches
+    )
     return (
         Ways(
             gate,
@@ -65,7 +72,8 @@ def ways(city, request):
 
 
 def least(city, allowed):
-    """(EDGES, EDGES) [s] from the end of one edge to the end of another over allowed edges, by Floyd and Warshall."""
+    """(EDGES, EDGES) [s] from the end of one edge to the end of another over allowed edges, by
+    Floyd and Warshall."""
     first, second, turn, time = city
     cost = np.full((EDGES, EDGES), np.inf)
     np.fill_diagonal(cost, np.where(allowed, 0.0, np.inf))
@@ -103,9 +111,11 @@ def test_the_searches_find_the_least_times_up_to_a_limit(city, ways):
                 cut += int((np.isinf(cost) & np.isfinite(exact)).sum())
                 for g in np.flatnonzero(np.isfinite(exact) & (exact <= most)):
                     way = found.route(here, int(g), target)
-                    assert way[0] == here and way[-1] == target
+                    assert way[0] == here
+                    assert way[-1] == target
                     crossing = way.index(int(entry[g]))
-                    assert way[crossing - 1] == gate[g] and (REGION[way[crossing:]] != 0).all()
+                    assert way[crossing - 1] == gate[g]
+                    assert (REGION[way[crossing:]] != 0).all()
                     assert takes(way, city) == pytest.approx(exact[g])
     assert cut > 100
 
@@ -123,7 +133,8 @@ def test_ways_that_come_back_are_found_where_they_are_the_fastest_of_all(city, w
                 if returning >= min(most, cost.min() - 1e-9):
                     continue
                 way = found.route(here, gateway, target, returning=True)
-                assert (way[0], way[-1]) == (here, target) and takes(way, city) == pytest.approx(returning)
+                assert (way[0], way[-1]) == (here, target)
+                assert takes(way, city) == pytest.approx(returning)
                 crossing = max(n for n, edge in enumerate(way) if REGION[edge] == 0)
                 assert (way[crossing], way[crossing + 1]) == (gate[gateway], entry[gateway])
                 assert (REGION[way[:crossing]] != 0).any()
@@ -135,7 +146,9 @@ def test_ways_that_come_back_are_found_where_they_are_the_fastest_of_all(city, w
 def test_ways_home_are_the_fastest_up_to_a_limit(city, kept):
     first, second, turn, time = city
     exact = least(city, np.full(EDGES, True))
-    home = Trees(Moves(first, second, allowed=np.full(EDGES, True), reverse=True), time, turn, Searches(kept))
+    home = Trees(
+        Moves(first, second, allowed=np.full(EDGES, True), reverse=True), time, turn, Searches(kept)
+    )
     for most in (60.0, np.inf, 100.0):
         for here in range(EDGES):
             for target in range(EDGES):
@@ -148,7 +161,8 @@ def test_ways_home_are_the_fastest_up_to_a_limit(city, kept):
                     assert cost == pytest.approx(exact[here, target]) == takes(way, city)
 
 
-# A main road a m b t of 10 s each, of which m is in another region, and the side street s of `side` s from a to t.
+# A main road a m b t of 10 s each, of which m is in another region, and the side street s of `side`
+# s from a to t.
 REGION_OF = {"a": 0, "b": 0, "m": 1, "s": 0, "t": 2}
 AFTER = {"a": ("m", "s"), "b": ("t",), "m": ("b",), "s": ("t",), "t": ()}
 
@@ -157,7 +171,8 @@ DRIVER = Event(vehicle="driver", source=None, region=0, destination=2, edge="t")
 
 
 def crossroads(route, *, ways_return, side=40.0, to_region_1=0.5, period=0.0, lanes=True):
-    """A guide, its commands, the routes of the drivers, and where they are, which is at their routes' first edges."""
+    """A guide, its commands, the routes of the drivers, and where they are, which is at their
+    routes' first edges."""
     length = dict.fromkeys(AFTER, 10.0) | {"s": side}
     routes, road = {"driver": route}, Mock(side_effect=lambda vehicle: routes[vehicle][0])
     own, splits = np.zeros((2, 3, 3, 3))
@@ -179,7 +194,8 @@ def crossroads(route, *, ways_return, side=40.0, to_region_1=0.5, period=0.0, la
 
 
 def guided(route, **chosen):
-    """The route of a driver on a bound for t after guidance, and the region for which he is said to leave."""
+    """The route of a driver on a bound for t after guidance, and the region for which he is said to
+    leave."""
     guide, _, routes, _ = crossroads(route, **chosen)
     guide.apply([DRIVER])
     return "".join(routes["driver"]), int(guide.realised[0, :, 2].argmax())
@@ -187,7 +203,10 @@ def guided(route, **chosen):
 
 @pytest.mark.parametrize("route", ["ambt", "ast"])
 def test_a_main_road_that_leaves_the_region_and_comes_back_is_open_to_all(route):
-    assert guided(tuple(route), ways_return=True) == ("ambt", 2)  # he leaves region 0 for good by b t
+    assert guided(tuple(route), ways_return=True) == (
+        "ambt",
+        2,
+    )  # he leaves region 0 for good by b t
     for side in (40.0, 200.0):  # however much longer
         assert guided(tuple(route), ways_return=False, side=side) == ("ast", 2)
 
@@ -195,7 +214,11 @@ def test_a_main_road_that_leaves_the_region_and_comes_back_is_open_to_all(route)
 def test_ways_that_return_are_taken_where_they_are_faster_and_no_command_for_the_next_region_closes_them():
     assert guided(tuple("ast"), ways_return=True, side=12.0) == ("ast", 2)
     assert guided(tuple("ambt"), ways_return=True, side=2.0) == ("ast", 2)
-    for to_region_1 in (0.0, 0.5, 1.0):  # nobody can leave for 1 for good: there is no other way on than back
+    for to_region_1 in (
+        0.0,
+        0.5,
+        1.0,
+    ):  # nobody can leave for 1 for good: there is no other way on than back
         assert guided(tuple("ambt"), ways_return=True, to_region_1=to_region_1)[0] == "ambt"
 
 
@@ -213,14 +236,21 @@ def test_prices_lengthen_the_ways_through_a_region_and_go_when_none_are_commande
 def test_with_prices_no_way_is_a_long_detour_by_the_times_without(city, ways_return, monkeypatch):
     monkeypatch.setattr(guidance, "SPREAD", 0.0)
     first, second, _, time = city
-    free, names, even = (first, second, 0.0 * first, time), [f"{n:02}" for n in range(EDGES)], np.full((4,) * 3, 0.25)
-    inside, outside, best = (least(free, allowed) for allowed in (REGION == 0, REGION != 0, REGION < 4))
+    free, names, even = (
+        (first, second, 0.0 * first, time),
+        [f"{n:02}" for n in range(EDGES)],
+        np.full((4,) * 3, 0.25),
+    )
+    inside, outside, best = (
+        least(free, allowed) for allowed in (REGION == 0, REGION != 0, REGION < 4)
+    )
     if not ways_return:
         leave = (REGION[first] == 0) & (REGION[second] != 0)
         a, b = first[leave], second[leave]
         best = np.min(inside[:, a, None] + time[b, None] + outside[b], axis=1)
     _, before = dijkstra(
-        csr_array((np.ones(len(first)), (first, second)), shape=(EDGES,) * 2), return_predecessors=True
+        csr_array((np.ones(len(first)), (first, second)), shape=(EDGES,) * 2),
+        return_predecessors=True,
     )
     after = {name: [names[b] for b in second[first == n]] for n, name in enumerate(names)}
     length = dict(zip(names, time, strict=True))
@@ -228,7 +258,12 @@ def test_with_prices_no_way_is_a_long_detour_by_the_times_without(city, ways_ret
     for most in (20.0, 60.0, 1e9):
         routes, detours, random = {}, [], np.random.default_rng(0)
         town = streets.city(dict(zip(names, REGION.tolist(), strict=True)), after, length=length)
-        chosen = {"compliance": 1.0, "most_detour": most, "random": random, "ways_return": ways_return}
+        chosen = {
+            "compliance": 1.0,
+            "most_detour": most,
+            "random": random,
+            "ways_return": ways_return,
+        }
         guide = Guide(streets.session(routes), town, even, **chosen)
         guide.command(even, None, np.array([0.0, 5.0, 5.0, 0.0]))
         for here, target in product(range(10), range(30, 39)):
@@ -238,7 +273,9 @@ def test_with_prices_no_way_is_a_long_detour_by_the_times_without(city, ways_ret
             if way[-1] == here and best[here, target] < np.inf:
                 routes["driver"] = tuple(names[n] for n in way[::-1])
                 guide.apply([DRIVER._replace(destination=3, edge=names[target])])
-                detours.append(time[[int(name) for name in routes["driver"][1:]]].sum() - best[here, target])
+                detours.append(
+                    time[[int(name) for name in routes["driver"][1:]]].sum() - best[here, target]
+                )
         longest[most] = max(detours)
         assert longest[most] <= most + 1e-6
     assert longest[1e9] > 60.0
@@ -248,11 +285,14 @@ def test_who_is_bound_for_a_region_does_not_see_its_price():
     guide, splits, routes, _ = crossroads(tuple("ast"), ways_return=True)
     guide.command(splits, None, np.array([0.0, 0.0, 9.0]))
     guide.apply([DRIVER])
-    assert "".join(routes["driver"]) == "ambt"  # 20 s less; t itself is in region 2, and takes the same both ways
+    assert (
+        "".join(routes["driver"]) == "ambt"
+    )  # 20 s less; t itself is in region 2, and takes the same both ways
 
 
 def test_drivers_are_asked_again_where_they_are():
-    """On his way over m, which comes to a stand, a driver turns into the side street if he is asked in time."""
+    """On his way over m, which comes to a stand, a driver turns into the side street if he is asked
+    in time."""
     for period, asked in ((0.0, 99), (2.5, 3), (6.0, 6)):
         guide, splits, routes, _ = crossroads(tuple("ambt"), ways_return=True, period=period)
         guide.apply([DRIVER])
@@ -261,7 +301,8 @@ def test_drivers_are_asked_again_where_they_are():
             guide.apply([])
             assert "".join(routes["driver"]) == ("ast" if step >= asked else "ambt")
             assert guide.realised.sum() == guide.realised[0, 2, 2] == 1
-        # Of the region that he was told before nothing is left, although a control interval has passed.
+        # Of the region that he was told before nothing is left, although a control interval has
+        # passed.
         assert guide._assigned[0, 2, 2] == pytest.approx(1.0 if asked < 9 else 0.9)
 
 
@@ -273,4 +314,6 @@ def test_on_a_junction_it_is_too_late_and_who_arrived_is_not_asked():
     for expected in ("ambt", "ambt", "ambt", "ast", "ast", "ast", "ast", "ast", "ast"):
         guide.apply([])
         assert "".join(routes["driver"]) == expected
-    assert road.call_count == 5  # when he came, twice on the junction, behind it, and when he had arrived
+    assert (
+        road.call_count == 5
+    )  # when he came, twice on the junction, behind it, and when he had arrived

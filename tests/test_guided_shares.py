@@ -1,4 +1,5 @@
-"""Who is guided where, worked out by hand: two ways from region 0 to region 3, a through region 1 and b through 2."""
+"""Who is guided where, worked out by hand: two ways from region 0 to region 3, a through region 1
+and b through 2."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -17,9 +18,18 @@ from nmfd.api import load_scenario
 from nmfd.controllers.strategy import parse
 from nmfd.types import Controls
 
-# s and z are in region 0, a and b in 1 and 2; all lead to t in 3, where t2 follows, and z by a shorter u.
+# s and z are in region 0, a and b in 1 and 2; all lead to t in 3, where t2 follows, and z by a
+# shorter u.
 REGION_OF = {"a": 1, "b": 2, "s": 0, "t": 3, "t2": 3, "u": 3, "v": 3}
-AFTER = {"s": ("a", "b"), "a": ("t",), "b": ("t",), "t": ("t2", "u"), "t2": ("v",), "u": ("v",), "v": ()}
+AFTER = {
+    "s": ("a", "b"),
+    "a": ("t",),
+    "b": ("t",),
+    "t": ("t2", "u"),
+    "t2": ("v",),
+    "u": ("v",),
+    "v": (),
+}
 EDGES = tuple(sorted(REGION_OF))
 HOMEWARD = Event(vehicle="x", source=None, region=3, destination=3, edge="v")
 
@@ -31,9 +41,21 @@ def everybody_sees_the_same_times(monkeypatch):
 
 
 class Town:
-    """A guide of drivers on s, bound for t: by a it takes `through_a` [s] more than the last edge, by b `through_b`."""
+    """A guide of drivers on s, bound for t: by a it takes `through_a` [s] more than the last edge,
+    by b `through_b`."""
 
-    def __init__(self, *, through_a, through_b, theta, own=0.5, most_detour=1e9, compliance=1.0, seed=0, lanes=True):
+    def __init__(
+        self,
+        *,
+        through_a,
+        through_b,
+        theta,
+        own=0.5,
+        most_detour=1e9,
+        compliance=1.0,
+        seed=0,
+        lanes=True,
+    ):
         length = dict.fromkeys(EDGES, 10.0) | {"a": through_a, "b": through_b, "u": 5.0}
         city = streets.city(
             REGION_OF,
@@ -64,7 +86,8 @@ class Town:
         return self.takes_it
 
     def command(self, **speeds):
-        """The next control interval, with these speeds [m/s] in the last one; elsewhere nobody was seen."""
+        """The next control interval, with these speeds [m/s] in the last one; elsewhere nobody was
+        seen."""
         seen_speeds = [speeds.get(edge, np.nan) for edge in EDGES]
         streets = seen(seen_speeds, crossing=(0.0, 0.0), crossed=(0.0, 0.0)) if speeds else None
         self.guide.command(self.shares[1], streets)
@@ -75,7 +98,9 @@ class Town:
         for n in range(count):
             vehicle = f"{len(self.routes)}-{n}"
             self.routes[vehicle] = ("s", by, "t")
-            self.guide.apply([Event(vehicle=vehicle, source=None, region=0, destination=3, edge="t", free=free)])
+            self.guide.apply(
+                [Event(vehicle=vehicle, source=None, region=0, destination=3, edge="t", free=free)]
+            )
             assert self.routes[vehicle] in (("s", "a", "t"), ("s", "b", "t"))
             ways += self.routes[vehicle][1]
         return ways
@@ -92,9 +117,12 @@ def test_theta_shifts_the_shares_of_those_who_wish(theta, expected):
 
 
 @pytest.mark.parametrize("bonus, first", [(30.0, 5), (10.0, 13)])
-def test_a_longer_way_is_taken_as_soon_as_its_region_is_far_enough_behind(monkeypatch, bonus, first):
-    """Half of them shall go by b, which takes 125 s more. After n drivers by a, the lead of a's price is
-    125 - bonus ((n + 1) / 2 - ((n + 1) / 2 - n)) = 125 - bonus n: b it is from n = 125 / bonus on."""
+def test_a_longer_way_is_taken_as_soon_as_its_region_is_far_enough_behind(
+    monkeypatch, bonus, first
+):
+    """Half of them shall go by b, which takes 125 s more. After n drivers by a, the lead of a's
+    price is 125 - bonus ((n + 1) / 2 - ((n + 1) / 2 - n)) = 125 - bonus n: b it is from n = 125 /
+    bonus on."""
     monkeypatch.setattr(guidance, "SHARE_PENALTY_S", bonus)
     town = Town(through_a=30.0, through_b=155.0, theta=0.25)
     ways = town.drive(first + 1)
@@ -104,9 +132,14 @@ def test_a_longer_way_is_taken_as_soon_as_its_region_is_far_enough_behind(monkey
 @pytest.mark.parametrize("most, expected", [(59.0, "a"), (61.0, "b")])
 def test_nobody_is_sent_on_a_longer_detour_whatever_theta_says(most, expected):
     """60 s more by b, where all are sent: or, where that is too much, the fastest way of all."""
-    assert Town(through_a=30.0, through_b=90.0, theta=0.0, most_detour=most).drive(3) == 3 * expected
+    assert (
+        Town(through_a=30.0, through_b=90.0, theta=0.0, most_detour=most).drive(3) == 3 * expected
+    )
     other = {"a": "b", "b": "a"}[expected]  # the same with the ways exchanged
-    assert Town(through_a=90.0, through_b=30.0, theta=1.0, most_detour=most).drive(3, by="b") == 3 * other
+    assert (
+        Town(through_a=90.0, through_b=30.0, theta=1.0, most_detour=most).drive(3, by="b")
+        == 3 * other
+    )
 
 
 @pytest.mark.parametrize("by_b, expected", [(69.0, "b"), (71.0, "a")])
@@ -121,11 +154,14 @@ def test_travel_times_are_those_seen(by_b, expected):
 
 @pytest.mark.parametrize("waited, expected", [(18.0, "a"), (24.0, "b")])
 def test_who_waits_on_a_junction_is_seen(waited, expected):
-    """It takes 20 s more by b; by a they wait on the junction before it, behind it, or on both, 1 s in any case."""
+    """It takes 20 s more by b; by a they wait on the junction before it, behind it, or on both, 1 s
+    in any case."""
     for inside in ((waited, 0.0), (0.0, waited), (waited / 2, waited / 2)):
         town = Town(through_a=30.0, through_b=50.0, theta=0.5)
         crossing = (0.5 * inside[0], 0.5 * inside[1])
-        town.guide.command(town.shares[1], seen(np.full(len(EDGES), np.nan), crossing=crossing, crossed=(0.5, 0.5)))
+        town.guide.command(
+            town.shares[1], seen(np.full(len(EDGES), np.nan), crossing=crossing, crossed=(0.5, 0.5))
+        )
         town.routes["new"] = ("s",)
         town.guide.apply([Event(vehicle="new", source=None, region=0, destination=3, edge="t")])
         assert town.routes["new"][1] == expected
@@ -139,7 +175,9 @@ def test_a_refused_way_counts_for_no_region():
 
 
 def test_compliance_and_drivers_who_are_not_free():
-    assert Town(through_a=30.0, through_b=90.0, theta=0.5, compliance=0.0).drive(5, by="b") == "bbbbb"
+    assert (
+        Town(through_a=30.0, through_b=90.0, theta=0.5, compliance=0.0).drive(5, by="b") == "bbbbb"
+    )
     assert Town(through_a=30.0, through_b=90.0, theta=0.5).drive(5, by="b", free=False) == "bbbbb"
     half = Town(through_a=30.0, through_b=90.0, theta=0.5, compliance=0.5).drive(200, by="b")
     assert 75 < half.count("a") < 125
@@ -162,8 +200,8 @@ def test_in_the_region_of_the_destination_it_is_the_fastest_way(present, expecte
 @pytest.mark.parametrize("present", ["t2", "u"])
 @pytest.mark.parametrize("at_v, best", [(30.5, False), (27.5, True)])
 def test_the_more_delay_the_more_another_way_must_save(present, at_v, best):
-    """It takes 12 s and that of v by t2, 5 s less by u. Of 42.5 s by t2, 20.5 s are delay: he keeps it for less than
-    0.6 20.5^2 / 42.5 = 5.9 s. Of 39.5 s, 17.5 s: less than 4.7 s."""
+    """It takes 12 s and that of v by t2, 5 s less by u. Of 42.5 s by t2, 20.5 s are delay: he keeps
+    it for less than 0.6 20.5^2 / 42.5 = 5.9 s. Of 39.5 s, 17.5 s: less than 4.7 s."""
     town = Town(through_a=30.0, through_b=90.0, theta=0.5)
     town.command(v=10.0 / at_v)
     town.routes["x"] = ("t", present, "v")
@@ -173,23 +211,32 @@ def test_the_more_delay_the_more_another_way_must_save(present, at_v, best):
 
 @pytest.mark.parametrize("at_v, best", [(16.0, False), (4.0, True)])
 def test_in_the_mesoscopic_model_another_way_must_save_a_share_of_its_own_time(at_v, best):
-    """v takes 13 s, the mean of now and before: 25 s by t2 and 20 by u, 1.25 times. Or t2 takes 22 s: 34 and 17 s."""
+    """v takes 13 s, the mean of now and before: 25 s by t2 and 20 by u, 1.25 times. Or t2 takes 22
+    s: 34 and 17 s."""
     town = Town(through_a=30.0, through_b=90.0, theta=0.5, lanes=False)
     town.command(t2=10.0 / (34.0 if best else 10.0), v=10.0 / at_v)
-    assert town.guide._times.edges[EDGES.index("t2")] == pytest.approx(22.0 if best else 10.0)  # smoothed: half of it
+    assert town.guide._times.edges[EDGES.index("t2")] == pytest.approx(
+        22.0 if best else 10.0
+    )  # smoothed: half of it
     town.routes["x"] = ("t", "t2", "v")
     town.guide.apply([HOMEWARD])
     assert town.routes["x"] == ("t", "u" if best else "t2", "v")
 
 
 def test_guided_is_guidance_by_travel_times_wherever_the_controller_says_nothing():
-    """The bytes are those of a controller that commands the nominal split ratios; without it no driver is guided."""
+    """The bytes are those of a controller that commands the nominal split ratios; without it no
+    driver is guided."""
     scenario = load_scenario(Path(__file__).parents[1] / "scenarios" / "grid7_peak")
     scenario = replace(scenario, steps=1, demand=scenario.demand[15:16])
     half = Controls(perimeter=np.full((7, 7), 0.4), splits=scenario.network.nominal_splits)
     by_hand, option, off = (
         simulate(Simulation(scenario, parse(tiny.Acting(lambda _, told=told: told), city), seed=1))
-        for city, told in (("", half), ("guided", replace(half, splits=None)), ("", replace(half, splits=None)))
+        for city, told in (
+            ("", half),
+            ("guided", replace(half, splits=None)),
+            ("", replace(half, splits=None)),
+        )
     )
-    assert option["guided"].sum() > 0 and off["guided"].sum() == 0
+    assert option["guided"].sum() > 0
+    assert off["guided"].sum() == 0
     assert option.without_times().equals(by_hand.without_times())

@@ -1,4 +1,5 @@
-"""What users of notebooks and shells expect: one name or many, patterns, tables, progress, a look at a city."""
+"""What users of notebooks and shells expect: one name or many, patterns, tables, progress, a look
+at a city."""
 
 import io
 import itertools
@@ -22,7 +23,9 @@ NAMES = ("no-control", "dpc-pc", "dpc-pcrg", "pi-gating")
 @pytest.fixture
 def listed(tmp_path, monkeypatch):
     """Names of the strategies in a list, where those of NAMES can be made."""
-    monkeypatch.setattr(strategy, "ready", lambda scenario: [strategy.parse(name) for name in NAMES])
+    monkeypatch.setattr(
+        strategy, "ready", lambda scenario: [strategy.parse(name) for name in NAMES]
+    )
     scenario = nmfd.load_scenario(tiny.write(tmp_path))
     return lambda given: [one.name for one in strategy.parse_many(given, scenario)]
 
@@ -49,10 +52,18 @@ def test_a_pattern_stands_for_what_has_a_policy(tmp_path, monkeypatch):
     folder = tiny.write(tmp_path)
     scenario = nmfd.load_scenario(folder)
     names = [one.name for one in strategy.ready(scenario)]
-    assert "mpc-pc" in names and not any(name.startswith("dpc") for name in names)
-    table = good(command("benchmark", folder, "--controllers", "no-*,pi-gating", "--out", tmp_path / "out"))
-    assert re.findall("^(no-control|pi-gating) ", table, re.MULTILINE) == ["no-control", "pi-gating"]
-    assert "matches 'dpc-*'" in error_line(command("benchmark", folder, "--controllers", "dpc-*"), "nmfd")
+    assert "mpc-pc" in names
+    assert not any(name.startswith("dpc") for name in names)
+    table = good(
+        command("benchmark", folder, "--controllers", "no-*,pi-gating", "--out", tmp_path / "out")
+    )
+    assert re.findall("^(no-control|pi-gating) ", table, re.MULTILINE) == [
+        "no-control",
+        "pi-gating",
+    ]
+    assert "matches 'dpc-*'" in error_line(
+        command("benchmark", folder, "--controllers", "dpc-*"), "nmfd"
+    )
     for name in ("dpc-pc.pt", "dpc-pc+max-pressure.pt", "dpc-pc+nonsense.pt"):
         (folder / name).touch()
     names = [one.name for one in strategy.ready(nmfd.load_scenario(folder))]
@@ -80,11 +91,20 @@ def test_progress_is_shown_on_a_terminal_and_in_notebooks_only(monkeypatch, caps
 
 
 @pytest.mark.parametrize("said, lines", [(False, ["train, b: about 5 min left"]), (True, [])])
-def test_a_long_stage_is_announced_once_from_the_time_of_its_first_steps(monkeypatch, capsys, said, lines):
+def test_a_long_stage_is_announced_once_from_the_time_of_its_first_steps(
+    monkeypatch, capsys, said, lines
+):
     clock = itertools.count(0.0, 3.0)
     monkeypatch.setattr(progress.time, "monotonic", lambda: next(clock))
     with progress.watched("train", said=said) as show:
-        for step in ((1, 101, "slow"), (1, 101, "a"), (2, 101, "b"), (3, 101, "c"), (0, 9, "short"), (1, 9, "d")):
+        for step in (
+            (1, 101, "slow"),
+            (1, 101, "a"),
+            (2, 101, "b"),
+            (3, 101, "c"),
+            (0, 9, "short"),
+            (1, 9, "d"),
+        ):
             show(*step)
     assert capsys.readouterr().err.splitlines() == lines
 
@@ -96,12 +116,14 @@ def city():
 
 def test_a_city_without_a_run(city):
     regions, gateways = city.regions, city.gateways
-    assert len(regions) == 7 and regions["lane_km"].between(10, 30).all()
+    assert len(regions) == 7
+    assert regions["lane_km"].between(10, 30).all()
     assert regions["critical_veh"].tolist() == [mfd.critical for mfd in city.network.mfds]
     joined = {(g.source, g.target) for g in gateways.itertuples()}
     assert joined == {(i, h) for i, h in np.argwhere(city.network.adjacency)}
     assert set(gateways["control"]) == {"controlled"}
-    assert "centre" in city._repr_html_() and "max_outflow_veh_s" in city._repr_html_()
+    assert "centre" in city._repr_html_()
+    assert "max_outflow_veh_s" in city._repr_html_()
 
 
 def test_the_map_is_drawn_into_the_axes_it_is_given(city):

@@ -1,4 +1,5 @@
-"""Identification on runs whose truth is known: made by the regional model itself, under the probing controller."""
+"""Identification on runs whose truth is known: made by the regional model itself, under the probing
+controller."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -54,7 +55,9 @@ def runs(scenario):
 
 
 def error(network, runs, intervals):
-    return np.sqrt((identification.prediction_errors(network, runs, intervals, step=30.0) ** 2).mean())
+    return np.sqrt(
+        (identification.prediction_errors(network, runs, intervals, step=30.0) ** 2).mean()
+    )
 
 
 def test_the_true_model_predicts_without_error(scenario, runs):
@@ -68,7 +71,8 @@ def test_the_fit_predicts_a_run_that_it_has_not_seen(scenario, runs):
     assert all(mfd.problem() is None for mfd in fitted.mfds)
     assert error(fitted, runs[3:], 10) < 0.35 * error(start, runs[3:], 10)
     first, again, other = (
-        identification.fit(start, runs[:3], step=30.0, iterations=5, seed=seed).hash for seed in (0, 0, 1)
+        identification.fit(start, runs[:3], step=30.0, iterations=5, seed=seed).hash
+        for seed in (0, 0, 1)
     )
     assert first == again != other  # the same seed gives the same model
     used = sum(run.accumulation.sum(axis=0) for run in runs[:3])
@@ -78,7 +82,8 @@ def test_the_fit_predicts_a_run_that_it_has_not_seen(scenario, runs):
 
 def test_windows_are_the_intervals_in_order(runs):
     states, demand, perimeter, splits = identification.windows(runs[:1], 5)
-    assert states.shape == (116, 6, 7, 7) and demand.shape == perimeter.shape == (116, 5, 7, 7)
+    assert states.shape == (116, 6, 7, 7)
+    assert demand.shape == perimeter.shape == (116, 5, 7, 7)
     np.testing.assert_array_equal(states[3, 2], runs[0].accumulation[5].astype(np.float32))
     np.testing.assert_array_equal(splits[7, 4], runs[0].splits[11].astype(np.float32))
 
@@ -93,7 +98,8 @@ def test_probing_moves_every_gate_and_repeats_itself(scenario):
     assert (first.perimeter != other.perimeter).any()
     gates = first.perimeter[:, scenario.network.adjacency]
     assert (np.ptp(gates, axis=0) > 0.2).all()
-    assert gates.min() >= scenario.network.u_min and gates.max() <= scenario.network.u_max
+    assert gates.min() >= scenario.network.u_min
+    assert gates.max() <= scenario.network.u_max
     sums = first.splits.sum(axis=2)
     assert np.isclose(sums, 1.0).sum() == np.isclose(sums, 0.0).sum() * 6  # all but j = i
     assert not first.splits[:, ~scenario.network.split_mask].any()
@@ -115,23 +121,30 @@ def test_any_free_numbers_are_a_valid_model(model):
     """q = c (1 - first y - second y^2) with y = x / jam, falling from c to a hundredth of it at the least."""
     p = model.regional()
     c, first, second, jam = model.shape()
-    assert (first >= 0).all() and (first + 2.0 * second >= 0).all() and (first + second <= 0.99).all()
+    assert (first >= 0).all()
+    assert (first + 2.0 * second >= 0).all()
+    assert (first + second <= 0.99).all()
     for y in (0.0, 0.3, 1.0):
         torch.testing.assert_close(dynamics.rate(p, y * jam), c * (1.0 - first * y - second * y**2))
     torch.testing.assert_close(dynamics.rate(p, 2.0 * jam), 0.5 * c * (1.0 - first - second))
     fastest = (p.mfd.c[:, None] * p.exit_rates).max().item()
-    assert fastest <= 1.0 / 30.0 and p.exit_rates.max() <= 8.0 and p.exit_rates.min() >= 1.0 / 8.0
+    assert fastest <= 1.0 / 30.0
+    assert p.exit_rates.max() <= 8.0
+    assert p.exit_rates.min() >= 1.0 / 8.0
     assert model.penalty().item() > 0.0
 
 
 def test_the_network_flows_as_the_free_numbers_do(scenario, runs, model):
-    """Its exit rates are scaled, and its capacities are those at u_max: the flows stay what they were."""
+    """Its exit rates are scaled, and its capacities are those at u_max: the flows stay what they
+    were."""
     network = identification._network(scenario.network, model, runs)
     random = np.random.default_rng(2)
     x = torch.from_numpy(random.uniform(0.0, 400.0, (7, 7)))
     perimeter, splits = map(torch.from_numpy, tiny.random_controls(random, network))
     expected = dynamics.flows(model.regional(), x.float(), perimeter.float(), splits.float())
-    for mine, free in zip(dynamics.flows(dynamics.parameters(network), x, perimeter, splits), expected, strict=True):
+    for mine, free in zip(
+        dynamics.flows(dynamics.parameters(network), x, perimeter, splits), expected, strict=True
+    ):
         assert free.abs().max() > 0.0
         torch.testing.assert_close(mine, free.detach().double(), rtol=1e-4, atol=1e-6)
 
@@ -147,9 +160,13 @@ def test_what_a_fit_makes_small(scenario, runs, by_origin):
     wrong[:, 1:] += missed
     far = (2.0 - 0.5 * identification.OUTLIER) * 2.0  # two errors of twice the scale
     found = identification._misfit(p, [wrong, *rest], scale, scheme)
-    assert found == pytest.approx(identification.BY_DESTINATION * far / 49 + (0.0 if by_origin else far / 7), rel=1e-3)
+    assert found == pytest.approx(
+        identification.BY_DESTINATION * far / 49 + (0.0 if by_origin else far / 7), rel=1e-3
+    )
 
 
 def test_a_run_shorter_than_the_horizon_is_left_out(runs):
     short = replace(runs[0], accumulation=runs[0].accumulation[:4], demand=runs[0].demand[:3])
-    assert len(identification.windows([short, runs[0]], 5)[0]) == len(identification.windows(runs[:1], 5)[0])
+    assert len(identification.windows([short, runs[0]], 5)[0]) == len(
+        identification.windows(runs[:1], 5)[0]
+    )

@@ -1,4 +1,5 @@
-"""cosim import: from a sumocfg to a network and a scenario that run, on a small city of everything."""
+"""cosim import: from a sumocfg to a network and a scenario that run, on a small city of
+everything."""
 
 import csv
 import gzip
@@ -37,24 +38,35 @@ def imported(config, tmp_path_factory):
     """(project folder, what the import printed)."""
     project = tmp_path_factory.mktemp("project")
     text = good(cosim("import", config, "--regions", 3, "--out", project / "networks" / "tiny"))
-    shutil.copytree(project, project.with_name("as-imported"))  # runs build something in the other one
+    shutil.copytree(
+        project, project.with_name("as-imported")
+    )  # runs build something in the other one
     return project, text
 
 
 def test_traffic_keeps_cars_and_leaves_the_rest_alone(config):
     case = read_sumo_input(config)
-    assert case.begin == 600.0 and case.end == 1500.0
+    assert case.begin == 600.0
+    assert case.end == 1500.0
     traffic = read_traffic(case, read_streets(case.net, case.additional), seed=0)
     ids = [vehicle.get("id") for vehicle in traffic.vehicles]
-    assert len(set(ids)) == len(ids) and {"round", "stops", "short"} <= set(ids)
+    assert len(set(ids)) == len(ids)
+    assert {"round", "stops", "short"} <= set(ids)
     assert not {"early", "astray", "gap", "bus"} & set(ids)
     assert sum(name.startswith("zones.") for name in ids) == 30
     assert sum(name.startswith("across.") for name in ids) == 75
     assert sum(name.startswith("back.") for name in ids) == 60
     assert 30 <= sum(name.startswith("chance.") for name in ids) <= 90
     assert 30 <= sum(name.startswith("down.") for name in ids) <= 90
-    assert (np.diff(traffic.depart) >= 0).all() and traffic.depart.min() >= 600.0
-    assert [element.get("id") for element in traffic.background] == ["line2.0", "bus", "walker", "line2.1", "line2.2"]
+    assert (np.diff(traffic.depart) >= 0).all()
+    assert traffic.depart.min() >= 600.0
+    assert [element.get("id") for element in traffic.background] == [
+        "line2.0",
+        "bus",
+        "walker",
+        "line2.1",
+        "line2.2",
+    ]
     assert "edgeData" not in [element.tag for element in traffic.shared]
     detector = next(element for element in traffic.shared if element.tag == "inductionLoop")
     assert detector.get("file") == "NUL"  # a run writes nothing into the user's folders
@@ -76,7 +88,11 @@ def test_import_gives_every_edge_one_region_and_connected_regions(imported, conf
     assert connected_components(graph(inside, len(region)), directed=False)[0] == 3
     city = load_city(network / "city.net.xml.gz", network / "regions.csv", 3)
     with gzip.open(network / "city.net.xml.gz") as stream:
-        internal = [e.get("id") for e in ElementTree.parse(stream).iter("edge") if e.get("function") == "internal"]
+        internal = [
+            e.get("id")
+            for e in ElementTree.parse(stream).iter("edge")
+            if e.get("function") == "internal"
+        ]
     assert set(internal) <= set(city.region_of)
 
 
@@ -84,7 +100,10 @@ def test_gateways_and_quality_add_up(imported):
     network = imported[0] / "networks" / "tiny"
     gateways, quality = pd.read_csv(network / "gateways.csv"), pd.read_csv(network / "quality.csv")
     regions = dict(pd.read_csv(network / "regions.csv").itertuples(index=False))
-    assert all(regions[g.from_edge] == g.source and regions[g.to_edge] == g.target for g in gateways.itertuples())
+    assert all(
+        regions[g.from_edge] == g.source and regions[g.to_edge] == g.target
+        for g in gateways.itertuples()
+    )
     streets = read_streets(network / "city.net.xml.gz")
     crossing = {
         (streets.edges[a], streets.edges[b])
@@ -92,15 +111,20 @@ def test_gateways_and_quality_add_up(imported):
         if regions[streets.edges[a]] != regions[streets.edges[b]]
     }
     assert crossing == set(zip(gateways.from_edge, gateways.to_edge, strict=True))
-    assert set(gateways.control) <= {"controlled", "no signal"} and (gateways.control == "controlled").any()
+    assert set(gateways.control) <= {"controlled", "no signal"}
+    assert (gateways.control == "controlled").any()
     whole = quality.iloc[-1]
     free = gateways.flow_veh[gateways.control != "controlled"].sum() / gateways.flow_veh.sum()
     assert whole.uncontrolled_share == pytest.approx(free, abs=1e-3)
     answer = (network / "verdict.txt").read_text().splitlines()[0]
-    assert answer.startswith("Can perimeter control help? Cannot say yet: the") and answer in imported[1]
-    assert "cosim identify scenarios/tiny" in imported[1] and "times its free-flow time" in imported[1]
+    assert answer.startswith("Can perimeter control help? Cannot say yet: the")
+    assert answer in imported[1]
+    assert "cosim identify scenarios/tiny" in imported[1]
+    assert "times its free-flow time" in imported[1]
     shares = load_network(network).controllable
-    assert (shares > 0).any() and ((shares >= 0) & (shares <= 1)).all() and load_network(network).placeholder
+    assert (shares > 0).any()
+    assert ((shares >= 0) & (shares <= 1)).all()
+    assert load_network(network).placeholder
     assert quality.lane_km[:-1].sum() == pytest.approx(whole.lane_km, abs=0.02)
 
 
@@ -112,7 +136,9 @@ def test_import_is_deterministic_and_atomic(imported, config, tmp_path):
         assert [file.name for file in here] == [file.name for file in there]
         for one, other in zip(here, there, strict=True):
             assert one.is_dir() or one.read_bytes() == other.read_bytes(), one.name
-    line = error_line(cosim("import", config, "--regions", 3, "--out", tmp_path / "networks" / "tiny"))
+    line = error_line(
+        cosim("import", config, "--regions", 3, "--out", tmp_path / "networks" / "tiny")
+    )
     assert "exists; choose another name" in line
 
 
@@ -121,15 +147,22 @@ def test_scenario_drives_the_original_vehicles(imported, config):
     case = read_sumo_input(config)
     traffic = read_traffic(case, read_streets(case.net, case.additional), seed=0)
     assert scenario.demand.sum() * scenario.step == pytest.approx(len(traffic.vehicles), rel=1e-4)
-    assert settings(scenario).begin == 600.0 and settings(scenario).ways_return
-    with tiny_city.played(scenario, 10, 0.9, scenario.network.nominal_splits) as (plant, measurement, record):
+    assert settings(scenario).begin == 600.0
+    assert settings(scenario).ways_return
+    with tiny_city.played(scenario, 10, 0.9, scenario.network.nominal_splits) as (
+        plant,
+        measurement,
+        record,
+    ):
         due = len(plant.meter.trips())
         # every car, and the buses: one, and one per 200 s in ten minutes
         assert due == (traffic.depart < 600.0 + 10 * scenario.step - 10).sum() + 1 + 3
         assert record.departures.sum() == due - measurement.backlog.sum()
         assert record.arrivals.sum() + measurement.accumulation.sum() == record.departures.sum()
         free = plant.session.is_free
-        assert not any(free(v) for v in plant.session.running() if v.startswith(("line2", "bus", "stops")))
+        assert not any(
+            free(v) for v in plant.session.running() if v.startswith(("line2", "bus", "stops"))
+        )
         assert record.guided.sum() > 0
 
 
@@ -140,7 +173,8 @@ def test_own_regions_come_back(imported, config, tmp_path):
 
 
 def test_networks_as_they_are(tmp_path):
-    """Left-hand traffic; two signals; none at all: a working result, with a demand that is generated."""
+    """Left-hand traffic; two signals; none at all: a working result, with a demand that is
+    generated."""
     for name, options, expected in (
         ("left", ("--lefthand", "true", "--tls.set", "B1,C2"), "left-hand traffic; 2 signals"),
         ("none", ("--default-junction-type", "priority"), "no gateway has a signal"),
@@ -162,7 +196,11 @@ def test_signals_that_are_left_alone(config, tmp_path):
     additional = tmp_path / "city.add.xml"
     additional.write_text(additional.read_text().replace("</additional>", timetable))
     scenario = load_scenario(tiny_city.imported(tmp_path, 4, tmp_path / "city.sumocfg"))
-    control = pd.read_csv(tmp_path / "networks" / "tiny" / "gateways.csv").set_index("signal").control.to_dict()
+    control = (
+        pd.read_csv(tmp_path / "networks" / "tiny" / "gateways.csv")
+        .set_index("signal")
+        .control.to_dict()
+    )
     assert control.get("C2", "programme follows a timetable") == "programme follows a timetable"
     assert settings(scenario).leave_signals == ("C2",)
 
@@ -181,7 +219,8 @@ def test_mesoscopic_has_no_lanes(imported, key, value):
 
 
 def test_options_and_includes_of_the_user_count(config, tmp_path):
-    """SUMO's short form of values, its scale, its mesoscopic model, files in files; all else is named."""
+    """SUMO's short form of values, its scale, its mesoscopic model, files in files; all else is
+    named."""
     for file in config.parent.glob("*.xml*"):
         shutil.copy(file, tmp_path)
     (tmp_path / "cars.rou.xml").write_text(
@@ -197,23 +236,48 @@ def test_options_and_includes_of_the_user_count(config, tmp_path):
         '<mesosim v="true"/><max-depart-delay value="60"/><tripinfo-output value="trips.xml"/></configuration>'
     )
     case = read_sumo_input(tmp_path / "city.sumocfg")
-    assert case.reading == {"scale": "2.5"} and case.mesoscopic and case.left_out == ()
-    assert case.options["max-depart-delay"] == "60" and case.options["meso-junction-control"] == "false"
-    text = good(cosim("import", tmp_path / "city.sumocfg", "--regions", 2, "--out", tmp_path / "networks" / "x"))
+    assert case.reading == {"scale": "2.5"}
+    assert case.mesoscopic
+    assert case.left_out == ()
+    assert case.options["max-depart-delay"] == "60"
+    assert case.options["meso-junction-control"] == "false"
+    text = good(
+        cosim(
+            "import",
+            tmp_path / "city.sumocfg",
+            "--regions",
+            2,
+            "--out",
+            tmp_path / "networks" / "x",
+        )
+    )
     assert "150 vehicles in" in text
     scenario = load_scenario(tmp_path / "scenarios" / "x")
-    assert scenario.demand_factor == 1.0 and scenario.demand.sum() * scenario.step == pytest.approx(150.0)
+    assert scenario.demand_factor == 1.0
+    assert scenario.demand.sum() * scenario.step == pytest.approx(150.0)
     assert settings(scenario).mesoscopic
-    options = "--routes", tmp_path / "cars.rou.xml", "--regions", 2, "--out", tmp_path / "networks" / "y"
+    options = (
+        "--routes",
+        tmp_path / "cars.rou.xml",
+        "--regions",
+        2,
+        "--out",
+        tmp_path / "networks" / "y",
+    )
     good(cosim("import", tmp_path / "city.net.xml", *options))  # without any sumocfg
-    assert load_scenario(tmp_path / "scenarios" / "y").demand.sum() * scenario.step == pytest.approx(60.0)
-    (tmp_path / "more" / "cars.rou.xml").write_text('<routes><include href="../cars.rou.xml"/></routes>')
+    assert load_scenario(
+        tmp_path / "scenarios" / "y"
+    ).demand.sum() * scenario.step == pytest.approx(60.0)
+    (tmp_path / "more" / "cars.rou.xml").write_text(
+        '<routes><include href="../cars.rou.xml"/></routes>'
+    )
     with pytest.raises(InputError, match="include each other without end"):
         read_traffic(case, read_streets(case.net), seed=0)
 
 
 def test_signal_plans_know_the_city_s_own_vehicles(imported):
-    """Turning flows are those of its routes, and of fastest ways; every signal plan runs on its signals."""
+    """Turning flows are those of its routes, and of fastest ways; every signal plan runs on its
+    signals."""
     scenario = replace(load_scenario(imported[0] / "scenarios" / "tiny"), steps=2)
     own, additional = (
         [scenario.folder / name for name in names]
@@ -223,7 +287,9 @@ def test_signal_plans_know_the_city_s_own_vehicles(imported):
     city = load_city(files / "city.net.xml.gz", files / "regions.csv", 3)
     flows = own_flows(city, read_recorded_trips(own), read_routes(additional), 2.0)
     assert flows["A1B1", "B1B0"] >= 2.0 / 900.0  # the route that one vehicle names
-    assert 2.0 * 75 / 900 <= flows["B1C1", "C1D1"] < 2.0 * 120 / 900  # the flow straight on, of trips
+    assert (
+        2.0 * 75 / 900 <= flows["B1C1", "C1D1"] < 2.0 * 120 / 900
+    )  # the flow straight on, of trips
     assert all(b in city.successors[a] for a, b in flows)
     for plan in ("max-pressure", "webster", "actuated"):
         with tiny_city.played(scenario, 2, 0.9, signals=plan) as (_, _, record):
@@ -235,8 +301,14 @@ def test_signal_plans_know_the_city_s_own_vehicles(imported):
     [
         (lambda folder: (folder / "buses.rou.xml").unlink(), "route-files: no such file"),
         (lambda folder: (folder / "city.net.xml").write_text("<net><edge"), "is not a"),
-        (lambda folder: (folder / "city.net.xml").write_text("<net></net>"), "has no edge that cars may use"),
-        (lambda folder: (folder / "city.sumocfg").write_text("<routes/>"), "a net.xml or a file of OpenStreetMap"),
+        (
+            lambda folder: (folder / "city.net.xml").write_text("<net></net>"),
+            "has no edge that cars may use",
+        ),
+        (
+            lambda folder: (folder / "city.sumocfg").write_text("<routes/>"),
+            "a net.xml or a file of OpenStreetMap",
+        ),
         (
             lambda folder: (folder / "city.sumocfg").write_text(
                 '<configuration><net-file value="city.net.xml"/></configuration>'
@@ -248,7 +320,16 @@ def test_signal_plans_know_the_city_s_own_vehicles(imported):
 def test_one_clear_line(config, tmp_path, change, expected):
     shutil.copytree(config.parent, tmp_path, dirs_exist_ok=True)
     change(tmp_path)
-    line = error_line(cosim("import", tmp_path / "city.sumocfg", "--regions", 3, "--out", tmp_path / "networks" / "x"))
+    line = error_line(
+        cosim(
+            "import",
+            tmp_path / "city.sumocfg",
+            "--regions",
+            3,
+            "--out",
+            tmp_path / "networks" / "x",
+        )
+    )
     assert expected in line
     assert not (tmp_path / "networks").exists() or not list((tmp_path / "networks").iterdir())
 
@@ -256,9 +337,12 @@ def test_one_clear_line(config, tmp_path, change, expected):
 def test_import_at_a_demand_level(config, tmp_path):
     """The factor reaches the scenario: vehicles and demand; mesoscopic too."""
     scenario = load_scenario(tiny_city.imported(tmp_path, 2, config, level=1.5, mesoscopic=True))
-    assert settings(scenario).mesoscopic and scenario.demand_factor == 1.5
+    assert settings(scenario).mesoscopic
+    assert scenario.demand_factor == 1.5
     vehicles = read_recorded_trips([scenario.folder / "vehicles.rou.xml.gz"])
-    assert scenario.demand.sum() * scenario.step == pytest.approx(1.5 * len(vehicles.depart), rel=1e-4)
+    assert scenario.demand.sum() * scenario.step == pytest.approx(
+        1.5 * len(vehicles.depart), rel=1e-4
+    )
 
 
 def test_guidance_leaves_roads_that_are_closed_to_cars_alone(config, tmp_path):
@@ -278,14 +362,25 @@ def test_guidance_leaves_roads_that_are_closed_to_cars_alone(config, tmp_path):
     (tmp_path / "city.sumocfg").write_text(
         '<configuration><net-file value="city.net.xml"/><route-files value="cars.rou.xml"/></configuration>'
     )
-    good(cosim("import", tmp_path / "city.sumocfg", "--regions", 2, "--out", tmp_path / "networks" / "taxis"))
+    good(
+        cosim(
+            "import",
+            tmp_path / "city.sumocfg",
+            "--regions",
+            2,
+            "--out",
+            tmp_path / "networks" / "taxis",
+        )
+    )
     scenario = load_scenario(tmp_path / "scenarios" / "taxis")
     with tiny_city.played(scenario, 6, 0.9, scenario.network.nominal_splits) as (_, _, record):
         assert record.guided.sum() > 10
 
 
 @pytest.mark.slow
-def test_identification_gives_both_models_and_the_import_takes_the_second_away(imported, config, tmp_path):
+def test_identification_gives_both_models_and_the_import_takes_the_second_away(
+    imported, config, tmp_path
+):
     """Drivers on their own routes and guided ones; new regions need new models."""
     shutil.copytree(imported[0], tmp_path, dirs_exist_ok=True)
     network, scenario = tmp_path / "networks" / "tiny", tmp_path / "scenarios" / "tiny"
@@ -296,11 +391,15 @@ def test_identification_gives_both_models_and_the_import_takes_the_second_away(i
     assert (tmp_path / "loading" / "guided" / "level-2" / "probing-pcrg-1000.nc").is_file()
     loaded = load_scenario(scenario)
     guided = planning_model(loaded, "dpc-pcrg").network
-    assert guided.hash != loaded.network.hash and guided.observed_split_ratios == loaded.network.observed_split_ratios
-    assert "PLACEHOLDERS" not in (network / "network.toml").read_text() and not loaded.network.placeholder
+    assert guided.hash != loaded.network.hash
+    assert guided.observed_split_ratios == loaded.network.observed_split_ratios
+    assert "PLACEHOLDERS" not in (network / "network.toml").read_text()
+    assert not loaded.network.placeholder
     assert all("one seed" in doubts for doubts in loaded.network.doubts)
-    assert text.count("Can perimeter control help?") == 2 and (tmp_path / "loading" / "fit.csv").is_file()
-    assert loaded.network.controllable is not None and loaded.network.controllable.any()
+    assert text.count("Can perimeter control help?") == 2
+    assert (tmp_path / "loading" / "fit.csv").is_file()
+    assert loaded.network.controllable is not None
+    assert loaded.network.controllable.any()
     shutil.rmtree(network)
     shutil.rmtree(scenario)
     tiny_city.imported(tmp_path, 2, config)
@@ -312,6 +411,17 @@ def test_the_chain_in_a_city_without_signals(tmp_path):
     """Perimeter control cannot act, and training says so."""
     net = tiny_city.network(tmp_path, "--default-junction-type", "priority", name="none.net.xml")
     scenario = tiny_city.imported(tmp_path, 2, net, demand="peak", level=0.1, iterations=1)
-    good(cosim("run", scenario, "--controller", "pi-gating", "--set", "steps=4", "--out", tmp_path / "out"))
+    good(
+        cosim(
+            "run",
+            scenario,
+            "--controller",
+            "pi-gating",
+            "--set",
+            "steps=4",
+            "--out",
+            tmp_path / "out",
+        )
+    )
     said = error_line(nmfd("train", scenario, "--controller", "dpc-pc"), "nmfd")
     assert "no gateway has a signal" in said

@@ -1,4 +1,5 @@
-"""sdist and wheel: built from what git would commit, installed, and used as a new user would, in an empty folder."""
+"""sdist and wheel: built from what git would commit, installed, and used as a new user would, in an
+empty folder."""
 
 import os
 import subprocess
@@ -17,10 +18,20 @@ NOT_FOR_USERS = ("/reference/", "/tests/", ".png", "ppo.")
 
 
 def called(*command: str | Path, where: Path, **variables: str) -> str:
-    """What a command prints, which has to end well; it sees this environment but for its Python's settings."""
-    kept = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "COV_", "VIRTUAL"))}
+    """What a command prints, which has to end well; it sees this environment but for its Python's
+    settings."""
+    kept = {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith(("PYTHON", "COV_", "VIRTUAL"))
+    }
     done = subprocess.run(
-        [*map(str, command)], cwd=where, env=kept | variables, capture_output=True, text=True, encoding="utf-8"
+        [*map(str, command)],
+        cwd=where,
+        env=kept | variables,
+        capture_output=True,
+        text=True,
+        encoding="utf-8",
     )
     assert done.returncode == 0, f"{command}: {done.stdout}{done.stderr}"
     return done.stdout
@@ -29,12 +40,18 @@ def called(*command: str | Path, where: Path, **variables: str) -> str:
 def contents(wheel: Path) -> dict[str, str]:
     """Name -> hash, of all files but the record of them."""
     with zipfile.ZipFile(wheel) as packed:
-        return {name: sha256(packed.read(name)).hexdigest() for name in packed.namelist() if "RECORD" not in name}
+        return {
+            name: sha256(packed.read(name)).hexdigest()
+            for name in packed.namelist()
+            if "RECORD" not in name
+        }
 
 
 def hashes(folder: Path) -> dict[str, str]:
     return {
-        str(path.relative_to(folder)): sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
+        str(path.relative_to(folder)): sha256(path.read_bytes()).hexdigest()
+        if path.is_file()
+        else ""
         for path in folder.rglob("*")
         if "__pycache__" not in path.parts
     }
@@ -44,7 +61,9 @@ def hashes(folder: Path) -> dict[str, str]:
 def built(tmp_path_factory) -> tuple[Path, Path, Path]:
     """The sdist, the wheel made of it, and one made of the tree."""
     source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("dist")
-    names = called("git", "ls-files", "-z", "--cached", "--others", "--exclude-standard", where=ROOT).split("\0")
+    names = called(
+        "git", "ls-files", "-z", "--cached", "--others", "--exclude-standard", where=ROOT
+    ).split("\0")
     for name in filter(None, names):
         if (ROOT / name).is_file():
             (source / name).parent.mkdir(parents=True, exist_ok=True)
@@ -52,12 +71,17 @@ def built(tmp_path_factory) -> tuple[Path, Path, Path]:
     build = (sys.executable, "-m", "build", "--no-isolation")
     called(*build, "--outdir", out / "both", source, where=out)
     called(*build, "--wheel", "--outdir", out / "tree", source, where=out)
-    return next((out / "both").glob("*.tar.gz")), next((out / "both").glob("*.whl")), next((out / "tree").glob("*.whl"))
+    return (
+        next((out / "both").glob("*.tar.gz")),
+        next((out / "both").glob("*.whl")),
+        next((out / "tree").glob("*.whl")),
+    )
 
 
 @pytest.fixture(scope="module")
 def installed(built, tmp_path_factory) -> Path:
-    """A virtual environment with the wheel and, to have them no second time, the libraries of this one."""
+    """A virtual environment with the wheel and, to have them no second time, the libraries of this
+    one."""
     folder = tmp_path_factory.mktemp("a new user")
     called(sys.executable, "-m", "venv", "--without-pip", folder / "venv", where=folder)
     programs = folder / "venv" / ("Scripts" if os.name == "nt" else "bin")
@@ -73,7 +97,9 @@ def test_the_sdist_makes_the_same_wheel(built):
     sdist, wheel, of_tree = built
     assert contents(wheel) == contents(of_tree)
     with tarfile.open(sdist) as packed:
-        assert "".join(packed.getnames()).count("scenario.toml") == len(list(ROOT.glob("scenarios/*/scenario.toml")))
+        assert "".join(packed.getnames()).count("scenario.toml") == len(
+            list(ROOT.glob("scenarios/*/scenario.toml"))
+        )
 
 
 def test_what_is_in_the_wheel(built):
@@ -95,11 +121,16 @@ def test_a_new_user(installed):
         return called(installed / program, *words, where=where)
 
     data = Path(run("python", "-c", "from nmfd.runs import shipped; print(shipped.root())").strip())
-    assert data.is_relative_to(installed.parent) and data.name == "data"
+    assert data.is_relative_to(installed.parent)
+    assert data.name == "data"
     before = hashes(data)
     assert "grid7_peak" in run("nmfd", "show")
-    assert "no-control" in run("nmfd", "benchmark", "economic_mpc", "--controllers", "no-control", "--seeds", "1")
-    assert "pi-gating" in run("cosim", "run", "grid7_peak", "--controller", "pi-gating", "--steps", "3", "--out", "out")
+    assert "no-control" in run(
+        "nmfd", "benchmark", "economic_mpc", "--controllers", "no-control", "--seeds", "1"
+    )
+    assert "pi-gating" in run(
+        "cosim", "run", "grid7_peak", "--controller", "pi-gating", "--steps", "3", "--out", "out"
+    )
     run("cosim", "run", "grid7_peak", "--controller", "webster", "--steps", "1", "--out", "webster")
     assert "Written to" in run("cosim", "report", "out")
     run("python", "-c", EVERYTHING)

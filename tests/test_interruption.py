@@ -1,4 +1,5 @@
-"""Ctrl-C and kill -9: finished runs stay, nothing half-written counts, and the same command continues to the same."""
+"""Ctrl-C and kill -9: finished runs stay, nothing half-written counts, and the same command
+continues to the same."""
 
 import os
 import shlex
@@ -16,14 +17,18 @@ from nmfd.controllers import training
 
 
 def stopped(program, *arguments, out, by, after="[!.]*.nc", wait=0.0):
-    """Run a command in a process group that gets a signal after its first finished run; return status and stderr.
+    """Run a command in a process group that gets a signal after its first finished run; return
+    status and stderr.
 
-    after: pattern of another file; wait: time after that (s). All processes have ended when stderr has
+    after: pattern of another file; wait: time after that (s). All processes have ended when stderr
+        has
     """
     command = [sys.executable, "-m", program, *map(str, arguments), "--out", str(out)]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
     deadline = time.monotonic() + 120.0
-    while process.poll() is None and time.monotonic() < deadline and not list(out.parent.rglob(after)):
+    while (
+        process.poll() is None and time.monotonic() < deadline and not list(out.parent.rglob(after))
+    ):
         time.sleep(0.02)
     time.sleep(wait)
     os.killpg(process.pid, by)
@@ -31,22 +36,48 @@ def stopped(program, *arguments, out, by, after="[!.]*.nc", wait=0.0):
     return process.returncode, said
 
 
-@pytest.mark.parametrize("after, wait", [("*", 0.15), ("*", 1.0), (".lock", 0.0), ("manifest.json", 0.3)])
+@pytest.mark.parametrize(
+    "after, wait", [("*", 0.15), ("*", 1.0), (".lock", 0.0), ("manifest.json", 0.3)]
+)
 def test_ctrl_c_at_any_moment_is_one_line(tmp_path, after, wait):
-    command = ("benchmark", tiny.write(tmp_path), "--controllers", "no-control", "--seeds", 200, "--workers", 2)
-    returned, said = stopped("nmfd", *command, out=tmp_path / "out", by=signal.SIGINT, after=after, wait=wait)
+    command = (
+        "benchmark",
+        tiny.write(tmp_path),
+        "--controllers",
+        "no-control",
+        "--seeds",
+        200,
+        "--workers",
+        2,
+    )
+    returned, said = stopped(
+        "nmfd", *command, out=tmp_path / "out", by=signal.SIGINT, after=after, wait=wait
+    )
     while "init_import_site" in said:  # before Python itself had started, on a busy machine
         wait *= 2
-        returned, said = stopped("nmfd", *command, out=tmp_path / "out", by=signal.SIGINT, after=after, wait=wait)
+        returned, said = stopped(
+            "nmfd", *command, out=tmp_path / "out", by=signal.SIGINT, after=after, wait=wait
+        )
     assert returned == 130 and said.startswith("nmfd: interrupted") and said.count("\n") == 1, said
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("streams", ["<&- >&- 2>&-", "2>&1 | true"])
 def test_runs_are_kept_without_standard_streams(tmp_path, streams):
-    command = [sys.executable, "-m", "nmfd", "benchmark", str(tiny.write(tmp_path)), "--controllers", "no-control"]
-    subprocess.run([f"{shlex.join(command)} --workers 2 --seeds 2 --out {tmp_path}/out {streams}"], shell=True)
-    assert len(runs(tmp_path / "out")) == 2 and (tmp_path / "out" / "total_accumulation.png").exists()
+    command = [
+        sys.executable,
+        "-m",
+        "nmfd",
+        "benchmark",
+        str(tiny.write(tmp_path)),
+        "--controllers",
+        "no-control",
+    ]
+    subprocess.run(
+        [f"{shlex.join(command)} --workers 2 --seeds 2 --out {tmp_path}/out {streams}"], shell=True
+    )
+    assert len(runs(tmp_path / "out")) == 2
+    assert (tmp_path / "out" / "total_accumulation.png").exists()
 
 
 @pytest.mark.parametrize(
@@ -59,7 +90,16 @@ def test_runs_are_kept_without_standard_streams(tmp_path, streams):
 )
 def test_a_stopped_benchmark_continues(tmp_path, by, status):
     scenario = tiny.write(tmp_path)
-    command = ("benchmark", scenario, "--controllers", "no-control,pi-gating", "--seeds", 10, "--workers", 2)
+    command = (
+        "benchmark",
+        scenario,
+        "--controllers",
+        "no-control,pi-gating",
+        "--seeds",
+        10,
+        "--workers",
+        2,
+    )
     returned, said = stopped("nmfd", *command, out=tmp_path / "out", by=by)
     assert returned == status and "Traceback" not in said, said
     if status == 130:
@@ -69,14 +109,24 @@ def test_a_stopped_benchmark_continues(tmp_path, by, status):
     good(nmfd(*command, "--out", tmp_path / "out"))
     good(nmfd(*command, "--out", tmp_path / "whole"))
     whole = runs(tmp_path / "whole")
-    assert len(whole) == 20 and same(runs(tmp_path / "out"), whole)
+    assert len(whole) == 20
+    assert same(runs(tmp_path / "out"), whole)
     assert same(first, {name: whole[name] for name in first})
 
 
 @pytest.mark.parametrize("stop", [2, 4, 5])
 def test_a_resumed_training_is_the_uninterrupted_one(tmp_path, monkeypatch, stop):
     monkeypatch.setattr(training, "VALIDATION_PERIOD", 1)
-    command = ("train", tiny.write(tmp_path), "--controller", "dpc-pcrg", "--steps", 5, "--device", "cpu")
+    command = (
+        "train",
+        tiny.write(tmp_path),
+        "--controller",
+        "dpc-pcrg",
+        "--steps",
+        5,
+        "--device",
+        "cpu",
+    )
     good(nmfd(*command, "--out", tmp_path / "whole.pt"))
     steps, clip = [], torch.nn.utils.clip_grad_norm_
 
@@ -90,7 +140,12 @@ def test_a_resumed_training_is_the_uninterrupted_one(tmp_path, monkeypatch, stop
     assert nmfd(*command, "--out", tmp_path / "mine.pt").exit_code == 130
     good(nmfd(*command, "--out", tmp_path / "mine.pt", "--resume"))
     assert (tmp_path / "mine.pt").read_bytes() == (tmp_path / "whole.pt").read_bytes()
-    assert {path.name for path in tmp_path.iterdir()} == {"network", "scenario", "whole.pt", "mine.pt"}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "network",
+        "scenario",
+        "whole.pt",
+        "mine.pt",
+    }
 
 
 @pytest.mark.parametrize("content", [b"", b"x", {"configuration": {}}], ids=str)
@@ -100,5 +155,15 @@ def test_a_damaged_training_state_is_one_line(tmp_path, content):
         state.write_bytes(content)
     else:
         torch.save(content, state)
-    command = ("train", scenario, "--controller", "dpc-pc", "--steps", 3, "--device", "cpu", "--resume")
+    command = (
+        "train",
+        scenario,
+        "--controller",
+        "dpc-pc",
+        "--steps",
+        3,
+        "--device",
+        "cpu",
+        "--resume",
+    )
     assert "p.pt.resume: " in error_line(nmfd(*command, "--out", tmp_path / "p.pt"), "nmfd")

@@ -1,4 +1,5 @@
-"""Vehicles that wait for each other on a junction: freed where the streets behind it are, left where they are full."""
+"""Vehicles that wait for each other on a junction: freed where the streets behind it are, left
+where they are full."""
 
 from types import SimpleNamespace
 
@@ -10,7 +11,8 @@ LENGTH, EDGES = 5.0, (":x_1", ":x_2", ":x_10", ":y_1", "a", "b")
 
 
 class Streets:
-    """A session: vehicles on junction x, since when they stand, and what is free of lanes a_0 and b_0 [m]."""
+    """A session: vehicles on junction x, since when they stand, and what is free of lanes a_0 and
+    b_0 [m]."""
 
     def __init__(self, standing, room):
         self.standing, self.free, self.set_on = standing, room, {}
@@ -46,9 +48,21 @@ class Streets:
     "standing, room, expected",
     [
         # One per lane.
-        ({"first": 130.0, "second": 150.0, "third": 200.0}, (50.0, 50.0), {"first": "a_0", "third": "b_0"}),
-        ({"first": 130.0, "second": 20.0}, (50.0, 0.0), {"first": "a_0"}),  # who has just come is not asked
-        ({"first": 130.0, "second": 130.0}, (50.0, 9.0), {}),  # one street behind is full: a real lock
+        (
+            {"first": 130.0, "second": 150.0, "third": 200.0},
+            (50.0, 50.0),
+            {"first": "a_0", "third": "b_0"},
+        ),
+        (
+            {"first": 130.0, "second": 20.0},
+            (50.0, 0.0),
+            {"first": "a_0"},
+        ),  # who has just come is not asked
+        (
+            {"first": 130.0, "second": 130.0},
+            (50.0, 9.0),
+            {},
+        ),  # one street behind is full: a real lock
         ({"first": JUNCTION_PATIENCE_S - 1.0}, (50.0, 50.0), {}),
     ],
 )

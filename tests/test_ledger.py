@@ -1,4 +1,5 @@
-"""The vehicle ledger of the regional plants: on in every run, and what it says when it is broken."""
+"""The vehicle ledger of the regional plants: on in every run, and what it says when it is
+broken."""
 
 from dataclasses import replace
 
@@ -17,7 +18,9 @@ from nmfd.model.plant import AcyclicPlant, NmfdPlant
 from nmfd.types import Controls
 
 PLANTS = pytest.mark.parametrize("make", [NmfdPlant, AcyclicPlant])
-SCHEMES = pytest.mark.parametrize("integrator, substeps", [("euler", 1), ("euler", 3), ("rk4", 1), ("rk4", 2)])
+SCHEMES = pytest.mark.parametrize(
+    "integrator, substeps", [("euler", 1), ("euler", 3), ("rk4", 1), ("rk4", 2)]
+)
 
 
 @pytest.fixture(scope="module")
@@ -38,14 +41,19 @@ def test_it_holds_with_every_scheme(scenario, make, integrator, substeps):
     for k in range(scenario.steps):
         measurement = plant.step(opened(scenario))
         entered = scenario.step * scenario.demand[: k + 1].sum()
-        assert measurement.completed + measurement.accumulation.sum() == pytest.approx(entered, abs=1e-9)
+        assert measurement.completed + measurement.accumulation.sum() == pytest.approx(
+            entered, abs=1e-9
+        )
     assert measurement.completed > 50.0
 
 
 @pytest.mark.parametrize("integrator, substeps", [("euler", 2), ("rk4", 2)])
 def test_counting_changes_nothing(scenario, integrator, substeps):
     random = np.random.default_rng(0)
-    p, x = dynamics.parameters(scenario.network), torch.from_numpy(random.uniform(0.0, 300.0, (5, 3, 3)))
+    p, x = (
+        dynamics.parameters(scenario.network),
+        torch.from_numpy(random.uniform(0.0, 300.0, (5, 3, 3))),
+    )
     demand, perimeter = (torch.from_numpy(random.uniform(0.0, 1.0, (5, 3, 3))) for _ in range(2))
     splits = torch.from_numpy(scenario.network.nominal_splits)
     options = {"integrator": integrator, "substeps": substeps}
@@ -61,7 +69,9 @@ def test_counting_changes_nothing(scenario, integrator, substeps):
     state = random.uniform(0.0, 50.0, len(model.region))
     arguments = model, state, demand[0].numpy(), perimeter[0].numpy(), theta, 30.0
     after, ended = acyclic.advance_counted(*arguments, **options)
-    assert ended == pytest.approx(state.sum() + 30.0 * demand[0].sum().item() - after.sum(), abs=1e-9)
+    assert ended == pytest.approx(
+        state.sum() + 30.0 * demand[0].sum().item() - after.sum(), abs=1e-9
+    )
 
 
 @PLANTS
@@ -89,7 +99,17 @@ def test_controls_that_move_more_than_there_is_stop_the_run(scenario, make):
 @pytest.mark.parametrize("plant", ["nmfd", "acyclic"])
 def test_the_command_says_it_in_one_line_and_keeps_what_was_finished(tmp_path, monkeypatch, plant):
     scenario, out = tiny.write(tmp_path), tmp_path / "out"
-    command = ["benchmark", scenario, "--controllers", "no-control", "--plant", plant, "--out", out, "--seeds"]
+    command = [
+        "benchmark",
+        scenario,
+        "--controllers",
+        "no-control",
+        "--plant",
+        plant,
+        "--out",
+        out,
+        "--seeds",
+    ]
     assert CliRunner().invoke(main, [str(a) for a in [*command, 1]]).exit_code == 0
     module = {"nmfd": dynamics, "acyclic": acyclic}[plant]
     honest = module.advance_counted
@@ -100,6 +120,7 @@ def test_the_command_says_it_in_one_line_and_keeps_what_was_finished(tmp_path, m
 
     monkeypatch.setattr(module, "advance_counted", leaking)
     result = CliRunner().invoke(main, [str(a) for a in [*command, 2]])
-    assert result.exit_code == 1 and result.stderr.count("\n") == 1
+    assert result.exit_code == 1
+    assert result.stderr.count("\n") == 1
     assert "no-control, seed 1: LedgerError: vehicle ledger broken at control step" in result.stderr
     assert list(pd.read_csv(out / "runs.csv").query("failure.isna()")["seed"]) == [0]

@@ -1,7 +1,9 @@
-"""The vehicle ledger of generated cities against SUMO's own tripinfo: whoever takes vehicles out, none goes unnoticed.
+"""The vehicle ledger of generated cities against SUMO's own tripinfo: whoever takes vehicles out,
+none goes unnoticed.
 
-Every case is a small grid of three regions in a row, random trips, and somebody who meddles: files of SUMO
-(calibrators, rerouters, stops), options of SUMO (collisions, teleports), or another program in the same simulation.
+Every case is a small grid of three regions in a row, random trips, and somebody who meddles: files
+of SUMO (calibrators, rerouters, stops), options of SUMO (collisions, teleports), or another program
+in the same simulation.
 """
 
 import xml.etree.ElementTree as ElementTree
@@ -27,14 +29,17 @@ from nmfd.ledger import LedgerError
 from nmfd.model.regional_model import load_network
 
 COUNT_EVERY, STEPS = 25, 250
-REGION = {"A": 0, "B": 0, "C": 1, "D": 2}  # by the junction that an edge leads to: 0 and 2 do not touch
+REGION = {
+    "A": 0,
+    "B": 0,
+    "C": 1,
+    "D": 2,
+}  # by the junction that an edge leads to: 0 and 2 do not touch
 CALIBRATOR = (
     '<calibrator id="c{0}" edge="{0}" pos="{1}" freq="10" jamThreshold="0.99"><flow begin="0" end="900" {2}/>'
     "</calibrator>"
 )
-REROUTER = (
-    '<rerouter id="r" edges="A1B1 B1C1 B2C2 C2B2 C1B1 B1B2 C1C2"><interval begin="0" end="900">{}</interval></rerouter>'
-)
+REROUTER = '<rerouter id="r" edges="A1B1 B1C1 B2C2 C2B2 C1B1 B1B2 C1C2"><interval begin="0" end="900">{}</interval></rerouter>'
 RECKLESS = (
     'jmIgnoreFoeProb="1" jmIgnoreFoeSpeed="99" jmIgnoreJunctionFoeProb="1" jmDriveAfterRedTime="999" '
     'collisionMinGapFactor="0"'
@@ -43,8 +48,9 @@ RECKLESS = (
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """additional, vehicles: XML; type: attributes of the vehicles' type; script(step, random) acts before every step of
-    SUMO, `after` it where `late`; expects: attributes of the meter that are not zero at the end"""
+    """additional, vehicles: XML; type: attributes of the vehicles' type; script(step, random) acts
+    before every step of SUMO, `after` it where `late`; expects: attributes of the meter that are
+    not zero at the end"""
 
     additional: str = ""
     vehicles: str = ""
@@ -79,7 +85,9 @@ def shorten(step, random):
 def change_target(step, random):
     for vehicle in some(random) if step % 5 == 0 else ():
         with suppress(libsumo.TraCIException):  # on a junction, without a way
-            libsumo.vehicle.changeTarget(vehicle, str(random.choice(["C3D3", "B1A1", "C2C1", "D1C1"])))
+            libsumo.vehicle.changeTarget(
+                vehicle, str(random.choice(["C3D3", "B1A1", "C2C1", "D1C1"]))
+            )
 
 
 def add(step, random):
@@ -108,7 +116,9 @@ def move(step, random):
 def forget(step, random):
     """Trips that wait or are to come are taken back."""
     if step % 20 == 10:
-        for vehicle in sorted(set(libsumo.vehicle.getLoadedIDList()) - set(libsumo.vehicle.getIDList()))[:3]:
+        for vehicle in sorted(
+            set(libsumo.vehicle.getLoadedIDList()) - set(libsumo.vehicle.getIDList())
+        )[:3]:
             libsumo.vehicle.remove(vehicle)
 
 
@@ -127,7 +137,10 @@ def flow(rate):
     return f'vehsPerHour="{rate}" speed="10"'
 
 
-CALIBRATORS = "".join(CALIBRATOR.format(edge, 5, flow(30)) for edge in ("B1C1", "C2C1", "B2B1", "C1D1", "A1B1", "B0C0"))
+CALIBRATORS = "".join(
+    CALIBRATOR.format(edge, 5, flow(30))
+    for edge in ("B1C1", "C2C1", "B2B1", "C1D1", "A1B1", "B0C0")
+)
 INSERTING = CALIBRATOR.format("A1B1", 5, 'vehsPerHour="900" speed="10" route="in" type="car"')
 CASES = {
     "plain": Case(expects=("arrivals", "crossings")),
@@ -190,14 +203,23 @@ CASES = {
         expects=("arrivals", "removals", "redirected"),
     ),
 }
-# What SUMO's mesoscopic model does not have: collisions, standing drivers, places on edges, parking rerouters.
+# What SUMO's mesoscopic model does not have: collisions, standing drivers, places on edges, parking
+# rerouters.
 MICRO_ONLY = {"collisions", "teleports", "moved-by-program"}
 QUICK = {  # in the default suite
-    False: ("calibrators", "collisions", "removed-as-anything", "ids-used-again", "moved-by-program"),
+    False: (
+        "calibrators",
+        "collisions",
+        "removed-as-anything",
+        "ids-used-again",
+        "moved-by-program",
+    ),
     True: ("another-target", "calibrators", "long-waits"),
 }
 MANY = [
-    pytest.param(name, meso, id=f"{name}-{way}", marks=() if name in QUICK[meso] else (pytest.mark.slow,))
+    pytest.param(
+        name, meso, id=f"{name}-{way}", marks=() if name in QUICK[meso] else (pytest.mark.slow,)
+    )
     for name in CASES
     for meso, way in ((False, "micro"), (True, "meso"))
     if not (meso and name in MICRO_ONLY)
@@ -208,7 +230,11 @@ MANY = [
 def city(tmp_path_factory):
     folder = tmp_path_factory.mktemp("city")
     net = tiny_city.network(folder, "--tls.set", "B1,B2,C1")
-    edges = [edge.get("id") for edge in ElementTree.parse(net).getroot().iter("edge") if not edge.get("function")]
+    edges = [
+        edge.get("id")
+        for edge in ElementTree.parse(net).getroot().iter("edge")
+        if not edge.get("function")
+    ]
     (folder / "regions.csv").write_text(
         "edge,region\n" + "".join(f"{edge},{REGION[edge[2]]}\n" for edge in sorted(edges))
     )
@@ -251,14 +277,24 @@ def run(folder: Path, city, case: Case, *, mesoscopic: bool, seed: int):
                 case.script(step, random)
             meter.observe()
             if (step + 1) % COUNT_EVERY == 0:
-                states.append((meter.state(step, session.time), meter.arrivals.sum(), meter.removals.sum(), told(out)))
+                states.append(
+                    (
+                        meter.state(step, session.time),
+                        meter.arrivals.sum(),
+                        meter.removals.sum(),
+                        told(out),
+                    )
+                )
                 now = np.zeros((3, 3))
                 for vehicle in libsumo.vehicle.getIDList():
                     road, end = session.road(vehicle), session.route(vehicle)[-1]
                     now[city.region_of[road], city.region_of[end]] += 1
                 rest = states[-1][0].accumulation - now
-                away = set(libsumo.vehicle.getLoadedIDList()) - set(libsumo.vehicle.getIDList())  # or waiting
-                assert (rest >= 0).all() and rest.sum() == sum(libsumo.vehicle.getDeparture(v) >= 0 for v in away)
+                away = set(libsumo.vehicle.getLoadedIDList()) - set(
+                    libsumo.vehicle.getIDList()
+                )  # or waiting
+                assert (rest >= 0).all()
+                assert rest.sum() == sum(libsumo.vehicle.getDeparture(v) >= 0 for v in away)
         _flush_all()()
         count = told(out)
     finally:
@@ -269,7 +305,9 @@ def run(folder: Path, city, case: Case, *, mesoscopic: bool, seed: int):
 
 def time_spent(infos) -> float:
     """Duration and departure delay by SUMO's tripinfo [s]."""
-    return sum(max(float(trip.get("duration")), 0.0) + float(trip.get("departDelay")) for trip in infos)
+    return sum(
+        max(float(trip.get("duration")), 0.0) + float(trip.get("departDelay")) for trip in infos
+    )
 
 
 def told(path: Path) -> int:
@@ -289,18 +327,32 @@ def check(city, meter, states, infos, count):
     assert meter.departures.sum() == departed
     for state, arrivals, removed, then in states:
         assert (arrivals, removed) == (sum(good[:then]), then - sum(good[:then]))
-        assert state.completed == arrivals and state.removed.sum() >= removed
+        assert state.completed == arrivals
+        assert state.removed.sum() >= removed
     joined = {(g.source, g.target) for g in city.gateways}
     touching = np.array([[(i, h) in joined for h in range(3)] for i in range(3)])
-    assert not meter.crossings[~touching].any() and not meter.jumps[touching].any()
-    for counts in (meter.arrivals, meter.removals, meter.given_up, meter.crossings, meter.jumps, meter.redirected):
+    assert not meter.crossings[~touching].any()
+    assert not meter.jumps[touching].any()
+    for counts in (
+        meter.arrivals,
+        meter.removals,
+        meter.given_up,
+        meter.crossings,
+        meter.jumps,
+        meter.redirected,
+    ):
         assert (counts >= 0).all()
     # Time spent is that of tripinfo, but for trips that SUMO dropped before they began.
     known = [trip.time for trip in meter.trips() if trip.outcome != "given up"]
-    assert sum(known) == pytest.approx(time_spent(infos), rel=1e-9) and len(known) == len(infos)
+    assert sum(known) == pytest.approx(time_spent(infos), rel=1e-9)
+    assert len(known) == len(infos)
     # x_ij follows from the books alone.
     x = meter.departures - meter.removals - np.diag(meter.arrivals) + meter.redirected.sum(axis=1)
-    x = x - meter.redirected.sum(axis=2) + sum(c.sum(axis=0) - c.sum(axis=1) for c in (meter.crossings, meter.jumps))
+    x = (
+        x
+        - meter.redirected.sum(axis=2)
+        + sum(c.sum(axis=0) - c.sum(axis=1) for c in (meter.crossings, meter.jumps))
+    )
     assert (x == meter._running).all()
 
 
@@ -319,7 +371,9 @@ def test_a_vehicle_that_sumo_tells_nothing_of_is_an_error(city, tmp_path):
         '<flow id="f" type="s" begin="0" end="50" period="5" from="A1B1" to="B1C1"/>',
         trips=5,
     )
-    says = r"such as f\.\d\): is the disk full\? Or does their type have has\.tripinfo\.device = false"
+    says = (
+        r"such as f\.\d\): is the disk full\? Or does their type have has\.tripinfo\.device = false"
+    )
     with pytest.raises(LedgerError, match=says):
         run(tmp_path, city, silent, mesoscopic=False, seed=1)
 
@@ -346,21 +400,36 @@ class Meddler:
 
 
 def test_a_run_says_who_was_removed_and_counts_them_until_then(tmp_path):
-    """Calibrators of the city's own files, and a controller that takes out four vehicles in every interval."""
+    """Calibrators of the city's own files, and a controller that takes out four vehicles in every
+    interval."""
     scenario = copies.peak(tmp_path)
     city = city_of(load_network(tmp_path / "networks" / "grid7"))
     (scenario / "more.add.xml").write_text(
-        "<additional>" + "".join(CALIBRATOR.format(edge, 5, flow(1)) for edge in city.edges[::5]) + "</additional>"
+        "<additional>"
+        + "".join(CALIBRATOR.format(edge, 5, flow(1)) for edge in city.edges[::5])
+        + "</additional>"
     )
     text = (scenario / "scenario.toml").read_text()
-    (scenario / "scenario.toml").write_text(text.replace("[sumo]", '[sumo]\nadditional = ["more.add.xml"]'))
+    (scenario / "scenario.toml").write_text(
+        text.replace("[sumo]", '[sumo]\nadditional = ["more.add.xml"]')
+    )
     (tmp_path / "mine.py").write_text(MEDDLER)
     trips = tmp_path / "trips.xml"
     run = cosim.run(scenario, f"{tmp_path / 'mine.py'}:Meddler", steps=8, seed=1, tripinfo=trips)
-    ended = [trip.get("vaporized") for trip in ElementTree.parse(trips).getroot() if float(trip.get("arrival")) >= 0]
+    ended = [
+        trip.get("vaporized")
+        for trip in ElementTree.parse(trips).getroot()
+        if float(trip.get("arrival")) >= 0
+    ]
     spent = time_spent(ElementTree.parse(trips).getroot())
     assert metrics.total_time_spent(run) == run.time_spent.sum() == pytest.approx(spent, rel=1e-9)
-    assert {"", "traci", "calibrator"} <= set(ended) and ended.count("traci") >= 24
+    assert {"", "traci", "calibrator"} <= set(ended)
+    assert ended.count("traci") >= 24
     assert run.completed[-1] == ended.count("") == run.arrivals.sum() > 0
-    assert run.removed_veh == len(ended) - ended.count("") == run.removals.sum() == run.removed[-1].sum()
+    assert (
+        run.removed_veh
+        == len(ended) - ended.count("")
+        == run.removals.sum()
+        == run.removed[-1].sum()
+    )
     assert run.departed_veh == run.completed[-1] + run.removed_veh + run.accumulation[-1].sum()

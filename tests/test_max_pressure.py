@@ -1,4 +1,5 @@
-"""Max-pressure without SUMO: the ways between stages, rations of green, and pressures worked out by hand."""
+"""Max-pressure without SUMO: the ways between stages, rations of green, and pressures worked out by
+hand."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -11,7 +12,15 @@ import tiny_city
 from signal_rules import CROSS, MIN_GREEN, PHASES, SINGLE, WALK, check, signal
 
 from cosim.plant import max_pressure
-from cosim.plant.max_pressure import MAX_RED_S, PERMISSIVE, Junction, MaxPressure, Roads, stages_of, transition
+from cosim.plant.max_pressure import (
+    MAX_RED_S,
+    PERMISSIVE,
+    Junction,
+    MaxPressure,
+    Roads,
+    stages_of,
+    transition,
+)
 from cosim.sumo.net import Gateway, load_city
 from cosim.sumo.session import Phase
 from cosim.sumo.signals import Link, read_signals
@@ -19,7 +28,8 @@ from cosim.sumo.signals import Link, read_signals
 
 @pytest.mark.parametrize("phases", [PHASES, SINGLE, CROSS])
 def test_every_way_between_stages_is_safe(phases):
-    """Random switching: yellow after green, the minimum green, nothing green together that never was."""
+    """Random switching: yellow after green, the minimum green, nothing green together that never
+    was."""
     random = np.random.default_rng(2)
     junction, states = Junction(signal(phases), 0.0), []
     for second in range(1500):
@@ -37,21 +47,29 @@ def test_every_way_between_stages_is_safe(phases):
 def test_the_programme_s_own_way_is_kept():
     phases = signal(SINGLE).phases
     assert [p.state for p in transition(phases, 0, 2)] == ["yr"]
-    phases = signal([("GGr", 20), ("yyr", 4), ("rrr", 2), ("rrG", 20), ("rry", 3), ("Grr", 9), ("yrr", 3)]).phases
+    phases = signal(
+        [("GGr", 20), ("yyr", 4), ("rrr", 2), ("rrG", 20), ("rry", 3), ("Grr", 9), ("yrr", 3)]
+    ).phases
     assert [(p.state, p.duration) for p in transition(phases, 0, 3)] == [("yyr", 4), ("rrr", 2)]
     assert [(p.state, p.duration) for p in transition(phases, 0, 5)] == [("Gyr", 4), ("Grr", 2)]
     assert transition(phases, 5, 0) == [Phase(duration=3, state="yrr")]
 
 
 def test_other_ways_take_the_times_between_greens_from_the_programme():
-    """Link 0 needs 2 s of red before 3, which no phase after the first has; a crossing is cleared beside cars."""
-    states = "GGrr Gyrr GrGr yryr rrrr rrrG rrry".split()
+    """Link 0 needs 2 s of red before 3, which no phase after the first has; a crossing is cleared
+    beside cars."""
+    states = ["GGrr", "Gyrr", "GrGr", "yryr", "rrrr", "rrrG", "rrry"]
     phases = signal(list(zip(states, (20, 3, 20, 3, 2, 20, 3), strict=True))).phases
     assert [(p.state, p.duration) for p in transition(phases, 0, 5)] == [("yyrr", 3), ("rrrr", 2)]
     crossed = signal(WALK)
-    assert [(p.state, p.duration) for p in transition(crossed.phases, 0, 4)] == [("Gry", 4), ("yry", 4), ("rrr", 1)]
+    assert [(p.state, p.duration) for p in transition(crossed.phases, 0, 4)] == [
+        ("Gry", 4),
+        ("yry", 4),
+        ("rrr", 1),
+    ]
     junction = Junction(crossed, 0.0)
-    assert junction.may_switch(20.0) and not junction.may_switch(19.0)
+    assert junction.may_switch(20.0)
+    assert not junction.may_switch(19.0)
 
 
 @pytest.mark.parametrize(
@@ -70,9 +88,10 @@ def test_stages_that_serve_nothing_more_are_left_out(states, kept):
 
 @pytest.mark.parametrize("phases", [PHASES, SINGLE, CROSS])
 def test_rationed_green(phases):
-    """Random switching and commands: all is safe; no cycle has more green than its ration; u_max rations nothing."""
+    """Random switching and commands: all is safe; no cycle has more green than its ration; u_max
+    rations nothing."""
     random, links = np.random.default_rng(3), (0, 1)
-    junction = Junction(signal(phases), 0.0, {link: 0 for link in links})
+    junction = Junction(signal(phases), 0.0, dict.fromkeys(links, 0))
     cycle, states, budgets = int(sum(d for _, d in phases)), [], []
     for second in range(40 * cycle):
         now = float(second)
@@ -87,10 +106,16 @@ def test_rationed_green(phases):
             junction.switch((junction.stage + 1) % junction.stages, now)
         states.append(junction.state)
     check(states, phases)
-    green = np.array([[state[link] in "Gg" for link in links] for state in states]).reshape(40, cycle, 2).sum(axis=1)
+    green = (
+        np.array([[state[link] in "Gg" for link in links] for state in states])
+        .reshape(40, cycle, 2)
+        .sum(axis=1)
+    )
     assert (green <= np.ceil(np.array(budgets))[:, None]).all()
     limited = np.isfinite(budgets)
-    assert (green[limited] >= np.array(budgets)[limited, None] - 1.0).any()  # rations are used up somewhere
+    assert (
+        green[limited] >= np.array(budgets)[limited, None] - 1.0
+    ).any()  # rations are used up somewhere
     spent = [junction.rations[link].green_time(40.0 * cycle) for link in links]
     assert spent == green.sum(axis=0).tolist()
 
@@ -99,7 +124,8 @@ def test_the_minimum_green():
     """Of a stage, and of a gateway whose ration is the least."""
     held = Junction(signal(CROSS), 0.0, {0: 0})
     held.rations[0].share = 0.0
-    assert held.may_switch(MIN_GREEN) and not held.may_switch(MIN_GREEN - 1.0)
+    assert held.may_switch(MIN_GREEN)
+    assert not held.may_switch(MIN_GREEN - 1.0)
     while held.next_change < 66.0:
         held.advance(held.next_change)
     assert held.rations[0].green_time(66.0) == MIN_GREEN
@@ -109,12 +135,19 @@ def link(index, start, end, lane=0):
     return Link(index=index, from_edge=start, lane=lane, to_edge=end)
 
 
-# a and c meet at the signal s, which lets one of them through; b, d, e and f follow. b has two lanes and ends at the
-# signal t, where the left one leads to e alone, the right one to e and f. x leads into a and nowhere else: one road.
+# a and c meet at the signal s, which lets one of them through; b, d, e and f follow. b has two
+# lanes and ends at the signal t, where the left one leads to e alone, the right one to e and f. x
+# leads into a and nowhere else: one road.
 LANES = dict.fromkeys("acdefx", 1) | {"b": 2}
 AFTER = {"x": ("a",), "a": ("b",), "c": ("d",), "b": ("e", "f"), "d": (), "e": (), "f": ()}
 LANE_IDS = {edge: tuple(f"{edge}_{n}" for n in range(lanes)) for edge, lanes in LANES.items()}
-TOWN = streets.city(dict.fromkeys(LANES, 0), AFTER, lanes=LANES, lane_ids=LANE_IDS, length=dict.fromkeys(LANES, 200.0))
+TOWN = streets.city(
+    dict.fromkeys(LANES, 0),
+    AFTER,
+    lanes=LANES,
+    lane_ids=LANE_IDS,
+    length=dict.fromkeys(LANES, 200.0),
+)
 CROSSING = signal(CROSS, (link(0, "a", "b"), link(1, "c", "d")), "s")
 END = signal(
     [("GGg", 30), ("yyy", 3), ("rrG", 30), ("rry", 3)],
@@ -132,17 +165,20 @@ def weights(**vehicles):
 
 
 def test_weights_by_hand():
-    """What waits for a movement: all of a; of b the left lane for e, and of the right one three quarters for e. Less
-    what it would run into, by turning shares: 0.75 (left + 0.75 right) + 0.25 (0.25 right)."""
+    """What waits for a movement: all of a; of b the left lane for e, and of the right one three
+    quarters for e. Less what it would run into, by turning shares: 0.75 (left + 0.75 right) + 0.25
+    (0.25 right)."""
     found, _ = weights(a=10.0, b=4.0, c=2.0)
-    assert found["b", "e"] == pytest.approx(4.0 + 3.0) and found["b", "f"] == pytest.approx(1.0)
+    assert found["b", "e"] == pytest.approx(4.0 + 3.0)
+    assert found["b", "f"] == pytest.approx(1.0)
     assert found["a", "b"] == pytest.approx(10.0 - 0.75 * 7.0 - 0.25 * 1.0)
     assert found["c", "d"] == pytest.approx(2.0)
 
 
 @pytest.mark.parametrize("length, weight", [(10.0, 5.0 + 0.25 * 8.0), (100.0, 5.0)])
 def test_a_short_piece_before_the_signal_is_not_all_of_the_queue(length, weight):
-    """x leads into a, and for three quarters of its vehicles elsewhere; within 100 m they count by that share."""
+    """x leads into a, and for three quarters of its vehicles elsewhere; within 100 m they count by
+    that share."""
     after = {**AFTER, "x": ("a", "f")}
     town = replace(TOWN, successors=after, length={**TOWN.length, "a": length})
     roads = Roads(town, [CROSSING], {("x", "a"): 1.0, ("x", "f"): 3.0})
@@ -151,19 +187,23 @@ def test_a_short_piece_before_the_signal_is_not_all_of_the_queue(length, weight)
 
 
 def test_who_waits_behind_a_piece_too_short_to_be_seen_on_is_seen():
-    """A vehicle stands on x, before the 5 m of a, where a detector would find nobody: it gets its green."""
+    """A vehicle stands on x, before the 5 m of a, where a detector would find nobody: it gets its
+    green."""
     town = replace(TOWN, length={**TOWN.length, "a": 5.0})
     shown = [state for _, state in shown_by(CROSSING, {"x": 1.0, "c": 9.0}, 120, town=town)]
-    assert shown.count("rG") == 2 and shown.count("Gr") >= 2
+    assert shown.count("rG") == 2
+    assert shown.count("Gr") >= 2
 
 
 def test_saturation_flows_by_hand():
-    """A lane each; of a lane that two movements share, a share; of a permissive green, less; nothing of a lane that
-    this stage serves in part and another one wholly: its queue stands behind whoever is first."""
+    """A lane each; of a lane that two movements share, a share; of a permissive green, less;
+    nothing of a lane that this stage serves in part and another one wholly: its queue stands behind
+    whoever is first."""
     _, roads = weights()
     assert roads.begins == [0, 2]
     dense, movement = roads.gain.toarray(), roads.movements
-    assert dense[0, movement["a", "b"]] == 1.0 and dense[1, movement["c", "d"]] == 1.0
+    assert dense[0, movement["a", "b"]] == 1.0
+    assert dense[1, movement["c", "d"]] == 1.0
     assert dense[2, movement["b", "e"]] == pytest.approx(1.75)
     assert dense[2, movement["b", "f"]] == pytest.approx(0.25 * PERMISSIVE)
     assert dense[3, movement["b", "f"]] == 0.0
@@ -171,7 +211,8 @@ def test_saturation_flows_by_hand():
 
 
 def test_a_lane_that_no_stage_serves_wholly_counts_as_its_first_vehicle_is_likely_to_be_served():
-    """Three quarters of the right lane of b go to e: a share of 0.75 with a chance of 0.75; 0.25 of 0.25 go to f."""
+    """Three quarters of the right lane of b go to e: a share of 0.75 with a chance of 0.75; 0.25 of
+    0.25 go to f."""
     divided = signal([("GGr", 30), ("yyr", 3), ("rrG", 30), ("rry", 3)], END.links, "t")
     roads = Roads(TOWN, [CROSSING, divided], FLOWS)
     dense, movement = roads.gain.toarray(), roads.movements
@@ -183,7 +224,9 @@ def test_a_lane_that_no_stage_serves_wholly_counts_as_its_first_vehicle_is_likel
 def junctions():
     """Max-pressure at both signals, what s has shown, and the vehicles on every lane of an edge."""
     vehicles, shown = {}, []
-    session = SimpleNamespace(time=0.0, lane_vehicles=lambda lane: vehicles.get(lane.partition("_")[0], 0.0))
+    session = SimpleNamespace(
+        time=0.0, lane_vehicles=lambda lane: vehicles.get(lane.partition("_")[0], 0.0)
+    )
 
     def show(name, state):
         if name == "s":
@@ -201,8 +244,12 @@ def junctions():
 
 
 def shown_by(crossing, vehicles, seconds, *, town=TOWN, **options):
-    """(time, state) of all that max-pressure shows at one signal, with so many vehicles on every lane of an edge."""
-    session, shown = SimpleNamespace(time=0.0, lane_vehicles=lambda lane: vehicles.get(lane[0], 0.0)), []
+    """(time, state) of all that max-pressure shows at one signal, with so many vehicles on every
+    lane of an edge."""
+    session, shown = (
+        SimpleNamespace(time=0.0, lane_vehicles=lambda lane: vehicles.get(lane[0], 0.0)),
+        [],
+    )
 
     def show(name, state):
         shown.append((session.time, state))
@@ -222,11 +269,16 @@ def test_no_green_outlasts_the_maximum_while_others_wait():
         return [time for time, state in shown if state == "rG"]
 
     assert greens(a=100.0) == []
-    assert greens(a=100.0, c=1.0) == [53.0, 113.0, 173.0]  # decided every 5 s: 50 s of green, 3 s; 47 s, 3 s
+    assert greens(a=100.0, c=1.0) == [
+        53.0,
+        113.0,
+        173.0,
+    ]  # decided every 5 s: 50 s of green, 3 s; 47 s, 3 s
 
 
 def test_who_waits_too_long_comes_first(monkeypatch):
-    """c has no pressure at all, as its road ahead is full; after 120 s of red its link gets the minimum green."""
+    """c has no pressure at all, as its road ahead is full; after 120 s of red its link gets the
+    minimum green."""
     monkeypatch.setattr(max_pressure, "MAX_GREEN_S", 500.0)
     town = replace(TOWN, successors={**AFTER, "d": ("e",)})
     shown = shown_by(CROSSING, {"a": 5.0, "c": 2.0, "d": 30.0}, 150, town=town)
@@ -236,7 +288,8 @@ def test_who_waits_too_long_comes_first(monkeypatch):
 
 @pytest.mark.parametrize("buses, first", [(1.0, MAX_RED_S + 3.0), (30.0, 8.0)])
 def test_who_waits_on_a_street_that_is_closed_to_cars_gets_a_green(buses, first, monkeypatch):
-    """Buses on k are in no count of cars: they press by their number, and a single one does not wait for ever."""
+    """Buses on k are in no count of cars: they press by their number, and a single one does not
+    wait for ever."""
     monkeypatch.setattr(max_pressure, "MAX_GREEN_S", 500.0)
     crossing = replace(CROSSING, links=(link(0, "a", "b"),), others=(link(1, "k", "d"),))
     shown = shown_by(crossing, {"a": 5.0, "k": buses}, 150)
@@ -251,12 +304,16 @@ def test_streets_that_are_closed_to_cars_are_read_with_their_signals(tmp_path):
         lane.set("allow", "bus")
     root.write(file)
     edges = [edge.get("id") for edge in root.iterfind("edge") if edge.get("function") != "internal"]
-    (tmp_path / "regions.csv").write_text("edge,region\n" + "".join(f"{edge},0\n" for edge in edges))
+    (tmp_path / "regions.csv").write_text(
+        "edge,region\n" + "".join(f"{edge},0\n" for edge in edges)
+    )
     city = load_city(file, tmp_path / "regions.csv", 1)
     (found,) = (one for one in read_signals(city)[0] if one.id == "B1")
     assert {each.from_edge for each in found.others} == {"B2B1"}
     assert "B2B1" not in {each.from_edge for each in found.links}
-    assert {each.index for each in (*found.links, *found.others)} == set(range(len(found.phases[0].state)))
+    assert {each.index for each in (*found.links, *found.others)} == set(
+        range(len(found.phases[0].state))
+    )
 
 
 def test_the_green_goes_where_the_pressure_is_after_the_minimum(junctions):
@@ -279,35 +336,63 @@ def test_the_green_goes_where_the_pressure_is_after_the_minimum(junctions):
         (0.0, 4.0, 0.1, "rG"),
         (0.0, 4.0, 0.0, "Gr"),
     ],
-    ids=["less", "not worth it", "more", "less but nothing ahead", "more and nothing ahead", "negative", "nobody"],
+    ids=[
+        "less",
+        "not worth it",
+        "more",
+        "less but nothing ahead",
+        "more and nothing ahead",
+        "negative",
+        "nobody",
+    ],
 )
 def test_the_higher_pressure_wins_and_the_green_stays_in_doubt(junctions, a, b, c, state):
-    """The pressure of a is what waits there less what stands on b: 9 - 0.75 * 5.25 - 0.25 * 0.75 = 4.9 - at b = 3. That
-    of c has to be four times as high: 3 s of yellow for 1 s of green."""
+    """The pressure of a is what waits there less what stands on b: 9 - 0.75 * 5.25 - 0.25 * 0.75 =
+    4.9 - at b = 3. That of c has to be four times as high: 3 s of yellow for 1 s of green."""
     _, vehicles, play = junctions
     vehicles.update(a=a, b=b, c=c)
     assert play(40.0)[-1][2] == state
 
 
 def test_a_spent_ration_exerts_no_pressure():
-    """The gateway a -> b has 10 s of green in a cycle; then it is red, and c gets the green for a single vehicle."""
-    town = replace(TOWN, gateways=(Gateway(source=0, target=1, from_edge="a", to_edge="b", signal="s", links=(0,)),))
-    shown, session = [], SimpleNamespace(time=0.0, lane_vehicles=lambda lane: {"a": 50.0, "c": 1.0}.get(lane[0], 0.0))
-    control = MaxPressure(session, town, [CROSSING], FLOWS, show=lambda name, state: shown.append(state), lookahead=1.0)
+    """The gateway a -> b has 10 s of green in a cycle; then it is red, and c gets the green for a
+    single vehicle."""
+    town = replace(
+        TOWN,
+        gateways=(Gateway(source=0, target=1, from_edge="a", to_edge="b", signal="s", links=(0,)),),
+    )
+    shown, session = (
+        [],
+        SimpleNamespace(
+            time=0.0, lane_vehicles=lambda lane: {"a": 50.0, "c": 1.0}.get(lane[0], 0.0)
+        ),
+    )
+    control = MaxPressure(
+        session,
+        town,
+        [CROSSING],
+        FLOWS,
+        show=lambda name, state: shown.append(state),
+        lookahead=1.0,
+    )
     control.command(np.full(1, 5.0 / 61.0))  # 5 s, and so much of the other 61 s
     assert control.green_time() == {"s": {0: 0.0}}
     for second in range(66):
         session.time = float(second)
         control.play(session.time)
     session.time = 66.0
-    assert control.green_time()["s"][0] == pytest.approx(10.0, abs=1.0) and shown[-1] == "rG"
+    assert control.green_time()["s"][0] == pytest.approx(10.0, abs=1.0)
+    assert shown[-1] == "rG"
 
 
 def test_what_is_known_of_a_run():
-    """Of five lanes one is served in part by a stage of t; CROSS is 6 s of 66 s between its stages, and so is t."""
+    """Of five lanes one is served in part by a stage of t; CROSS is 6 s of 66 s between its stages,
+    and so is t."""
     vehicles = {"a": 9.0, "c": 9.0}
     session = SimpleNamespace(time=0.0, lane_vehicles=lambda lane: vehicles.get(lane[0], 0.0))
-    control = MaxPressure(session, TOWN, [CROSSING, END], FLOWS, show=lambda *_: None, lookahead=1.0)
+    control = MaxPressure(
+        session, TOWN, [CROSSING, END], FLOWS, show=lambda *_: None, lookahead=1.0
+    )
     for _ in range(100):
         control.play(session.time)
         session.time += 1.0

@@ -1,4 +1,5 @@
-"""The meter on a session that is made up: every vehicle followed by hand from loading to arrival."""
+"""The meter on a session that is made up: every vehicle followed by hand from loading to
+arrival."""
 
 from types import SimpleNamespace
 
@@ -11,7 +12,8 @@ from cosim.sumo.outputs import End
 from cosim.sumo.session import REFUSALS
 from nmfd.ledger import LedgerError
 
-# a0 -> b0 -> b1 -> c0 in a row, regions 0, 1, 1, 2, and a way back c0 -> a0. Entries: b0, c0 and a0.
+# a0 -> b0 -> b1 -> c0 in a row, regions 0, 1, 1, 2, and a way back c0 -> a0. Entries: b0, c0 and
+# a0.
 EDGES = {"a0": 0, "b0": 1, "b1": 1, "c0": 2}
 
 
@@ -24,14 +26,19 @@ CITY = streets.city(
 
 
 class Streets:
-    """A session in which vehicles are moved by hand. places: vehicle -> edge; routes: vehicle -> edges."""
+    """A session in which vehicles are moved by hand. places: vehicle -> edge; routes: vehicle ->
+    edges."""
 
     step_length = 1.0
 
     def __init__(self):
         self.time, self.places, self.routes, self.waiting, self.bound = 0.0, {}, {}, [], set()
         self.held, self.due = set(), {}
-        self.teleports, self.running, self.road = lambda: 0, lambda: tuple(self.places), self.places.__getitem__
+        self.teleports, self.running, self.road = (
+            lambda: 0,
+            lambda: tuple(self.places),
+            self.places.__getitem__,
+        )
         self.known, self.pending = lambda: (*self.places, *self.held), lambda: tuple(self.waiting)
         self.is_free = self.is_private = lambda vehicle: vehicle not in self.bound
         self.is_public = lambda vehicle: vehicle in self.bound
@@ -48,13 +55,18 @@ class Streets:
 
 @pytest.fixture
 def play():
-    """A function that makes one simulation step: new=, move=, gone= and so on; the meter's events of it."""
+    """A function that makes one simulation step: new=, move=, gone= and so on; the meter's events
+    of it."""
     session = Streets()
     meter = Meter(session, CITY, probes=frozenset({"p"}))
 
-    def step(*, new=(), move=None, gone=(), loads=(), jumps=(), lands=(), waiting=None, observed=meter):
+    def step(
+        *, new=(), move=None, gone=(), loads=(), jumps=(), lands=(), waiting=None, observed=meter
+    ):
         session.time += 1.0
-        session.places.update({vehicle: session.routes[vehicle][0] for vehicle in new} | (move or {}))
+        session.places.update(
+            {vehicle: session.routes[vehicle][0] for vehicle in new} | (move or {})
+        )
         for vehicle in (*gone, *jumps):
             session.places.pop(vehicle, None)
         session.loaded, session.departed, session.arrived = lambda: loads, lambda: new, lambda: gone
@@ -75,8 +87,11 @@ def x(*entries):
 
 def test_a_trip_through_three_regions(play):
     play.session.routes = {"v": ("a0", "b0", "b1", "c0")}
-    assert play.step(new=["v"]) == [Event(vehicle="v", source=None, region=0, destination=2, edge="c0", free=True)]
-    assert (play.meter.accumulation() == x((0, 2))).all() and (play.meter.departures == x((0, 2))).all()
+    assert play.step(new=["v"]) == [
+        Event(vehicle="v", source=None, region=0, destination=2, edge="c0", free=True)
+    ]
+    assert (play.meter.accumulation() == x((0, 2))).all()
+    assert (play.meter.departures == x((0, 2))).all()
     events = [event for _ in range(3) for event in play.step(move={"v": "b0"})]
     assert events == [Event(vehicle="v", source=0, region=1, destination=2, edge="c0", free=True)]
     assert (play.meter.accumulation() == x((1, 2))).all()
@@ -85,9 +100,12 @@ def test_a_trip_through_three_regions(play):
     assert [(event.source, event.region) for event in events] == [(1, 2)]
     assert (play.meter.accumulation() == x((2, 2))).all()
     play.step(gone=["v"])
-    assert (play.meter.accumulation() == 0).all() and (play.meter.arrivals == [0, 0, 1]).all()
-    assert play.meter.crossings[0, 1, 2] == play.meter.crossings[1, 2, 2] == 1 and play.meter.crossings.sum() == 2
-    assert dict(play.meter.entry_flow) == {(0, "b0"): 1, (1, "c0"): 1} and play.meter.teleports == 0
+    assert (play.meter.accumulation() == 0).all()
+    assert (play.meter.arrivals == [0, 0, 1]).all()
+    assert play.meter.crossings[0, 1, 2] == play.meter.crossings[1, 2, 2] == 1
+    assert play.meter.crossings.sum() == 2
+    assert dict(play.meter.entry_flow) == {(0, "b0"): 1, (1, "c0"): 1}
+    assert play.meter.teleports == 0
     assert play.meter._vehicles == {}  # nothing is kept of who has gone
 
 
@@ -95,27 +113,36 @@ def test_two_boundaries_between_two_counts(play):
     """Where a vehicle comes from is known without a count in between."""
     play.session.routes = {"v": ("a0", "b0", "b1", "c0")}
     play.step(new=["v"])
-    events = [event for edge in ("b0", "b0", "b1", "c0", "c0", "c0") for event in play.step(move={"v": edge})]
+    events = [
+        event
+        for edge in ("b0", "b0", "b1", "c0", "c0", "c0")
+        for event in play.step(move={"v": edge})
+    ]
     assert [(event.source, event.region) for event in events] == [(0, 1), (1, 2)]
-    assert (play.meter.accumulation() == x((2, 2))).all() and play.meter.crossings.sum() == 2
+    assert (play.meter.accumulation() == x((2, 2))).all()
+    assert play.meter.crossings.sum() == 2
 
 
 def test_a_region_that_is_first_seen_at_the_count(play):
-    """On a junction, where no edge is polled; the entry is an event all the same, and its source is where it was."""
+    """On a junction, where no edge is polled; the entry is an event all the same, and its source is
+    where it was."""
     play.session.routes = {"v": ("a0", "b0", "b1")}
     play.step(new=["v"])
     play.session.places["v"] = ":j_0"
-    assert (play.meter.accumulation() == x((1, 1))).all() and play.meter.crossings[0, 1, 1] == 1
+    assert (play.meter.accumulation() == x((1, 1))).all()
+    assert play.meter.crossings[0, 1, 1] == 1
     events = [event for _ in range(3) for event in play.step(move={"v": "b0"})]
     assert [(event.source, event.region) for event in events] == [(0, 1)]
-    assert play.meter.crossings.sum() == 1 and dict(play.meter.entry_flow) == {(0, "b0"): 1}
+    assert play.meter.crossings.sum() == 1
+    assert dict(play.meter.entry_flow) == {(0, "b0"): 1}
 
 
 def test_a_vehicle_that_arrives_unseen_has_crossed_too(play):
     play.session.routes = {"v": ("a0", "b0")}
     play.step(new=["v"])
     play.step(gone=["v"])
-    assert (play.meter.accumulation() == 0).all() and play.meter.crossings[0, 1, 1] == 1
+    assert (play.meter.accumulation() == 0).all()
+    assert play.meter.crossings[0, 1, 1] == 1
     assert (play.meter.arrivals == [0, 1, 0]).all()
 
 
@@ -123,18 +150,22 @@ def test_teleporting_vehicles_stay_where_they_were(play):
     play.session.routes = {"v": ("a0", "b0", "b1", "c0"), "w": ("a0", "b0")}
     play.step(new=["v", "w"])
     play.step(jumps=["v"])
-    assert (play.meter.accumulation() == x((0, 2), (0, 1))).all() and play.meter.teleports == 1
+    assert (play.meter.accumulation() == x((0, 2), (0, 1))).all()
+    assert play.meter.teleports == 1
     play.step(move={"v": "b1"}, lands=["v"])
-    assert (play.meter.accumulation() == x((1, 2), (0, 1))).all() and play.meter.teleports == 1
+    assert (play.meter.accumulation() == x((1, 2), (0, 1))).all()
+    assert play.meter.teleports == 1
     assert play.meter._teleporting == set()
     play.step(jumps=["v"])
     play.step(gone=["v"])
-    assert (play.meter.accumulation() == x((0, 1))).all() and play.meter.teleports == 2
+    assert (play.meter.accumulation() == x((0, 1))).all()
+    assert play.meter.teleports == 2
     assert play.meter._teleporting == set()
 
 
 def test_vehicles_that_the_mesoscopic_model_holds_stay_where_they_were(play):
-    """Taken off the road without a word, but not forgotten; one that SUMO does not know any more is lost."""
+    """Taken off the road without a word, but not forgotten; one that SUMO does not know any more is
+    lost."""
     play.session.routes = {"v": ("a0", "b0", "b1", "c0"), "w": ("a0", "b0"), "u": ("a0", "b0")}
     play.step(new=["v", "w"], loads=["u"], waiting=["u"])
     play.session.places.pop("v")
@@ -148,9 +179,11 @@ def test_vehicles_that_the_mesoscopic_model_holds_stay_where_they_were(play):
 def test_who_waits_to_enter_is_backlog(play):
     play.session.routes = {"v": ("a0", "b0", "b1", "c0"), "w": ("b0", "b1")}
     play.step(loads=["v", "w"], waiting=["v", "w"])
-    assert (play.meter.backlog() == x((0, 2), (1, 1))).all() and (play.meter.accumulation() == 0).all()
+    assert (play.meter.backlog() == x((0, 2), (1, 1))).all()
+    assert (play.meter.accumulation() == 0).all()
     play.step(new=["v"], waiting=["w"])
-    assert (play.meter.backlog() == x((1, 1))).all() and (play.meter.accumulation() == x((0, 2))).all()
+    assert (play.meter.backlog() == x((1, 1))).all()
+    assert (play.meter.accumulation() == x((0, 2))).all()
 
 
 def test_a_vehicle_that_sumo_gives_up_at_once(play):
@@ -160,24 +193,30 @@ def test_a_vehicle_that_sumo_gives_up_at_once(play):
         raise REFUSALS(f"Vehicle '{vehicle}' is not known.")
 
     play.session.route = gone
-    assert play.step(loads=("ghost",)) == [] and play.meter.given_up.sum() == 1
+    assert play.step(loads=("ghost",)) == []
+    assert play.meter.given_up.sum() == 1
 
 
 def test_a_vehicle_that_gives_up_before_it_departs_was_never_there(play):
     play.session.routes = {"v": ("a0", "b0")}
     play.step(loads=["v"], waiting=["v"])
     play.step(gone=["v"], waiting=[])
-    assert (play.meter.accumulation() == 0).all() and play.meter.arrivals.sum() == play.meter.departures.sum() == 0
-    assert (play.meter.backlog() == 0).all() and play.meter.crossings.sum() == 0
+    assert (play.meter.accumulation() == 0).all()
+    assert play.meter.arrivals.sum() == play.meter.departures.sum() == 0
+    assert (play.meter.backlog() == 0).all()
+    assert play.meter.crossings.sum() == 0
 
 
 def test_probes_are_counted_apart(play):
     play.session.routes = {"p": ("a0", "b0", "b1"), "v": ("a0", "b0", "b1")}
     play.step(loads=["p", "v"], waiting=["p", "v"])
-    assert (play.meter.probes() == 0).all() and (play.meter.probe_backlog() == x((0, 1))).all()
+    assert (play.meter.probes() == 0).all()
+    assert (play.meter.probe_backlog() == x((0, 1))).all()
     play.step(new=["p", "v"], waiting=[])
-    assert (play.meter.probes() == x((0, 1))).all() and (play.meter.probe_departures == x((0, 1))).all()
-    assert (play.meter.departures == 2 * x((0, 1))).all() and (play.meter.probe_backlog() == 0).all()
+    assert (play.meter.probes() == x((0, 1))).all()
+    assert (play.meter.probe_departures == x((0, 1))).all()
+    assert (play.meter.departures == 2 * x((0, 1))).all()
+    assert (play.meter.probe_backlog() == 0).all()
     play.session.routes["w"] = ("b0", "b1")
     play.step(new=["w"])
     assert (play.meter.probe_departures == x((0, 1))).all()
@@ -203,7 +242,10 @@ def test_public_transport_is_not_free(play):
             lambda play: play.meter.departures.__setitem__((0, 0), 1),
             "2 vehicles are in the city, but 3 departures minus 0",
         ),
-        (lambda play: play.meter._running.__setitem__((1, 1), 1), "region 1 bound for 1 there are 0, and 1 were"),
+        (
+            lambda play: play.meter._running.__setitem__((1, 1), 1),
+            "region 1 bound for 1 there are 0, and 1 were",
+        ),
     ],
 )
 def test_the_ledger_names_step_and_numbers(play, break_it, numbers):
@@ -211,35 +253,45 @@ def test_the_ledger_names_step_and_numbers(play, break_it, numbers):
     play.step(new=["v", "w"])
     play.meter.accumulation(6)
     break_it(play)
-    with pytest.raises(LedgerError, match=f"vehicle ledger broken at control step 7, 1 s: .*{numbers}"):
+    with pytest.raises(
+        LedgerError, match=f"vehicle ledger broken at control step 7, 1 s: .*{numbers}"
+    ):
         play.meter.accumulation(7)
 
 
 def test_the_ends_that_sumo_tells_are_booked_by_hand(play):
     """Start all in 0, bound for 2 or 1; one ends in 1 instead, others are removed in 0, 1 and 2."""
-    play.session.routes = {vehicle: ("a0", "b0", "b1", "c0") for vehicle in "vwkju"} | {"l": ("a0", "b0")}
+    play.session.routes = dict.fromkeys("vwkju", ("a0", "b0", "b1", "c0")) | {"l": ("a0", "b0")}
     told, trips = [], SimpleNamespace(under_way={"u": 7.0}, completed=2, removed=3)
     trips.ends, trips.finish = (lambda: [told.pop() for _ in list(told)]), lambda gone: []
     meter = Meter(play.session, CITY, trips=trips)
     play.step(new=[*play.session.routes], observed=meter)
     play.step(gone="vwkl", observed=meter)
     assert (meter._running == x((0, 2), (0, 2))).all()
-    with pytest.raises(LedgerError, match=r"step 3: .* how the trips of 4 vehicles ended \(such as k\)"):
+    with pytest.raises(
+        LedgerError, match=r"step 3: .* how the trips of 4 vehicles ended \(such as k\)"
+    ):
         meter.accumulation(3)
     told += [
         End(vehicle="v", time=9.0, edge="b1", time_loss=5.0),
         End(vehicle="w", time=9.0, edge="b0", reason="traci", time_loss=11.0),
         End(vehicle="k", time=9.0, reason="traci", time_loss=0.0),
         End(vehicle="l", time=9.0, time_loss=0.0),
-        End(vehicle="j", time=9.0, edge="c0", reason="collision", time_loss=0.0),  # not called arrived
+        End(
+            vehicle="j", time=9.0, edge="c0", reason="collision", time_loss=0.0
+        ),  # not called arrived
     ]
     play.session.places.pop("j")
     assert (meter.accumulation() == x((0, 2))).all()
-    assert meter.arrivals.tolist() == [0, 2, 0] and (meter.removals == x((1, 2), (0, 2), (2, 2))).all()
-    assert np.argwhere(meter.redirected).tolist() == [[0, 2, 1]] and np.argwhere(meter.jumps).tolist() == [[0, 2, 2]]
-    assert meter.crossings[0, 1].tolist() == [0, 2, 1] and meter.crossings.sum() == 3
+    assert meter.arrivals.tolist() == [0, 2, 0]
+    assert (meter.removals == x((1, 2), (0, 2), (2, 2))).all()
+    assert np.argwhere(meter.redirected).tolist() == [[0, 2, 1]]
+    assert np.argwhere(meter.jumps).tolist() == [[0, 2, 2]]
+    assert meter.crossings[0, 1].tolist() == [0, 2, 1]
+    assert meter.crossings.sum() == 3
     state = meter.state(4, 9.0)
-    assert (state.step, state.time, state.completed) == (4, 9.0, 2.0) and (state.removed == meter.removals).all()
+    assert (state.step, state.time, state.completed) == (4, 9.0, 2.0)
+    assert (state.removed == meter.removals).all()
     meter.close_books()
     assert [(trip.outcome, trip.time_loss) for trip in meter.trips()] == [
         ("removed", 0.0),
@@ -250,7 +302,9 @@ def test_the_ends_that_sumo_tells_are_booked_by_hand(play):
         ("under way", 7.0),
     ]
     trips.removed = 4
-    with pytest.raises(LedgerError, match="2 completed trips and 3 removed vehicles were booked, .* has 2 and 4"):
+    with pytest.raises(
+        LedgerError, match="2 completed trips and 3 removed vehicles were booked, .* has 2 and 4"
+    ):
         meter.close_books()
 
 
@@ -258,12 +312,16 @@ def test_trips_dropped_rerouted_and_begun_again(play):
     """Book a trip that SUMO drops, a change of destination, and the second trip of one id."""
     play.session.routes = {"v": ("a0", "b0", "b1", "c0"), "w": ("b0", "b1"), "k": ("b0", "c0")}
     play.step(loads=["w", "k"], waiting=["w", "k"])
-    play.step(new=["v"], move={"k": "b0"}, waiting=[])  # SUMO does not know w any more; a program moved k
-    assert (play.meter.backlog() == 0).all() and (play.meter.given_up == x((1, 1))).all()
+    play.step(
+        new=["v"], move={"k": "b0"}, waiting=[]
+    )  # SUMO does not know w any more; a program moved k
+    assert (play.meter.backlog() == 0).all()
+    assert (play.meter.given_up == x((1, 1))).all()
     play.session.routes["v"] = ("a0", "b0")
     assert (play.meter.accumulation() == x((0, 1), (1, 2))).all()
     assert np.argwhere(play.meter.redirected).tolist() == [[0, 2, 1]]
     play.session.routes["v"] = ("c0", "a0")
     assert [event.region for event in play.step(new=["v"])] == [2]  # the id is used again
-    assert (play.meter.accumulation() == x((2, 0), (1, 2))).all() and play.meter.arrivals.tolist() == [0, 1, 0]
+    assert (play.meter.accumulation() == x((2, 0), (1, 2))).all()
+    assert play.meter.arrivals.tolist() == [0, 1, 0]
     assert (play.meter.departures == x((0, 2), (2, 0), (1, 2))).all()

@@ -22,7 +22,10 @@ def tables(*, days: int = 3, most: float = 900.0) -> tuple[pd.DataFrame, pd.Data
     """(counts, detectors) of two regions with ten links each, all of which follow CURVE exactly."""
     random, rows = np.random.default_rng(0), []
     links = [(f"{region}{n}", f"{region}-{n}", region) for region in REGIONS for n in range(10)]
-    detectors, (r, n) = pd.DataFrame(links, columns=["detid", "linkid", "region"]), np.indices((2, 10)).reshape(2, -1)
+    detectors, (r, n) = (
+        pd.DataFrame(links, columns=["detid", "linkid", "region"]),
+        np.indices((2, 10)).reshape(2, -1),
+    )
     detectors = detectors.assign(length=(0.25 + 0.05 * n) * LANE_KM / 2.0 / 4.75, lanes=2, pos=0.1)
     detectors = detectors.assign(long=8.5 + 0.01 * (n % 5), lat=47.4 - 0.03 * r - 0.01 * (n // 5))
     for day in range(days):
@@ -34,9 +37,16 @@ def tables(*, days: int = 3, most: float = 900.0) -> tuple[pd.DataFrame, pd.Data
                 own = (detectors["region"] == region).to_numpy()
                 spread[own] /= np.average(spread[own], weights=detectors["length"][own])
             occ = n / LANE_KM / 1000.0 * VEHICLE * spread
-            table = {"day": f"2019-05-{day + 1:02d}", "interval": 300 * k, "flow": flow * spread, "occ": occ}
+            table = {
+                "day": f"2019-05-{day + 1:02d}",
+                "interval": 300 * k,
+                "flow": flow * spread,
+                "occ": occ,
+            }
             rows.append(detectors[["detid"]].assign(**table))
-    return pd.concat(rows, ignore_index=True).assign(error=0, city="made up", speed=np.nan), detectors
+    return pd.concat(rows, ignore_index=True).assign(
+        error=0, city="made up", speed=np.nan
+    ), detectors
 
 
 @pytest.fixture(scope="module")
@@ -61,17 +71,27 @@ def test_the_curve_that_made_the_tables_comes_back(tmp_path, made):
     for fit, curve in zip(found.fits.itertuples(), found.network.mfds, strict=True):
         x = np.linspace(10.0, 840.0, 50)
         assert np.abs(curve.outflow(x) - CURVE.outflow(x)).max() < 0.01 * CURVE.capacity
-        assert fit.r2 > 0.99 and fit.spread < 0.02 and fit.critical_veh == pytest.approx(CURVE.critical, rel=0.03)
+        assert fit.r2 > 0.99
+        assert fit.spread < 0.02
+        assert fit.critical_veh == pytest.approx(CURVE.critical, rel=0.03)
         assert fit.doubts == ("coverage unknown",)
     frame = found.intervals
-    assert len(frame) == 2 * 3 * 40 and frame["reporting"].between(0.999, 1.001).all()
+    assert len(frame) == 2 * 3 * 40
+    assert frame["reporting"].between(0.999, 1.001).all()
     assert frame["production_veh_km_h"].to_numpy() == pytest.approx(
         3.6 * TRIP * CURVE.outflow(frame["accumulation_veh"].to_numpy()), rel=1e-6
     )
     again = nmfd.load_network(tmp_path / "city")
-    assert again.region_names == REGIONS and again.adjacency.tolist() == [[False, True], [True, False]]
-    assert again.doubts == found.network.doubts and not again.placeholder
-    assert np.hypot(*(again.positions[0] - again.positions[1])) == pytest.approx(3336.0, rel=0.01)  # 0.03 degrees
+    assert again.region_names == REGIONS
+    assert again.adjacency.tolist() == [
+        [False, True],
+        [True, False],
+    ]
+    assert again.doubts == found.network.doubts
+    assert not again.placeholder
+    assert np.hypot(*(again.positions[0] - again.positions[1])) == pytest.approx(
+        3336.0, rel=0.01
+    )  # 0.03 degrees
     files = {path.name for path in (tmp_path / "city").iterdir()}
     assert files == {"network.toml", "mfd.png", "samples.csv", "fit.csv", "identify.txt"}
     assert "Not in such data" in found.text
@@ -106,16 +126,23 @@ def test_doubts_of_few_days_free_flow_and_loops_at_stop_lines(tmp_path):
     text = " ".join(found.fits["doubts"][0])
     loops = "loops at stop lines (100 %)"
     for doubt in ("no falling branch", "coverage unknown", loops, "trip length assumed", "days: 1"):
-        assert doubt in text and f"WARNING, {doubt.split(' (')[0].split(':')[0]}" in found.text, doubt
+        assert doubt in text and f"WARNING, {doubt.split(' (')[0].split(':')[0]}" in found.text, (
+            doubt
+        )
     n = found.network.critical_above[0]
-    assert n == found.intervals["accumulation_veh"].max() < 210.0 and np.isnan(found.fits["critical_veh"]).all()
+    assert n == found.intervals["accumulation_veh"].max() < 210.0
+    assert np.isnan(found.fits["critical_veh"]).all()
     assert f"above {n:.0f} " in found.text
     assert f"critical_above = {n:.6g}" in (tmp_path / "city/network.toml").read_text()
-    for curve in found.network.mfds:  # measured up to n, beyond a guess from lanes: 27 veh per lane-km
+    for (
+        curve
+    ) in found.network.mfds:  # measured up to n, beyond a guess from lanes: 27 veh per lane-km
         assert curve.outflow(n) == pytest.approx(CURVE.outflow(n), rel=0.03)
-        assert curve.jam == 80.0 * LANE_KM and curve.critical == pytest.approx(27.2 * LANE_KM, rel=0.01)
+        assert curve.jam == 80.0 * LANE_KM
+        assert curve.critical == pytest.approx(27.2 * LANE_KM, rel=0.01)
     again = nmfd.load_network(tmp_path / "city")
-    assert np.isnan(again.seen_critical).all() and (again.critical > 200.0).all()
+    assert np.isnan(again.seen_critical).all()
+    assert (again.critical > 200.0).all()
 
 
 @pytest.mark.usefixtures("without_pictures")
@@ -145,12 +172,32 @@ MISTAKES = {
         {},
         "occ is missing; did you mean occc?",
     ),
-    "nan": (changed(flow=np.nan), {}, "line 5: flow: expected vehicles per hour and lane, from 0 to 3600, got nothing"),
-    "a word": (changed(occ="much"), {}, "line 5: occ: expected a share of the time, from 0 to 1, got 'much' instead"),
-    "percent": (changed(occ=12.5), {}, "got '12.5' instead (1 such rows); is it percent?; correct it, or leave"),
+    "nan": (
+        changed(flow=np.nan),
+        {},
+        "line 5: flow: expected vehicles per hour and lane, from 0 to 3600, got nothing",
+    ),
+    "a word": (
+        changed(occ="much"),
+        {},
+        "line 5: occ: expected a share of the time, from 0 to 1, got 'much' instead",
+    ),
+    "percent": (
+        changed(occ=12.5),
+        {},
+        "got '12.5' instead (1 such rows); is it percent?; correct it, or leave",
+    ),
     "no day": (changed(day=np.nan), {}, "line 5: day is missing"),
-    "per interval": (lambda c, d: (c.assign(flow=c["flow"] / 60), d), {}, "m/s, with 6.5 m for a vehicle over a loop"),
-    "all percent": (lambda c, d: (c.assign(occ=c["occ"] * 100), d), {"skip_bad": True}, "occ a share?"),
+    "per interval": (
+        lambda c, d: (c.assign(flow=c["flow"] / 60), d),
+        {},
+        "m/s, with 6.5 m for a vehicle over a loop",
+    ),
+    "all percent": (
+        lambda c, d: (c.assign(occ=c["occ"] * 100), d),
+        {"skip_bad": True},
+        "occ a share?",
+    ),
     "twice": (
         lambda c, d: (pd.concat([c, c[:1]]), d),
         {},
@@ -160,12 +207,28 @@ MISTAKES = {
     "no such city": (lambda c, d: (c, d), {"city": "madeup"}, "did you mean made up?"),
     "a detector without a row": (lambda c, d: (c, d[1:]), {}, "detector north0, which"),
     "no regions": (lambda c, d: (c, d.drop(columns="region")), {}, "has no column region"),
-    "metres": (lambda c, d: (c, d.assign(length=1000 * d["length"])), {}, "km of its link, from 0.001 to 30, got"),
-    "a detector twice": (lambda c, d: (c, pd.concat([d, d[:1]])), {}, "detid north0 is there twice"),
-    "no positions": (lambda c, d: (c, d.drop(columns=["long", "lat"])), {"trip_length": 900.0}, "give a table region,"),
+    "metres": (
+        lambda c, d: (c, d.assign(length=1000 * d["length"])),
+        {},
+        "km of its link, from 0.001 to 30, got",
+    ),
+    "a detector twice": (
+        lambda c, d: (c, pd.concat([d, d[:1]])),
+        {},
+        "detid north0 is there twice",
+    ),
+    "no positions": (
+        lambda c, d: (c, d.drop(columns=["long", "lat"])),
+        {"trip_length": 900.0},
+        "give a table region,",
+    ),
     "no trip length": (lambda c, d: (c, d.drop(columns=["long", "lat"])), {}, "give --trip-length"),
     "too few intervals": (lambda c, d: (c[: 20 * 5], d), {}, "fewer than 10 intervals"),
-    "a trip length in km": (lambda c, d: (c, d), {"trip_length": 1.2}, "--trip-length: expected a number from 10"),
+    "a trip length in km": (
+        lambda c, d: (c, d),
+        {"trip_length": 1.2},
+        "--trip-length: expected a number from 10",
+    ),
 }
 
 
@@ -173,14 +236,19 @@ MISTAKES = {
 def test_malformed_tables_end_in_one_line(tmp_path, made, change, options, expected):
     with pytest.raises(nmfd.InputError, match="^[^\n]*$") as caught:
         nmfd.identify(**written(tmp_path, *change(*made)), out=tmp_path / "city", **options)
-    assert expected in str(caught.value) and not (tmp_path / "city").exists()
+    assert expected in str(caught.value)
+    assert not (tmp_path / "city").exists()
 
 
 def test_the_command(tmp_path, made):
     files = written(tmp_path, *made)
     out = tmp_path / "city"
-    text = good(command("identify", files["counts"], "--detectors", files["detectors"], "--out", out))
-    assert "R2" in text and "trip length assumed" in text and f"Written to {out}" in text
+    text = good(
+        command("identify", files["counts"], "--detectors", files["detectors"], "--out", out)
+    )
+    assert "R2" in text
+    assert "trip length assumed" in text
+    assert f"Written to {out}" in text
 
 
 TABLES = {  # expected in the error -> name and text of a table
@@ -199,7 +267,11 @@ def test_other_tables_end_in_one_line(tmp_path, made, expected):
     name, text = TABLES[expected]
     (tmp_path / "other.csv").write_text(text)
     test_malformed_tables_end_in_one_line(
-        tmp_path, made, lambda *given: given, {name: tmp_path / "other.csv", "trip_length": TRIP}, expected
+        tmp_path,
+        made,
+        lambda *given: given,
+        {name: tmp_path / "other.csv", "trip_length": TRIP},
+        expected,
     )
 
 
@@ -209,23 +281,39 @@ def test_bad_rows_and_silent_detectors_are_left_out_and_counted(tmp_path, made):
     counts = counts.copy()
     counts.loc[[3, 7], "flow"] = np.nan
     counts.loc[[30, 31], "error"] = 1
-    counts = counts[~((counts["interval"] == 900) & counts["detid"].str.startswith("north") & (counts.index % 10 < 7))]
-    hour = counts[(counts["day"] == "2019-05-02") & counts["interval"].between(3000, 4800)]  # clocks go back
+    counts = counts[
+        ~(
+            (counts["interval"] == 900)
+            & counts["detid"].str.startswith("north")
+            & (counts.index % 10 < 7)
+        )
+    ]
+    hour = counts[
+        (counts["day"] == "2019-05-02") & counts["interval"].between(3000, 4800)
+    ]  # clocks go back
     counts = pd.concat([counts, hour.assign(flow=hour["flow"] + 30.0)])
-    options = {**written(tmp_path, counts, detectors), "trip_length": TRIP, "skip_bad": True, "out": tmp_path / "city"}
+    options = {
+        **written(tmp_path, counts, detectors),
+        "trip_length": TRIP,
+        "skip_bad": True,
+        "out": tmp_path / "city",
+    }
     found = nmfd.identify(**options)
     left = f"2 rows marked as errors, 2 rows with a missing or impossible number, {len(hour)} rows doubled"
     assert left in " ".join(found.text.split())
     assert found.fits["critical_veh"][0] == pytest.approx(CURVE.critical, rel=0.03)
     frame = found.intervals
-    assert not ((frame["region"] == "north") & (frame["interval"] == 900)).any() and frame["reporting"].min() >= 0.5
+    assert not ((frame["region"] == "north") & (frame["interval"] == 900)).any()
+    assert frame["reporting"].min() >= 0.5
     with pytest.raises(nmfd.InputError, match="exists; choose another"):
         nmfd.identify(**options)
 
 
 def faulty(counts, where, **values):
     """The counts with other values where `where` is true."""
-    return counts.assign(**{name: counts[name].where(~where, value) for name, value in values.items()})
+    return counts.assign(
+        **{name: counts[name].where(~where, value) for name, value in values.items()}
+    )
 
 
 def total(counts, one):
@@ -244,9 +332,15 @@ FAULTS = {  # change of the counts, reason
         "zero while others count: north0 (1 of 3 days)",
     ),
     "parked on": (lambda c, one: faulty(c, one, flow=0.0, occ=1.0), "occupancy without flow"),
-    "frozen": (lambda c, one: faulty(c, one & (c["interval"] > 5000), flow=321.0, occ=0.07), "constant"),
+    "frozen": (
+        lambda c, one: faulty(c, one & (c["interval"] > 5000), flow=321.0, occ=0.07),
+        "constant",
+    ),
     "wrong unit": (lambda c, one: faulty(c, one, occ=c["occ"] / 3.0), "unlike its neighbours"),
-    "noise": (lambda c, one: faulty(c, one, flow=1500 * NOISE[: len(c)], occ=NOISE[: len(c)]), "unlike its neighbours"),
+    "noise": (
+        lambda c, one: faulty(c, one, flow=1500 * NOISE[: len(c)], occ=NOISE[: len(c)]),
+        "unlike its neighbours",
+    ),
     "lanes twice": (lambda c, one: total(c[~one], one), "sum of others"),
 }
 
@@ -258,8 +352,12 @@ def test_detectors_that_cannot_be_right_are_left_out_and_named(tmp_path, made, f
     counts, detectors = made
     files = written(tmp_path, fault(counts, counts["detid"] == "north0"), detectors)
     found = nmfd.identify(**files, trip_length=TRIP, out=tmp_path / "city")
-    (line,) = (line for line in found.text.splitlines() if line.startswith("WARNING, detectors left out, "))
-    assert line.startswith(f"WARNING, detectors left out, {reason}") and "north0" in line and line.count("north") == 1
+    (line,) = (
+        line for line in found.text.splitlines() if line.startswith("WARNING, detectors left out, ")
+    )
+    assert line.startswith(f"WARNING, detectors left out, {reason}")
+    assert "north0" in line
+    assert line.count("north") == 1
     lanes = 1.0 if reason != "sum of others" else 1.0 - detectors["length"][0] * 2.0 / LANE_KM
     assert found.fits["critical_veh"][0] == pytest.approx(lanes * CURVE.critical, rel=0.05)
     assert (len(found.fits["doubts"][0]) == 2) == ("day" not in reason) or reason == "sum of others"

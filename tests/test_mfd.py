@@ -8,7 +8,8 @@ import pytest
 from nmfd.errors import InputError
 from nmfd.model.mfd import Cubic, fit, trapezoid
 
-# The published curve with a tenth of its jam accumulation: the coefficients span nine orders of magnitude.
+# The published curve with a tenth of its jam accumulation: the coefficients span nine orders of
+# magnitude.
 TRUTH = Cubic(a=4.133e-9, b=-8.282e-6, c=0.0042, jam=1000.0)
 # One sample in each of the 24 bins, the last one at the jam.
 X = TRUTH.jam * (np.arange(24) + 0.5) / 23.5
@@ -25,18 +26,27 @@ def test_a_parabola_in_closed_form():
     curve = Cubic(a=0.0, b=-0.004 / 1000.0, c=0.004, jam=2000.0)
     assert curve.critical == pytest.approx(500.0, abs=0.1)
     assert curve.capacity == pytest.approx(1.0)
-    assert curve.reaching(0.75) == pytest.approx(250.0, abs=0.1) and curve.reaching(1.0) == curve.critical
-    np.testing.assert_allclose(curve.outflow(np.array([0.0, 250.0, 1000.0])), [0.0, 0.75, 0.0], atol=1e-12)
+    assert curve.reaching(0.75) == pytest.approx(250.0, abs=0.1)
+    assert curve.reaching(1.0) == curve.critical
+    np.testing.assert_allclose(
+        curve.outflow(np.array([0.0, 250.0, 1000.0])), [0.0, 0.75, 0.0], atol=1e-12
+    )
     np.testing.assert_allclose(curve.rate(np.array([0.0, 250.0])), [0.004, 0.003])
 
 
 def test_a_trapezoid_in_closed_form():
-    """The least of three lines, constant from where a twentieth of the capacity is left; and what is no curve."""
+    """The least of three lines, constant from where a twentieth of the capacity is left; and what
+    is no curve."""
     curve = trapezoid(free=0.004, capacity=6.0, wave=0.001, jam=8000.0)
     n = np.array([0.0, 1000.0, 1500.0, 1900.0, 2000.0, 5000.0, 7700.0])
-    np.testing.assert_allclose(curve.outflow(n), np.minimum(np.minimum(0.004 * n, 6.0), 8.0 - 0.001 * n), atol=1e-12)
-    assert curve.outflow(9000.0) == pytest.approx(0.3) and curve.critical == pytest.approx(1500.0, abs=0.4)
-    with pytest.raises(InputError, match="^PiecewiseLinear: expected as many finite outflows as accumulations"):
+    np.testing.assert_allclose(
+        curve.outflow(n), np.minimum(np.minimum(0.004 * n, 6.0), 8.0 - 0.001 * n), atol=1e-12
+    )
+    assert curve.outflow(9000.0) == pytest.approx(0.3)
+    assert curve.critical == pytest.approx(1500.0, abs=0.4)
+    with pytest.raises(
+        InputError, match="^PiecewiseLinear: expected as many finite outflows as accumulations"
+    ):
         replace(curve, accumulations=(1500.0, 1500.0, 7700.0))
 
 
@@ -52,10 +62,15 @@ def test_what_is_no_curve():
     assert "is not positive at" in Cubic(a=TRUTH.a, b=-9e-6, c=TRUTH.c, jam=TRUTH.jam).problem()
 
 
-@pytest.mark.parametrize("name, value", [("jam", np.inf), ("jam", 0.0), ("a", np.nan), ("b", -np.inf), ("c", np.inf)])
+@pytest.mark.parametrize(
+    "name, value", [("jam", np.inf), ("jam", 0.0), ("a", np.nan), ("b", -np.inf), ("c", np.inf)]
+)
 def test_numbers_that_give_no_outflow_are_refused(name, value):
     """A cubic with jam = inf gave NaN in every plant."""
-    with pytest.raises(InputError, match=f"^Mfd: {name}: expected a number.*got {value:g} instead; give a finite one$"):
+    with pytest.raises(
+        InputError,
+        match=f"^Mfd: {name}: expected a number.*got {value:g} instead; give a finite one$",
+    ):
         replace(TRUTH, **{name: value})
 
 
@@ -85,7 +100,9 @@ def test_every_bin_counts_alike_and_by_its_median():
     """A thousand samples of an empty city and a wild one among three change nothing."""
     g = TRUTH.outflow(X)
     x = np.concatenate([np.full(1000, X[0]), X, X[[5, 5]], X[[9, 9]]])
-    many = np.concatenate([np.full(1000, g[0]), g, g[5] * np.array([1.0, 30.0]), g[9] * np.array([0.0, 1.0])])
+    many = np.concatenate(
+        [np.full(1000, g[0]), g, g[5] * np.array([1.0, 30.0]), g[9] * np.array([0.0, 1.0])]
+    )
     same(fit(x, many), TRUTH)
 
 
@@ -96,27 +113,40 @@ def test_the_jam_is_where_the_outflow_stops_falling():
 
 @pytest.mark.parametrize("seed", range(4))
 def test_whatever_the_samples_the_curve_is_safe(seed):
-    """The rate falls, stays positive up to the jam and keeps to the most that the integration step allows."""
+    """The rate falls, stays positive up to the jam and keeps to the most that the integration step
+    allows."""
     random = np.random.default_rng(seed)
     x = random.uniform(1.0, 500.0, 200)
-    for g in (random.uniform(0.0, 2.0, 200), 1e-5 * x**2, 0.01 * x, np.maximum(1.0 - 0.01 * x, 0.0), 0.02 * x**0.5):
+    for g in (
+        random.uniform(0.0, 2.0, 200),
+        1e-5 * x**2,
+        0.01 * x,
+        np.maximum(1.0 - 0.01 * x, 0.0),
+        0.02 * x**0.5,
+    ):
         for most in (np.inf, 1.0 / 150.0):
             curve = fit(x, g, max_rate=most)
             rate = curve.rate(np.linspace(0.0, curve.jam, 400))
-            assert curve.problem() is None and curve.jam <= x.max()
-            assert (np.diff(rate) <= 1e-9 * rate[0]).all() and rate[0] <= most * (1.0 + 1e-6)
+            assert curve.problem() is None
+            assert curve.jam <= x.max()
+            assert (np.diff(rate) <= 1e-9 * rate[0]).all()
+            assert rate[0] <= most * (1.0 + 1e-6)
             assert curve.outflow(curve.jam) >= 0.009 * g.max()
 
 
 def test_the_most_that_is_allowed_binds():
-    """Samples of 0.01 x with at most half of that: the line 0.005 x is as near as a curve may come."""
+    """Samples of 0.01 x with at most half of that: the line 0.005 x is as near as a curve may
+    come."""
     curve = fit(X, 0.01 * X, max_rate=0.005)
     np.testing.assert_allclose(curve.outflow(X), 0.005 * X, rtol=1e-3)
 
 
 def test_the_largest_samples_share_a_bin():
     """Of three in the last one the median counts: the largest of all is no bin of its own."""
-    x, g = np.append(X[:-1], [980.0, 990.0, 1000.0]), TRUTH.outflow(np.append(X[:-1], [990.0, 990.0, 990.0]))
+    x, g = (
+        np.append(X[:-1], [980.0, 990.0, 1000.0]),
+        TRUTH.outflow(np.append(X[:-1], [990.0, 990.0, 990.0])),
+    )
     g[-1] *= 9.0
     curve = fit(x, g)
     np.testing.assert_allclose(curve.outflow(X[:-1]), TRUTH.outflow(X[:-1]), rtol=2e-3)

@@ -1,4 +1,5 @@
-"""Economic MPC: optimal and admissible plans, forecasts, declared fallbacks, and the benchmark rows."""
+"""Economic MPC: optimal and admissible plans, forecasts, declared fallbacks, and the benchmark
+rows."""
 
 import time
 from dataclasses import replace
@@ -30,8 +31,14 @@ BOTH = pytest.mark.parametrize("guidance", [False, True], ids=["pc", "pcrg"])
 
 @pytest.fixture(scope="module")
 def states():
-    """Measurements of a run without control: its first 50 intervals, from empty to gridlock in the centre."""
-    trajectory = run(NmfdPlant(SCENARIO), NoControl(planning_model(SCENARIO)), replace(SCENARIO, steps=50), seed=0)
+    """Measurements of a run without control: its first 50 intervals, from empty to gridlock in the
+    centre."""
+    trajectory = run(
+        NmfdPlant(SCENARIO),
+        NoControl(planning_model(SCENARIO)),
+        replace(SCENARIO, steps=50),
+        seed=0,
+    )
     return [
         Observation(step=k, time=30.0 * k, accumulation=x, backlog=np.zeros((7, 7)))
         for k, x in enumerate(trajectory.accumulation)
@@ -49,12 +56,15 @@ def with_options(scenario=SCENARIO, **options):
 
 def assert_admissible(controls, guidance):
     u = controls.perimeter[NETWORK.adjacency]
-    assert NETWORK.u_min <= u.min() and u.max() <= NETWORK.u_max
+    assert NETWORK.u_min <= u.min()
+    assert u.max() <= NETWORK.u_max
     assert (controls.splits is not None) == guidance
     if guidance:
         assert controls.splits.min() >= 0.0
         assert (controls.splits[~NETWORK.split_mask] == 0.0).all()
-        np.testing.assert_allclose(controls.splits.sum(axis=1), 1.0 - np.eye(7), rtol=0.0, atol=1e-9)
+        np.testing.assert_allclose(
+            controls.splits.sum(axis=1), 1.0 - np.eye(7), rtol=0.0, atol=1e-9
+        )
 
 
 @BOTH
@@ -69,16 +79,24 @@ def test_controls_are_admissible_and_solved(states, guidance):
 @BOTH
 @pytest.mark.parametrize("k", [10, 30])
 def test_no_random_plan_nearby_or_far_is_better(states, guidance, k):
-    controller, random = EconomicMpc(planning_model(SCENARIO), guidance=guidance), np.random.default_rng(k)
+    controller, random = (
+        EconomicMpc(planning_model(SCENARIO), guidance=guidance),
+        np.random.default_rng(k),
+    )
     assert controller.act(states[k]).status == Status.OK
     forecast, plan = controller.forecast(states[k]), controller._plan
     best = cost(controller, *forecast, plan)
     for _ in range(300):
-        other = np.stack([controller.admissible.decision(*random_controls(random, NETWORK)) for _ in plan])
+        other = np.stack(
+            [controller.admissible.decision(*random_controls(random, NETWORK)) for _ in plan]
+        )
         if not guidance:
             other[:, len(controller._model.edges) :] = plan[:, len(controller._model.edges) :]
         share = 10.0 ** random.uniform(-3.0, 0.0)
-        assert cost(controller, *forecast, plan + share * (other - plan)) >= best - share * TOLERANCE * best
+        assert (
+            cost(controller, *forecast, plan + share * (other - plan))
+            >= best - share * TOLERANCE * best
+        )
     without = cost(controller, *forecast, controller._open)
     assert best < without if k == 30 else best <= without
 
@@ -103,17 +121,25 @@ def test_two_decisions_against_brute_force(tmp_path):
 
 @BOTH
 def test_the_plan_costs_what_the_regional_model_says(states, guidance):
-    for scenario in (SCENARIO, replace(SCENARIO, step=90.0, substeps=3), replace(SCENARIO, integrator="rk4")):
+    for scenario in (
+        SCENARIO,
+        replace(SCENARIO, step=90.0, substeps=3),
+        replace(SCENARIO, integrator="rk4"),
+    ):
         controller = EconomicMpc(planning_model(scenario), guidance=guidance)
         start, demand = controller.forecast(states[20])
         random, admissible = np.random.default_rng(7), controller.admissible
-        rows = [admissible.decision(*random_controls(random, NETWORK)) for _ in range(controller._moves)]
+        rows = [
+            admissible.decision(*random_controls(random, NETWORK)) for _ in range(controller._moves)
+        ]
         plan = admissible.project(np.stack(rows))
         p, x, total = dynamics.parameters(NETWORK), torch.from_numpy(states[20].accumulation), 0.0
         for k in range(8):
             perimeter, splits = controller.admissible.controls(plan[min(k, len(plan) - 1)])
             splits = NETWORK.nominal_splits if splits is None else splits
-            inputs = (torch.from_numpy(values) for values in (scenario.demand[20 + k], perimeter, splits))
+            inputs = (
+                torch.from_numpy(values) for values in (scenario.demand[20 + k], perimeter, splits)
+            )
             x = dynamics.advance(p, x, *inputs, **scenario.scheme)
             total += x.sum().item()
         # Region 3 holds no destination: the measured columns without demand are empty.
@@ -124,10 +150,13 @@ def test_the_backlog_is_demand_and_noise_is_not_negative(states):
     controller = EconomicMpc(planning_model(SCENARIO), guidance=False)
     backlog = np.zeros((7, 7))
     backlog[0, 6] = 60.0
-    start, demand = controller.forecast(replace(states[0], backlog=backlog, accumulation=np.full((7, 7), -0.5)))
+    start, demand = controller.forecast(
+        replace(states[0], backlog=backlog, accumulation=np.full((7, 7), -0.5))
+    )
     plain = controller.forecast(states[0])[1]
     assert (start == 0.0).all()
-    assert 30.0 * (demand - plain).sum() == pytest.approx(60.0) and (demand[1:] == plain[1:]).all()
+    assert 30.0 * (demand - plain).sum() == pytest.approx(60.0)
+    assert (demand[1:] == plain[1:]).all()
 
 
 def test_nothing_is_demanded_after_the_end(states):
@@ -166,7 +195,8 @@ def test_more_iterations_never_make_the_plan_worse(states, guidance, monkeypatch
         controller = EconomicMpc(planning_model(SCENARIO), guidance=guidance)
         assert_admissible(controller.act(states[30]), guidance)
         costs.append(cost(controller, *controller.forecast(states[30]), controller._plan))
-    assert costs == sorted(costs, reverse=True) and costs[-1] < costs[0]
+    assert costs == sorted(costs, reverse=True)
+    assert costs[-1] < costs[0]
 
 
 def test_without_a_measurement_the_last_plan_is_used_until_it_ends(states):
@@ -177,7 +207,9 @@ def test_without_a_measurement_the_last_plan_is_used_until_it_ends(states):
     for ahead in range(1, len(plan)):
         controls = controller.act(replace(states[20 + ahead], accumulation=nothing))
         assert controls.note == "not a number: last plan used"
-        np.testing.assert_array_equal(controls.perimeter, controller.admissible.controls(plan[ahead])[0])
+        np.testing.assert_array_equal(
+            controls.perimeter, controller.admissible.controls(plan[ahead])[0]
+        )
     controls = controller.act(replace(states[20], accumulation=nothing))
     assert controls.note == "not a number: perimeter opened, nominal splits"
     assert (controls.perimeter[NETWORK.adjacency] == NETWORK.u_max).all()
@@ -198,7 +230,10 @@ def test_reset_forgets_the_plan(states):
         ({"horizen": 8}, "horizen: unknown key"),
         ({"horizon": 1}, "horizon: should be greater"),
         ({"control_horizon": 0}, "control_horizon: should be greater"),
-        ({"control_horizon": 2, "solver": "ipopt"}, "control_horizon: ipopt has controls of its own"),
+        (
+            {"control_horizon": 2, "solver": "ipopt"},
+            "control_horizon: ipopt has controls of its own",
+        ),
     ],
 )
 def test_wrong_options(options, problem):
@@ -211,14 +246,22 @@ def test_wrong_options(options, problem):
     "guidance, most", [pytest.param(False, 1.381e8, id="pc"), pytest.param(True, 9.0e7, id="pcrg")]
 )
 def test_benchmark_row(guidance, most):
-    row = summary(run(NmfdPlant(SCENARIO), EconomicMpc(planning_model(SCENARIO), guidance=guidance), SCENARIO, seed=0))
+    row = summary(
+        run(
+            NmfdPlant(SCENARIO),
+            EconomicMpc(planning_model(SCENARIO), guidance=guidance),
+            SCENARIO,
+            seed=0,
+        )
+    )
     assert row["total_time_spent_veh_s"] < most
     assert row["solver_failures"] == 0
 
 
 @pytest.mark.parametrize("guidance", [False, True], ids=["pc", "pcrg"])
 def test_ipopt_is_the_reference_solver(states, guidance):
-    """The published formulation, in the place of our solver: as good a plan from the same state, to a thousandth."""
+    """The published formulation, in the place of our solver: as good a plan from the same state, to
+    a thousandth."""
     ours = EconomicMpc(planning_model(SCENARIO), guidance=guidance)
     reference = EconomicMpc(planning_model(with_options(solver="ipopt")), guidance=guidance)
     costs = []
@@ -231,7 +274,8 @@ def test_ipopt_is_the_reference_solver(states, guidance):
 
 @pytest.mark.parametrize("limit", [0.002, 0.02])
 def test_the_clock_is_looked_at_wherever_a_decision_takes_time(states, monkeypatch, limit):
-    """A model that takes a millisecond for every interval: the search, its line search and what comes before stop."""
+    """A model that takes a millisecond for every interval: the search, its line search and what
+    comes before stop."""
     slow, ticks = edge_model.advance, []
 
     def advance(*arguments, **more):
@@ -247,7 +291,8 @@ def test_the_clock_is_looked_at_wherever_a_decision_takes_time(states, monkeypat
         begin = time.perf_counter()
         ticks.clear()
         assert "time limit" in controller.act(states[k]).note
-        assert len(ticks) > 0 and sum(tick > begin + limit for tick in ticks) <= 1
+        assert len(ticks) > 0
+        assert sum(tick > begin + limit for tick in ticks) <= 1
 
 
 def test_a_decision_that_came_late_is_late_in_the_books(tmp_path):
@@ -260,9 +305,14 @@ def test_a_decision_that_came_late_is_late_in_the_books(tmp_path):
 
     scenario = replace(load_scenario(tiny.write(tmp_path)), steps=3)
     for controller, kinds, note in (
-        (Slow(planning_model(scenario)), [Status.OK, Status.LATE, Status.OK], "later than its deadline of 0.2 s"),
+        (
+            Slow(planning_model(scenario)),
+            [Status.OK, Status.LATE, Status.OK],
+            "later than its deadline of 0.2 s",
+        ),
         (NoControl(planning_model(scenario)), [Status.OK] * 3, ""),
     ):
         trajectory = run(NmfdPlant(scenario), controller, scenario, seed=0)
-        assert list(trajectory.status) == [kind.value for kind in kinds] and trajectory.note[1] == note
+        assert list(trajectory.status) == [kind.value for kind in kinds]
+        assert trajectory.note[1] == note
         assert summary(trajectory)["late_decisions"] == kinds.count(Status.LATE)

@@ -1,5 +1,5 @@
-"""Nobody drives: no demand, or runs too short for anybody to spend time. Percentages are then not defined, and every
-table, picture and sentence says so."""
+"""Nobody drives: no demand, or runs too short for anybody to spend time. Percentages are then not
+defined, and every table, picture and sentence says so."""
 
 import math
 
@@ -45,9 +45,11 @@ def test_tables(rows):
     assert math.isnan(statistics.paired({1: 0.0, 2: 3.0}, {1: 0.0, 2: 2.0}).percent)
     assert math.isnan(interval([math.nan, 1.0, 2.0]))
     table = statistics.statistics(rows)
-    assert table["change_percent"].isna().all() and not table["change_significant"].astype(bool).any()
+    assert table["change_percent"].isna().all()
+    assert not table["change_significant"].astype(bool).any()
     text = statistics.text(rows.assign(trips=0.0))
-    assert "nan" not in text and "inf" not in text
+    assert "nan" not in text
+    assert "inf" not in text
     assert text.splitlines()[3].split()[:6] == ["pi-gating", "2", "0.000e+00", "±", "0.0e+00", "-"]
 
 

@@ -14,17 +14,25 @@ SIDE = 4  # junctions along a side
 
 
 def street_map(south: float = 44.49, west: float = 11.33) -> bytes:
-    """A grid of streets, both ways: the third of either direction is a main street, its inner junctions have signals;
-    and a footway, a railway and a street that is cut off from the rest."""
+    """A grid of streets, both ways: the third of either direction is a main street, its inner
+    junctions have signals; and a footway, a railway and a street that is cut off from the rest."""
     lines = ["<?xml version='1.0' encoding='UTF-8'?>", "<osm version='0.6'>"]
     for y in range(SIDE):
         for x in range(SIDE):
             signal = "<tag k='highway' v='traffic_signals'/>" if {x, y} <= {1, 2} else ""
             place = f"lat='{south + 0.0018 * y}' lon='{west + 0.0025 * x}'"
             lines.append(f"<node id='{10 * y + x}' {place}>{signal}</node>")
-    lines += [f"<node id='{98 + n}' lat='{south + 0.03}' lon='{west + 0.001 * n}'/>" for n in range(2)]
-    ways = [([10 * y + x for x in range(SIDE)], "primary" if y == 2 else "residential") for y in range(SIDE)]
-    ways += [([10 * y + x for y in range(SIDE)], "primary" if x == 2 else "residential") for x in range(SIDE)]
+    lines += [
+        f"<node id='{98 + n}' lat='{south + 0.03}' lon='{west + 0.001 * n}'/>" for n in range(2)
+    ]
+    ways = [
+        ([10 * y + x for x in range(SIDE)], "primary" if y == 2 else "residential")
+        for y in range(SIDE)
+    ]
+    ways += [
+        ([10 * y + x for y in range(SIDE)], "primary" if x == 2 else "residential")
+        for x in range(SIDE)
+    ]
     ways += [([0, 11], "footway"), ([98, 99], "residential")]
     for n, (nodes, kind) in enumerate(ways, start=1):
         lines.append(
@@ -49,7 +57,8 @@ def test_streets_and_signals_of_a_file(tmp_path):
             assert {logic.kind for logic in streets.logics.values()} == {"actuated"}
             assert "ODbL-1.0" in found.notice
         assert not found.net.exists()
-    assert written[0] == written[1] and b"osm.net.xml" not in written[0]
+    assert written[0] == written[1]
+    assert b"osm.net.xml" not in written[0]
 
 
 LEFT = """Bangkok 13.75 100.50, Chiang Mai 18.79 98.98, Nong Khai 17.88 102.74, Hat Yai 7.01 100.47, London 51.51 -0.13,
@@ -91,7 +100,8 @@ def test_a_box_is_asked_of_a_server(tmp_path, monkeypatch):
         monkeypatch.setattr(case, "SERVERS", f"http://127.0.0.1:{server.server_port}/")
         file = case.fetch_osm((-0.5, 44.48, 11.34, 44.5), tmp_path)
         server.shutdown()
-    assert 'w="-0.5"' in asked[0] and 'n="44.5"' in asked[0]
+    assert 'w="-0.5"' in asked[0]
+    assert 'n="44.5"' in asked[0]
     with gzip.open(file) as stream:
         assert b"<way id='1'>" in stream.read()
 
@@ -101,23 +111,44 @@ def test_import_makes_a_scenario_and_names_the_licence(tmp_path):
     with gzip.open(tmp_path / "city.osm.gz", "wb") as stream:
         stream.write(street_map())
     net, scenario = tmp_path / "networks" / "mycity", tmp_path / "scenarios" / "mycity"
-    good(cosim("import", tmp_path / "city.osm.gz", "--regions", 2, "--demand", "peak", "--level", 0.1, "--out", net))
+    good(
+        cosim(
+            "import",
+            tmp_path / "city.osm.gz",
+            "--regions",
+            2,
+            "--demand",
+            "peak",
+            "--level",
+            0.1,
+            "--out",
+            net,
+        )
+    )
     assert "OpenStreetMap contributors" in (net / "NOTICE.txt").read_text()
     assert "right-hand traffic; 4 signals" in (net / "import.txt").read_text()
-    good(cosim("run", scenario, "--controller", "pi-gating", "--steps", 3, "--out", tmp_path / "run"))
+    good(
+        cosim("run", scenario, "--controller", "pi-gating", "--steps", 3, "--out", tmp_path / "run")
+    )
 
 
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (("--bbox", "11.3,44.4,11.4,44.5"), "osmGet.py got nothing from OpenStreetMap (urllib.error.URLError"),
+        (
+            ("--bbox", "11.3,44.4,11.4,44.5"),
+            "osmGet.py got nothing from OpenStreetMap (urllib.error.URLError",
+        ),
         (("--bbox", "11.3,44.4,11.4"), "expected west,south,east,north in degrees"),
         (("--bbox", "11.4,44.4,11.3,44.5"), "expected west,south,east,north in degrees"),
         ((), "either a file or --bbox"),
         (("empty.osm", "--bbox", "11.3,44.4,11.4,44.5"), "either a file or --bbox"),
         (("empty.osm",), "netconvert cannot run it: Error: No nodes loaded"),
         (("city.osm.pbf",), "osmium cat city.osm.pbf -o city.osm"),
-        (("other.xml",), "expected a sumocfg, a net.xml or a file of OpenStreetMap, got a file of <html>"),
+        (
+            ("other.xml",),
+            "expected a sumocfg, a net.xml or a file of OpenStreetMap, got a file of <html>",
+        ),
     ],
 )
 def test_one_line(tmp_path, monkeypatch, arguments, expected):
@@ -125,5 +156,8 @@ def test_one_line(tmp_path, monkeypatch, arguments, expected):
     monkeypatch.setattr(case, "SERVERS", "http://127.0.0.1:1/")
     for name, content in (("empty.osm", "<osm/>"), ("city.osm.pbf", ""), ("other.xml", "<html/>")):
         (tmp_path / name).write_text(content)
-    assert expected in error_line(cosim("import", *arguments, "--regions", 2, "--out", "networks/x"))
-    assert not (tmp_path / "networks" / "x").exists() and not (tmp_path / "scenarios").exists()
+    assert expected in error_line(
+        cosim("import", *arguments, "--regions", 2, "--out", "networks/x")
+    )
+    assert not (tmp_path / "networks" / "x").exists()
+    assert not (tmp_path / "scenarios").exists()

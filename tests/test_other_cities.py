@@ -1,4 +1,5 @@
-"""What cities of others bring: each gives a working result or one clear line, and loses no vehicle without a word."""
+"""What cities of others bring: each gives a working result or one clear line, and loses no vehicle
+without a word."""
 
 import re
 import shutil
@@ -61,9 +62,12 @@ def imported(source, out=None, **options):
 
 def refused(config, *options):
     """The one line of an import that fails and leaves nothing behind."""
-    result = cosim("import", config, "--regions", 2, "--out", config.parent / "networks" / "x", *options)
+    result = cosim(
+        "import", config, "--regions", 2, "--out", config.parent / "networks" / "x", *options
+    )
     assert result.exit_code == 2, result.stdout + str(result.exception)
-    assert result.stderr.count("\n") == 1 and "Traceback" not in result.stderr
+    assert result.stderr.count("\n") == 1
+    assert "Traceback" not in result.stderr
     assert not list(config.parent.glob("*/x/*"))
     return result.stderr
 
@@ -80,14 +84,18 @@ def test_files_are_found_wherever_they_are(net, tmp_path):
     )
     out = tmp_path / "networks" / 'd\'"x" \\ y'
     scenario = imported(config, out=out)[1]
-    assert scenario.name == out.name and scenario.demand.sum() * scenario.step == pytest.approx(60)
+    assert scenario.name == out.name
+    assert scenario.demand.sum() * scenario.step == pytest.approx(60)
 
 
 @pytest.mark.parametrize(
     "options, expected",
     [
         ('<begin value="-10"/>', "c.sumocfg: expected 0 s <= begin < end, got begin -10 s"),
-        ('<begin value="600"/><end value="300"/>', "c.sumocfg: expected 0 s <= begin < end, got begin 600 s, end 300"),
+        (
+            '<begin value="600"/><end value="300"/>',
+            "c.sumocfg: expected 0 s <= begin < end, got begin 600 s, end 300",
+        ),
         ('<time-to-teleport value="abc"/>', "c.sumocfg: time-to-teleport: expected seconds"),
         ('<step-length value="abc"/>', "c.sumocfg: step-length: expected seconds"),
     ],
@@ -100,15 +108,21 @@ def test_options_that_are_wrong(city, options, expected):
 def test_folders_that_can_have_no_city(city, tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     result = cosim("import", city(), "--regions", 2, "--out", name)
-    assert result.exit_code == 2 and "--out: expected a folder such as networks/mycity" in result.stderr
+    assert result.exit_code == 2
+    assert "--out: expected a folder such as networks/mycity" in result.stderr
     assert not list(tmp_path.rglob("*.toml"))
 
 
 def test_steps_and_teleports_of_the_city(city):
-    """Any negative time means never; steps that do not fit are not simulated before either, and that is said."""
-    text, scenario = imported(city(options='<time-to-teleport value="-10"/><step-length value="2"/>'))
-    assert settings(scenario).time_to_teleport == -1.0 and settings(scenario).step_length == 1.0
-    assert "not taken over from c.sumocfg: step-length = 2, not 1" in text and " 0 teleports" in text
+    """Any negative time means never; steps that do not fit are not simulated before either, and
+    that is said."""
+    text, scenario = imported(
+        city(options='<time-to-teleport value="-10"/><step-length value="2"/>')
+    )
+    assert settings(scenario).time_to_teleport == -1.0
+    assert settings(scenario).step_length == 1.0
+    assert "not taken over from c.sumocfg: step-length = 2, not 1" in text
+    assert " 0 teleports" in text
 
 
 def test_an_id_twice(city):
@@ -119,37 +133,55 @@ def test_an_id_twice(city):
 def test_copies_of_vehicles_get_ids_of_their_own(tmp_path):
     (tmp_path / "a.rou.xml").write_text(
         "<routes>"
-        + "".join(f'<trip id="{name}" depart="1" from="a" to="b"/>' for name in ("0", "0.1", "0.1.1", "1"))
+        + "".join(
+            f'<trip id="{name}" depart="1" from="a" to="b"/>' for name in ("0", "0.1", "0.1.1", "1")
+        )
         + "</routes>"
     )
-    drawn = draw(read_recorded_trips([tmp_path / "a.rou.xml"]), seed=0, factor=3.0, jitter=0.0, begin=0.0)
+    drawn = draw(
+        read_recorded_trips([tmp_path / "a.rou.xml"]), seed=0, factor=3.0, jitter=0.0, begin=0.0
+    )
     names = [name for _, _, name in drawn]
-    assert len(names) == len(set(names)) == 12 and {"0", "0.1", "0.1.1", "1", "1.1", "1.2", "0.2"} <= set(names)
+    assert len(names) == len(set(names)) == 12
+    assert {
+        "0",
+        "0.1",
+        "0.1.1",
+        "1",
+        "1.1",
+        "1.2",
+        "0.2",
+    } <= set(names)
 
 
 def test_cars_for_streets_that_are_closed_to_them(net, city, tmp_path):
-    """SUMO would keep them waiting for ever: they are left out, with a word; lorries that may go there are not."""
+    """SUMO would keep them waiting for ever: they are left out, with a word; lorries that may go
+    there are not."""
     text = re.sub(r'(<lane id="C1D1_\d" index="\d") ', r'\1 allow="bus truck" ', net.read_text())
     (tmp_path / "closed.net.xml").write_text(text)
     said, scenario = imported(
         city(
-            FLOW + '<vType id="lorry" vClass="truck"/><trip id="lorry" type="lorry" depart="9" from="A1B1" to="C1D1"/>'
+            FLOW
+            + '<vType id="lorry" vClass="truck"/><trip id="lorry" type="lorry" depart="9" from="A1B1" to="C1D1"/>'
             '<vehicle id="over" depart="10"><route edges="B1C1 C1D1 D1D2"/></vehicle>'
             '<trip id="car" depart="12" from="A1B1" to="D1D2"/>',
             net_file="closed.net.xml",
         )
     )
-    assert "2 vehicles in" in said and "without a route that SUMO could drive, left out: 61" in said
+    assert "2 vehicles in" in said
+    assert "without a route that SUMO could drive, left out: 61" in said
     due, departed, *_, backlog = driven(scenario, 2, 0.4)
-    assert due == departed == 2 and backlog == 0
+    assert due == departed == 2
+    assert backlog == 0
 
 
 def test_what_else_changes_routes_and_vehicles(city, tmp_path, monkeypatch):
-    """Rerouters with other routes, closed streets and calibrators: SUMO runs them, the ledger is exact; vehicles that
-    SUMO gives up are told; nothing is written where the user is."""
+    """Rerouters with other routes, closed streets and calibrators: SUMO runs them, the ledger is
+    exact; vehicles that SUMO gives up are told; nothing is written where the user is."""
     monkeypatch.chdir(tmp_path)
     config = city(
-        FLOW + '<trip id="shut" depart="100" from="C2D2" to="D1D0"/><trip id="begins" depart="begin" from="A1B1" '
+        FLOW
+        + '<trip id="shut" depart="100" from="C2D2" to="D1D0"/><trip id="begins" depart="begin" from="A1B1" '
         'to="D1D0"><param key="has.ssm.device" value="true"/></trip>',
         '<routeProbe id="probe" edge="A1B1" freq="60" file="probe.xml"/><route id="other" edges="B1C1 C1C2"/>'
         '<route id="more" edges="B2C2 C2D2"/>'
@@ -162,7 +194,8 @@ def test_what_else_changes_routes_and_vehicles(city, tmp_path, monkeypatch):
     assert " 1 without a route or a free lane" in text
     assert {element.get("id") for element in traffic_of(config).vehicles} >= {"begins", "shut"}
     due, departed, arrived, inside, _ = driven(scenario, 5, 0.4, rerouting=0.5)
-    assert departed - arrived == inside and departed > 40
+    assert departed - arrived == inside
+    assert departed > 40
     assert {path.name for path in tmp_path.iterdir()} == {
         "c.rou.xml",
         "c.add.xml",
@@ -173,7 +206,8 @@ def test_what_else_changes_routes_and_vehicles(city, tmp_path, monkeypatch):
 
 
 def test_signals_that_cannot_be_controlled(net, city, tmp_path):
-    """Off, or without any programme, as railway crossings are: no gateway counts as controlled by them."""
+    """Off, or without any programme, as railway crossings are: no gateway counts as controlled by
+    them."""
     config = city(additional='<tlLogic id="B1" programID="off" type="static" offset="0"/>')
     case = read_sumo_input(config)
     found = left_alone(read_streets(case.net, case.additional), traffic_of(config).switched)
@@ -185,7 +219,8 @@ def test_signals_that_cannot_be_controlled(net, city, tmp_path):
 
 
 def test_phases_that_do_not_follow_in_order(net, city):
-    """Perimeter control would play them one after the other: it leaves such signals alone, in table and run."""
+    """Perimeter control would play them one after the other: it leaves such signals alone, in table
+    and run."""
     text = re.sub(r'(<phase duration="\d+")', r'\1 next="0 1"', net.read_text())
     branching = net.with_name("branching.net.xml")
     branching.write_text(text)
@@ -198,8 +233,12 @@ def test_phases_that_do_not_follow_in_order(net, city):
 
 def test_cycles_shorter_than_half_a_second(net, tmp_path):
     """Of a network that somebody made for something else: control intervals are the usual 90 s."""
-    (tmp_path / "fast.net.xml").write_text(re.sub(r'(<phase duration=")\d+', r"\g<1>0.05", net.read_text()))
-    _, scenario = imported(tmp_path / "fast.net.xml", demand="peak", level=0.1, iterations=1, mesoscopic=True)
+    (tmp_path / "fast.net.xml").write_text(
+        re.sub(r'(<phase duration=")\d+', r"\g<1>0.05", net.read_text())
+    )
+    _, scenario = imported(
+        tmp_path / "fast.net.xml", demand="peak", level=0.1, iterations=1, mesoscopic=True
+    )
     assert scenario.step == 90.0
 
 
@@ -207,28 +246,40 @@ def test_a_city_along_a_straight_road(tmp_path):
     """It has no width."""
     nodes = "".join(f'<node id="{n}" x="{200 * n}" y="0" type="traffic_light"/>' for n in range(9))
     edges = "".join(
-        f'<edge id="f{n}" from="{n}" to="{n + 1}"/><edge id="b{n}" from="{n + 1}" to="{n}"/>' for n in range(8)
+        f'<edge id="f{n}" from="{n}" to="{n + 1}"/><edge id="b{n}" from="{n + 1}" to="{n}"/>'
+        for n in range(8)
     )
     (tmp_path / "n.nod.xml").write_text(f"<nodes>{nodes}</nodes>")
     (tmp_path / "e.edg.xml").write_text(f"<edges>{edges}</edges>")
     net = tmp_path / "road.net.xml"
-    tiny_city.run("netconvert", "-n", tmp_path / "n.nod.xml", "-e", tmp_path / "e.edg.xml", "-o", net)
+    tiny_city.run(
+        "netconvert", "-n", tmp_path / "n.nod.xml", "-e", tmp_path / "e.edg.xml", "-o", net
+    )
     text, scenario = imported(net, demand="peak", level=0.2, iterations=1, mesoscopic=True)
-    assert "regions instead of" not in text and scenario.network.adjacency.sum() == 2
+    assert "regions instead of" not in text
+    assert scenario.network.adjacency.sum() == 2
     sizes = np.bincount(
-        np.loadtxt(tmp_path / "networks" / "x" / "regions.csv", dtype=int, delimiter=",", skiprows=1, usecols=1)
+        np.loadtxt(
+            tmp_path / "networks" / "x" / "regions.csv",
+            dtype=int,
+            delimiter=",",
+            skiprows=1,
+            usecols=1,
+        )
     )
     assert sizes.min() >= 4
 
 
 def test_own_regions_from_a_spreadsheet_and_in_pieces(net, city, tmp_path):
-    """A mark at the beginning and empty lines do not matter; streets that cannot stay where they were put are told."""
+    """A mark at the beginning and empty lines do not matter; streets that cannot stay where they
+    were put are told."""
     config, edges = city(), read_streets(net).edges
     rows = [f"{edge},{int(edge[0] in 'CD')}" for edge in edges]
     csv = tmp_path / "own.csv"
     csv.write_bytes("\r\n".join(["\ufeffedge,region", *rows, "", ""]).encode())
     text, scenario = imported(config, regions=csv)
-    assert "are in other regions" not in text and scenario.network.regions == 2
+    assert "are in other regions" not in text
+    assert scenario.network.regions == 2
     apart = {"A0A1", "A1A2", "D2D3"}
     csv.write_text("\n".join(["edge,region", *(f"{edge},{int(edge in apart)}" for edge in edges)]))
     assert "1 streets are in other regions than in" in imported(config, regions=csv)[0]
@@ -243,7 +294,9 @@ def test_sumos_own_words_in_one_line(city, capfd):
     _, scenario = imported(city())
     (scenario.folder / "broken.add.xml").write_text(f"<additional>{extra}</additional>")
     toml = scenario.folder / "scenario.toml"
-    toml.write_text(toml.read_text().replace("[sumo]\n", '[sumo]\nadditional = ["broken.add.xml"]\n'))
+    toml.write_text(
+        toml.read_text().replace("[sumo]\n", '[sumo]\nadditional = ["broken.add.xml"]\n')
+    )
     capfd.readouterr()
     with pytest.raises(InputError, match="SUMO cannot run it .* plan loaded for tls 'none'"):
         driven(load_scenario(scenario.folder), 1, 0.4)
@@ -251,7 +304,8 @@ def test_sumos_own_words_in_one_line(city, capfd):
 
 
 def test_speeds_and_coordinates(city):
-    """A fixed speed is deadly before a signal under control; trips between coordinates are driven."""
+    """A fixed speed is deadly before a signal under control; trips between coordinates are
+    driven."""
     traffic = traffic_of(
         city(
             '<trip id="a" depart="1" from="A1B1" to="C1D1" departSpeed="13.9"/><trip id="b" depart="1" fromXY="1,1" '

@@ -1,4 +1,5 @@
-"""Controllers of the user's own: the template, options, checked controls, and mistakes with file and line."""
+"""Controllers of the user's own: the template, options, checked controls, and mistakes with file
+and line."""
 
 import re
 from pathlib import Path
@@ -35,7 +36,9 @@ def observation(accumulation):
 
 def test_the_template_is_copied_runs_and_counts_in_the_fingerprint(place):
     assert command("new-controller", "mine.py").exit_code == 0
-    assert "--controllers no-control,pi-gating,mine.py:MyController" in (place / "mine.py").read_text()
+    assert (
+        "--controllers no-control,pi-gating,mine.py:MyController" in (place / "mine.py").read_text()
+    )
     assert command("new-controller", "mine.py").exit_code == 2
     scenario, strategy = nmfd.load_scenario(place / "scenario"), parse("mine.py:MyController")
     assert nmfd.run(scenario, "mine.py:MyController").perimeter[:, 0, 1].max() == 0.9
@@ -61,14 +64,18 @@ def test_it_has_a_table_of_its_own(place):
         file.write("\n[controllers.own.my-controller]\ngain = 0.0\n")
     assert command("new-controller", "mine.py").exit_code == 0
     controller = nmfd.controller("mine.py:MyController", place / "scenario")
-    assert controller.act(observation(np.full((2, 2), 900.0))).perimeter[0, 1] == 0.9  # without gain nothing is held
+    assert (
+        controller.act(observation(np.full((2, 2), 900.0))).perimeter[0, 1] == 0.9
+    )  # without gain nothing is held
 
 
 def test_files_and_modules_beside_it(place):
     (place / "helper_of_mine.py").write_text("OPENING = 0.5\n")
     (place / "weights.txt").write_text("1")
     source = "from helper_of_mine import OPENING\n" + GOOD.replace("0.5", "OPENING")
-    (place / "mine.py").write_text(source.replace("class Mine:\n", 'class Mine:\n    files = ("weights.txt",)\n'))
+    (place / "mine.py").write_text(
+        source.replace("class Mine:\n", 'class Mine:\n    files = ("weights.txt",)\n')
+    )
     scenario, strategy = nmfd.load_scenario(place / "scenario"), parse("mine.py:Mine")
     assert strategy.make(scenario).act(observation(np.zeros((2, 2)))).perimeter[0, 1] == 0.5
     before = strategy.fingerprint(scenario)
@@ -81,30 +88,71 @@ def test_sumo_takes_it(place):
     (place / "mine.py").write_text(GOOD)
     copies.peak(place)
     name = "mine.py:Mine+max-pressure"
-    assert name in good(commands.cosim("run", "scenarios/peak", "--controller", name, "--steps", 2, "--out", "out"))
+    assert name in good(
+        commands.cosim("run", "scenarios/peak", "--controller", name, "--steps", 2, "--out", "out")
+    )
 
 
 @pytest.mark.parametrize(
     "source, expected",
     [
-        (None, "mine.py: no such file for controller mine.py:Mine; write one with: nmfd new-controller "),
+        (
+            None,
+            "mine.py: no such file for controller mine.py:Mine; write one with: nmfd new-controller ",
+        ),
         ("class Other:\n    act = None\n", "mine.py: has no class Mine; write one"),
-        ("import numpy\n\nclass Mine(:\n", r"mine\.py:3: mine\.py:Mine: import: SyntaxError: invalid syntax"),
-        ("\nimport nothing_of_the_kind\n", r"mine\.py:2: mine\.py:Mine: import: ModuleNotFoundError: No module named"),
+        (
+            "import numpy\n\nclass Mine(:\n",
+            r"mine\.py:3: mine\.py:Mine: import: SyntaxError: invalid syntax",
+        ),
+        (
+            "\nimport nothing_of_the_kind\n",
+            r"mine\.py:2: mine\.py:Mine: import: ModuleNotFoundError: No module named",
+        ),
         ("import sys\nsys.exit('bye')\n", r"mine\.py:2: mine\.py:Mine: import: SystemExit: bye"),
         (GOOD.replace("self, scenario", "self"), "__init__: TypeError"),
         (GOOD.replace("def act", "def acts"), "act: AttributeError"),
         (GOOD.replace("pass", "1 / 0"), r"mine\.py:8: mine\.py:Mine: reset: ZeroDivisionError"),
-        (GOOD.replace("0.5,", "measurement.nothing,"), r"mine\.py:10: mine\.py:Mine: act: AttributeError"),
-        (GOOD.replace("self.shape, 0.5", "3, 0.5"), "act: interval 0: perimeter: expected numbers of shape"),
-        (GOOD.replace("0.5", "np.nan"), "act: interval 0: perimeter[0, 0]: expected -inf to inf, got nan instead"),
-        (GOOD.replace("0.5", "1.5"), "act: interval 0: perimeter[0, 1]: expected 0.1 to 0.9, got 1.5 instead"),
-        (GOOD.replace("splits=None", "splits=np.zeros((2, 2))"), "splits: expected numbers of shape (2, 2, 2)"),
-        (GOOD.replace("splits=None", "splits=np.zeros((2, 2, 2))"), "splits: expected a sum of 1 over h"),
-        (GOOD.replace("splits=None", "splits=np.ones((2, 2, 2))"), "splits[0, 0, 0]: expected 0 to 0, got 1 instead"),
-        (GOOD.replace("splits=None", "splits=None, prices=np.array([0.0, -1.0])"), "prices[1]: expected 0 to 100"),
-        (GOOD.replace("splits=None", "splits=None, metering='all'"), "metering: expected numbers of shape (2,)"),
-        (GOOD.replace("return Controls(", "return dict("), "act: interval 0: expected nmfd.Controls, got dict instead"),
+        (
+            GOOD.replace("0.5,", "measurement.nothing,"),
+            r"mine\.py:10: mine\.py:Mine: act: AttributeError",
+        ),
+        (
+            GOOD.replace("self.shape, 0.5", "3, 0.5"),
+            "act: interval 0: perimeter: expected numbers of shape",
+        ),
+        (
+            GOOD.replace("0.5", "np.nan"),
+            "act: interval 0: perimeter[0, 0]: expected -inf to inf, got nan instead",
+        ),
+        (
+            GOOD.replace("0.5", "1.5"),
+            "act: interval 0: perimeter[0, 1]: expected 0.1 to 0.9, got 1.5 instead",
+        ),
+        (
+            GOOD.replace("splits=None", "splits=np.zeros((2, 2))"),
+            "splits: expected numbers of shape (2, 2, 2)",
+        ),
+        (
+            GOOD.replace("splits=None", "splits=np.zeros((2, 2, 2))"),
+            "splits: expected a sum of 1 over h",
+        ),
+        (
+            GOOD.replace("splits=None", "splits=np.ones((2, 2, 2))"),
+            "splits[0, 0, 0]: expected 0 to 0, got 1 instead",
+        ),
+        (
+            GOOD.replace("splits=None", "splits=None, prices=np.array([0.0, -1.0])"),
+            "prices[1]: expected 0 to 100",
+        ),
+        (
+            GOOD.replace("splits=None", "splits=None, metering='all'"),
+            "metering: expected numbers of shape (2,)",
+        ),
+        (
+            GOOD.replace("return Controls(", "return dict("),
+            "act: interval 0: expected nmfd.Controls, got dict instead",
+        ),
     ],
 )
 @pytest.mark.usefixtures("unchecked")
@@ -129,6 +177,10 @@ def test_rounding_errors_of_float32_are_removed(place):
     (place / "mine.py").write_text(
         GOOD.replace("0.5", "0.9000005").replace("splits=None", f"splits={splits} * 1.000001")
     )
-    controls = nmfd.controller("mine.py:Mine", place / "scenario").act(observation(np.zeros((2, 2))))
-    assert controls.perimeter[0, 1] == 0.9 and controls.perimeter[0, 0] == 0.0
-    assert controls.splits[0, 1, 1] == 1.0 and controls.perimeter.dtype == float
+    controls = nmfd.controller("mine.py:Mine", place / "scenario").act(
+        observation(np.zeros((2, 2)))
+    )
+    assert controls.perimeter[0, 1] == 0.9
+    assert controls.perimeter[0, 0] == 0.0
+    assert controls.splits[0, 1, 1] == 1.0
+    assert controls.perimeter.dtype == float

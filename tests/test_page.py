@@ -68,9 +68,12 @@ def content(evaluation):
 def test_the_page_is_valid_and_needs_nothing_else(content):
     read = Page(content)
     pictures = [link for link in read.links if link.startswith("data:image/png;base64,")]
-    assert len(pictures) == 2 + 3 and set(read.links) == {*pictures, "data:,"}
-    assert content.startswith("<!DOCTYPE html>") and len(content) < 8_000_000
-    assert "a<b>" not in content and "a<b>&c" in read.words
+    assert len(pictures) == 2 + 3
+    assert set(read.links) == {*pictures, "data:,"}
+    assert content.startswith("<!DOCTYPE html>")
+    assert len(content) < 8_000_000
+    assert "a<b>" not in content
+    assert "a<b>&c" in read.words
 
 
 def test_every_number_of_the_tables_is_there(content, evaluation):
@@ -79,7 +82,8 @@ def test_every_number_of_the_tables_is_there(content, evaluation):
         assert f"{row['total_time_spent_veh_s']:.7g}" in cells
     level = results.read(evaluation).level()
     emitted = np.mean([run.co2.sum() for run in level.results("dpc-pcrg")])
-    assert "By region" in content and {"1,300", "+30.0 %", f"{emitted:,.0f}"} <= set(cells)
+    assert "By region" in content
+    assert {"1,300", "+30.0 %", f"{emitted:,.0f}"} <= set(cells)
     for row in statistics.statistics(results.read(evaluation).rows).to_dict("records"):
         half = row["change_half_interval_percent"]
         assert row["controller"] == "no-control" or any(
@@ -88,27 +92,38 @@ def test_every_number_of_the_tables_is_there(content, evaluation):
 
 
 def test_the_card_has_the_figures_of_the_best_strategy(evaluation):
-    rows = results.read(evaluation).level(1.0).rows.assign(mean_trip_time_s=0.0, co2_kg=float("nan"))
+    rows = (
+        results.read(evaluation).level(1.0).rows.assign(mean_trip_time_s=0.0, co2_kg=float("nan"))
+    )
     rows.loc[rows["controller"] == "no-control", "mean_trip_time_s"] = 600.0
     rows.loc[rows["controller"] == "dpc-pcrg", "mean_trip_time_s"] = [299.0, 301.0]
     heading, shown, name = html.card(rows)
-    assert heading.startswith("dpc-pcrg compared with no control: ") and name == "dpc-pcrg"
+    assert heading.startswith("dpc-pcrg compared with no control: ")
+    assert name == "dpc-pcrg"
     spent, served, trip = shown  # CO2 was not recorded
-    assert (trip.value, trip.before, trip.change) == ("5.0 min", "10.0 min without control", "50 ± 2 % less")
-    assert served.value == "500" and served.better is None
-    times = rows.groupby("controller")["total_time_spent_veh_s"].mean() / 3600
-    assert (
-        spent.label == "Vehicle hours saved" and spent.value == f"{times['no-control'] - times['dpc-pcrg']:,.0f} veh h"
+    assert (trip.value, trip.before, trip.change) == (
+        "5.0 min",
+        "10.0 min without control",
+        "50 ± 2 % less",
     )
+    assert served.value == "500"
+    assert served.better is None
+    times = rows.groupby("controller")["total_time_spent_veh_s"].mean() / 3600
+    assert spent.label == "Vehicle hours saved"
+    assert spent.value == f"{times['no-control'] - times['dpc-pcrg']:,.0f} veh h"
     assert all(one.verdict == "no proof (2 seeds)" and one.better is None for one in shown)
     third = rows[rows["seed"] == 2000].assign(seed=2002)
     assert html.card(pd.concat([rows, third]))[1][2][-2:] == ("significant", True)
     same = pd.concat([rows, third]).assign(mean_trip_time_s=600.0)
     assert html.card(same)[1][2][-3:] == ("no change", "not significant", None)
     alone = html.card(rows[rows["controller"] == "no-control"])
-    assert alone[0] == "no-control" and all(figure.change == "" for figure in alone[1])
+    assert alone[0] == "no-control"
+    assert all(figure.change == "" for figure in alone[1])
     single = html.card(rows[rows["seed"] == 2000])[1]
-    assert all(one.better is None and one.verdict == "no proof (1 seed)" and "±" not in one.change for one in single)
+    assert all(
+        one.better is None and one.verdict == "no proof (1 seed)" and "±" not in one.change
+        for one in single
+    )
 
 
 def test_names_are_escaped_and_several_folders_fit_on_a_page(evaluation, tmp_path, monkeypatch):
@@ -117,16 +132,23 @@ def test_names_are_escaped_and_several_folders_fit_on_a_page(evaluation, tmp_pat
     named = replace(run, scenario=replace(run.scenario, name=EVIL))
     path = html.write_page(tmp_path / "x.html", [named, run], seed=2001)
     page = path.read_text()
-    assert EVIL not in page and f"Traffic control in SUMO: {EVIL}" in Page(page).words
-    assert "seed 2001" in page and len(re.findall("<h2>", page)) == 2
+    assert EVIL not in page
+    assert f"Traffic control in SUMO: {EVIL}" in Page(page).words
+    assert "seed 2001" in page
+    assert len(re.findall("<h2>", page)) == 2
 
 
 @pytest.mark.parametrize(
     "arguments, expected",
-    [(("none",), "holds no finished runs"), ((".", "--seed", 7), "have no run with seed 7; choose from")],
+    [
+        (("none",), "holds no finished runs"),
+        ((".", "--seed", 7), "have no run with seed 7; choose from"),
+    ],
 )
 def test_error_lines(evaluation, tmp_path, monkeypatch, arguments, expected):
     monkeypatch.setattr(html, "_pictures", lambda *_: [])
     folder, *options = arguments
-    assert expected in error_line(cosim("report", evaluation / folder, *options, "--out", tmp_path / "x.html"))
+    assert expected in error_line(
+        cosim("report", evaluation / folder, *options, "--out", tmp_path / "x.html")
+    )
     assert not (tmp_path / "x.html").exists()

@@ -1,4 +1,5 @@
-"""Partitions: connected regions of similar density with boundaries at signals, and the user's own table."""
+"""Partitions: connected regions of similar density with boundaries at signals, and the user's own
+table."""
 
 from dataclasses import replace
 
@@ -17,7 +18,18 @@ from nmfd.errors import InputError
 def streets(tmp_path_factory):
     """A grid of 9 x 9 junctions, 150 m apart."""
     path = tmp_path_factory.mktemp("grid") / "grid.net.xml"
-    options = "--grid --grid.number 9 --grid.length 150 --no-turnarounds true --seed 1 --output-file".split()
+    options = [
+        "--grid",
+        "--grid.number",
+        "9",
+        "--grid.length",
+        "150",
+        "--no-turnarounds",
+        "true",
+        "--seed",
+        "1",
+        "--output-file",
+    ]
     tiny_city.run("netgenerate", *options, path)
     return read_streets(path)
 
@@ -51,7 +63,9 @@ def test_regions_are_connected_and_as_many_as_requested(streets, regions):
 
 def test_density_finds_the_congested_quarter(streets):
     congested = (streets.centre < 600.0).all(axis=1)
-    density = np.where(congested, 0.08, 0.01) * np.random.default_rng(0).uniform(0.5, 1.5, len(congested))
+    density = np.where(congested, 0.08, 0.01) * np.random.default_rng(0).uniform(
+        0.5, 1.5, len(congested)
+    )
     found = partition(streets, baseline(streets, density), 2)
     region = int(np.argmax(np.bincount(found[congested], minlength=2)))
     assert (found[congested] == region).mean() > 0.8
@@ -60,7 +74,8 @@ def test_density_finds_the_congested_quarter(streets):
 
 
 def test_boundaries_are_at_signals(streets):
-    """Half of the junctions have signals: more of the boundary is there than if none of these could be used."""
+    """Half of the junctions have signals: more of the boundary is there than if none of these could
+    be used."""
     at = streets.junctions[streets.links[:, 0], 1]
     signalled = np.random.default_rng(1).random(streets.junctions.max() + 1) < 0.5
     signals = tuple("s" if signalled[place] else None for place in at)
@@ -94,9 +109,12 @@ def test_a_region_without_return_goes_to_its_neighbour(tmp_path):
     )
     (tmp_path / "n.xml").write_text(f"<nodes>{nodes}</nodes>")
     (tmp_path / "e.xml").write_text(f"<edges>{edges}</edges>")
-    tiny_city.run("netconvert", "-n", tmp_path / "n.xml", "-e", tmp_path / "e.xml", "-o", tmp_path / "net.xml")
+    tiny_city.run(
+        "netconvert", "-n", tmp_path / "n.xml", "-e", tmp_path / "e.xml", "-o", tmp_path / "net.xml"
+    )
     streets = read_streets(tmp_path / "net.xml")
-    assert streets.core.sum() == 3 and streets.main_part.all()
+    assert streets.core.sum() == 3
+    assert streets.main_part.all()
     labels = np.array([{"in-a": 0, "b-out": 2}.get(edge, 1) for edge in streets.edges])
     assert set(finish(streets, labels)) == {0}
     labels = np.array([{"in-a": 0, "a-b": 0}.get(edge, 1) for edge in streets.edges])
@@ -110,7 +128,10 @@ def test_a_region_without_return_goes_to_its_neighbour(tmp_path):
         ("edge,region\nA0A1,x\n", "line 2: expected an edge and a region"),
         ("edge,region\nnone,0\n", "edge none is not in"),
         ("edge,region\nA0A1,0\nA0A1,1\n", "edge A0A1 appears twice"),
-        ("edge,region\nA0A1,0\nA1A2,2\n", "expected two or more regions 0, 1, ..., each with an edge"),
+        (
+            "edge,region\nA0A1,0\nA1A2,2\n",
+            "expected two or more regions 0, 1, ..., each with an edge",
+        ),
     ],
 )
 def test_mistakes_in_a_table_of_regions(streets, tmp_path, text, expected):

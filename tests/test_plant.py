@@ -1,4 +1,5 @@
-"""The SUMO plant: ledger, signals second by second, guidance, reproducibility. Small, seeded simulations of grid7."""
+"""The SUMO plant: ledger, signals second by second, guidance, reproducibility. Small, seeded
+simulations of grid7."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -30,7 +31,9 @@ def random_controls(scenario, random, *, guidance=False):
     perimeter = random.uniform(network.u_min - 0.2, network.u_max + 0.2, (network.regions,) * 2)
     perimeter = np.clip(perimeter, network.u_min, network.u_max)
     splits = random.random(network.split_mask.shape) * network.split_mask
-    splits /= np.where(splits.sum(axis=1, keepdims=True) > 0, splits.sum(axis=1, keepdims=True), 1.0)
+    splits /= np.where(
+        splits.sum(axis=1, keepdims=True) > 0, splits.sum(axis=1, keepdims=True), 1.0
+    )
     return Controls(perimeter=perimeter, splits=splits if guidance else None)
 
 
@@ -91,13 +94,20 @@ def test_the_samples_are_those_of_every_edge(scenario, plant_of):
         counts, speeds = sampler.last
         session, edges = plant.session, plant.city.edges
         assert counts.tolist() == [session.vehicle_count(edge) for edge in edges]
-        there = [[libsumo.vehicle.getSpeed(one) for one in session.vehicles_on(edge)] for edge in edges]
-        np.testing.assert_allclose(speeds, [np.mean(one) if one else 0.0 for one in there], atol=1e-9)
+        there = [
+            [libsumo.vehicle.getSpeed(one) for one in session.vehicles_on(edge)] for edge in edges
+        ]
+        np.testing.assert_allclose(
+            speeds, [np.mean(one) if one else 0.0 for one in there], atol=1e-9
+        )
         means = sampler.finish(np.full(len(edges), False))
         routed = [
-            libsumo.edge.getLastStepMeanSpeed(edge) if one else np.nan for edge, one in zip(edges, there, strict=True)
+            libsumo.edge.getLastStepMeanSpeed(edge) if one else np.nan
+            for edge, one in zip(edges, there, strict=True)
         ]
-        np.testing.assert_allclose(means.speed, routed)  # guidance goes by what SUMO's own drivers have
+        np.testing.assert_allclose(
+            means.speed, routed
+        )  # guidance goes by what SUMO's own drivers have
         assert means.production.sum() == pytest.approx(sum(map(sum, there)))
         on_junctions = [session.vehicles_on(edge) for edge in plant.city.inside]
         assert means.crossing.tolist() == [len(there) for there in on_junctions]
@@ -116,7 +126,8 @@ def test_the_samples_are_those_of_every_edge(scenario, plant_of):
         for _ in range(10):
             plant.session.step()
         compared()
-    assert 0 < min(asked) < max(asked) == len(plant.city.edges) and max(crossing) > 10
+    assert 0 < min(asked) < max(asked) == len(plant.city.edges)
+    assert max(crossing) > 10
 
 
 def test_teleporting_vehicles_stay_in_the_ledger(scenario, plant_of):
@@ -128,23 +139,27 @@ def test_teleporting_vehicles_stay_in_the_ledger(scenario, plant_of):
 
 
 def test_guided_vehicles_go_where_theta_sends_them(scenario, plant_of, monkeypatch):
-    """All vehicles in region 2 bound for 4 are sent through 0: with full compliance none leaves for 3 or 5, but for the
-    few who depart just before the stop line of a lane that leads there."""
+    """All vehicles in region 2 bound for 4 are sent through 0: with full compliance none leaves for
+    3 or 5, but for the few who depart just before the stop line of a lane that leads there."""
     monkeypatch.setitem(Guide.__init__.__kwdefaults__, "most_detour", 1e9)
     crossings, guided = sent_round(scenario, plant_of())
     assert guided > 15
-    assert crossings[0] >= 10 and crossings[0] > 0.8 * crossings.sum()
+    assert crossings[0] >= 10
+    assert crossings[0] > 0.8 * crossings.sum()
 
 
 def sent_round(scenario, plant):
-    """Vehicles in 2 bound for 4 that left for every region (R,), and those guided to 0, where theta sends all there."""
+    """Vehicles in 2 bound for 4 that left for every region (R,), and those guided to 0, where theta
+    sends all there."""
     network = scenario.network
     splits = network.nominal_splits.copy()
     splits[2, :, 4] = 0.0
     splits[2, 0, 4] = 1.0
     plant.reset(1)
     for _ in range(scenario.steps):
-        plant.step(Controls(perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=splits))
+        plant.step(
+            Controls(perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=splits)
+        )
     record = SimpleNamespace(**plant.record())
     return record.crossings.sum(axis=0)[2, :, 4], record.guided.sum(axis=0)[2, 0, 4]
 

@@ -1,4 +1,5 @@
-"""The two regional plants: conservation, what the acyclic one forbids, and their agreement without control."""
+"""The two regional plants: conservation, what the acyclic one forbids, and their agreement without
+control."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -37,11 +38,14 @@ def completions(network, accumulation):
 
 
 @pytest.mark.parametrize(
-    "network", [SCENARIO.network, LIMITED, tiny.mixed(LIMITED)], ids=["published", "limited", "mixed"]
+    "network",
+    [SCENARIO.network, LIMITED, tiny.mixed(LIMITED)],
+    ids=["published", "limited", "mixed"],
 )
 @pytest.mark.parametrize("make", [NmfdPlant, AcyclicPlant])
 def test_conservation_and_non_negativity_under_random_controls(make, network):
-    """Trip ends, integrated here from the states, account for every vehicle that is no longer there."""
+    """Trip ends, integrated here from the states, account for every vehicle that is no longer
+    there."""
     scenario, random = busy(0, network=network), np.random.default_rng(1)
     plant = make(scenario)
     measured, ended, entered = plant.reset(0), 0.0, 0.0
@@ -68,13 +72,17 @@ def test_non_negative_with_other_integrators(make, integrator, substeps):
 
 
 @pytest.mark.parametrize(
-    "network", [SCENARIO.network, LIMITED, tiny.mixed(LIMITED)], ids=["published", "limited", "mixed"]
+    "network",
+    [SCENARIO.network, LIMITED, tiny.mixed(LIMITED)],
+    ids=["published", "limited", "mixed"],
 )
 def test_without_control_both_plants_are_the_same(network):
     """Shortest ways never turn back."""
     scenario = replace(SCENARIO, network=network)
     controller = NoControl(planning_model(scenario))
-    nmfd, anmfd = (run(make(scenario), controller, scenario, seed=0) for make in (NmfdPlant, AcyclicPlant))
+    nmfd, anmfd = (
+        run(make(scenario), controller, scenario, seed=0) for make in (NmfdPlant, AcyclicPlant)
+    )
     assert total_time_spent(anmfd) == pytest.approx(total_time_spent(nmfd), rel=1e-3)
     np.testing.assert_allclose(anmfd.accumulation, nmfd.accumulation, rtol=0.0, atol=1e-6)
 
@@ -97,12 +105,17 @@ def test_no_way_leads_back_to_the_origin_or_the_previous_region():
 
 
 def test_shares_sum_to_one_and_are_theta_renormalised():
-    model, (_, splits) = acyclic.build(SCENARIO.network), random_controls(np.random.default_rng(5), SCENARIO.network)
+    model, (_, splits) = (
+        acyclic.build(SCENARIO.network),
+        random_controls(np.random.default_rng(5), SCENARIO.network),
+    )
     theta, forced = acyclic.shares(model, splits)
     sums = np.bincount(model.move_from, theta, minlength=len(model.region))
     np.testing.assert_allclose(sums, model.region != model.destination, atol=1e-12)
     # From 0 by way of 3 (o = g = 0, i = 3) to 6: 1, 2, 4, 5 and 6 are left, 0 is not.
-    here = (model.origin == 0) & (model.previous == 0) & (model.region == 3) & (model.destination == 6)
+    here = (
+        (model.origin == 0) & (model.previous == 0) & (model.region == 3) & (model.destination == 6)
+    )
     moves = here[model.move_from]
     expected = splits[3, model.move_next[moves], 6]
     assert sorted(model.move_next[moves]) == [1, 2, 4, 5, 6]
@@ -111,7 +124,8 @@ def test_shares_sum_to_one_and_are_theta_renormalised():
 
 
 def test_what_theta_leaves_no_way_on_is_forced_and_counted(tmp_path):
-    """In a row of regions 0-1-2, trips from 1 to 0 that are sent into the dead end 2 must turn back there."""
+    """In a row of regions 0-1-2, trips from 1 to 0 that are sent into the dead end 2 must turn back
+    there."""
     scenario = load_scenario(
         tiny.write(
             tmp_path,

@@ -58,15 +58,23 @@ def test_total_accumulation_counts_the_backlog(ax, scenario):
 
 
 def test_seeds_share_one_curve_and_controllers_do_not(ax, scenario):
-    plots.total_accumulation(ax, runs_of(scenario, controllers=("no-control", "dpc-pc"), seeds=(0, 1)))
+    plots.total_accumulation(
+        ax, runs_of(scenario, controllers=("no-control", "dpc-pc"), seeds=(0, 1))
+    )
     assert [line.get_label() for line in ax.lines] == ["no-control", "dpc-pc"]
-    assert [line.get_color() for line in ax.lines] == [plots.COLOURS["no-control"], plots.COLOURS["dpc-pc"]]
+    assert [line.get_color() for line in ax.lines] == [
+        plots.COLOURS["no-control"],
+        plots.COLOURS["dpc-pc"],
+    ]
 
 
 def test_plants_differ_in_line_style(ax, scenario):
     plots.region_accumulation(ax, scenario.network, 3, runs_of(scenario, plants=("sumo", "nmfd")))
     lines = ax.lines
-    assert [(line.get_label(), line.get_linestyle()) for line in lines] == [("SUMO", "-"), ("regional model", "--")]
+    assert [(line.get_label(), line.get_linestyle()) for line in lines] == [
+        ("SUMO", "-"),
+        ("regional model", "--"),
+    ]
     assert len({line.get_color() for line in lines}) == 1
     assert lines[0].get_ydata() == pytest.approx(70.0)
     assert "veh" in ax.get_ylabel()
@@ -75,7 +83,8 @@ def test_plants_differ_in_line_style(ax, scenario):
 def test_mfd_with_samples(ax, scenario):
     samples = {"loading": np.array([[1000.0, 3.0], [6000.0, 8.0]]), "unloading": np.empty((0, 2))}
     plots.mfd(ax, scenario.network.mfds[0], samples)
-    assert ax.get_ylim()[1] > 8.0 and ax.get_xlim()[1] > 6000.0
+    assert ax.get_ylim()[1] > 8.0
+    assert ax.get_xlim()[1] > 6000.0
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("accumulation [veh]", "outflow [veh/s]")
 
 
@@ -96,7 +105,13 @@ def test_scenario_without_demand(scenario):
 @pytest.mark.parametrize("width", [4, 8, 16])
 def test_the_legend_fits_the_figure(scenario, width):
     drawing = plots.figure(width, 4)
-    ax = plots.region_accumulation(drawing.subplots(), scenario.network, 3, runs_of(scenario, controllers=CONTROLLERS))
+    ax = plots.region_accumulation(
+        drawing.subplots(), scenario.network, 3, runs_of(scenario, controllers=CONTROLLERS)
+    )
     plots.legend_below(drawing, [ax], columns=8)
-    assert len(drawing.legends) == 1 and len(drawing.legends[0].get_texts()) == len(CONTROLLERS) + 1  # critical
-    assert drawing.legends[0].get_window_extent(drawing.canvas.get_renderer()).width <= drawing.bbox.width
+    assert len(drawing.legends) == 1
+    assert len(drawing.legends[0].get_texts()) == len(CONTROLLERS) + 1
+    assert (
+        drawing.legends[0].get_window_extent(drawing.canvas.get_renderer()).width
+        <= drawing.bbox.width
+    )

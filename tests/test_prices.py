@@ -23,7 +23,9 @@ def test_every_decoder_descends_the_total_time_spent():
     planning = planning_model(load_scenario("grid7_peak"), "dpc-pcrg", "dpc-pcrg+max-pressure")
     rollout = Rollout(planning, dtype=torch.float64)
     torch.manual_seed(0)
-    made = Policy(planning.network, Architecture(width=16, guidance=True, prices=True, metering=True)).double()
+    made = Policy(
+        planning.network, Architecture(width=16, guidance=True, prices=True, metering=True)
+    ).double()
     x, demand = rollout.random_start(4, 0.2, 1.0, torch.Generator().manual_seed(1))
 
     def total():
@@ -39,7 +41,8 @@ def test_every_decoder_descends_the_total_time_spent():
                 values.append(float(total()))
             decoder.bias.add_(1e-4 * way)
         expected = (values[0] - values[1]) / 2e-4
-        assert float((decoder.bias.grad * way).sum()) == pytest.approx(expected, rel=1e-3) and abs(expected) > 1.0
+        assert float((decoder.bias.grad * way).sum()) == pytest.approx(expected, rel=1e-3)
+        assert abs(expected) > 1.0
 
 
 def test_a_trained_network_closes_the_loop_and_its_trips_wait(tmp_path):
@@ -51,9 +54,12 @@ def test_a_trained_network_closes_the_loop_and_its_trips_wait(tmp_path):
     scenario = replace(scenario, demand=6.0 * scenario.demand)
     controller = parse("dpc-pcrg").make(scenario)
     run = closed_loop.run(NmfdPlant(scenario), controller, scenario, seed=0)
-    expected = controller.policy.prices(torch.from_numpy(run.observed[:-1]).float()).detach().numpy()
+    expected = (
+        controller.policy.prices(torch.from_numpy(run.observed[:-1]).float()).detach().numpy()
+    )
     np.testing.assert_allclose(run.prices, expected, rtol=1e-4)
-    assert run.prices.max() < 1.0 and run.backlog.max() > 1.0
+    assert run.prices.max() < 1.0
+    assert run.backlog.max() > 1.0
 
 
 def test_the_lower_bound_without_metering_is_not_that_of_a_policy_that_meters():
@@ -64,10 +70,16 @@ def test_the_lower_bound_without_metering_is_not_that_of_a_policy_that_meters():
 
 
 def test_mpc_of_grid7_has_the_outputs_of_the_policy():
-    """The script decides within its bounds, prices the filling centre most, and lets fewest trips begin there."""
+    """The script decides within its bounds, prices the filling centre most, and lets fewest trips
+    begin there."""
     scenario = replace(load_scenario("grid7_peak", {"demand_factor": 2.0}), steps=12)
-    strategy = parse(f"{scenario.folder}/price_mpc.py:PriceMpc+max-pressure+guidance-period-60+metering")
+    strategy = parse(
+        f"{scenario.folder}/price_mpc.py:PriceMpc+max-pressure+guidance-period-60+metering"
+    )
     x = run(scenario, "no-control").accumulation[12]
-    controls = strategy.make(scenario).act(Observation(step=12, time=1080.0, accumulation=x, backlog=0.0 * x))
-    assert controls.prices.argmax() == 3 and controls.prices[3] > 0.5
+    controls = strategy.make(scenario).act(
+        Observation(step=12, time=1080.0, accumulation=x, backlog=0.0 * x)
+    )
+    assert controls.prices.argmax() == 3
+    assert controls.prices[3] > 0.5
     assert controls.metering[3] < 3.0 < controls.metering[2]

@@ -1,4 +1,5 @@
-"""Published benchmarks: their curves, the greedy controller, cities that do not begin empty, published figures."""
+"""Published benchmarks: their curves, the greedy controller, cities that do not begin empty,
+published figures."""
 
 import runpy
 from dataclasses import replace
@@ -39,7 +40,9 @@ def begun(tmp_path):
 
 
 @pytest.mark.parametrize("plant", [NmfdPlant, AcyclicPlant])
-def test_the_noise_of_the_benchmark_is_a_standard_deviation_of_the_measurement_or_of_the_state(plant):
+def test_the_noise_of_the_benchmark_is_a_standard_deviation_of_the_measurement_or_of_the_state(
+    plant,
+):
     scenario = replace(load_scenario("economic_mpc"), steps=30, initial=np.full((7, 7), 100.0))
     assert (scenario.measurement_std, scenario.process_std) == (0.25, 0.0)
     moved = replace(scenario, measurement_std=0.0, process_std=0.25)
@@ -48,19 +51,25 @@ def test_the_noise_of_the_benchmark_is_a_standard_deviation_of_the_measurement_o
         for s, seed in ((scenario, 0), (moved, 0), (moved, 0), (moved, 1))
     )
     assert (quiet.observed - quiet.accumulation).std() == pytest.approx(0.25, rel=0.05)
-    assert (first.observed == first.accumulation).all() and (first.accumulation == again.accumulation).all()
-    assert (first.accumulation != noisy.accumulation).any() and first.accumulation.min() >= 0.0
+    assert (first.observed == first.accumulation).all()
+    assert (first.accumulation == again.accumulation).all()
+    assert (first.accumulation != noisy.accumulation).any()
+    assert first.accumulation.min() >= 0.0
     assert (first.accumulation - quiet.accumulation)[1].std() == pytest.approx(0.25, rel=0.3)
     assert scenario.hash != moved.hash != replace(moved, process_std=0.0).hash
 
 
 def test_the_benchmark_without_control():
-    """The reconstructed demand, and the published figures, which the constant outflow beyond the jam decides."""
+    """The reconstructed demand, and the published figures, which the constant outflow beyond the
+    jam decides."""
     scenario = load_scenario("economic_mpc")
     assert scenario.step * scenario.demand.sum() == pytest.approx(31_680)
     bare = tuple(replace(mfd, jam=1e9) for mfd in scenario.network.mfds)
     other = replace(scenario, network=replace(scenario.network, mfds=bare))
-    row, bare_row = (summary(run(NmfdPlant(s), make_controller("no-control", s), s, seed=0)) for s in (scenario, other))
+    row, bare_row = (
+        summary(run(NmfdPlant(s), make_controller("no-control", s), s, seed=0))
+        for s in (scenario, other)
+    )
     assert row["total_time_spent_veh_s"] == pytest.approx(1.773e8, rel=0.005)
     assert row["final_accumulation_veh"] == pytest.approx(25_526, rel=0.01)
     assert bare_row["final_accumulation_veh"] < 0.9 * 25_526
@@ -69,7 +78,10 @@ def test_the_benchmark_without_control():
 def seen(inside):
     """A measurement with so many vehicles in every region."""
     return Observation(
-        step=0, time=0.0, accumulation=np.diag(np.array(inside, dtype=float)), backlog=np.zeros((len(inside),) * 2)
+        step=0,
+        time=0.0,
+        accumulation=np.diag(np.array(inside, dtype=float)),
+        backlog=np.zeros((len(inside),) * 2),
     )
 
 
@@ -79,7 +91,8 @@ def test_the_curve_of_2013():
         n = np.array([500.0, 3400.0, 5400.0, 10000.0])
         printed = (1.4877e-7 * n**3 - 2.9815e-3 * n**2 + 15.0912 * n) / 3600.0
         np.testing.assert_allclose(mfd.outflow(n), printed, rtol=1e-6)
-        assert mfd.critical == pytest.approx(3400.0, abs=10.0) and mfd.capacity == pytest.approx(6.3, abs=0.05)
+        assert mfd.critical == pytest.approx(3400.0, abs=10.0)
+        assert mfd.capacity == pytest.approx(6.3, abs=0.05)
 
 
 @pytest.mark.parametrize(
@@ -99,7 +112,8 @@ def test_greedy_decides_by_table_1(two_regions, inside, u12, u21):
 
 
 def test_greedy_closes_the_way_into_the_fuller_of_two_by_their_own_jam():
-    """Of congested neighbours it is the one nearer to its jam, which need not hold more vehicles."""
+    """Of congested neighbours it is the one nearer to its jam, which need not hold more
+    vehicles."""
     scenario = load_scenario("economic_mpc")
     mfds = list(scenario.network.mfds)
     mfds[3] = replace(mfds[3], a=16 * mfds[3].a, b=4 * mfds[3].b, jam=0.25 * mfds[3].jam)
@@ -112,7 +126,9 @@ def test_greedy_closes_the_way_into_the_fuller_of_two_by_their_own_jam():
 
 def test_greedy_does_what_the_paper_has_it_do(two_regions):
     """Published: n1(590) = n2(590) = 4125, and 17.07 thousand trips completed in the hour."""
-    trajectory = run(NmfdPlant(two_regions), make_controller("greedy", two_regions), two_regions, seed=0)
+    trajectory = run(
+        NmfdPlant(two_regions), make_controller("greedy", two_regions), two_regions, seed=0
+    )
     assert trajectory.completed[-1] == pytest.approx(17070.0, rel=0.01)
     n1, n2 = trajectory.accumulation.sum(axis=2).T
     assert (n1[0], n2[0]) == (5400.0, 4000.0)
@@ -129,11 +145,15 @@ def test_trips_of_2018():
     assert (trips * crossed).sum() * 3600.0 == pytest.approx(3.87e8, rel=1e-3)
 
 
-@pytest.mark.parametrize("name, arguments", [("seven_region_2018", (240, 35833.33)), ("economic_mpc_figure4", (30,))])
+@pytest.mark.parametrize(
+    "name, arguments", [("seven_region_2018", (240, 35833.33)), ("economic_mpc_figure4", (30,))]
+)
 def test_demand_files_are_what_the_script_writes(name, arguments):
     scenario = load_scenario(name)
     written = np.zeros_like(scenario.demand)
-    for k, i, j, rate in runpy.run_path(str(SCENARIOS / "seven_region_2018" / "demand.py"))["table"](*arguments):
+    for k, i, j, rate in runpy.run_path(str(SCENARIOS / "seven_region_2018" / "demand.py"))[
+        "table"
+    ](*arguments):
         written[k, i, j] = rate
     np.testing.assert_allclose(scenario.demand, written, atol=1e-9)
 
@@ -146,7 +166,8 @@ def test_the_demand_of_figure_4_gives_the_published_row_without_control():
 
 
 def test_drivers_of_2018_prefer_the_fastest_way():
-    """In the empty city most go straight through the centre; with that jammed hardly anybody does."""
+    """In the empty city most go straight through the centre; with that jammed hardly anybody
+    does."""
     scenario = load_scenario("seven_region_2018")
     made = make_controller(f"{SCENARIOS / 'seven_region_2018' / 'logit.py'}:LogitDrivers", scenario)
     for inside, least, most in ((0.0, 0.9, 1.0), (9000.0, 0.0, 0.05)):
@@ -182,23 +203,31 @@ def test_a_city_that_does_not_begin_empty(begun, plant):
     np.testing.assert_array_equal(trajectory.accumulation[0], [[0.0, 100.0], [0.0, 50.0]])
     assert trajectory.accumulation[-1].sum() + trajectory.completed[-1] == pytest.approx(150.0)
     assert trajectory.completed[-1] > 50.0
-    assert (quiet.start == begun.initial).all() and quiet.hash != replace(quiet, initial=None).hash
+    assert (quiet.start == begun.initial).all()
+    assert quiet.hash != replace(quiet, initial=None).hash
 
 
 def test_policies_are_trained_and_bounds_sought_from_the_same_start(begun):
     quiet = replace(begun, demand=0.0 * begun.demand, measurement_std=0.0)
     planning = planning_model(quiet)
-    assert planning.destinations.tolist() == [False, True]  # nobody starts, but they are bound for somewhere
+    assert planning.destinations.tolist() == [
+        False,
+        True,
+    ]  # nobody starts, but they are bound for somewhere
     x, _ = Rollout(planning).random_start(3, 0.0, 0.0, torch.Generator())
     np.testing.assert_array_equal(x[2], quiet.initial)
     gates, splits = bound.neutral_starts(quiet.network, quiet.steps, guidance=False)["open"]
     controls = (torch.tensor(values).unsqueeze(1) for values in (gates, splits))
     (total,) = bound._total_time_spent(quiet, dynamics.parameters(quiet.network), *controls)
-    uncontrolled = total_time_spent(run(NmfdPlant(quiet), make_controller("no-control", quiet), quiet, seed=0))
+    uncontrolled = total_time_spent(
+        run(NmfdPlant(quiet), make_controller("no-control", quiet), quiet, seed=0)
+    )
     assert float(total) == pytest.approx(uncontrolled, rel=1e-12)
     assert make_controller("mpc-pc", quiet).act(seen([100.0, 50.0])).note == ""
 
 
 def test_sumo_begins_empty(begun):
-    with pytest.raises(InputError, match="scenario.toml: initial: a city in SUMO begins empty; remove it"):
+    with pytest.raises(
+        InputError, match="scenario.toml: initial: a city in SUMO begins empty; remove it"
+    ):
         settings(begun)

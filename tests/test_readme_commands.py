@@ -1,4 +1,5 @@
-"""The commands of all READMEs run one after another, in reduced sizes; those of the notebooks in test_tutorials.py."""
+"""The commands of all READMEs run one after another, in reduced sizes; those of the notebooks in
+test_tutorials.py."""
 
 import shutil
 from pathlib import Path
@@ -29,14 +30,19 @@ NOT_RUN = {  # what takes long or needs more, and where it is tested
     "cosim demo": "test_demo.py",
     "nmfd identify": "test_measured.py",
 }
-LONG = ("scenarios/grid7_peak", "networks/grid7", "scenarios/demo")  # whose loading runs and training take minutes
+LONG = (
+    "scenarios/grid7_peak",
+    "networks/grid7",
+    "scenarios/demo",
+)  # whose loading runs and training take minutes
 FIRST = ["README.md", "nmfd/README.md", "cosim/README.md"]  # with every controller that they name
 HERE = [
     str(file.relative_to(ROOT).as_posix())
     for file in FILES
     if file not in NOTEBOOKS
     and any(
-        words[0] in MAINS and "..." not in words and " ".join(words[:2]) not in NOT_RUN for words in read(file).commands
+        words[0] in MAINS and "..." not in words and " ".join(words[:2]) not in NOT_RUN
+        for words in read(file).commands
     )
 ]
 
@@ -50,8 +56,8 @@ def reduced(name: str, kind: str, words: list[str]) -> list[str]:
 
 
 def instead(words: list[str]) -> list[str]:
-    """The tiny city stands for one that the project does not have, its own demand for one that is made, which takes
-    minutes (test_import.py makes one); what was made of an earlier one goes."""
+    """The tiny city stands for one that the project does not have, its own demand for one that is
+    made, which takes minutes (test_import.py makes one); what was made of an earlier one goes."""
     city, out = Path(words[0]), Path(words[words.index("--out") + 1])
     for folder in (out, Path("scenarios", out.name), Path("runs")):
         shutil.rmtree(folder, ignore_errors=True)
@@ -69,16 +75,22 @@ def test_the_commands_run(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for folder in ("networks", "scenarios"):
         shutil.copytree(
-            ROOT / folder, tmp_path / folder, ignore=shutil.ignore_patterns("reference", "tutorials", "*.md", "ppo.*")
+            ROOT / folder,
+            tmp_path / folder,
+            ignore=shutil.ignore_patterns("reference", "tutorials", "*.md", "ppo.*"),
         )
     tiny_city.city(tmp_path)  # city.sumocfg
     done, ran = set(), 0
-    for program, command, *words in (words for words in read(ROOT / name).commands if words[0] in MAINS):
+    for program, command, *words in (
+        words for words in read(ROOT / name).commands if words[0] in MAINS
+    ):
         if (kind := f"{program} {command}") in NOT_RUN or "..." in words:
             continue
         assert kind in REDUCED, f"{kind}: say in REDUCED or NOT_RUN whether it is run here"
         shape = (kind, *sorted(word for word in words if word.startswith("--")), words[0])
-        if (shape in done and command != "import") or (command in ("identify", "train") and words[0] in LONG):
+        if (shape in done and command != "import") or (
+            command in ("identify", "train") and words[0] in LONG
+        ):
             continue
         if command == "import":
             words = instead(words)
@@ -90,5 +102,6 @@ def test_the_commands_run(name, tmp_path, monkeypatch):
 
 def test_what_is_not_run_here_is_tested_elsewhere():
     there = [kind.split() for kind in NOT_RUN if kind.split()[1] in MAINS[kind.split()[0]].commands]
-    assert there and all((ROOT / "tests" / NOT_RUN[" ".join(kind)]).is_file() for kind in there)
+    assert there
+    assert all((ROOT / "tests" / NOT_RUN[" ".join(kind)]).is_file() for kind in there)
     assert not set(NOT_RUN) & set(REDUCED)

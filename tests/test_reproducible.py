@@ -1,4 +1,5 @@
-"""The same seed gives the same bytes: in this process and in others, one run at a time and with workers."""
+"""The same seed gives the same bytes: in this process and in others, one run at a time and with
+workers."""
 
 import os
 import subprocess
@@ -25,15 +26,34 @@ def elsewhere(program, *arguments):
 
 def test_benchmarks(tmp_path):
     scenario = tiny.write(tmp_path)
-    command = ("benchmark", scenario, "--controllers", "mpc-pcrg,probing-pcrg", "--plant", "acyclic", "--out")
+    command = (
+        "benchmark",
+        scenario,
+        "--controllers",
+        "mpc-pcrg,probing-pcrg",
+        "--plant",
+        "acyclic",
+        "--out",
+    )
     good(nmfd(*command, tmp_path / "a"))
     elsewhere("nmfd", *command, tmp_path / "b")
-    assert same(runs(tmp_path / "a"), runs(tmp_path / "b")) and len(runs(tmp_path / "a")) == 2
+    assert same(runs(tmp_path / "a"), runs(tmp_path / "b"))
+    assert len(runs(tmp_path / "a")) == 2
 
 
 @pytest.mark.slow
 def test_trainings(tmp_path):
-    command = ("train", tiny.write(tmp_path), "--controller", "dpc-pcrg", "--steps", 4, "--device", "cpu", "--out")
+    command = (
+        "train",
+        tiny.write(tmp_path),
+        "--controller",
+        "dpc-pcrg",
+        "--steps",
+        4,
+        "--device",
+        "cpu",
+        "--out",
+    )
     good(nmfd(*command, tmp_path / "a.pt"))
     elsewhere("nmfd", *command, tmp_path / "b.pt")
     assert (tmp_path / "a.pt").read_bytes() == (tmp_path / "b.pt").read_bytes()
@@ -42,16 +62,35 @@ def test_trainings(tmp_path):
 @pytest.fixture(scope="module")
 def city(tmp_path_factory):
     folder = tmp_path_factory.mktemp("city")
-    good(cosim("import", tiny_city.city(folder), "--regions", 3, "--out", folder / "networks" / "tiny"))
+    good(
+        cosim(
+            "import", tiny_city.city(folder), "--regions", 3, "--out", folder / "networks" / "tiny"
+        )
+    )
     return folder / "scenarios" / "tiny"
 
 
 @pytest.mark.slow
 def test_runs_in_sumo_and_workers(city, tmp_path):
-    """Two runs in this process, one after the other, and the same two side by side in processes of their own."""
+    """Two runs in this process, one after the other, and the same two side by side in processes of
+    their own."""
     names = ("route-guidance+rerouting-50", "probing-pcrg")
     for name in names:
-        good(cosim("run", city, "--controller", name, "--seed", 5, "--steps", 3, "--out", tmp_path / "a"))
+        good(
+            cosim(
+                "run",
+                city,
+                "--controller",
+                name,
+                "--seed",
+                5,
+                "--steps",
+                3,
+                "--out",
+                tmp_path / "a",
+            )
+        )
     both = f"--controller {names[0]} --against {names[1]} --seed 5 --steps 3".split()
     good(cosim("run", city, *both, "--out", tmp_path / "b"))
-    assert same(runs(tmp_path / "a"), runs(tmp_path / "b")) and len(runs(tmp_path / "a")) == 2
+    assert same(runs(tmp_path / "a"), runs(tmp_path / "b"))
+    assert len(runs(tmp_path / "a")) == 2

@@ -1,4 +1,5 @@
-"""Signals that SUMO actuates: held back and rationed, with yellow and minimum green; untouched elsewhere."""
+"""Signals that SUMO actuates: held back and rationed, with yellow and minimum green; untouched
+elsewhere."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -34,7 +35,15 @@ def imported(folder, name, *options, signals):
     tiny_city.network(folder, *signals)
     (folder / "cars.rou.xml").write_text(CARS)
     (folder / "city.sumocfg").write_text(CONFIG)
-    done = cosim("import", folder / "city.sumocfg", "--regions", 2, "--out", folder / "networks" / name, *options)
+    done = cosim(
+        "import",
+        folder / "city.sumocfg",
+        "--regions",
+        2,
+        "--out",
+        folder / "networks" / name,
+        *options,
+    )
     assert done.exit_code == 0, done.output + str(done.exception)
     return folder / "scenarios" / name
 
@@ -56,14 +65,19 @@ def opened(town):
 
 
 def drive(folder, gates, faults=(), **overrides):
-    """A run under u = gates[k] in interval k: what every signal shows second by second, and more."""
+    """A run under u = gates[k] in interval k: what every signal shows second by second, and
+    more."""
     scenario = replace(load_scenario(folder), steps=len(gates), faults=tuple(faults))
-    plant = SumoPlant(scenario, settings=settings(scenario).changed(**({"chain_limit": 0.0} | overrides)))
+    plant = SumoPlant(
+        scenario, settings=settings(scenario).changed(**({"chain_limit": 0.0} | overrides))
+    )
     try:
         plant.reset(1)
         shown = watched(plant)
         for gate in gates:
-            plant.step(Controls(perimeter=np.where(scenario.network.adjacency, gate, 0.0), splits=None))
+            plant.step(
+                Controls(perimeter=np.where(scenario.network.adjacency, gate, 0.0), splits=None)
+            )
         return SimpleNamespace(
             shown=shown,
             record=SimpleNamespace(**plant.record()),
@@ -78,27 +92,39 @@ def drive(folder, gates, faults=(), **overrides):
 def test_gateways_of_actuated_signals_are_controlled(town):
     """The table tells them from fixed ones and from missing ones."""
     kind, scenario = town
-    gateways = pd.read_csv(scenario.parents[1] / "networks" / "town" / "gateways.csv", keep_default_na=False)
-    assert set(zip(gateways.control, gateways.kind, strict=True)) == {("controlled", kind), ("no signal", "")}
+    gateways = pd.read_csv(
+        scenario.parents[1] / "networks" / "town" / "gateways.csv", keep_default_na=False
+    )
+    assert set(zip(gateways.control, gateways.kind, strict=True)) == {
+        ("controlled", kind),
+        ("no signal", ""),
+    }
 
 
 def test_held_back(town, opened):
     """Less flow at u_min, and the minimum green; given back to SUMO afterwards."""
     run = drive(town[1], [0.1, 0.1, 0.5, 0.9, 0.9, 0.9])
-    assert run.leaks and all(gateway.signal is None for gateway in run.leaks)
+    assert run.leaks
+    assert all(gateway.signal is None for gateway in run.leaks)
     reached = ~np.isnan(run.record.gateway_green[0])
     green, free = run.record.gateway_green[:, reached], opened.record.gateway_green[:, reached]
-    assert (green[1] <= MIN_GREEN + 1.0).all() and (free[1] > 2 * MIN_GREEN).all()
-    assert (green[2] > MIN_GREEN + 1.0).any() and (green[-1] > 2 * MIN_GREEN).all()
+    assert (green[1] <= MIN_GREEN + 1.0).all()
+    assert (free[1] > 2 * MIN_GREEN).all()
+    assert (green[2] > MIN_GREEN + 1.0).any()
+    assert (green[-1] > 2 * MIN_GREEN).all()
     assert run.record.gateway_flow[1].sum() < 0.5 * opened.record.gateway_flow[1].sum()
-    assert set(run.programmes.values()) == {"0"}  # not "online", as signals that are told their states
+    assert set(run.programmes.values()) == {
+        "0"
+    }  # not "online", as signals that are told their states
 
 
 def test_open_gates_leave_sumo_s_own_signals_to_the_byte(town, opened):
     """As if no gateway signal could be held."""
     alone = drive(town[1], [0.9] * 4, leave_signals=tuple(opened.shown))
-    assert opened.shown == alone.shown and (opened.record.edge_vehicles == alone.record.edge_vehicles).all()
-    assert np.isnan(alone.record.gateway_green).all() and not np.isnan(opened.record.gateway_green).all()
+    assert opened.shown == alone.shown
+    assert (opened.record.edge_vehicles == alone.record.edge_vehicles).all()
+    assert np.isnan(alone.record.gateway_green).all()
+    assert not np.isnan(opened.record.gateway_green).all()
 
 
 def test_rationed_under_max_pressure(town, opened):
@@ -118,7 +144,8 @@ def test_a_deaf_signal_runs_its_own_programme_and_can_be_held_again(town):
     )
     green = run.record.gateway_green[:, [n for n, g in enumerate(run.gateways) if g.signal == "B2"]]
     held = ~np.isnan(green[0])
-    assert (green[[0, 2]][:, held] <= MIN_GREEN + 1.0).all() and (green[1, held] > 2 * MIN_GREEN).all()
+    assert (green[[0, 2]][:, held] <= MIN_GREEN + 1.0).all()
+    assert (green[1, held] > 2 * MIN_GREEN).all()
 
 
 @pytest.fixture(scope="module")
@@ -143,7 +170,9 @@ def places(tmp_path_factory):
         ("evaluate", "pi-gating+max-pressure", "bare", "max-pressure needs signals"),
     ],
 )
-def test_what_cannot_run_here_is_refused_before_the_first_run(places, tmp_path, monkeypatch, command, name, city, said):
+def test_what_cannot_run_here_is_refused_before_the_first_run(
+    places, tmp_path, monkeypatch, command, name, city, said
+):
     """One line that names it, though another strategy comes first; nothing is written."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.py").write_text(tiny.CONTROLLER)
@@ -154,5 +183,6 @@ def test_what_cannot_run_here_is_refused_before_the_first_run(places, tmp_path, 
     )
     done = cosim(command, places[city], *names, "--steps", 1, "--out", "out")
     assert done.exit_code != 0 and len(done.stderr.strip().splitlines()) == 1, done.stderr
-    assert f"controller {name} cannot run here: " in done.stderr and said in done.stderr
+    assert f"controller {name} cannot run here: " in done.stderr
+    assert said in done.stderr
     assert not (tmp_path / "out").exists()

@@ -1,4 +1,5 @@
-"""Environments for reinforcement learning: the libraries' own checks, and agreement with the closed loop."""
+"""Environments for reinforcement learning: the libraries' own checks, and agreement with the closed
+loop."""
 
 import subprocess
 import sys
@@ -46,7 +47,8 @@ def gymnasium_check(env):
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", ".*not within.*|.*recommend.*")
         check_env(env, skip_render_check=True, skip_close_check=True)
-    assert np.isfinite(env.observation_space.low).all() and np.isfinite(env.observation_space.high).all()
+    assert np.isfinite(env.observation_space.low).all()
+    assert np.isfinite(env.observation_space.high).all()
     env.close()
 
 
@@ -74,13 +76,16 @@ def test_gymnasium_and_pettingzoo_accept_sumo(peak):
 @pytest.mark.parametrize("modules", ["nmfd, gymnasium", "gymnasium, nmfd", "nmfd.rl, gymnasium"])
 def test_environments_have_names_in_any_order_of_imports(modules):
     code = f"import {modules}; gymnasium.make('nmfd/Hexagon7-v0').reset(seed=1)"
-    done = subprocess.run([sys.executable, "-W", "error::UserWarning", "-c", code], capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-W", "error::UserWarning", "-c", code], capture_output=True, text=True
+    )
     assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_environments_have_names(scenario):
     env = gymnasium.make("nmfd/Hexagon7-v0", guidance=True)
-    assert env.reset(seed=1)[0] in env.observation_space and env.unwrapped.interface.action_size > 24
+    assert env.reset(seed=1)[0] in env.observation_space
+    assert env.unwrapped.interface.action_size > 24
     for _ in range(30):
         seen, *_ = env.step(env.action_space.sample())
         assert seen in env.observation_space
@@ -92,7 +97,10 @@ def test_environments_have_names(scenario):
 def test_every_action_is_admissible_and_reaches_the_bounds(hexagon, guidance):
     interface, network = rl.Interface(hexagon.network, guidance=guidance), hexagon.network
     random = np.random.default_rng(0)
-    for action in (random.uniform(-1.3, 1.3, interface.action_size), np.ones(interface.action_size)):
+    for action in (
+        random.uniform(-1.3, 1.3, interface.action_size),
+        np.ones(interface.action_size),
+    ):
         controls = interface.controls(action)
         perimeter, splits = controls.perimeter, controls.splits
         assert (perimeter[~network.adjacency] == 0).all()
@@ -126,10 +134,16 @@ def test_agents_together_do_what_one_agent_does(hexagon):
     one.reset(seed=3), many.reset(seed=3)
     random = np.random.default_rng(0)
     for _ in range(30):
-        actions = {agent: random.uniform(-1, 1, i.action_size) for agent, i in many.interfaces.items()}
-        # The order of boundaries and ways goes by region: the joint action is that of the agents, one after another.
+        actions = {
+            agent: random.uniform(-1, 1, i.action_size) for agent, i in many.interfaces.items()
+        }
+        # The order of boundaries and ways goes by region: the joint action is that of the agents,
+        # one after another.
         boundaries = [int(hexagon.network.adjacency[n].sum()) for n in range(7)]
-        parts = [np.split(action, [count]) for action, count in zip(actions.values(), boundaries, strict=True)]
+        parts = [
+            np.split(action, [count])
+            for action, count in zip(actions.values(), boundaries, strict=True)
+        ]
         joint = np.concatenate([*(first for first, _ in parts), *(second for _, second in parts)])
         seen, reward, *_ = one.step(joint)
         _, rewards, *_ = many.step(actions)
@@ -143,7 +157,9 @@ def test_an_action_that_is_no_number_is_named(hexagon):
     action = np.zeros(one.interface.action_size)
     one.step(action)
     action[30] = np.nan
-    with pytest.raises(InputError, match=r"^RegionalEnv: interval 1: action\[30\]: expected a number from -1 to 1"):
+    with pytest.raises(
+        InputError, match=r"^RegionalEnv: interval 1: action\[30\]: expected a number from -1 to 1"
+    ):
         one.step(action)
     with pytest.raises(InputError, match=r"^region_2: interval 0: action\[0\]: expected a number"):
         many.step({"region_2": np.full(many.interfaces["region_2"].action_size, np.nan)})

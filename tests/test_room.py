@@ -19,14 +19,17 @@ from nmfd.controllers.rules import PiGating
 from nmfd.model.planning import planning_model
 from nmfd.types import Controls, Observation
 
-# Streets a and b lead to the gateways a -> x and b -> y; c, which has a signal at its end, d and e lead to a.
+# Streets a and b lead to the gateways a -> x and b -> y; c, which has a signal at its end, d and e
+# lead to a.
 TOWN = streets.city(
     dict.fromkeys("abcde", 0) | {"x": 1, "y": 1},
     {"a": "x", "b": "y", "c": "a", "d": "a", "e": "d", "x": "", "y": ""},
     length={"a": 150.0, "b": 150.0, "c": 75.0, "d": 300.0, "e": 75.0, "x": 75.0, "y": 75.0},
     signals={"a": "s", "b": "s", "c": "t"},
     gateways=tuple(
-        Gateway(source=0, target=1, from_edge=one, to_edge=other, signal="s", links=(n,), lanes=(0,))
+        Gateway(
+            source=0, target=1, from_edge=one, to_edge=other, signal="s", links=(n,), lanes=(0,)
+        )
         for n, (one, other) in enumerate((("a", "x"), ("b", "y")))
     ),
 )
@@ -46,11 +49,18 @@ def vehicles(**counts):
 @pytest.mark.parametrize("seed", range(20))
 def test_the_mean_by_capacity_is_the_command_unless_floors_let_more_through(seed):
     random = np.random.default_rng(seed)
-    urgency, floor, capacity = random.uniform(-1, 1, 7), random.uniform(0, 0.5, 7), random.uniform(1, 9, 7)
+    urgency, floor, capacity = (
+        random.uniform(-1, 1, 7),
+        random.uniform(0, 0.5, 7),
+        random.uniform(1, 9, 7),
+    )
     for share in (0.0, 0.1, 0.4, 0.9, 1.0):
         given = shared(share, urgency, floor, capacity)
-        assert np.average(given, weights=capacity) == pytest.approx(max(share, np.average(floor, weights=capacity)))
-        assert (given >= floor).all() and (given <= 1.0).all()
+        assert np.average(given, weights=capacity) == pytest.approx(
+            max(share, np.average(floor, weights=capacity))
+        )
+        assert (given >= floor).all()
+        assert (given <= 1.0).all()
         order = np.argsort(urgency)
         free = (given > floor)[order] & (given < 1.0)[order]
         assert (np.diff(given[order][free]) >= -1e-12).all()
@@ -58,7 +68,8 @@ def test_the_mean_by_capacity_is_the_command_unless_floors_let_more_through(seed
 
 def test_the_chain_ends_at_a_signal_and_400_m_before_the_gateway():
     nearer = replace(TOWN, length={**TOWN.length, "d": 200.0})
-    assert upstream(TOWN, "a") == ["a", "d"] and upstream(TOWN, "b") == ["b"]
+    assert upstream(TOWN, "a") == ["a", "d"]
+    assert upstream(TOWN, "b") == ["b"]
     assert upstream(nearer, "a") == ["a", "d", "e"]
 
 
@@ -70,7 +81,8 @@ def test_the_fuller_gateway_gets_more_and_a_full_one_is_open():
     assert gates.share == pytest.approx([0.5 - 0.15, 0.5 + 0.15])
     gates = room(on_lanes=(12, 0))  # 0.6 of its lane
     gates.command(np.zeros((2, 2)), vehicles(a=12))
-    assert gates.share == pytest.approx([1.0, 0.0]) and gates.realised()[0, 1] == pytest.approx(0.5)
+    assert gates.share == pytest.approx([1.0, 0.0])
+    assert gates.realised()[0, 1] == pytest.approx(0.5)
     gates = room()  # the same in the street before, and one gateway without a command
     gates.command(np.zeros((2, 2)), vehicles(d=27))
     assert gates.share == pytest.approx([0.5, 0.0])  # 27 of 60 places: half-way between 0.3 and 0.6
@@ -89,20 +101,31 @@ def test_realised_is_the_mean_since_the_command():
 
 @pytest.fixture(scope="module")
 def town(tmp_path_factory):
-    return imported(tmp_path_factory.mktemp("room") / "x", "town", signals=("--tls.set", "B1,B2,C1,C2"))
+    return imported(
+        tmp_path_factory.mktemp("room") / "x", "town", signals=("--tls.set", "B1,B2,C1,C2")
+    )
 
 
 @pytest.mark.parametrize("limit, held", [(0.6, True), (0.0, False)])
 def test_no_command_fills_the_street_before_a_gateway(town, limit, held):
     scenario = replace(load_scenario(town), steps=4)
-    with closing(SumoPlant(scenario, settings=settings(scenario).changed(chain_limit=limit))) as plant:
+    with closing(
+        SumoPlant(scenario, settings=settings(scenario).changed(chain_limit=limit))
+    ) as plant:
         plant.reset(1)
-        closed = Controls(perimeter=np.where(scenario.network.adjacency, scenario.network.u_min, 0.0), splits=None)
+        closed = Controls(
+            perimeter=np.where(scenario.network.adjacency, scenario.network.u_min, 0.0), splits=None
+        )
         realised = [plant.step(closed) for _ in range(4)][-1].realised
         record, streets = plant.record(), plant.city.edges
-        before = [streets.index(gateway.from_edge) for gateway in plant.city.gateways if gateway.signal]
-        assert (record["edge_vehicles"][:, before].max() < 0.75 * 2 * 200.0 / 7.5) == held  # room of two lanes
-        assert (record["gateway_command"] == 0.0).all() and (record["gateway_share"].max() > 0.3) == held
+        before = [
+            streets.index(gateway.from_edge) for gateway in plant.city.gateways if gateway.signal
+        ]
+        assert (
+            record["edge_vehicles"][:, before].max() < 0.75 * 2 * 200.0 / 7.5
+        ) == held  # room of two lanes
+        assert (record["gateway_command"] == 0.0).all()
+        assert (record["gateway_share"].max() > 0.3) == held
         assert realised.max() > scenario.network.u_min + 0.05 if held else realised is None
 
 
@@ -115,7 +138,9 @@ def test_the_integral_goes_on_from_what_was_realised():
     entries = network.adjacency[:, 3]
     realised = np.where(network.adjacency, network.u_max, 0.0)
     realised[entries, 3] = np.linspace(0.3, 0.7, entries.sum())
-    seen = Observation(step=1, time=30.0, accumulation=accumulation, backlog=accumulation, realised=realised)
+    seen = Observation(
+        step=1, time=30.0, accumulation=accumulation, backlog=accumulation, realised=realised
+    )
     assert controller.act(seen).perimeter[entries, 3] == pytest.approx(0.5)
 
 

@@ -1,4 +1,5 @@
-"""Results and their files; many runs in a folder: nothing half-written, resumable, the same numbers everywhere."""
+"""Results and their files; many runs in a folder: nothing half-written, resumable, the same numbers
+everywhere."""
 
 import errno
 import json
@@ -34,12 +35,16 @@ from nmfd.types import VARIABLES, Controls, Result
 
 
 def test_a_result_is_read_as_it_was_written(tmp_path):
-    original = trajectories.recorded(trajectory(), trajectories.record(4, regions=2), {"co2_kg": 3.25, "notes": ""})
+    original = trajectories.recorded(
+        trajectory(), trajectories.record(4, regions=2), {"co2_kg": 3.25, "notes": ""}
+    )
     original.write(tmp_path / "a.nc")
     back = Result.read(tmp_path / "a.nc")
     xr.testing.assert_identical(back.data, original.data)
     assert (back.controller, back.plant, back.seed, back.step) == ("no-control", "nmfd", 0, 30.0)
-    assert back.co2_kg == 3.25 and back.gateway_flow.shape == (4, 3) and list(back.note) == ["", "", "", "no"]
+    assert back.co2_kg == 3.25
+    assert back.gateway_flow.shape == (4, 3)
+    assert list(back.note) == ["", "", "", "no"]
     assert list(tmp_path.iterdir()) == [tmp_path / "a.nc"]
     assert pickle.loads(pickle.dumps(back)).seed == 0
     with pytest.raises(AttributeError, match="nothing"):
@@ -49,7 +54,8 @@ def test_a_result_is_read_as_it_was_written(tmp_path):
 def test_the_same_run_is_the_same_but_for_times():
     one = trajectory()
     other = one.assign(decision_time=2.0 * one.decision_time, wall_time=7.0)
-    assert not one.data.identical(other.data) and one.without_times().identical(other.without_times())
+    assert not one.data.identical(other.data)
+    assert one.without_times().identical(other.without_times())
     assert not one.without_times().identical(trajectory(seed=1).without_times())
 
 
@@ -66,20 +72,29 @@ def test_xarray_opens_a_run_with_names_and_units(tmp_path):
         for name, values in data.variables.items():
             assert values.attrs["long_name"] and ("units" in values.attrs or name == "note"), name
         assert list(data["status"].values) == [0, 0, 0, 3]  # a solver failure and a fallback
-        assert list(data["time"].values) == [0.0, 30.0, 60.0, 90.0, 120.0] and data["time"].attrs["units"] == "s"
-        assert float(data["accumulation"].sel(time=60.0, region=1, destination=0)) == original.accumulation[2, 1, 0]
+        assert list(data["time"].values) == [0.0, 30.0, 60.0, 90.0, 120.0]
+        assert data["time"].attrs["units"] == "s"
+        assert (
+            float(data["accumulation"].sel(time=60.0, region=1, destination=0))
+            == original.accumulation[2, 1, 0]
+        )
 
 
 def test_half_precision_is_kept_in_a_file(tmp_path):
     record = trajectories.record(4, regions=2) | {"edge_vehicles": np.full((4, 5), 0.1, np.float16)}
     trajectories.recorded(trajectory(), record, {}).write(tmp_path / "a.nc")
-    np.testing.assert_array_equal(Result.read(tmp_path / "a.nc").edge_vehicles, record["edge_vehicles"])
+    np.testing.assert_array_equal(
+        Result.read(tmp_path / "a.nc").edge_vehicles, record["edge_vehicles"]
+    )
 
 
 def test_a_row_holds_the_figures_and_the_facts_of_a_run():
     row = metrics.summary(trajectories.recorded(trajectory(), {}, {"trips": 12}))
-    assert list(row)[:4] == ["controller", "seed", "plant", "total_time_spent_veh_s"] and list(row)[-1] == "trips"
-    assert row["trips"] == 12 and row["solver_failures"] == 1 and set(metrics.COUNTED) < set(row)
+    assert list(row)[:4] == ["controller", "seed", "plant", "total_time_spent_veh_s"]
+    assert list(row)[-1] == "trips"
+    assert row["trips"] == 12
+    assert row["solver_failures"] == 1
+    assert set(metrics.COUNTED) < set(row)
     facts = Result(xr.Dataset(attrs={"controller": "x", "seed": 1, "trips_veh": 2.0, "key": "{}"}))
     assert metrics.summary(facts) == {"controller": "x", "seed": 1, "trips_veh": 2.0}
     assert "accumulation" in trajectory()._repr_html_()
@@ -107,7 +122,13 @@ def test_decision_times_are_processor_times_of_all_threads(tmp_path):
             return Controls(perimeter=np.where(scenario.network.adjacency, 0.5, 0.0), splits=None)
 
     row = metrics.summary(closed_loop.run(NmfdPlant(scenario), Sleeper(), scenario, seed=0))
-    assert row["control_step_ms_first"] == row["control_step_ms_max"] >= 60.0 > 20.0 > row["control_step_ms_median"]
+    assert (
+        row["control_step_ms_first"]
+        == row["control_step_ms_max"]
+        >= 60.0
+        > 20.0
+        > row["control_step_ms_median"]
+    )
 
 
 @pytest.mark.parametrize("damage", ["missing", "cut off", "empty", "a table"])
@@ -116,7 +137,9 @@ def test_what_is_no_run_is_one_line(tmp_path, damage):
     if damage != "missing":
         trajectory().write(file)
         whole = file.read_bytes()
-        file.write_bytes({"cut off": whole[: len(whole) // 2], "empty": b"", "a table": b"a,b\n1,2\n"}[damage])
+        file.write_bytes(
+            {"cut off": whole[: len(whole) // 2], "empty": b"", "a table": b"a,b\n1,2\n"}[damage]
+        )
     with pytest.raises(InputError, match=r"a\.nc: (no such run|is no run)") as error:
         Result.read(file)
     assert "\n" not in str(error.value)
@@ -128,7 +151,8 @@ def test_atomic_write_leaves_the_old_file_when_interrupted(tmp_path):
     with pytest.raises(KeyboardInterrupt), files.atomic(path) as temporary:
         temporary.write_text("half")
         raise KeyboardInterrupt
-    assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
 
 
 # Jobs, for processes that import this module.
@@ -150,9 +174,13 @@ def divide():
     return 1 / 0
 
 
-def run_of(controller="no-control", seed=0, *, calls=None, scenario="s", policy="p", folder="", work=None):
+def run_of(
+    controller="no-control", seed=0, *, calls=None, scenario="s", policy="p", folder="", work=None
+):
     key = {"scenario_hash": scenario, "controller": {"policy_hash": policy}}
-    return Run(files.run_name(controller, seed), key, work or partial(job, controller, seed, calls), folder)
+    return Run(
+        files.run_name(controller, seed), key, work or partial(job, controller, seed, calls), folder
+    )
 
 
 def test_runs_are_done_once_and_come_in_the_order_asked_for(tmp_path):
@@ -160,10 +188,15 @@ def test_runs_are_done_once_and_come_in_the_order_asked_for(tmp_path):
     first = [run_of("b", 1, calls=calls), run_of("a", 0, calls=calls)]
     rows = run_many(first, out, workers=0)
     assert list(zip(rows["controller"], rows["seed"], strict=True)) == [("b", 1), ("a", 0)] == calls
-    assert set(rows["failure"]) == {""} and rows["total_time_spent_veh_s"].iloc[1] > 0 and "folder" not in rows
+    assert set(rows["failure"]) == {""}
+    assert rows["total_time_spent_veh_s"].iloc[1] > 0
+    assert "folder" not in rows
     again = run_many([run_of("c", calls=calls), *first[1:]], out, workers=0)
-    assert list(again["controller"]) == ["c", "a", "b"] and len(calls) == 3
-    pd.testing.assert_frame_equal(pd.read_csv(out / "runs.csv", keep_default_na=False), again, check_dtype=False)
+    assert list(again["controller"]) == ["c", "a", "b"]
+    assert len(calls) == 3
+    pd.testing.assert_frame_equal(
+        pd.read_csv(out / "runs.csv", keep_default_na=False), again, check_dtype=False
+    )
     manifest = read_manifest(out)
     assert [session["seeds"] for session in manifest["sessions"]] == [[0, 1], [0]]
     assert manifest["folders"][""] == {
@@ -177,24 +210,31 @@ def test_runs_are_done_once_and_come_in_the_order_asked_for(tmp_path):
 def test_another_key_does_a_run_again(tmp_path, capsys):
     calls = []
     run_many([run_of("a", calls=calls), run_of("b", calls=calls)], tmp_path / "out", workers=0)
-    run_many([run_of("a", calls=calls, policy="q"), run_of("b", calls=calls)], tmp_path / "out", workers=0)
+    run_many(
+        [run_of("a", calls=calls, policy="q"), run_of("b", calls=calls)],
+        tmp_path / "out",
+        workers=0,
+    )
     assert calls == [("a", 0), ("b", 0), ("a", 0)]
     assert "a-0.nc: out of date, controller changed" in capsys.readouterr().err
     rows = run_many([run_of("a", calls=calls, scenario="other")], tmp_path / "out", workers=0)
-    assert len(calls) == 4 and list(rows["controller"]) == ["a"]  # b is of another scenario
+    assert len(calls) == 4
+    assert list(rows["controller"]) == ["a"]
 
 
 def test_a_run_that_is_cut_off_is_done_again(tmp_path):
     calls, file = [], tmp_path / "out" / "a-0.nc"
     run_many([run_of("a", calls=calls)], file.parent, workers=0)
     file.write_bytes(file.read_bytes()[:100])
-    assert len(run_many([run_of("a", calls=calls)], file.parent, workers=0)) == 1 and len(calls) == 2
+    assert len(run_many([run_of("a", calls=calls)], file.parent, workers=0)) == 1
+    assert len(calls) == 2
 
 
 def test_levels_have_folders_of_their_own(tmp_path):
     runs = [run_of("path/to/file.py:Class", level, folder=f"demand-{level}") for level in (1, 2)]
     rows = run_many(runs, tmp_path / "out", workers=0)
-    assert list(rows["folder"]) == ["demand-1", "demand-2"] and set(rows["controller"]) == {"path/to/file.py:Class"}
+    assert list(rows["folder"]) == ["demand-1", "demand-2"]
+    assert set(rows["controller"]) == {"path/to/file.py:Class"}
     assert len(list((tmp_path / "out" / "demand-1").glob("*.nc"))) == 1
     assert len(run_many(runs[:1], tmp_path / "out", workers=0)) == 2
 
@@ -203,13 +243,22 @@ def test_failures_are_rows_and_the_others_go_on(tmp_path):
     def mistaken():
         raise InputError("policy.pt: no such file")
 
-    runs = [run_of("a", work=lambda: 1 / 0), run_of("b", work=mistaken), run_of("c", work=lambda: exit(3)), run_of("d")]
+    runs = [
+        run_of("a", work=lambda: 1 / 0),
+        run_of("b", work=mistaken),
+        run_of("c", work=lambda: exit(3)),
+        run_of("d"),
+    ]
     rows = run_many(runs, tmp_path / "out", workers=0).set_index("controller")["failure"]
     assert rows["a"].startswith("ZeroDivisionError: division by zero (test_runs.py:")
-    assert rows["b"] == "policy.pt: no such file" and rows["c"].startswith("SystemExit: 3") and rows["d"] == ""
+    assert rows["b"] == "policy.pt: no such file"
+    assert rows["c"].startswith("SystemExit: 3")
+    assert rows["d"] == ""
     with pytest.raises(RunFailed, match=r"^a, seed 0: ZeroDivisionError.*; b, seed 0: policy.pt"):
         raise_failures(run_many(runs, tmp_path / "out", workers=0))
-    assert set(run_many([run_of(name) for name in "abcd"], tmp_path / "out", workers=0)["failure"]) == {""}
+    assert set(
+        run_many([run_of(name) for name in "abcd"], tmp_path / "out", workers=0)["failure"]
+    ) == {""}
 
 
 @pytest.mark.slow
@@ -238,8 +287,12 @@ print("begun", flush=True)
 from test_runs import run_of, run_many
 print(list(run_many([run_of("a"), run_of("b")], {str(tmp_path / "out")!r}, workers=2)["failure"]))
 """)
-    (tmp_path / "statistics.py").write_text("raise ImportError")  # a file of the user is not a module
-    done = subprocess.run([sys.executable, "-P", script], capture_output=True, text=True, cwd=tmp_path, timeout=120)
+    (tmp_path / "statistics.py").write_text(
+        "raise ImportError"
+    )  # a file of the user is not a module
+    done = subprocess.run(
+        [sys.executable, "-P", script], capture_output=True, text=True, cwd=tmp_path, timeout=120
+    )
     assert done.stdout.split("\n") == ["begun", "['', '']", ""], done.stderr
 
 
@@ -250,7 +303,10 @@ def test_a_folder_is_that_of_one_process_and_of_runs(tmp_path):
     with pytest.raises(InputError, match="is not empty and holds no manifest.json"):
         run_many([run_of()], tmp_path, workers=0)
     run_many([run_of()], tmp_path / "out", workers=0)
-    with FileLock(tmp_path / "out" / ".lock"), pytest.raises(InputError, match="another process is writing to it"):
+    with (
+        FileLock(tmp_path / "out" / ".lock"),
+        pytest.raises(InputError, match="another process is writing to it"),
+    ):
         run_many([run_of()], tmp_path / "out", workers=0)
     with module.locked(tmp_path / "out"):  # as a command does
         run_many([run_of()], tmp_path / "out", workers=0)
@@ -263,7 +319,10 @@ def test_a_full_disk_leaves_nothing_that_is_refused(tmp_path, monkeypatch):
     def full(path, _):
         raise OSError(errno.ENOSPC, "No space left on device", str(path))
 
-    with monkeypatch.context() as patch, pytest.raises(OSError, match="No space left on device: .*manifest.json"):
+    with (
+        monkeypatch.context() as patch,
+        pytest.raises(OSError, match="No space left on device: .*manifest.json"),
+    ):
         patch.setattr(module, "write_text", full)
         run_many([run_of()], tmp_path / "out", workers=0)
     assert list(tmp_path.iterdir()) == []
@@ -274,17 +333,28 @@ def test_a_full_disk_leaves_nothing_that_is_refused(tmp_path, monkeypatch):
 
 def test_progress_counts_runs(tmp_path):
     shown = []
-    run_many([run_of("a"), run_of("b")], tmp_path / "out", workers=0, progress=lambda *what: shown.append(what))
+    run_many(
+        [run_of("a"), run_of("b")],
+        tmp_path / "out",
+        workers=0,
+        progress=lambda *what: shown.append(what),
+    )
     assert shown == [(0, 2), (1, 2, "a-0"), (2, 2, "b-0")]
 
 
 @pytest.mark.slow
 def test_a_dask_cluster_gives_the_same_runs(tmp_path):
     distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(n_workers=1, threads_per_worker=2, dashboard_address=None) as cluster:
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=2, dashboard_address=None
+    ) as cluster:
         runs = [run_of("a"), run_of("b", work=die), run_of("c", work=divide)]
-        rows = run_many(runs, tmp_path / "out", scheduler=cluster.scheduler_address).set_index("controller")["failure"]
-    assert rows["a"] == "" and rows["b"] == "its process died (status 3)" and "ZeroDivisionError" in rows["c"]
+        rows = run_many(runs, tmp_path / "out", scheduler=cluster.scheduler_address).set_index(
+            "controller"
+        )["failure"]
+    assert rows["a"] == ""
+    assert rows["b"] == "its process died (status 3)"
+    assert "ZeroDivisionError" in rows["c"]
     assert (
         Result.read(tmp_path / "out" / "a-0.nc")
         .without_times()

@@ -28,7 +28,9 @@ kp = 3.0
 
 @pytest.fixture
 def base(tmp_path):
-    return tiny.write(tmp_path, scenario=tiny.SCENARIO + "\n[controllers.pi-gating]\nkp = 1.0\nki = 0.02\n")
+    return tiny.write(
+        tmp_path, scenario=tiny.SCENARIO + "\n[controllers.pi-gating]\nkp = 1.0\nki = 0.02\n"
+    )
 
 
 def beside(base, text, name="other"):
@@ -41,13 +43,16 @@ def beside(base, text, name="other"):
 def model(folder, jam=800.0, regions=2):
     """A network in `folder`, named by its jam accumulation."""
     folder.mkdir()
-    (folder / "network.toml").write_text(tiny.row_network(regions).replace("jam = 1000.0", f"jam = {jam}"))
+    (folder / "network.toml").write_text(
+        tiny.row_network(regions).replace("jam = 1000.0", f"jam = {jam}")
+    )
 
 
 def test_what_a_scenario_does_not_say_is_its_bases(base):
     own, inherited = load_scenario(base), load_scenario(beside(base, OTHER))
     assert (inherited.name, inherited.steps, inherited.step) == ("other", 5, own.step)
-    assert inherited.network.hash == own.network.hash and inherited.protected == own.protected
+    assert inherited.network.hash == own.network.hash
+    assert inherited.protected == own.protected
     np.testing.assert_allclose(inherited.demand, 2.0 * own.demand[:5])
     assert inherited.controller_options["pi-gating"] == {"kp": 3.0, "ki": 0.02}
 
@@ -62,9 +67,16 @@ def test_a_base_in_another_folder(base):
 def test_settings_replace_those_of_the_file(base):
     changed = read_scenario(
         base,
-        {"steps": 12, "controllers.pi-gating.kp": 2, 'controllers."pi-gating+rerouting-30".ki': 0.1, "sumo.seed": 1},
+        {
+            "steps": 12,
+            "controllers.pi-gating.kp": 2,
+            'controllers."pi-gating+rerouting-30".ki': 0.1,
+            "sumo.seed": 1,
+        },
     )
-    assert changed.steps == 12 and len(changed.demand) == 12 and changed.sumo == {"seed": 1}
+    assert changed.steps == 12
+    assert len(changed.demand) == 12
+    assert changed.sumo == {"seed": 1}
     assert changed.controller_options["pi-gating"] == {"kp": 2, "ki": 0.02}
     assert changed.controller_options["pi-gating+rerouting-30"] == {"ki": 0.1}
     with pytest.raises(InputError, match="scenario.toml: stepz"):
@@ -74,20 +86,28 @@ def test_settings_replace_those_of_the_file(base):
 def test_vehicles_at_the_start(base):
     assert not load_scenario(base).start.any()
     begun = read_scenario(base, {"initial": [[0.0, 100.0], [0.0, 50.0]]})
-    assert begun.start.tolist() == [[0.0, 100.0], [0.0, 50.0]] and begun.hash != load_scenario(base).hash
+    assert begun.start.tolist() == [[0.0, 100.0], [0.0, 50.0]]
+    assert begun.hash != load_scenario(base).hash
     for wrong in ([[1.0, 2.0]], [[1.0, -2.0], [0.0, 0.0]]):
-        with pytest.raises(InputError, match="scenario.toml: initial: expected 2 lists of 2 numbers"):
+        with pytest.raises(
+            InputError, match="scenario.toml: initial: expected 2 lists of 2 numbers"
+        ):
             read_scenario(base, {"initial": wrong})
 
 
 def test_a_network_is_written_as_it_is_read(tmp_path):
     network = load_network("grid7")
     doubted = replace(
-        network, doubts=(("one seed",),) * 7, placeholder=True, controllable=np.where(network.adjacency, 0.25, 0.0)
+        network,
+        doubts=(("one seed",),) * 7,
+        placeholder=True,
+        controllable=np.where(network.adjacency, 0.25, 0.0),
     )
     (tmp_path / "network.toml").write_text(network_toml(doubted, {}, "a test"))
     again = load_network(tmp_path)
-    assert again.hash == network.hash and again.doubts == doubted.doubts and again.placeholder
+    assert again.hash == network.hash
+    assert again.doubts == doubted.doubts
+    assert again.placeholder
     assert again.observed_split_ratios.keys() == network.observed_split_ratios.keys() != set()
     np.testing.assert_array_equal(again.controllable, doubted.controllable)
 
@@ -97,11 +117,20 @@ def test_a_network_is_written_as_it_is_read(tmp_path):
     [
         ('name = "x"\nbase = "../nowhere"\n', "nowhere/scenario.toml: no such file"),
         ('name = "x"\nbase = "."\n', "base: the scenarios are each other's base"),
-        ('name = "x"\nbase = "../scenario"\ndemand_factor = -1.0\n', "scenario.toml: demand_factor"),
+        (
+            'name = "x"\nbase = "../scenario"\ndemand_factor = -1.0\n',
+            "scenario.toml: demand_factor",
+        ),
         ('name = "x"\nbase = "../scenario"\nprotected = [2]\n', "scenario.toml: protected"),
         ('name = "x"\nbase = "../scenario"\nnetwork = "../none"\n', "network.toml: no such file"),
-        ('name = "x"\nnetwork = "../network"\nstep = 30.0\nsteps = 5\n', "scenario.toml: demand: missing"),
-        (tiny.SCENARIO.replace("to = 1", "to = 7"), r"scenario.toml: demand\[0\].to: region 7 is unknown"),
+        (
+            'name = "x"\nnetwork = "../network"\nstep = 30.0\nsteps = 5\n',
+            "scenario.toml: demand: missing",
+        ),
+        (
+            tiny.SCENARIO.replace("to = 1", "to = 7"),
+            r"scenario.toml: demand\[0\].to: region 7 is unknown",
+        ),
     ],
 )
 def test_wrong_scenarios(base, text, message):
@@ -115,9 +144,21 @@ def test_wrong_scenarios(base, text, message):
     [
         ("[0]", "[5]", r"regions\[1\].adjacent: .*\[5\]"),
         ("adjacent = [1]", "adjacent = []", "regions: region 1 cannot be reached from region 0"),
-        ("adjacent = [1]", "adjacent = [1]\ncapacity = [1.0]", r"regions\[0\].capacity: capacity and storage belong"),
-        ("adjacent = [1]", "adjacent = [1]\nexit_rates = [1.0]", r"regions\[0\].exit_rates: .* 2 numbers"),
-        ("adjacent = [0]", "adjacent = [0]\nexit_rates = [1.0, 1.0]", r"regions\[0\].exit_rates: missing"),
+        (
+            "adjacent = [1]",
+            "adjacent = [1]\ncapacity = [1.0]",
+            r"regions\[0\].capacity: capacity and storage belong",
+        ),
+        (
+            "adjacent = [1]",
+            "adjacent = [1]\nexit_rates = [1.0]",
+            r"regions\[0\].exit_rates: .* 2 numbers",
+        ),
+        (
+            "adjacent = [0]",
+            "adjacent = [0]\nexit_rates = [1.0, 1.0]",
+            r"regions\[0\].exit_rates: missing",
+        ),
         ("adjacent = [1]", "adjacent = [1]\nobserved_split_ratios.1 = { 1 = 0.5 }", "with sum 1"),
         ("max = 0.9", "max = 0.1", "perimeter: min must be less"),
     ],
@@ -130,10 +171,14 @@ def test_wrong_networks(tmp_path, old, new, message):
 
 def test_a_controller_plans_with_the_model_that_it_names(base, tmp_path):
     model(tmp_path / "model")
-    folder = beside(base, 'name = "x"\nbase = "../scenario"\n[controllers.mpc-pc]\nmodel = "../model"\nhorizon = 4\n')
+    folder = beside(
+        base,
+        'name = "x"\nbase = "../scenario"\n[controllers.mpc-pc]\nmodel = "../model"\nhorizon = 4\n',
+    )
     scenario = load_scenario(folder)
     planned = planning_model(scenario, "mpc-pc")
-    assert planned.network.mfds[0].jam == 800.0 and planned.controller_options["mpc-pc"] == {"horizon": 4}
+    assert planned.network.mfds[0].jam == 800.0
+    assert planned.controller_options["mpc-pc"] == {"horizon": 4}
     assert planning_model(scenario, "mpc-pcrg").network.mfds[0].jam == 1000.0
     assert make_controller("mpc-pc", scenario).options.horizon == 4
 
@@ -143,7 +188,10 @@ def test_guiding_controllers_find_the_model_of_guided_drivers(base, tmp_path):
     model(network / "guided")
     model(tmp_path / "model", jam=700.0)
     scenario = load_scenario(
-        beside(base, 'name = "x"\nbase = "../scenario"\n[controllers."dpc-pcrg+max-pressure"]\nmodel = "../model"\n')
+        beside(
+            base,
+            'name = "x"\nbase = "../scenario"\n[controllers."dpc-pcrg+max-pressure"]\nmodel = "../model"\n',
+        )
     )
     jam = {
         name: planning_model(scenario, name).network.mfds[0].jam
@@ -157,7 +205,9 @@ def test_guiding_controllers_find_the_model_of_guided_drivers(base, tmp_path):
 
 def test_an_inherited_model_lies_where_the_base_says(base, tmp_path):
     model(tmp_path / "model")
-    first = beside(base, 'name = "x"\nbase = "../scenario"\n[controllers.mpc-pc]\nmodel = "../model"\n')
+    first = beside(
+        base, 'name = "x"\nbase = "../scenario"\n[controllers.mpc-pc]\nmodel = "../model"\n'
+    )
     far = tmp_path / "far" / "away"
     far.mkdir(parents=True)
     (far / "scenario.toml").write_text(f'name = "y"\nbase = "../../{first.name}"\n')
@@ -195,6 +245,10 @@ mfd_spread = 0.2
 
 def test_a_model_of_another_city_is_refused(base, tmp_path):
     model(tmp_path / "model", regions=3)
-    folder = beside(base, 'name = "x"\nbase = "../scenario"\n[controllers.mpc-pc]\nmodel = "../model"\n')
-    with pytest.raises(InputError, match="controllers.mpc-pc.model: network row3 has other regions"):
+    folder = beside(
+        base, 'name = "x"\nbase = "../scenario"\n[controllers.mpc-pc]\nmodel = "../model"\n'
+    )
+    with pytest.raises(
+        InputError, match="controllers.mpc-pc.model: network row3 has other regions"
+    ):
         make_controller("mpc-pc", load_scenario(folder))

@@ -1,4 +1,5 @@
-"""The proof sheet of signals: violations by hand, SUMO's own record, and random commands under every signal control."""
+"""The proof sheet of signals: violations by hand, SUMO's own record, and random commands under
+every signal control."""
 
 from dataclasses import replace
 from xml.etree import ElementTree
@@ -40,7 +41,11 @@ def judge(phases, shown, crossings=()):
         (CROSS, [*CROSS, ("Gr", 9), ("yr", 2), ("rr", 1), *CROSS[2:]], {"short_yellows": 1}),
         (CROSS, [*CROSS, ("Gr", 9), ("rr", 3), *CROSS[2:]], {"short_yellows": 1}),
         (CROSS, [*CROSS, ("Gr", 9), ("yr", 1), ("yG", 2), ("rG", 9)], {"short_intergreens": 1}),
-        (CROSS, [*CROSS, ("GG", 9), ("yy", 3), ("rr", 9)], {"conflicts": 1, "short_intergreens": 0}),
+        (
+            CROSS,
+            [*CROSS, ("GG", 9), ("yy", 3), ("rr", 9)],
+            {"conflicts": 1, "short_intergreens": 0},
+        ),
         ([("Gg", 9), ("yr", 3), ("rG", 9), ("ry", 3)], [("GG", 9), ("gG", 9)], {"conflicts": 1}),
         (WALK, [*WALK, ("GrG", 19), *WALK[1:]], {"short_greens": 1}),  # a crossing keeps its 20 s
         (WALK, [*WALK, WALK[0], *WALK[2:5]], {"short_intergreens": 1}),  # and is cleared for 9 s
@@ -58,13 +63,18 @@ def test_figures_of_a_sheet():
 
 
 def proven(folder, words, intervals, tmp_path):
-    """Run with random commands in every interval; return the sheet of what SUMO's saveTLSStates wrote."""
+    """Run with random commands in every interval; return the sheet of what SUMO's saveTLSStates
+    wrote."""
     scenario, strategy = replace(load_scenario(folder), steps=intervals), parse("no-control", words)
-    chosen = settings(scenario).changed(gateways_fixed=False, mesoscopic=False).changed(**strategy.city)
+    chosen = (
+        settings(scenario).changed(gateways_fixed=False, mesoscopic=False).changed(**strategy.city)
+    )
     city, network, random = city_of(scenario.network), scenario.network, np.random.default_rng(5)
     programmes = [city.net_file, *own_files(scenario, chosen.additional)]
     events = ElementTree.Element("additional")
-    for signal in {logic.get("id") for file in programmes for logic in read_xml(file).iter("tlLogic")}:
+    for signal in {
+        logic.get("id") for file in programmes for logic in read_xml(file).iter("tlLogic")
+    }:
         about = {"type": "SaveTLSStates", "source": signal, "dest": str(tmp_path / "states.xml")}
         ElementTree.SubElement(events, "timedEvent", about)
     ElementTree.ElementTree(events).write(tmp_path / "tls.add.xml")
@@ -76,7 +86,9 @@ def proven(folder, words, intervals, tmp_path):
             share = random.choice([0.0, 1.0, random.uniform()], network.adjacency.shape)
             u = network.u_min + share * (network.u_max - network.u_min)
             rate = random.uniform(0.0, 1.0, network.regions)
-            plant.step(Controls(perimeter=np.where(network.adjacency, u, 0.0), splits=None, metering=rate))
+            plant.step(
+                Controls(perimeter=np.where(network.adjacency, u, 0.0), splits=None, metering=rate)
+            )
         end, observed = plant.session.time, plant.actuation.states
     finally:
         plant.close()
@@ -85,8 +97,12 @@ def proven(folder, words, intervals, tmp_path):
         row = states.setdefault(element.get("id"), [])
         if not row or row[-1][1] != element.get("state"):
             row.append((float(element.get("time")), element.get("state")))
-    sheet, own = (proof_sheet(each, programmes, end=end, step=chosen.step_length) for each in (states, observed))
-    assert all(np.array_equal(sheet[key], own[key]) for key in VIOLATIONS) and len(sheet["signal"]) > 3
+    sheet, own = (
+        proof_sheet(each, programmes, end=end, step=chosen.step_length)
+        for each in (states, observed)
+    )
+    assert all(np.array_equal(sheet[key], own[key]) for key in VIOLATIONS)
+    assert len(sheet["signal"]) > 3
     return sheet
 
 
@@ -97,7 +113,9 @@ def imported(tmp_path_factory):
     for kind in ("static", "actuated", "delay_based"):
         folder = tmp_path_factory.mktemp(kind)
         crossings = ("--sidewalks.guess", "--sidewalks.guess.max-speed", "50", "--crossings.guess")
-        tiny_city.network(folder, "--tls.set", "B1,B2,C1,C2", "--tls.default-type", kind, *crossings)
+        tiny_city.network(
+            folder, "--tls.set", "B1,B2,C1,C2", "--tls.default-type", kind, *crossings
+        )
         (folder / "cars.rou.xml").write_text(CARS)
         (folder / "city.sumocfg").write_text(CONFIG)
         made[kind] = tiny_city.imported(folder, regions=2, source=folder / "city.sumocfg")
@@ -109,11 +127,18 @@ def test_a_run_says_that_signals_break_rules(imported, tmp_path):
     scenario, faults = imported["static"], ["signal:B1@1-2", "signal:B2@3-5"]
     for settings_, said in (({"faults": faults}, True), ({}, False)):
         out = tmp_path / str(said)
-        text = run_controllers(scenario, ["no-control+max-pressure"], settings=settings_, steps=8, out=out)
+        text = run_controllers(
+            scenario, ["no-control+max-pressure"], settings=settings_, steps=8, out=out
+        )
         table = pd.read_csv(out / "signals.csv")
-        assert list(table)[2] == "signal" and sorted(table.signal) == ["B1", "B2", "C1", "C2"]
+        assert list(table)[2] == "signal"
+        assert sorted(table.signal) == ["B1", "B2", "C1", "C2"]
         broken = table[list(VIOLATIONS)].to_numpy().sum()
-        assert (broken > 0) == said == (f"signals break their rules {broken} times, see {out}/signals.csv" in text)
+        assert (
+            (broken > 0)
+            == said
+            == (f"signals break their rules {broken} times, see {out}/signals.csv" in text)
+        )
         assert pd.read_csv(out / "runs.csv").signal_violations.tolist() == [broken]
 
 
@@ -124,11 +149,16 @@ def test_a_run_says_that_signals_break_rules(imported, tmp_path):
         "static",
         "actuated",
         "delay_based",
-        *(pytest.param(name, marks=pytest.mark.slow) for name in ("demo", "grid7_peak", "bologna", "luxembourg")),
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("demo", "grid7_peak", "bologna", "luxembourg")
+        ),
     ],
 )
 def test_random_commands_violate_nothing(imported, tmp_path, place, city):
     if place in ("actuated", "delay_based") and city in ("actuated", "webster"):
         pytest.skip("only for fixed-time signals")
     sheet = proven(imported.get(place, place), city, 4 if place == "luxembourg" else 6, tmp_path)
-    assert {key: sheet["signal"][sheet[key] > 0].tolist() for key in VIOLATIONS} == {key: [] for key in VIOLATIONS}
+    assert {key: sheet["signal"][sheet[key] > 0].tolist() for key in VIOLATIONS} == {
+        key: [] for key in VIOLATIONS
+    }

@@ -1,4 +1,5 @@
-"""Signal plans: max-pressure, actuated and optimised fixed time. Known answers, and states second by second in SUMO."""
+"""Signal plans: max-pressure, actuated and optimised fixed time. Known answers, and states second
+by second in SUMO."""
 
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
@@ -37,7 +38,8 @@ def city(scenario):
 
 @pytest.fixture(scope="module")
 def driven(scenario):
-    """The first four intervals at u with these overrides, for all tests that ask for the same: `drive`, and leaks."""
+    """The first four intervals at u with these overrides, for all tests that ask for the same:
+    `drive`, and leaks."""
 
     @cache
     def run(u, **overrides):
@@ -51,7 +53,8 @@ def driven(scenario):
 
 
 def drive(plant, scenario, intervals, seed=1, u=0.9):
-    """States of every signal, second by second, under u at all gateways; the network's own programmes; the record."""
+    """States of every signal, second by second, under u at all gateways; the network's own
+    programmes; the record."""
     plant.reset(seed)
     shown, network = watched(plant), scenario.network
     for _ in range(intervals):
@@ -61,7 +64,8 @@ def drive(plant, scenario, intervals, seed=1, u=0.9):
 
 def test_signals_of_the_city(city):
     simple, others = read_signals(city)
-    assert len(simple) > 90 and not others
+    assert len(simple) > 90
+    assert not others
     for found in simple:
         assert sum(phase.duration for phase in found.phases) == 90
         assert {link.index for link in found.links} == set(range(len(found.phases[0].state)))
@@ -78,15 +82,18 @@ def test_signals_that_are_not_simple_are_left_alone(city, tmp_path):
     (tmp_path / "net.xml").write_text(text)
     changed = replace(city, net_file=tmp_path / "net.xml")
     simple, others = read_signals(changed)
-    assert others == ["c11", "c12"] and not {"c11", "c12"} & {s.id for s in simple}
+    assert others == ["c11", "c12"]
+    assert not {"c11", "c12"} & {s.id for s in simple}
     last = night.replace("night", "last").replace('offset="0"', 'offset="7"')
     (tmp_path / "more.add.xml").write_text(f"<additional>{last}</additional>")
     simple, others = read_signals(changed, [tmp_path / "more.add.xml"])
-    assert others == ["c11"] and [s.offset for s in simple if s.id == "c12"] == [7.0]
+    assert others == ["c11"]
+    assert [s.offset for s in simple if s.id == "c12"] == [7.0]
 
 
 def test_pressure_is_upstream_minus_downstream(city, scenario):
-    """A queue gives its stage the pressure; the same queue behind the junction takes it away; shares add up."""
+    """A queue gives its stage the pressure; the same queue behind the junction takes it away;
+    shares add up."""
     simple, _ = read_signals(city)
     roads = Roads(city, simple, turning_flows(city, scenario.demand, scenario.step))
     n = next(n for n, s in enumerate(simple) if s.id == "o11")
@@ -96,22 +103,33 @@ def test_pressure_is_upstream_minus_downstream(city, scenario):
     def pressures(counts):
         present = np.array([counts.get(lane.rpartition("_")[0], 0.0) for lane in roads.lanes])
         begin = roads.begins[n]
-        return (roads.gain @ np.maximum(roads.weights @ present, 0.0))[begin : begin + len(chosen.stages)]
+        return (roads.gain @ np.maximum(roads.weights @ present, 0.0))[
+            begin : begin + len(chosen.stages)
+        ]
 
     queue = pressures({straight.from_edge: 5.0})
-    assert int(np.argmax(queue)) == 0 and queue[0] > 5.0
+    assert int(np.argmax(queue)) == 0
+    assert queue[0] > 5.0
     targets = {k.to_edge: 25.0 for k in chosen.links if k.from_edge == straight.from_edge}
     assert pressures({straight.from_edge: 5.0, **targets})[0] < 0.2 * queue[0]
-    held = roads.weights.toarray().clip(min=0.0).sum(axis=0)  # a vehicle before a signal is counted once
+    held = (
+        roads.weights.toarray().clip(min=0.0).sum(axis=0)
+    )  # a vehicle before a signal is counted once
     before = [lane for lane, total in zip(roads.lanes, held, strict=True) if total > 0]
-    assert len(before) > 300 and held[held > 0] == pytest.approx(1.0)
+    assert len(before) > 300
+    assert held[held > 0] == pytest.approx(1.0)
 
 
 @pytest.mark.slow
 def test_perimeter_control_over_max_pressure(driven):
-    """Open gateways leave max-pressure as it is; closed ones let less through and keep to their ration."""
+    """Open gateways leave max-pressure as it is; closed ones let less through and keep to their
+    ration."""
     seen = {}
-    for name, u, overrides in (("alone", 0.9, {"gateways_fixed": False}), ("open", 0.9, {}), ("closed", 0.1, {})):
+    for name, u, overrides in (
+        ("alone", 0.9, {"gateways_fixed": False}),
+        ("open", 0.9, {}),
+        ("closed", 0.1, {}),
+    ):
         shown, _, record, _ = driven(u, signals="max-pressure", **overrides)
         seen[name] = shown, record
     assert seen["alone"][0] == seen["open"][0] != seen["closed"][0]
@@ -129,8 +147,10 @@ def test_max_pressure_runs_all_signals(city, driven):
         cycle = [phase.state for phase in original[name].phases for _ in range(int(phase.duration))]
         if states != [cycle[n % 90] for n in range(len(states))]:
             changed.add(name)
-    assert len(changed) > 30 and len(changed & gateways) > 10
-    assert not np.isnan(record.gateway_green).any() and not leaks
+    assert len(changed) > 30
+    assert len(changed & gateways) > 10
+    assert not np.isnan(record.gateway_green).any()
+    assert not leaks
 
 
 @pytest.mark.parametrize("gateways_fixed", [True, False])
@@ -176,13 +196,18 @@ def test_the_same_drivers_reroute(scenario, plant_of):
             step()
             for vehicle in plant.session.departed():
                 own = plant.session.route(vehicle) == planned[int(vehicle[1:])]
-                seen[vehicle] = libsumo.vehicle.getParameter(vehicle, "has.rerouting.device") == "true", own
+                seen[vehicle] = (
+                    libsumo.vehicle.getParameter(vehicle, "has.rerouting.device") == "true",
+                    own,
+                )
 
         plant.session.step = watch
         plant.step(Controls(perimeter=np.full((7, 7), 0.9), splits=None))
         equipped[share, signals] = {v for v, (reroutes, _) in seen.items() if reroutes}
         assert all(own for reroutes, own in seen.values() if not reroutes)
-        assert sum(not own for reroutes, own in seen.values() if reroutes) > 10  # on the fastest way from the start
+        assert (
+            sum(not own for reroutes, own in seen.values() if reroutes) > 10
+        )  # on the fastest way from the start
         assert abs(len(equipped[share, signals]) / len(seen) - share) < 0.15
         plant.close()
     assert equipped[0.3, "fixed"] == equipped[0.3, "max-pressure"] < equipped[0.6, "fixed"]

@@ -8,7 +8,14 @@ import tiny
 
 from cosim.plant.settings import Settings
 from nmfd.controllers.rules import NoControl
-from nmfd.controllers.strategy import ALONE, CITY_NUMBERS, CITY_WORDS, CONTROLLERS, city_words, parse
+from nmfd.controllers.strategy import (
+    ALONE,
+    CITY_NUMBERS,
+    CITY_WORDS,
+    CONTROLLERS,
+    city_words,
+    parse,
+)
 from nmfd.errors import InputError
 from nmfd.model.planning import planning_model
 from nmfd.types import Observation
@@ -30,7 +37,11 @@ from nmfd.types import Observation
         ("dpc-pc+metering", "dpc-pc", {"metering": 1.2}),
         ("metering-120", "no-control", {"metering": 1.2}),
         ("a.py:Gate", "a.py:Gate", {}),
-        ("a+b/c d.py:Gate+actuated+rerouting-30", "a+b/c d.py:Gate", {"signals": "actuated", "rerouting": 0.3}),
+        (
+            "a+b/c d.py:Gate+actuated+rerouting-30",
+            "a+b/c d.py:Gate",
+            {"signals": "actuated", "rerouting": 0.3},
+        ),
     ],
 )
 def test_what_a_name_means(name, controller, city):
@@ -43,7 +54,13 @@ def test_what_a_name_means(name, controller, city):
 
 @pytest.mark.parametrize(
     "name, guides",
-    [("pi-gating", False), ("pi-gating+guided", True), ("guided", True), ("route-guidance", True), ("dpc-pc", False)],
+    [
+        ("pi-gating", False),
+        ("pi-gating+guided", True),
+        ("guided", True),
+        ("route-guidance", True),
+        ("dpc-pc", False),
+    ],
 )
 def test_who_guides(name, guides):
     assert parse(name).guides == guides
@@ -60,7 +77,12 @@ def test_every_controller_and_word_is_a_strategy():
 
 
 def test_the_table_with_most_words_applies(scenario):
-    tables = ["dpc-pc", "dpc-pc+max-pressure", "dpc-pc+max-pressure+rerouting-30", "dpc-pcrg+max-pressure"]
+    tables = [
+        "dpc-pc",
+        "dpc-pc+max-pressure",
+        "dpc-pc+max-pressure+rerouting-30",
+        "dpc-pcrg+max-pressure",
+    ]
     scenario = replace(scenario, controller_options=dict.fromkeys(tables, {}))
     for name, expected in (
         ("dpc-pc", "dpc-pc"),
@@ -77,7 +99,9 @@ def test_the_table_with_most_words_applies(scenario):
 def test_tables_that_fit_equally_well_are_an_error(scenario):
     tables = dict.fromkeys(["dpc-pc+max-pressure", "dpc-pc+metering"], {})
     rivals = replace(scenario, controller_options=tables)
-    with pytest.raises(InputError, match=r'fit it equally well; add a table \[controllers."dpc-pc\+metering\+max-p'):
+    with pytest.raises(
+        InputError, match=r'fit it equally well; add a table \[controllers."dpc-pc\+metering\+max-p'
+    ):
         parse("dpc-pc+metering+max-pressure").table(rivals)
     both = "dpc-pc+max-pressure+metering"  # its words may come in any order
     solved = replace(scenario, controller_options={**tables, both: {}})
@@ -87,12 +111,18 @@ def test_tables_that_fit_equally_well_are_an_error(scenario):
 @pytest.mark.parametrize(
     "name, expected",
     [
-        ("nobody", "controller 'nobody' is unknown; choose from no-control, route-guidance, pi-gating"),
+        (
+            "nobody",
+            "controller 'nobody' is unknown; choose from no-control, route-guidance, pi-gating",
+        ),
         ("pi_gating", "unknown; did you mean pi-gating?"),
         ("dpc-pcrg+max-presure", "'max-presure' is unknown; did you mean max-pressure?"),
         ("dpc-pcrg+complience-50", "did you mean compliance-N?"),
         ("", "controller '' is unknown"),
-        ("dpc-pc+", "strategy 'dpc-pc+': '' is unknown; choose from webster, actuated, max-pressure"),
+        (
+            "dpc-pc+",
+            "strategy 'dpc-pc+': '' is unknown; choose from webster, actuated, max-pressure",
+        ),
         ("dpc-pc+pi-gating", "'pi-gating' is unknown"),
         ("webster+no-control", "'no-control' is unknown"),
         ("rerouting-0", "rerouting-N from 1 to 100"),
@@ -111,12 +141,15 @@ def test_tables_that_fit_equally_well_are_an_error(scenario):
 def test_errors_say_what_is_allowed(name, expected):
     with pytest.raises(InputError) as caught:
         parse(name)
-    assert expected in str(caught.value) and "\n" not in str(caught.value)
+    assert expected in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 def test_the_regional_model_takes_no_words_for_a_city():
     assert parse("pi-gating").regional().name == "pi-gating"
-    with pytest.raises(InputError, match=r"\+guided\+max-pressure needs a city in SUMO .*use pi-gating"):
+    with pytest.raises(
+        InputError, match=r"\+guided\+max-pressure needs a city in SUMO .*use pi-gating"
+    ):
         parse("pi-gating+guided+max-pressure").regional()
 
 
@@ -124,7 +157,8 @@ def test_an_object_is_a_strategy(scenario):
     controller = NoControl(planning_model(scenario))
     strategy = parse(controller, "max-pressure")
     assert (strategy.name, strategy.city["signals"]) == ("no-control+max-pressure", "max-pressure")
-    assert strategy.make(scenario) is controller and strategy.planning(scenario).network.hash == scenario.network.hash
+    assert strategy.make(scenario) is controller
+    assert strategy.planning(scenario).network.hash == scenario.network.hash
     with pytest.raises(InputError, match="an object with reset and act"):
         parse(type("Half", (), {"reset": lambda self: None})())
     with pytest.raises(InputError, match="reads no policy"):
@@ -138,22 +172,29 @@ def test_a_fingerprint_changes_with_what_the_runs_depend_on(scenario):
     assert gating.fingerprint(other) != before == gating.fingerprint(scenario)
     assert gating.fingerprint(other)["options"] == {"kp": 2.0}
     assert parse(ALONE).fingerprint(scenario) == {}
-    network = replace(scenario.network, mfds=tuple(replace(m, jam=2 * m.jam) for m in scenario.network.mfds))
+    network = replace(
+        scenario.network, mfds=tuple(replace(m, jam=2 * m.jam) for m in scenario.network.mfds)
+    )
     moved = replace(scenario, network=network)
     assert gating.fingerprint(moved)["model"] != before["model"]
     assert parse("probing-pc").fingerprint(moved) == parse("probing-pc").fingerprint(scenario)
 
 
 def test_a_missing_policy_is_named(scenario):
-    with pytest.raises(InputError, match=r"dpc-pc\.pt: no such policy for dpc-pc; make one with: nmfd train"):
+    with pytest.raises(
+        InputError, match=r"dpc-pc\.pt: no such policy for dpc-pc; make one with: nmfd train"
+    ):
         parse("dpc-pc").make(scenario)
     with pytest.raises(InputError, match="controller greedy reads no policy"):
         parse("greedy").make(scenario, tiny)
 
 
-@pytest.mark.parametrize("name", ["no-control", "route-guidance", "pi-gating", "greedy", "mpc-pc", "probing-pcrg"])
+@pytest.mark.parametrize(
+    "name", ["no-control", "route-guidance", "pi-gating", "greedy", "mpc-pc", "probing-pcrg"]
+)
 def test_controllers_are_made_from_arrays_of_their_own(scenario, name):
     controller, x = parse(name).make(scenario), np.full((2, 2), 100.0)
     controller.reset(1)
     controls = controller.act(Observation(step=0, time=0.0, accumulation=x, backlog=0 * x))
-    assert controls.perimeter.shape == (2, 2) and not np.shares_memory(controls.perimeter, scenario.network.adjacency)
+    assert controls.perimeter.shape == (2, 2)
+    assert not np.shares_memory(controls.perimeter, scenario.network.adjacency)

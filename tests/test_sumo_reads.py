@@ -31,12 +31,18 @@ CALIBRATOR = """<calibrator id="c" edge="B2C2" pos="0">
 TRIP, ENDS = '<trip id="{0}" depart="{1}" ', 'from="A1B1" to="C1D1"'
 FLOW, ROUTED = '<flow id="{0}" begin="{1}" ', '<vehicle id="{0}" depart="{1}" '
 FORMS = {
-    "line": FLOW.replace("{1}", "{1}.4") + 'end="25" period="1" line="7" departPos="base" ' + ENDS + "/>",
+    "line": FLOW.replace("{1}", "{1}.4")
+    + 'end="25" period="1" line="7" departPos="base" '
+    + ENDS
+    + "/>",
     "trip": TRIP + ENDS + "/>",
     "via": TRIP + ENDS + ' via="B2C2"/>',
     "blanks": TRIP + 'from=" A1B1 " to="C1D1&#9;" via=" B2C2 "/>',
-    "stops_only": TRIP + '><stop lane="A1B1_0" duration="3"/><stop lane="C1D1_0" duration="3"/></trip>',
-    "stop_on_the_way": TRIP + ENDS + '><stop lane="B2C2_0" duration="3" startPos="5" endPos="30"/></trip>',
+    "stops_only": TRIP
+    + '><stop lane="A1B1_0" duration="3"/><stop lane="C1D1_0" duration="3"/></trip>',
+    "stop_on_the_way": TRIP
+    + ENDS
+    + '><stop lane="B2C2_0" duration="3" startPos="5" endPos="30"/></trip>',
     "stop_at_the_end": TRIP + 'from="A1B1"><stop busStop="bus" duration="5"/></trip>',
     "parking": TRIP + ENDS + '><stop parkingArea="park" duration="9"/></trip>',
     "junctions": TRIP + 'fromJunction="A1" toJunction="D1"/>',
@@ -48,15 +54,22 @@ FORMS = {
     "types": TRIP + ENDS + ' type="mixed"/>',
     "named_types": TRIP + ENDS + ' type="named"/>',
     "own_speed": TRIP + ENDS + ' speedFactor="1.3"/>',
-    "places": TRIP + ENDS + ' departLane="free" departPos="random" departSpeed="random" arrivalPos="random"/>',
-    "last": TRIP + ENDS + ' departLane="best_prob" departPos="last" departSpeed="avg" arrivalLane="1"/>',
-    "numbers": TRIP + ENDS + ' departLane="1" departPos="30.5" departSpeed="0" arrivalPos="-20" arrivalSpeed="3"/>',
+    "places": TRIP
+    + ENDS
+    + ' departLane="free" departPos="random" departSpeed="random" arrivalPos="random"/>',
+    "last": TRIP
+    + ENDS
+    + ' departLane="best_prob" departPos="last" departSpeed="avg" arrivalLane="1"/>',
+    "numbers": TRIP
+    + ENDS
+    + ' departLane="1" departPos="30.5" departSpeed="0" arrivalPos="-20" arrivalSpeed="3"/>',
     "rerouting": TRIP + ENDS + '><param key="has.rerouting.device" value="true"/></trip>',
     "named_route": ROUTED + 'route="r"/>',
     "route_with_stop": ROUTED + 'route="halt"/>',
     "nested": ROUTED + '><route edges="A1B1&#10;  B1C1"/></vehicle>',
     "repeat": ROUTED + '><route edges="A1B1 B1B2 B2A2 A2A1" repeat="2"/></vehicle>',
-    "nested_stop": ROUTED + '><route edges="A1B1 B1C1"/><stop lane="B1C1_1" until="90" parking="true"/></vehicle>',
+    "nested_stop": ROUTED
+    + '><route edges="A1B1 B1C1"/><stop lane="B1C1_1" until="90" parking="true"/></vehicle>',
     "depart_edge": ROUTED + 'route="r" departEdge="1" arrivalEdge="2"/>',
     "reroute": ROUTED + 'reroute="true"><route edges="A1B1 C1D1"/></vehicle>',
     "shared": ROUTED + 'route="d"/>',
@@ -73,10 +86,14 @@ FORMS = {
     "poisson": FLOW + 'end="60" period="exp(0.2)" ' + ENDS + ' type="named"/>',
     "until_then": FLOW + 'period="20" number="3" ' + ENDS + "/>",
     "endless": FLOW + 'vehsPerHour="60" ' + ENDS + "/>",
-    "flow_via": FLOW + 'end="60" number="3" via="B2C2" ' + ENDS + '><stop lane="C1D1_0" duration="2"/></flow>',
+    "flow_via": FLOW
+    + 'end="60" number="3" via="B2C2" '
+    + ENDS
+    + '><stop lane="C1D1_0" duration="2"/></flow>',
     "flow_zones": FLOW + 'end="60" number="3" fromTaz="west" toTaz="east"/>',
     "scaled_type": FLOW + 'end="60" number="9" route="r" type="thin"/>',
-    "waits_for_a_person": ROUTED.replace("{1}", "triggered") + 'route="r"/><person id="p{0}" depart="{1}">'
+    "waits_for_a_person": ROUTED.replace("{1}", "triggered")
+    + 'route="r"/><person id="p{0}" depart="{1}">'
     '<ride from="A1B1" to="B1C1" lines="{0}"/></person>',
     "walker": '<personFlow id="{0}" begin="{1}" end="60" number="3"><walk from="A1B1" to="B1C1"/></personFlow>',
     "unsorted": TRIP.replace("{1}", "1") + ENDS + "/>",
@@ -93,7 +110,8 @@ OPTIONS = {  # of SUMO
 }
 
 
-# SUMO draws these with other random numbers of a run, or differs by itself: the same vehicles, driven otherwise.
+# SUMO draws these with other random numbers of a run, or differs by itself: the same vehicles,
+# driven otherwise.
 DRIVEN = ("meso", "lateral", "equipped", "window")
 OF_CHANCE = ("per_hour", "places", "last", "walker", "waits_for_a_person", "line")
 DRAWN = ("chance", "hourly", "shared", "references", "alternatives")  # their destinations
@@ -115,13 +133,26 @@ def city(folder, forms, options="", additional=ADDITIONAL):
 def trips(file) -> dict[str, dict[str, str]]:
     """Id -> what SUMO says about every vehicle that departed, without those of the calibrator."""
     driven = (trip.attrib for trip in ElementTree.parse(file).iter("tripinfo"))
-    return {trip["id"]: trip for trip in driven if not trip["id"].startswith("c.") and float(trip["depart"]) >= 0}
+    return {
+        trip["id"]: trip
+        for trip in driven
+        if not trip["id"].startswith("c.") and float(trip["depart"]) >= 0
+    }
 
 
 def plain(config):
     """The trips of SUMO alone."""
     out = config.with_name("plain.xml")
-    tiny_city.run("sumo", "-c", config, "--tripinfo-output", out, "--tripinfo-output.write-unfinished", "--seed", 0)
+    tiny_city.run(
+        "sumo",
+        "-c",
+        config,
+        "--tripinfo-output",
+        out,
+        "--tripinfo-output.write-unfinished",
+        "--seed",
+        0,
+    )
     return trips(out)
 
 
@@ -143,7 +174,9 @@ def test_an_import_reads_what_sumo_reads(tmp_path, options):
     read = {vehicle.get("id"): n for n, vehicle in enumerate(traffic.vehicles)}
     assert traffic.left_out == (0.0, 0.0)
     timed = {name for name in driven if not name.startswith(("waits_for_a_person", "line"))}
-    assert timed <= set(read) and ("max-depart-delay" in case.options or timed == set(read)), timed ^ set(read)
+    assert timed <= set(read) and ("max-depart-delay" in case.options or timed == set(read)), (
+        timed ^ set(read)
+    )
     for name in timed:
         start, end = (driven[name][key].rpartition("_")[0] for key in ("departLane", "arrivalLane"))
         assert streets.edges[traffic.origin[read[name]]] == start, name
@@ -157,7 +190,8 @@ SURE = [name for name in FORMS if name not in OF_CHANCE]
 
 
 @pytest.mark.parametrize(
-    "forms, options", [(["line", "until_then"], ""), (SURE, "")] + [(SURE, OPTIONS[name]) for name in DRIVEN]
+    "forms, options",
+    [(["line", "until_then"], ""), (SURE, "")] + [(SURE, OPTIONS[name]) for name in DRIVEN],
 )
 def test_seed_0_without_control_is_plain_sumo(tmp_path, forms, options):
     """Buses wait in one queue with cars."""
@@ -175,26 +209,37 @@ def test_buses_keep_their_place_among_cars_that_depart_with_them(tmp_path):
 
 
 def drive_and_compare(config, ended):
-    """Compare a run of the imported city with SUMO alone, trip by trip. ended: least number of trips"""
+    """Compare a run of the imported city with SUMO alone, trip by trip. ended: least number of
+    trips"""
     imported(config)
     tmp_path = config.parent
     out = tmp_path / "t.xml"
     run(tmp_path / "scenarios" / "x", "no-control", seed=0, tripinfo=out, progress=False)
     keys = ("depart", "arrival", "routeLength", "departLane", "arrivalLane", "timeLoss")
-    mine, alone = ({name: [trip[key] for key in keys] for name, trip in t.items()} for t in (trips(out), plain(config)))
-    done = {name: trip for name, trip in alone.items() if trip[1] != "-1.00"}  # the import simulates longer
-    assert {name: mine[name] for name in done} == done and len(done) >= ended and set(mine) == set(alone)
+    mine, alone = (
+        {name: [trip[key] for key in keys] for name, trip in t.items()}
+        for t in (trips(out), plain(config))
+    )
+    done = {
+        name: trip for name, trip in alone.items() if trip[1] != "-1.00"
+    }  # the import simulates longer
+    assert {name: mine[name] for name in done} == done
+    assert len(done) >= ended
+    assert set(mine) == set(alone)
 
 
 def test_vehicles_of_a_loaded_state_begin_where_they_are(tmp_path):
     config = city(tmp_path, ["trip", "via", "period", "later"])
     state = tmp_path / "state.xml"
-    tiny_city.run("sumo", "-c", config, "--save-state.times", 50, "--save-state.files", state, "--end", 51)
+    tiny_city.run(
+        "sumo", "-c", config, "--save-state.times", 50, "--save-state.files", state, "--end", 51
+    )
     config.write_text(config.read_text().replace("<end", '<load-state value="state.xml"/><end'))
     case = read_sumo_input(config)
     traffic = read_traffic(case, read_streets(case.net, case.additional), seed=0)
     placed = [vehicle for vehicle in traffic.vehicles if float(vehicle.get("depart")) == 50.0]
-    assert case.begin == 50.0 and {"trip", "via", "period.0"} <= {vehicle.get("id") for vehicle in placed}
+    assert case.begin == 50.0
+    assert {"trip", "via", "period.0"} <= {vehicle.get("id") for vehicle in placed}
     assert all(vehicle.get("departLane") in "01" and vehicle.get("departPos") for vehicle in placed)
     assert len(traffic.vehicles) == len(plain(config)) == 11
     imported(config)
@@ -206,10 +251,13 @@ def test_what_is_left_out_is_said_first_and_last(tmp_path):
     """SUMO refuses a route with a gap, or drives it if it is told to ignore errors."""
     config = city(tmp_path, ["count", "reroute"])
     route = '<vehicle id="gap" depart="9"><route edges="A1B1 C1D1"/></vehicle></routes>'
-    (tmp_path / "c.rou.xml").write_text((tmp_path / "c.rou.xml").read_text().replace("</routes>", route))
+    (tmp_path / "c.rou.xml").write_text(
+        (tmp_path / "c.rou.xml").read_text().replace("</routes>", route)
+    )
     first, *_, last, _ = imported(config).splitlines()
     share = "10.0% of the vehicles and 6.9% of the distance left out"
-    assert share in first and last == f"WARNING: {share}: this is not the traffic of c.sumocfg"
+    assert share in first
+    assert last == f"WARNING: {share}: this is not the traffic of c.sumocfg"
     assert last in (tmp_path / "networks" / "x" / "verdict.txt").read_text()
     config.write_text(config.read_text().replace("<end", '<ignore-route-errors value="true"/><end'))
     assert " 0.0% of the vehicles and 0.0% of the distance left out" in imported(config)

@@ -36,7 +36,9 @@ def learned(scenario):
 def crowded(scenario, seed=0):
     """Cells (C,) [veh]."""
     planning = planning_model(scenario)
-    return np.random.default_rng(seed).uniform(0.0, 400.0, planning.network.regions * planning.destinations.sum())
+    return np.random.default_rng(seed).uniform(
+        0.0, 400.0, planning.network.regions * planning.destinations.sum()
+    )
 
 
 def test_the_slope_is_that_of_the_value(scenario, learned):
@@ -46,13 +48,18 @@ def test_the_slope_is_that_of_the_value(scenario, learned):
         for cell in range(0, len(x), 5):
             moved = x.copy()
             moved[cell] += 1e-3
-            assert (learned(moved, step)[0] - value) / 1e-3 == pytest.approx(slope[cell], rel=1e-3, abs=1e-4)
-    assert learned(x, 240)[0] == learned(x, 300)[0] == 0.0 and not learned(x, 240)[1].any()
+            assert (learned(moved, step)[0] - value) / 1e-3 == pytest.approx(
+                slope[cell], rel=1e-3, abs=1e-4
+            )
+    assert learned(x, 240)[0] == learned(x, 300)[0] == 0.0
+    assert not learned(x, 240)[1].any()
 
 
 def test_more_vehicles_cost_more_and_the_later_the_less(scenario, learned):
     x = crowded(scenario)
-    values = [learned(share * x, step)[0] for share, step in ((1.5, 60), (1.0, 60), (0.5, 60), (0.5, 230))]
+    values = [
+        learned(share * x, step)[0] for share, step in ((1.5, 60), (1.0, 60), (0.5, 60), (0.5, 230))
+    ]
     assert values == sorted(values, reverse=True)
 
 
@@ -62,11 +69,16 @@ def test_the_plan_descends_on_both_sums(scenario, learned):
     mpc = EconomicMpc(planning, guidance=False, terminal=learned)
     used = np.flatnonzero(planning.destinations)
     model = edge_model.build(planning.network, used, guidance=False, step=planning.step)
-    start, demand = crowded(scenario), planning.forecast[:8][:, :, planning.destinations].reshape(8, -1)
+    start, demand = (
+        crowded(scenario),
+        planning.forecast[:8][:, :, planning.destinations].reshape(8, -1),
+    )
     plan = 0.8 * mpc.admissible.open(8)
 
     def total(plan, **chosen):
-        return edge_model.vehicle_steps(model, start, demand, plan, beyond=lambda x: learned(x, 100), **chosen)
+        return edge_model.vehicle_steps(
+            model, start, demand, plan, beyond=lambda x: learned(x, 100), **chosen
+        )
 
     without = edge_model.vehicle_steps(model, start, demand, plan)[0]
     value, slope = total(plan, gradient=True)
@@ -82,14 +94,22 @@ def test_mpc_looks_beyond_its_horizon(scenario, learned):
     """Even with what little was learned here."""
     planning = planning_model(scenario, NAME)
     plain, far = (
-        closed_loop.run(NmfdPlant(scenario), EconomicMpc(planning, guidance=False, terminal=known), scenario, seed=1)
+        closed_loop.run(
+            NmfdPlant(scenario),
+            EconomicMpc(planning, guidance=False, terminal=known),
+            scenario,
+            seed=1,
+        )
         for known in (None, learned)
     )
     assert far.accumulation.sum() < 0.9 * plain.accumulation.sum()
-    assert (plain.controller, far.controller) == ("mpc-pc", NAME) and not far.status.any()
+    assert (plain.controller, far.controller) == ("mpc-pc", NAME)
+    assert not far.status.any()
 
 
-@pytest.mark.parametrize("name, most", [("mpc-pc-terminal", 8.787e7), ("mpc-pcrg-terminal", 5.475e7)])
+@pytest.mark.parametrize(
+    "name, most", [("mpc-pc-terminal", 8.787e7), ("mpc-pcrg-terminal", 5.475e7)]
+)
 def test_the_committed_ones_come_within_five_percent_of_the_bound(scenario, name, most):
     run = closed_loop.run(NmfdPlant(scenario), make_controller(name, scenario), scenario, seed=1)
     assert most < 30.0 * run.accumulation[:-1].sum() < 1.05 * most
@@ -118,6 +138,8 @@ def test_the_same_seed_learns_the_same_and_the_file_keeps_it(scenario, learned, 
 
 
 def test_ipopt_knows_none(scenario, learned):
-    planning = replace(planning_model(scenario, NAME), controller_options={NAME: {"solver": "ipopt"}})
+    planning = replace(
+        planning_model(scenario, NAME), controller_options={NAME: {"solver": "ipopt"}}
+    )
     with pytest.raises(InputError, match="ipopt has no terminal cost"):
         EconomicMpc(planning, guidance=False, terminal=learned)

@@ -1,4 +1,5 @@
-"""What a training draws, descends and keeps: every number from its definition, on a scenario of two regions."""
+"""What a training draws, descends and keeps: every number from its definition, on a scenario of two
+regions."""
 
 import math
 import shutil
@@ -31,45 +32,63 @@ def made(scenario, *, guidance=False):
 
 
 def test_starts_without_a_spread_are_those_of_the_scenario(scenario, generator):
-    x, demand = Rollout(planning_model(scenario), dtype=torch.float64).random_start(3, 0.0, 0.0, generator)
-    assert x.shape == (3, 2, 2) and not x.any()
+    x, demand = Rollout(planning_model(scenario), dtype=torch.float64).random_start(
+        3, 0.0, 0.0, generator
+    )
+    assert x.shape == (3, 2, 2)
+    assert not x.any()
     for n in range(3):
         np.testing.assert_array_equal(demand[:, n], scenario.demand)
 
 
 def test_spread_and_level_scale_the_flows(scenario, generator):
-    """Every flow for itself by 1 +- 0.3, evenly and the same at all times; all of a rollout by 0.5 to 2."""
+    """Every flow for itself by 1 +- 0.3, evenly and the same at all times; all of a rollout by 0.5
+    to 2."""
     rollout = Rollout(planning_model(scenario), dtype=torch.float64)
     _, demand = rollout.random_start(4000, 0.3, 0.0, generator)
     busy = int(scenario.demand[:, 0, 1].argmax())
     factor = demand[busy, :, 0, 1] / scenario.demand[busy, 0, 1]
-    assert 0.7 <= factor.min() < 0.71 and 1.29 < factor.max() <= 1.3 and factor.mean() == pytest.approx(1.0, abs=0.01)
-    torch.testing.assert_close(demand, factor[:, None, None] * torch.tensor(scenario.demand)[:, None])
+    assert 0.7 <= factor.min() < 0.71
+    assert 1.29 < factor.max() <= 1.3
+    assert factor.mean() == pytest.approx(1.0, abs=0.01)
+    torch.testing.assert_close(
+        demand, factor[:, None, None] * torch.tensor(scenario.demand)[:, None]
+    )
     _, demand = rollout.random_start(4000, 0.0, 0.0, generator, (0.5, 2.0))
     level = demand[busy, :, 0, 1] / scenario.demand[busy, 0, 1]
-    assert 0.5 <= level.min() < 0.51 and 1.99 < level.max() <= 2.0 and level.mean() == pytest.approx(1.25, abs=0.03)
+    assert 0.5 <= level.min() < 0.51
+    assert 1.99 < level.max() <= 2.0
+    assert level.mean() == pytest.approx(1.25, abs=0.03)
 
 
 def test_a_share_of_the_rollouts_starts_later_in_a_random_state(scenario, generator):
-    """Three quarters of them: up to 80 % of the jam, only for destinations in use; the demand goes on from there."""
+    """Three quarters of them: up to 80 % of the jam, only for destinations in use; the demand goes
+    on from there."""
     rollout = Rollout(planning_model(scenario), dtype=torch.float64)
     x, demand = rollout.random_start(4000, 0.0, 0.75, generator)
-    assert not x[3000:].any() and (x[:3000].sum((1, 2)) > 0).all()
+    assert not x[3000:].any()
+    assert (x[:3000].sum((1, 2)) > 0).all()
     assert not x[:, :, 0].any()  # nobody is bound for region 0
     filling = x[:3000].sum(-1) / 1000.0
-    assert filling.min() >= 0.0 and 0.7 < filling.max() <= 0.8 and filling.mean() == pytest.approx(0.2, abs=0.01)
+    assert filling.min() >= 0.0
+    assert 0.7 < filling.max() <= 0.8
+    assert filling.mean() == pytest.approx(0.2, abs=0.01)
     padded = np.concatenate([scenario.demand, np.zeros_like(scenario.demand)])
     later = {
-        n: [k for k in range(11) if (demand[:, n].numpy() == padded[k : k + 20]).all()] for n in (*range(50), 3500)
+        n: [k for k in range(11) if (demand[:, n].numpy() == padded[k : k + 20]).all()]
+        for n in (*range(50), 3500)
     }
-    assert later[3500] == [0] and all(later.values())
+    assert later[3500] == [0]
+    assert all(later.values())
     assert {0, 1, 2, 3} <= {shift for shifts in later.values() for shift in shifts}
     assert max(map(min, later.values())) < 10  # at most half of the time
 
 
 def test_every_destination_in_use_gets_its_part(scenario, generator):
     both = replace(scenario, demand=scenario.demand + scenario.demand.transpose(0, 2, 1))
-    x, _ = Rollout(planning_model(both), dtype=torch.float64).random_start(2000, 0.0, 1.0, generator)
+    x, _ = Rollout(planning_model(both), dtype=torch.float64).random_start(
+        2000, 0.0, 1.0, generator
+    )
     assert (x > 0).all()
     assert (x[:, 0, 0] > x[:, 0, 1]).double().mean() == pytest.approx(0.5, abs=0.05)
 
@@ -81,17 +100,20 @@ def test_noise_on_the_demand(scenario, generator):
     assert rollout.perturb(demand, torch.ones(4000), 0.0, generator) is demand
     level = torch.linspace(0.0, 1.0, 4000, dtype=torch.float64)
     off = rollout.perturb(demand, level, 2.0, generator) - 50.0
-    assert not off[:, :, 1, 0].any() and not off[:, 0].any()
+    assert not off[:, :, 1, 0].any()
+    assert not off[:, 0].any()
     for n in (1000, 2500, 3999):
         around = off[:, n - 100 : n + 1, 0, 1]
         assert around.std().item() == pytest.approx(2.0 * level[n - 50].item(), rel=0.1)
     empty = rollout.perturb(0.0 * demand, torch.ones(4000, dtype=torch.float64), 2.0, generator)
-    assert empty.min() == 0.0 and empty.max() > 0.0
+    assert empty.min() == 0.0
+    assert empty.max() > 0.0
 
 
 @pytest.mark.parametrize("rates", [None, 1.5], ids=["one rate", "exit rates"])
 def test_no_drawn_model_is_too_fast_for_the_step(scenario, generator, rates):
-    """A free rate of 0.9 per integration step, half of the draws above it: all above 1 are cut down to 1."""
+    """A free rate of 0.9 per integration step, half of the draws above it: all above 1 are cut down
+    to 1."""
     fastest = 0.9 / scenario.step * scenario.substeps
     network = replace(
         scenario.network,
@@ -101,18 +123,23 @@ def test_no_drawn_model_is_too_fast_for_the_step(scenario, generator, rates):
     rollout = Rollout(planning_model(replace(scenario, network=network)), dtype=torch.float64)
     rollout.draw_model(500, 0.8, generator)
     drawn = rollout.parameters.mfd.c * (rates or 1.0) * scenario.step / scenario.substeps
-    assert drawn.max().item() == pytest.approx(1.0) and drawn.min() < 0.6
+    assert drawn.max().item() == pytest.approx(1.0)
+    assert drawn.min() < 0.6
     assert 0.2 < (drawn > 0.999).double().mean() < 0.6
 
 
 def test_compilation_is_tried_out_where_there_is_a_compiler(monkeypatch):
     asked = []
-    monkeypatch.setattr(rollout_module, "compiled_step", lambda step: lambda x: asked.append(step(x).tolist()))
+    monkeypatch.setattr(
+        rollout_module, "compiled_step", lambda step: lambda x: asked.append(step(x).tolist())
+    )
     monkeypatch.setenv("CXX", "my-compiler")
     monkeypatch.setattr(shutil, "which", lambda name: name if name == "my-compiler" else None)
-    assert rollout_module.can_compile() and asked == [[-1.0]]
+    assert rollout_module.can_compile()
+    assert asked == [[-1.0]]
     monkeypatch.delenv("CXX")
-    assert not rollout_module.can_compile() and len(asked) == 1
+    assert not rollout_module.can_compile()
+    assert len(asked) == 1
     monkeypatch.setattr(shutil, "which", lambda name: name)
     monkeypatch.setattr(rollout_module, "compiled_step", lambda step: step / 0)
     assert not rollout_module.can_compile()
@@ -123,9 +150,12 @@ def test_the_total_time_spent_is_that_of_the_states(scenario, generator):
     rollout, policy = Rollout(planning_model(scenario), dtype=torch.float32), made(scenario)
     x, demand = rollout.random_start(5, 0.2, 0.5, generator)
     exact, seen, _ = rollout.states(policy, x, demand, generator.manual_seed(1))
-    assert torch.equal(exact[0], x) and exact.shape == (20, 5, 2, 2)
+    assert torch.equal(exact[0], x)
+    assert exact.shape == (20, 5, 2, 2)
     assert (seen - exact).std().item() == pytest.approx(scenario.measurement_std, rel=0.1)
-    again = torch.stack([rollout.step(policy, exact[k], demand[k], seen[k] - exact[k]) for k in range(19)])
+    again = torch.stack(
+        [rollout.step(policy, exact[k], demand[k], seen[k] - exact[k]) for k in range(19)]
+    )
     torch.testing.assert_close(again, exact[1:], rtol=1e-4, atol=1e-3)
     total = rollout.total_time_spent(policy, x, demand, generator.manual_seed(1))
     torch.testing.assert_close(total, scenario.step * sum(state.sum((1, 2)) for state in exact))
@@ -140,7 +170,9 @@ def test_a_validation_is_the_scenario_itself(scenario):
             policy, torch.zeros(1, 2, 2), rollout.demand[:, None], torch.Generator()
         ).item()
     for seed in (0, 1):
-        assert training.validate(policy, rollout, seed, training.Training()) == pytest.approx(expected, rel=1e-5)
+        assert training.validate(policy, rollout, seed, training.Training()) == pytest.approx(
+            expected, rel=1e-5
+        )
 
 
 @pytest.mark.parametrize(
@@ -149,7 +181,8 @@ def test_a_validation_is_the_scenario_itself(scenario):
     ids=lambda chosen: next(iter(chosen)),
 )
 def test_a_validation_is_perturbed_as_the_training(scenario, chosen):
-    """18 rollouts instead of 2; the same seed gives the same number, and more demand or noise means more vehicles."""
+    """18 rollouts instead of 2; the same seed gives the same number, and more demand or noise means
+    more vehicles."""
     quiet, policy = replace(scenario, measurement_std=0.0), made(scenario)
     rollout, asked = Rollout(planning_model(quiet)), []
     total = rollout.total_time_spent
@@ -157,30 +190,40 @@ def test_a_validation_is_perturbed_as_the_training(scenario, chosen):
         asked.append(demand) or total(policy, x, demand, generator)
     )
     plain = training.validate(policy, rollout, 0, training.Training())
-    values = [training.validate(policy, rollout, seed, training.Training(**chosen)) for seed in (0, 0, 1)]
+    values = [
+        training.validate(policy, rollout, seed, training.Training(**chosen)) for seed in (0, 0, 1)
+    ]
     assert [demand.shape[1] for demand in asked] == [2, 18, 18, 18]
     assert values[0] == values[1] != plain
     sums = asked[1].sum((0, 2, 3)) / quiet.demand.sum()
     if "mfd_spread" in chosen:
         assert sums.tolist() == pytest.approx([1.0] * 18)
     elif "demand_low" in chosen or "demand_high" in chosen:
-        end = 0.5 if "demand_low" in chosen else 2.0  # nine levels from 1 to the end, two rollouts of each
+        end = (
+            0.5 if "demand_low" in chosen else 2.0
+        )  # nine levels from 1 to the end, two rollouts of each
         low, high = sorted((1.0, end))
-        assert sorted(sums.tolist()) == pytest.approx(np.repeat(np.linspace(low, high, 9), 2).tolist(), rel=1e-4)
+        assert sorted(sums.tolist()) == pytest.approx(
+            np.repeat(np.linspace(low, high, 9), 2).tolist(), rel=1e-4
+        )
     else:  # sigma rises from none to that of the training
-        assert sums[0] == pytest.approx(1.0) and sums[-2:].mean() > 1.05
+        assert sums[0] == pytest.approx(1.0)
+        assert sums[-2:].mean() > 1.05
 
 
 @pytest.fixture
 def steps(monkeypatch):
-    """The learning rate of every Adam step, and the gradients it saw (None for what it leaves alone)."""
+    """The learning rate of every Adam step, and the gradients it saw (None for what it leaves
+    alone)."""
     seen = []
 
     class Noted(torch.optim.Adam):
         def step(self):
             [group] = self.param_groups
             given = [weights.grad is not None for weights in group["params"]]
-            norm = math.sqrt(sum((w.grad**2).sum().item() for w in group["params"] if w.grad is not None))
+            norm = math.sqrt(
+                sum((w.grad**2).sum().item() for w in group["params"] if w.grad is not None)
+            )
             seen.append((group["lr"], given, norm))
             super().step()
 
@@ -193,7 +236,8 @@ def test_the_learning_rate_falls_to_a_tenth_along_a_cosine(tmp_path, scenario, s
     training.train(chosen, parse("dpc-pc"), seed=0, out=tmp_path / "p.pt", steps=4)
     expected = [0.5 * (0.1 + 0.45 * (1.0 + math.cos(math.pi * k / 4))) for k in range(4)]
     assert [rate for rate, _, _ in steps] == pytest.approx(expected)
-    assert expected[0] == 0.5 and expected[2] == pytest.approx(0.275)
+    assert expected[0] == 0.5
+    assert expected[2] == pytest.approx(0.275)
     assert max(norm for _, _, norm in steps) <= 1.0 + 1e-5  # clipped
 
 
@@ -211,17 +255,30 @@ def test_the_best_validation_is_kept(tmp_path, scenario, monkeypatch):
     monkeypatch.setattr(training, "VALIDATION_PERIOD", 2)
     monkeypatch.setattr(training, "validate", lambda *_: next(scores))
     out = training.train(
-        scenario, parse("dpc-pc"), seed=3, out=tmp_path / "p.pt", steps=5, progress=lambda *note: notes.append(note)
+        scenario,
+        parse("dpc-pc"),
+        seed=3,
+        out=tmp_path / "p.pt",
+        steps=5,
+        progress=lambda *note: notes.append(note),
     )
     assert notes == [(k, 5, f"best {best} veh s") for k, best in enumerate(("inf", 7, 7, 5, 5), 1)]
-    expected = {"controller": "dpc-pc", "scenario": "tiny", "seed": 3, "compiled": False, "steps": 5}
+    expected = {
+        "controller": "dpc-pc",
+        "scenario": "tiny",
+        "seed": 3,
+        "compiled": False,
+        "steps": 5,
+    }
     expected["validation_veh_s"] = 5.0
     assert expected.items() <= torch.load(out, weights_only=True)["configuration"].items()
 
 
 def test_a_training_that_diverges_is_an_error(tmp_path, scenario, monkeypatch):
     monkeypatch.setattr(training, "validate", lambda *_: math.nan)
-    with pytest.raises(RunFailed, match="dpc-pc: every validation of 2 steps diverged; lower the learning rate"):
+    with pytest.raises(
+        RunFailed, match="dpc-pc: every validation of 2 steps diverged; lower the learning rate"
+    ):
         training.train(scenario, parse("dpc-pc"), seed=0, out=tmp_path / "p.pt", steps=2)
 
 
@@ -239,7 +296,9 @@ def test_the_model_that_a_controller_is_trained_on_must_be_measured(scenario):
     with pytest.raises(InputError, match="placeholder: is true.*anyway=True"):
         training.check(city, parse("dpc-pc"))
     training.check(scenario, parse("dpc-pc"))
-    shut = replace(scenario.network, controllable=np.zeros_like(scenario.network.adjacency, dtype=float))
+    shut = replace(
+        scenario.network, controllable=np.zeros_like(scenario.network.adjacency, dtype=float)
+    )
     with pytest.raises(InputError, match="controllable: is 0 at every boundary.*anyway=True"):
         training.check(replace(scenario, network=shut), parse("dpc-pcrg"))
 
@@ -248,35 +307,56 @@ def test_nothing_is_trained_on_a_guess_unless_anyway(scenario, tmp_path):
     city = replace(scenario, network=replace(scenario.network, placeholder=True))
     with pytest.raises(InputError, match="placeholder: is true"):
         training.train(city, parse("dpc-pc"), seed=0, out=tmp_path / "a.pt", steps=1)
-    assert training.train(city, parse("dpc-pc"), seed=0, out=tmp_path / "a.pt", steps=1, anyway=True).is_file()
+    assert training.train(
+        city, parse("dpc-pc"), seed=0, out=tmp_path / "a.pt", steps=1, anyway=True
+    ).is_file()
 
 
-def test_a_policy_that_begins_as_no_control_and_gains_nothing_stays_open(scenario, tmp_path, capsys):
+def test_a_policy_that_begins_as_no_control_and_gains_nothing_stays_open(
+    scenario, tmp_path, capsys
+):
     table = {"from_no_control": True, "learning_rate": 1e-6, "holding_cost": 30.0}
     chosen = replace(scenario, controller_options={"dpc-pcrg": table})
     file = training.train(chosen, parse("dpc-pcrg"), seed=0, out=tmp_path / "a.pt", steps=1)
     assert "its gates stay open" in capsys.readouterr().err
-    perimeter, splits = load_policy(file, scenario.network)[0](torch.rand(2, 2, generator=torch.manual_seed(0)) * 100.0)
+    perimeter, splits = load_policy(file, scenario.network)[0](
+        torch.rand(2, 2, generator=torch.manual_seed(0)) * 100.0
+    )
     assert perimeter[0, 1].item() == pytest.approx(scenario.network.u_max, abs=1e-4)
     assert np.allclose(splits.detach(), scenario.network.nominal_splits, atol=0.05)
 
 
 def test_holding_costs_by_the_vehicle(scenario):
-    """Vehicles that would leave per second, times the mean closed share of their boundaries, times the cost."""
-    rollout, costly = (Rollout(planning_model(scenario, "dpc-pc"), holding_cost=cost) for cost in (0.0, 30.0))
+    """Vehicles that would leave per second, times the mean closed share of their boundaries, times
+    the cost."""
+    rollout, costly = (
+        Rollout(planning_model(scenario, "dpc-pc"), holding_cost=cost) for cost in (0.0, 30.0)
+    )
     x, generator = rollout.start[None], torch.manual_seed(0)
     network = scenario.network
 
     class Half(torch.nn.Module):
         def forward(self, x):
-            return torch.full_like(x, 0.5 * (network.u_min + network.u_max)) * rollout.parameters.adjacency
+            return (
+                torch.full_like(x, 0.5 * (network.u_min + network.u_max))
+                * rollout.parameters.adjacency
+            )
 
-    free, paid = (r.total_time_spent(Half(), x, r.demand[:, None], generator) for r in (rollout, costly))
+    free, paid = (
+        r.total_time_spent(Half(), x, r.demand[:, None], generator) for r in (rollout, costly)
+    )
     states = rollout.states(Half(), x, rollout.demand[:, None], generator)[0].sum(-1)
     leaving = torch.tensor(
-        np.array([mfd.outflow(n) for mfd, n in zip(network.mfds, states.squeeze(1).numpy().T, strict=True)])
+        np.array(
+            [
+                mfd.outflow(n)
+                for mfd, n in zip(network.mfds, states.squeeze(1).numpy().T, strict=True)
+            ]
+        )
     )
-    assert (paid - free).item() == pytest.approx(30.0 * scenario.step * 0.5 * leaving.sum().item(), rel=1e-3)
+    assert (paid - free).item() == pytest.approx(
+        30.0 * scenario.step * 0.5 * leaving.sum().item(), rel=1e-3
+    )
 
 
 def test_a_model_of_its_own_counts(tmp_path):

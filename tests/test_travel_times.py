@@ -1,4 +1,5 @@
-"""What streets and junctions take, worked out by hand: a, 100 m at up to 10 m/s, leads over a junction to b and c."""
+"""What streets and junctions take, worked out by hand: a, 100 m at up to 10 m/s, leads over a
+junction to b and c."""
 
 import math
 
@@ -35,15 +36,19 @@ def learn(times, *speeds, vehicles=(2.0, 2.0, 2.0), **others):
 def test_at_first_everything_is_free(times):
     assert times.edges.tolist() == times.free.tolist() == [10.0] * 3
     assert times.turns.tolist() == times.free_turns.tolist() == [2.0, 1.0]
-    assert times.first.tolist() == [0, 0] and times.second.tolist() == [1, 2]
+    assert times.first.tolist() == [0, 0]
+    assert times.second.tolist() == [1, 2]
     learn(times, NOBODY, NOBODY, NOBODY)
-    assert times.edges.tolist() == [10.0] * 3 and times.turns.tolist() == [2.0, 1.0]
+    assert times.edges.tolist() == [10.0] * 3
+    assert times.turns.tolist() == [2.0, 1.0]
 
 
 def test_many_count_more_than_few_and_nobody_is_faster_than_allowed(times):
     learn(times, 2.0, 2.0, 30.0, vehicles=(2.0, 0.01, 2.0), duration=60.0)
     for edge, spent in ((0, 120.0), (1, 0.6)):
-        assert times.edges[edge] == pytest.approx(100.0 / ((2.0 * spent + 10.0 * PRIOR_VEH_S) / (spent + PRIOR_VEH_S)))
+        assert times.edges[edge] == pytest.approx(
+            100.0 / ((2.0 * spent + 10.0 * PRIOR_VEH_S) / (spent + PRIOR_VEH_S))
+        )
     assert times.edges[2] == 10.0
 
 
@@ -52,19 +57,29 @@ def test_the_newest_counts_most(times):
     learn(times, 8.0, NOBODY, 8.0, vehicles=(1.0, 0.0, 1.0), duration=90.0)
     kept = math.exp(-90.0 / WINDOW_S)
     driven, spent = 240.0 * kept + 8.0 * 90.0, 120.0 * kept + 90.0
-    assert times.edges[0] == pytest.approx(100.0 * (spent + PRIOR_VEH_S) / (driven + 10.0 * PRIOR_VEH_S))
-    driven, spent = 240.0 * EMPTY_WEIGHT, 120.0 * EMPTY_WEIGHT  # an empty street is soon as good as free
-    assert times.edges[1] == pytest.approx(100.0 * (spent + PRIOR_VEH_S) / (driven + 10.0 * PRIOR_VEH_S))
+    assert times.edges[0] == pytest.approx(
+        100.0 * (spent + PRIOR_VEH_S) / (driven + 10.0 * PRIOR_VEH_S)
+    )
+    driven, spent = (
+        240.0 * EMPTY_WEIGHT,
+        120.0 * EMPTY_WEIGHT,
+    )  # an empty street is soon as good as free
+    assert times.edges[1] == pytest.approx(
+        100.0 * (spent + PRIOR_VEH_S) / (driven + 10.0 * PRIOR_VEH_S)
+    )
     for _ in range(12):
         learn(times, 8.0, NOBODY, 8.0, vehicles=(1.0, 0.0, 1.0))
-    assert times.edges[1] == pytest.approx(10.0, rel=0.02) and times.edges[0] == pytest.approx(12.5, rel=0.1)
+    assert times.edges[1] == pytest.approx(10.0, rel=0.02)
+    assert times.edges[0] == pytest.approx(12.5, rel=0.1)
 
 
 def test_a_long_interval_leaves_less_of_an_empty_street(times):
     learn(times, 2.0, 2.0, 2.0, duration=60.0)
     learn(times, NOBODY, NOBODY, NOBODY, duration=900.0)
     kept = math.exp(-900.0 / WINDOW_S)
-    assert times.edges[0] == pytest.approx(100.0 * (120.0 * kept + PRIOR_VEH_S) / (240.0 * kept + 10.0 * PRIOR_VEH_S))
+    assert times.edges[0] == pytest.approx(
+        100.0 * (120.0 * kept + PRIOR_VEH_S) / (240.0 * kept + 10.0 * PRIOR_VEH_S)
+    )
 
 
 def test_closed_and_standing_streets_are_so_at_once(times):
@@ -88,6 +103,8 @@ def test_turns_take_those_on_the_junction_by_those_who_get_over_it(times):
 
 def test_who_stands_on_a_junction_takes_as_long_as_at_the_slowest_speed(times):
     learn(times, NOBODY, NOBODY, NOBODY, crossing=(1.0, 1.0), crossed=(0.0, 1e-9))
-    assert times.turns.tolist() == pytest.approx([8.0 / STANDING_M_S + 4.0 / STANDING_M_S, 8.0 / STANDING_M_S])
+    assert times.turns.tolist() == pytest.approx(
+        [8.0 / STANDING_M_S + 4.0 / STANDING_M_S, 8.0 / STANDING_M_S]
+    )
     learn(times, NOBODY, NOBODY, NOBODY, crossing=(0.0, 0.0), crossed=(1e6, 1e6))
     assert np.allclose(times.turns, [2.0, 1.0])  # no faster than in free flow

@@ -66,11 +66,14 @@ def test_seeds(city, scenario, tmp_path):
     written = []
     for seed in (1, 1, 2):
         made = as_recorded(make_trips(city, scenario.demand, scenario.step, seed))
-        write_recorded_trips(made, draw(made, seed=seed, factor=1.0, jitter=0.0, begin=0.0), tmp_path / "trips.rou.xml")
+        write_recorded_trips(
+            made,
+            draw(made, seed=seed, factor=1.0, jitter=0.0, begin=0.0),
+            tmp_path / "trips.rou.xml",
+        )
         written.append((tmp_path / "trips.rou.xml").read_bytes())
     first, again, other = written
     assert first == again != other
     vehicles = list(ElementTree.fromstring(first).iter("vehicle"))
-    assert len(vehicles) > 7000 and [vehicle.get("id") for vehicle in vehicles] == [
-        f"v{n}" for n in range(len(vehicles))
-    ]
+    assert len(vehicles) > 7000
+    assert [vehicle.get("id") for vehicle in vehicles] == [f"v{n}" for n in range(len(vehicles))]

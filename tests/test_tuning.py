@@ -64,13 +64,18 @@ def tune(chosen):
 def test_the_best_options_are_found_and_written(city, tmp_path, runs):
     done, _ = runs
     table = tune(order(city, tmp_path / "out"))
-    assert len(table) == 37 and done == [(1000, 1.6)] * 37
+    assert len(table) == 37
+    assert done == [(1000, 1.6)] * 37
     first, best = table.iloc[0], table.loc[table[tuning.SCORE].idxmin()]
-    assert first["kp"] == pytest.approx(1.0) and first["set_point[0]"] == 400.0  # the scenario's, the middle
+    assert first["kp"] == pytest.approx(1.0)
+    assert first["set_point[0]"] == 400.0
     floor = 1e6 * 1.1 * 1.6
     assert floor <= best["score_veh_s"] < 1.1 * floor < first["score_veh_s"]
-    assert table["set_point[0]"].between(200.0, 600.0).all() and table["kp"].between(0.1, 10.0).all()
-    written = config.read(tmp_path / "out" / "tune.toml")["controllers"]["pi-gating+guided+max-pressure"]
+    assert table["set_point[0]"].between(200.0, 600.0).all()
+    assert table["kp"].between(0.1, 10.0).all()
+    written = config.read(tmp_path / "out" / "tune.toml")["controllers"][
+        "pi-gating+guided+max-pressure"
+    ]
     assert written["kp"] == pytest.approx(best["kp"], rel=1e-5)
     assert written["set_point"] == [pytest.approx(best["set_point[0]"], rel=1e-5)]
 
@@ -82,7 +87,9 @@ def test_numbers_of_a_list_without_a_range_stay_as_they_are(city, tmp_path):
         options={"numbers[3]": (2.0, 12.0), "numbers[6]": (1.0, 2.0)},
         out=tmp_path,
     )
-    table = tuned.tuned({"numbers[3]": 7.0, "numbers[6]": 1.0}).controller_options[tuned.strategy.table(city)]
+    table = tuned.tuned({"numbers[3]": 7.0, "numbers[6]": 1.0}).controller_options[
+        tuned.strategy.table(city)
+    ]
     assert tuple(table["numbers"]) == (9.0, 1.0, 0.0, 7.0, 0.6, 0.5, 1.0, 1.2)
 
 
@@ -142,18 +149,31 @@ def test_a_candidate_whose_run_failed_has_no_score(city, tmp_path, runs):
 )
 def test_one_line_for_what_cannot_be_tuned(city, tmp_path, arguments, expected):
     options = [word for text in arguments for word in ("--option", text)]
-    done = cosim("tune", city.folder, "--controller", "pi-gating", *options, "--out", tmp_path / "out")
-    assert done.exit_code == 2 and expected in done.stderr and not (tmp_path / "out").exists()
+    done = cosim(
+        "tune", city.folder, "--controller", "pi-gating", *options, "--out", tmp_path / "out"
+    )
+    assert done.exit_code == 2
+    assert expected in done.stderr
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_command(city, tmp_path, runs):
-    options = ("--option", "set_point[0]=200:600", "--option", "kp=0.1:10", "--candidates", 3, "--seeds", 1)
-    said = good(cosim("tune", city.folder, "--controller", "pi-gating", *options, "--out", tmp_path / "out"))
-    assert (
-        "# Best of 3 candidates: " in said
-        and "set_point = [" in said
-        and len(pd.read_csv(tmp_path / "out" / "tune.csv")) == 3
+    options = (
+        "--option",
+        "set_point[0]=200:600",
+        "--option",
+        "kp=0.1:10",
+        "--candidates",
+        3,
+        "--seeds",
+        1,
     )
+    said = good(
+        cosim("tune", city.folder, "--controller", "pi-gating", *options, "--out", tmp_path / "out")
+    )
+    assert "# Best of 3 candidates: " in said
+    assert "set_point = [" in said
+    assert len(pd.read_csv(tmp_path / "out" / "tune.csv")) == 3
 
 
 def test_options_that_train_a_policy_train_one_for_every_candidate(city, tmp_path, monkeypatch):
@@ -161,7 +181,9 @@ def test_options_that_train_a_policy_train_one_for_every_candidate(city, tmp_pat
 
     def made(scenario, strategy, *, seed, demand):
         seen.append(scenario.controller_options["dpc-pcrg"]["mfd_scale"])
-        return trajectories.in_city(scenario, strategy, seed, demand, tts=1e6 * seen[-1], trips=9, completed=9)
+        return trajectories.in_city(
+            scenario, strategy, seed, demand, tts=1e6 * seen[-1], trips=9, completed=9
+        )
 
     monkeypatch.setattr(tuning, "processes", lambda jobs, _: [(job, job.job()) for job in jobs])
     made_up.instead_of_sumo(monkeypatch, made)
@@ -175,4 +197,5 @@ def test_options_that_train_a_policy_train_one_for_every_candidate(city, tmp_pat
     )
     table = tune(chosen)
     assert list(table["steps"]) == [1, 1]  # a whole number
-    assert len(set(seen)) == 2 and chosen.policy(0).read_bytes() != chosen.policy(1).read_bytes()
+    assert len(set(seen)) == 2
+    assert chosen.policy(0).read_bytes() != chosen.policy(1).read_bytes()

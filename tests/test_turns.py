@@ -1,4 +1,5 @@
-"""The regional model by its turns against nmfd.model.dynamics, its gradient against autograd; projected gradients."""
+"""The regional model by its turns against nmfd.model.dynamics, its gradient against autograd;
+projected gradients."""
 
 import time
 from dataclasses import replace
@@ -23,7 +24,8 @@ EVERY, SOME = np.arange(7), np.array([1, 2, 6])
 
 
 def problem(model, *, moves=3, horizon=4, seed=0, guidance=True):
-    """start (C,), demand (H, C) and an admissible plan; some regions are beyond the jam accumulation."""
+    """start (C,), demand (H, C) and an admissible plan; some regions are beyond the jam
+    accumulation."""
     random, cells = np.random.default_rng(seed), len(model.region)
     plan = random.uniform(0.0, 1.0, (moves, len(model.edges) + len(model.turns)))
     return (
@@ -34,7 +36,8 @@ def problem(model, *, moves=3, horizon=4, seed=0, guidance=True):
 
 
 def by_dynamics(network, model, start, demand, plan, *, step, substeps, integrator):
-    """The same sum by nmfd.model.dynamics, as a tensor that knows its gradient with respect to `plan`."""
+    """The same sum by nmfd.model.dynamics, as a tensor that knows its gradient with respect to
+    `plan`."""
 
     def cells(vector):
         full = torch.zeros(7, 7, dtype=torch.float64)
@@ -45,16 +48,29 @@ def by_dynamics(network, model, start, demand, plan, *, step, substeps, integrat
     for k in range(len(demand)):
         row = plan[min(k, len(plan) - 1)]
         perimeter, splits = (
-            torch.zeros((7,) * len(at.T), dtype=torch.float64).index_put(tuple(torch.from_numpy(at.T)), values)
+            torch.zeros((7,) * len(at.T), dtype=torch.float64).index_put(
+                tuple(torch.from_numpy(at.T)), values
+            )
             for at, values in ((model.edges, row[:edges]), (model.turns, row[edges:]))
         )
-        x = dynamics.advance(p, x, cells(demand[k]), perimeter, splits, step, integrator=integrator, substeps=substeps)
+        x = dynamics.advance(
+            p,
+            x,
+            cells(demand[k]),
+            perimeter,
+            splits,
+            step,
+            integrator=integrator,
+            substeps=substeps,
+        )
         total = total + x.sum()
     return total
 
 
 @BOTH
-@pytest.mark.parametrize("network", [NETWORK, LIMITED, tiny.mixed(NETWORK)], ids=["published", "limited", "mixed"])
+@pytest.mark.parametrize(
+    "network", [NETWORK, LIMITED, tiny.mixed(NETWORK)], ids=["published", "limited", "mixed"]
+)
 @pytest.mark.parametrize("used", [EVERY, SOME], ids=["every", "some"])
 @pytest.mark.parametrize(
     "scheme",
@@ -72,7 +88,9 @@ def test_the_twin_of_dynamics_and_its_gradient(scheme, used, network, guidance):
     expected.backward()
     value, gradient = edge_model.vehicle_steps(model, start, demand, plan, gradient=True)
     assert value == pytest.approx(expected.item(), rel=1e-12)
-    np.testing.assert_allclose(gradient, tensor.grad.numpy(), rtol=1e-9, atol=1e-9 * np.abs(gradient).max())
+    np.testing.assert_allclose(
+        gradient, tensor.grad.numpy(), rtol=1e-9, atol=1e-9 * np.abs(gradient).max()
+    )
 
 
 def test_the_gradient_of_the_rounded_kink():
@@ -84,7 +102,9 @@ def test_the_gradient_of_the_rounded_kink():
     random = np.random.default_rng(1)
     for _ in range(5):
         way = random.standard_normal(plan.shape)
-        ahead, behind = (edge_model.vehicle_steps(model, start, demand, plan + s * way)[0] for s in (1e-5, -1e-5))
+        ahead, behind = (
+            edge_model.vehicle_steps(model, start, demand, plan + s * way)[0] for s in (1e-5, -1e-5)
+        )
         assert (ahead - behind) / 2e-5 == pytest.approx((gradient * way).sum(), rel=1e-5)
 
 
@@ -108,7 +128,8 @@ def test_projection_is_admissible_nearest_and_idempotent(guidance):
     for spread in (0.1, 3.0, 1e6):
         far = spread * random.standard_normal((2, edges + len(model.turns)))
         near = admissible.project(far)
-        assert NETWORK.u_min <= near[:, :edges].min() and near[:, :edges].max() <= NETWORK.u_max
+        assert NETWORK.u_min <= near[:, :edges].min()
+        assert near[:, :edges].max() <= NETWORK.u_max
         assert near[:, edges:].min() >= 0.0
         for row in near[:, edges:]:
             np.testing.assert_allclose(np.bincount(model.source, row)[model.source], 1.0, atol=1e-9)
@@ -128,7 +149,9 @@ def test_the_gap_is_what_the_best_plan_saves(guidance):
     plan = admissible.project(random.uniform(0.0, 1.0, (2, len(model.edges) + len(model.turns))))
     gradient = random.standard_normal(plan.shape)
     best = admissible.project(plan - 1e6 * gradient)  # far enough: a vertex
-    assert admissible.gap(plan, gradient) == pytest.approx((gradient * (plan - best)).sum(), rel=1e-6)
+    assert admissible.gap(plan, gradient) == pytest.approx(
+        (gradient * (plan - best)).sum(), rel=1e-6
+    )
     assert admissible.gap(best, gradient) == pytest.approx(0.0, abs=1e-3)
 
 
@@ -153,7 +176,8 @@ def test_minimise_a_quadratic_in_a_box():
     for metric, most in ((1.0, 1000), (curvature, 5)):  # the exact metric makes it one step
         function = Mock(side_effect=quadratic(curvature, centre))
         found = minimise(function, in_box, box_gap, np.full(30, 0.5), metric=metric, **limits)
-        assert found.reason is None and function.call_count <= most
+        assert found.reason is None
+        assert function.call_count <= most
         np.testing.assert_allclose(found.point, in_box(centre), atol=1e-3)
 
 
@@ -172,4 +196,5 @@ def test_minimise_says_why_it_stopped():
     search(rising, seconds=0.025)
     assert rising.call_count <= 3
     wrong = search(lambda x: (1.0 + x.sum(), -np.ones(2)))
-    assert wrong.reason == "no further descent" and (wrong.point == 0.0).all()
+    assert wrong.reason == "no further descent"
+    assert (wrong.point == 0.0).all()

@@ -1,4 +1,5 @@
-"""The notebooks of scenarios/tutorials run from their first cell to the last, reduced and in any folder."""
+"""The notebooks of scenarios/tutorials run from their first cell to the last, reduced and in any
+folder."""
 
 import os
 from pathlib import Path
@@ -20,11 +21,14 @@ def test_all_are_there_and_are_small_and_have_their_outputs():
         nbformat.validate(notebook)
         cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
         counts = [cell.execution_count for cell in cells]
-        assert counts == list(range(1, len(cells) + 1)), "run it anew, from the first cell to the last"
+        assert counts == list(range(1, len(cells) + 1)), (
+            "run it anew, from the first cell to the last"
+        )
         outputs = [output for cell in cells for output in cell.outputs]
         assert any("image/png" in output.get("data", {}) for output in outputs)
         text = "".join(cell.source for cell in notebook.cells) + str(outputs)
-        assert not any(output.output_type == "error" for output in outputs) and str(Path.home()) + os.sep not in text
+        assert not any(output.output_type == "error" for output in outputs)
+        assert str(Path.home()) + os.sep not in text
 
 
 @pytest.mark.slow

@@ -1,4 +1,5 @@
-"""The view: watching changes nothing, frames of live and finished runs agree, and the page draws them."""
+"""The view: watching changes nothing, frames of live and finished runs agree, and the page draws
+them."""
 
 import multiprocessing
 import queue
@@ -84,8 +85,11 @@ def test_frames_of_a_finished_run_are_those_of_the_live_one(drawn, plain, seen, 
 def test_the_picture_of_a_city(scenario, drawn):
     city = city_of(scenario.network)
     assert len(drawn.shapes) == len(drawn.edges) == len(drawn.lane_km) == len(city.edges)
-    assert sorted(n for gate in drawn.gates for n in gate.gateways) == list(range(len(city.gateways)))
-    assert all(len(rings) >= 1 for rings in drawn.outlines) and (drawn.critical > 0).all()
+    assert sorted(n for gate in drawn.gates for n in gate.gateways) == list(
+        range(len(city.gateways))
+    )
+    assert all(len(rings) >= 1 for rings in drawn.outlines)
+    assert (drawn.critical > 0).all()
     for curve, critical in zip(drawn.curves, drawn.critical, strict=True):
         assert abs(curve[curve[:, 1].argmax(), 0] - critical) < 0.1 * critical
 
@@ -94,7 +98,8 @@ def test_the_frame_at_a_time(whole):
     seen = live.Seen("x")
     assert seen.at(100.0) is None
     seen.whole, seen.latest = whole, replace(whole[-1], time=whole[-1].time + 20.0, whole=False)
-    assert seen.at(whole[2].time + 1.0) is whole[2] and seen.at(1e9) is seen.latest
+    assert seen.at(whole[2].time + 1.0) is whole[2]
+    assert seen.at(1e9) is seen.latest
 
 
 def test_the_page_draws_every_street_and_escapes_names(drawn, whole):
@@ -104,26 +109,44 @@ def test_the_page_draws_every_street_and_escapes_names(drawn, whole):
     document.add_root(one.layout([Button(label=EVIL)]))
     one.show([replace(whole[-1], note=EVIL), None], whole[-1].time)
     one.trace([whole, whole[:2]], whole[-1].time)
-    assert np.isfinite(one.loads[0].plot.renderers[0].data_source.data["image"][0]).all(), "no critical was seen"
+    assert np.isfinite(one.loads[0].plot.renderers[0].data_source.data["image"][0]).all(), (
+        "no critical was seen"
+    )
     streets = one.maps[0].streets.data
-    assert list(streets["edge"]) == list(drawn.edges) and len(streets["xs"]) == len(drawn.edges)
+    assert list(streets["edge"]) == list(drawn.edges)
+    assert len(streets["xs"]) == len(drawn.edges)
     np.testing.assert_array_equal(streets["density"], whole[-1].density.astype(np.float32))
-    assert len(one.curves.lines[0].data["time"]) == STEPS + 1 and len(one.curves.lines[1].data["time"]) == 2
+    assert len(one.curves.lines[0].data["time"]) == STEPS + 1
+    assert len(one.curves.lines[1].data["time"]) == 2
     content = file_html(document, CDN, title=EVIL)
-    assert EVIL not in content and EVIL not in one.numbers.text
-    for plot in (one.curves.region, one.curves.plane, one.curves.gates, one.curves.trips, one.curves.spent):
+    assert EVIL not in content
+    assert EVIL not in one.numbers.text
+    for plot in (
+        one.curves.region,
+        one.curves.plane,
+        one.curves.gates,
+        one.curves.trips,
+        one.curves.spent,
+    ):
         assert all("[" in axis.axis_label for axis in plot.axis)  # units
 
 
 def test_finished_runs_on_one_page_with_a_slider(drawn, plain):
     later = picture.frames(drawn, plain)
-    emptier = [replace(frame, density=frame.density / 2, accumulation=frame.accumulation / 2) for frame in later]
+    emptier = [
+        replace(frame, density=frame.density / 2, accumulation=frame.accumulation / 2)
+        for frame in later
+    ]
     runs = {"plain": later, EVIL: emptier}
-    layout = page.with_slider(drawn, runs, dict.fromkeys(runs, "red"), picture.totals(drawn, [plain, plain]))
+    layout = page.with_slider(
+        drawn, runs, dict.fromkeys(runs, "red"), picture.totals(drawn, [plain, plain])
+    )
     choose = next(layout.select({"name": "streets"}))
     layers = choose.js_property_callbacks["change:value"][0].args["layers"]
     shown = [label for label, parts in layers if all(part.visible for part in parts)]
-    assert len(choose.options) == 3 and len(layers) == 6 and shown == [choose.value] * 2
+    assert len(choose.options) == 3
+    assert len(layers) == 6
+    assert shown == [choose.value] * 2
     streets = layers[1][1][0].data_source.data
     kilometres = streets["CO2 [kg/km]"] * drawn.lane_km / drawn.lanes
     np.testing.assert_allclose(kilometres, plain.co2, rtol=1e-5)
@@ -133,13 +156,21 @@ def test_finished_runs_on_one_page_with_a_slider(drawn, plain):
     for run, values in zip(runs.values(), film, strict=True):
         for frame, row in zip(run, values, strict=True):
             np.testing.assert_array_equal(row, frame.density.astype(np.float32))
-    choices = [table.data["accumulation"] for _, table, names in arguments["choices"] if "accumulation" in names]
+    choices = [
+        table.data["accumulation"]
+        for _, table, names in arguments["choices"]
+        if "accumulation" in names
+    ]
     for r in range(drawn.regions):
-        np.testing.assert_allclose(choices[0][r], [frame.accumulation[r] for frame in later], rtol=1e-6)
+        np.testing.assert_allclose(
+            choices[0][r], [frame.accumulation[r] for frame in later], rtol=1e-6
+        )
     most = int(np.argmax([frame.accumulation.sum() for frame in later]))
-    assert slider.value == pytest.approx(most * drawn.step / 60) and len(arguments["words"]) == STEPS + 1
+    assert slider.value == pytest.approx(most * drawn.step / 60)
+    assert len(arguments["words"]) == STEPS + 1
     script, div = components(layout, wrap_script=False)
-    assert EVIL not in script and EVIL not in div
+    assert EVIL not in script
+    assert EVIL not in div
 
 
 def test_runs_in_processes_of_their_own(scenario, strategy, tmp_path):
@@ -164,9 +195,12 @@ def test_runs_in_processes_of_their_own(scenario, strategy, tmp_path):
         viewer._toggle()
         wait(lambda: show.over)
         viewer._choose(1)
-        assert viewer._pause.label == "Finished" and viewer._page.region == 1
-        assert show.runs[0].row["completed_veh"] > 0 and len(show.runs[0].whole) == STEPS + 1
-        assert isinstance(show.runs[1].error, InputError) and show.now == show.runs[0].latest.time
+        assert viewer._pause.label == "Finished"
+        assert viewer._page.region == 1
+        assert show.runs[0].row["completed_veh"] > 0
+        assert len(show.runs[0].whole) == STEPS + 1
+        assert isinstance(show.runs[1].error, InputError)
+        assert show.now == show.runs[0].latest.time
     finally:
         show.close()
 
@@ -177,17 +211,21 @@ def test_a_process_that_dies_is_an_error(scenario, strategy):
         show._processes[0].kill()
         show._processes[0].join()
         show.update()
-        assert show.over and isinstance(show.runs[0].error, RunFailed)
+        assert show.over
+        assert isinstance(show.runs[0].error, RunFailed)
     finally:
         show.close()
 
 
 @pytest.mark.slow
-def test_watching_ends_when_the_runs_have_ended_and_nobody_looks(scenario, strategy, monkeypatch, capsys):
+def test_watching_ends_when_the_runs_have_ended_and_nobody_looks(
+    scenario, strategy, monkeypatch, capsys
+):
     monkeypatch.setattr(live, "OPENING_S", 0.0)
     jobs = [Simulation(scenario, strategy, seed=3)]
     [run] = live.watch(jobs)
-    assert run.row["completed_veh"] > 0 and "Watch it at http://localhost:" in capsys.readouterr().err
+    assert run.row["completed_veh"] > 0
+    assert "Watch it at http://localhost:" in capsys.readouterr().err
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

@@ -1,4 +1,5 @@
-"""The page in a browser: the slider and the region of a report, pause and pace of live runs, names that stay text."""
+"""The page in a browser: the slider and the region of a report, pause and pace of live runs, names
+that stay text."""
 
 import re
 import shutil
@@ -37,7 +38,9 @@ def scenario(tmp_path_factory):
 def report(scenario, tmp_path_factory):
     out = tmp_path_factory.mktemp("report") / "run"
     controllers = ("--controller", NAME, "--against", "no-control")
-    good(call("cosim", "run", scenario, *controllers, "--seed", 3, "--set", "steps=6", "--out", out))
+    good(
+        call("cosim", "run", scenario, *controllers, "--seed", 3, "--set", "steps=6", "--out", out)
+    )
     good(call("cosim", "report", out))
     return out / "report.html"
 
@@ -50,14 +53,21 @@ def opened(address: str, origin: str, width: int):
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         page, wrong = browser.new_page(viewport={"width": width, "height": 900}), []
-        page.on("console", lambda message: message.type in ("error", "warning") and wrong.append(message.text))
+        page.on(
+            "console",
+            lambda message: message.type in ("error", "warning") and wrong.append(message.text),
+        )
         page.on("pageerror", lambda error: wrong.append(str(error)))
         page.on("dialog", lambda dialog: wrong.append(dialog.message))
-        page.on("request", lambda one: one.url.startswith((origin, "data:", "blob:")) or wrong.append(one.url))
+        page.on(
+            "request",
+            lambda one: one.url.startswith((origin, "data:", "blob:")) or wrong.append(one.url),
+        )
         page.goto(address)
         page.wait_for_function("() => window.Bokeh && Bokeh.documents.length")
         yield page
-        assert wrong == [] and page.evaluate(NARROW)
+        assert wrong == []
+        assert page.evaluate(NARROW)
         browser.close()
 
 
@@ -73,7 +83,8 @@ def test_the_report(report, width):
             page.keyboard.press("ArrowLeft")
         page.wait_for_timeout(500)
         before = page.evaluate(DENSITIES)
-        assert before[0] != at_the_end[0] and before[1] != at_the_end[1]
+        assert before[0] != at_the_end[0]
+        assert before[1] != at_the_end[1]
         page.locator("select").first.select_option(index=1)
         page.wait_for_timeout(300)
         assert page.evaluate(PLANE).startswith("Region 1")
@@ -96,7 +107,9 @@ def test_the_report(report, width):
         page.wait_for_timeout(500)
         assert page.evaluate(TIME) == 4.5
         assert 0 <= page.locator(".noUi-handle").bounding_box()["y"] < 200, "the bar stays in view"
-        assert page.evaluate("() => document.documentElement.scrollHeight") < (3000 if width > 1000 else 5000)
+        assert page.evaluate("() => document.documentElement.scrollHeight") < (
+            3000 if width > 1000 else 5000
+        )
         page.locator("summary").first.click()
         assert page.locator("table").last.is_visible()
         assert page.evaluate("() => [...document.images].every(one => one.naturalWidth > 100)")
@@ -106,7 +119,9 @@ def test_the_report(report, width):
 def test_the_live_page(width):
     """Two runs that take minutes, so that they are under way when the browser has started."""
     command = [sys.executable, "-m", "cosim", "watch", "grid7_peak", "--controller", "no-control"]
-    process = subprocess.Popen([*command, "--against", "pi-gating"], stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [*command, "--against", "pi-gating"], stderr=subprocess.PIPE, text=True
+    )
     try:
         address = re.search(r"http://localhost:\d+/", process.stderr.readline())[0]
         with opened(address, address, width) as page:
@@ -119,7 +134,9 @@ def test_the_live_page(width):
 
             def wait_for_other_numbers():
                 shown = page.evaluate(NUMBERS)
-                page.wait_for_function(f"before => ({NUMBERS})() !== before", arg=shown, timeout=20_000)
+                page.wait_for_function(
+                    f"before => ({NUMBERS})() !== before", arg=shown, timeout=20_000
+                )
 
             wait_for_other_numbers()
             press("Pause")

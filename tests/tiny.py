@@ -1,4 +1,5 @@
-"""A scenario small enough for tests: two or three regions in a row, 0-1-2, twenty control intervals."""
+"""A scenario small enough for tests: two or three regions in a row, 0-1-2, twenty control
+intervals."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -63,14 +64,19 @@ class Mine:
 def row_network(regions: int = 2) -> str:
     """network.toml of `regions` regions in a row."""
     return NETWORK.format(name=f"row{regions}") + "".join(
-        REGION.format(position=region, adjacent=[h for h in (region - 1, region + 1) if 0 <= h < regions])
+        REGION.format(
+            position=region, adjacent=[h for h in (region - 1, region + 1) if 0 <= h < regions]
+        )
         for region in range(regions)
     )
 
 
 def write(folder: Path, *, scenario: str = SCENARIO, network: str | None = None) -> Path:
     """The folder of a scenario in `folder`, its network beside it."""
-    for name, text in (("network", row_network() if network is None else network), ("scenario", scenario)):
+    for name, text in (
+        ("network", row_network() if network is None else network),
+        ("scenario", scenario),
+    ):
         (folder / name).mkdir(parents=True)
         (folder / name / f"{name}.toml").write_text(text)
     return folder / "scenario"
@@ -106,7 +112,8 @@ def mixed(network: RegionalModel) -> RegionalModel:
     own = Exponential(free=np.e * high / (0.3 * jam), middle=0.3 * jam, jam=jam)
     flat = trapezoid(free=4.0 * high / jam, capacity=high, wave=2.0 * high / jam, jam=1.1 * jam)
     lines = PiecewiseLinear(
-        accumulations=(0.2 * jam, 0.35 * jam, 0.6 * jam, jam), outflows=(0.8 * high, high, 0.7 * high, 0.1 * high)
+        accumulations=(0.2 * jam, 0.35 * jam, 0.6 * jam, jam),
+        outflows=(0.8 * high, high, 0.7 * high, 0.1 * high),
     )
     others = own, flat, lines, replace(flat, outflows=(0.9 * high, high, 0.2 * high))
     return replace(network, mfds=(*others, *network.mfds)[: network.regions])
@@ -147,5 +154,8 @@ def made(**fields) -> Result:
         "wall_time": 1.0,
     }
     values = usual | fields
-    attrs = {name: values.pop(name) for name in ("controller", "plant", "seed", "step", "estimated", "wall_time")}
+    attrs = {
+        name: values.pop(name)
+        for name in ("controller", "plant", "seed", "step", "estimated", "wall_time")
+    }
     return Result.make(attrs, **values)

@@ -1,4 +1,5 @@
-"""A small SUMO city with everything that a real one brings: buses, flows, zones, persons, several files."""
+"""A small SUMO city with everything that a real one brings: buses, flows, zones, persons, several
+files."""
 
 import gzip
 import subprocess
@@ -57,15 +58,30 @@ BUSES = """<routes>
 
 def run(program: str, *arguments) -> None:
     done = subprocess.run(
-        [str(Path(sumo.SUMO_HOME) / "bin" / program), *map(str, arguments)], capture_output=True, text=True
+        [str(Path(sumo.SUMO_HOME) / "bin" / program), *map(str, arguments)],
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == 0, done.stderr
 
 
 def network(folder: Path, *options: str, name: str = "city.net.xml") -> Path:
-    """A grid of 4 x 4 junctions A0 to D3, 200 m apart, with signals at all inner ones unless told otherwise."""
+    """A grid of 4 x 4 junctions A0 to D3, 200 m apart, with signals at all inner ones unless told
+    otherwise."""
     options = options or ("--tls.set", "B1,B2,C1,C2,B3,C0")
-    grid = "--grid --grid.number 4 --grid.length 200 --default.lanenumber 2 --no-turnarounds true --seed 1".split()
+    grid = [
+        "--grid",
+        "--grid.number",
+        "4",
+        "--grid.length",
+        "200",
+        "--default.lanenumber",
+        "2",
+        "--no-turnarounds",
+        "true",
+        "--seed",
+        "1",
+    ]
     run("netgenerate", *grid, "--output-file", folder / name, *options)
     return folder / name
 
@@ -96,9 +112,11 @@ def imported(folder: Path, regions: int = 3, source: Path | None = None, **optio
 
 
 @contextmanager
-def played(scenario: Scenario, intervals: int, gates: float, splits: np.ndarray | None = None, **overrides) -> Iterator:
-    """A plant after so many intervals with all u at `gates`, its state and its record; the ledger is checked in every
-    interval."""
+def played(
+    scenario: Scenario, intervals: int, gates: float, splits: np.ndarray | None = None, **overrides
+) -> Iterator:
+    """A plant after so many intervals with all u at `gates`, its state and its record; the ledger
+    is checked in every interval."""
     scenario = replace(scenario, steps=intervals)
     plant = SumoPlant(scenario, settings=settings(scenario).changed(**overrides))
     controls = Controls(perimeter=np.where(scenario.network.adjacency, gates, 0.0), splits=splits)
@@ -110,7 +128,12 @@ def played(scenario: Scenario, intervals: int, gates: float, splits: np.ndarray 
 
 
 def driven(scenario: Scenario, intervals: int, gates: float, **overrides) -> tuple:
-    """(trips due, departures, arrivals, accumulation, backlog) of `played` with nominal split ratios."""
-    with played(scenario, intervals, gates, scenario.network.nominal_splits, **overrides) as (plant, state, record):
+    """(trips due, departures, arrivals, accumulation, backlog) of `played` with nominal split
+    ratios."""
+    with played(scenario, intervals, gates, scenario.network.nominal_splits, **overrides) as (
+        plant,
+        state,
+        record,
+    ):
         due, inside = len(plant.meter.trips()), state.accumulation.sum()
         return due, record.departures.sum(), record.arrivals.sum(), inside, state.backlog.sum()

@@ -10,16 +10,21 @@ from nmfd.types import Result, Status
 
 
 def recorded(run: Result, arrays: dict[str, np.ndarray], facts: dict) -> Result:
-    """`run` in a city, with the arrays of a Record and its facts, and one signal that kept its rules."""
+    """`run` in a city, with the arrays of a Record and its facts, and one signal that kept its
+    rules."""
     sheet = {name: np.zeros(1) for name in SHEET} | {"signal": np.array(["J"])}
     return run.add(facts, {**RECORD, **SHEET, **TOTALS}, **sheet, **arrays)
 
 
 def record(steps: int, *, regions: int, gateways: int = 3, edges: int = 5) -> dict[str, np.ndarray]:
     """The arrays of a Record, at random."""
-    sizes, random = {"interval": steps, "gateway": gateways, "edge": edges}, np.random.default_rng(0)
+    sizes, random = (
+        {"interval": steps, "gateway": gateways, "edge": edges},
+        np.random.default_rng(0),
+    )
     return {
-        name: random.random([sizes.get(axis, regions) for axis in about.dimensions]) for name, about in RECORD.items()
+        name: random.random([sizes.get(axis, regions) for axis in about.dimensions])
+        for name, about in RECORD.items()
     }
 
 
@@ -41,7 +46,9 @@ def trajectory(controller="no-control", seed=0, steps=4):
     )
 
 
-def in_city(scenario, strategy, seed: int, demand: float, *, tts: float, trips: int, completed: int) -> Result:
+def in_city(
+    scenario, strategy, seed: int, demand: float, *, tts: float, trips: int, completed: int
+) -> Result:
     """A run of one interval; tts: its total time spent [veh s]."""
     regions = scenario.network.regions
     accumulation = np.zeros((2, regions, regions))
@@ -57,7 +64,7 @@ def in_city(scenario, strategy, seed: int, demand: float, *, tts: float, trips: 
         perimeter=np.ones((1, regions, regions)),
         splits=np.zeros((1, regions, regions, regions)),
     )
-    facts = {name: 0 for name in FACTS} | {
+    facts = dict.fromkeys(FACTS, 0) | {
         "outside_training": "",
         "trips": trips,
         "scenario": scenario.name,

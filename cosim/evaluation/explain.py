@@ -1,4 +1,5 @@
-"""Why a controller gains or loses against the reference: one paragraph from the numbers of the runs."""
+"""Why a controller gains or loses against the reference: one paragraph from the numbers of the
+runs."""
 
 from collections.abc import Sequence
 
@@ -25,19 +26,24 @@ LONGER_PERCENT = 5.0  # trips from one region, while the whole gains
 
 
 def load(network: RegionalModel, runs: Sequence[Result]) -> tuple[PerRegion, PerRegion]:
-    """Return peak accumulation over critical (R,) and the share of time beyond critical (R,), mean over runs.
+    """Return peak accumulation over critical (R,) and the share of time beyond critical (R,), mean
+    over runs.
 
     NaN and 0 where the critical accumulation was not seen.
     """
     states = [run.accumulation.sum(axis=2) / network.seen_critical for run in runs]
-    return np.mean([s.max(axis=0) for s in states], axis=0), np.mean([(s > 1).mean(axis=0) for s in states], axis=0)
+    return np.mean([s.max(axis=0) for s in states], axis=0), np.mean(
+        [(s > 1).mean(axis=0) for s in states], axis=0
+    )
 
 
 def text(level: Level, finished: Finished) -> str:
     """Return the section of evaluate.md for one demand level."""
     names = list(dict.fromkeys(level.rows["controller"]))
     lines = [f"- {paragraph(level, finished, name)}" for name in names if name != REFERENCE]
-    return "\n".join([f"## Why, at demand times {level.demand:g}", "", city(level, finished), "", *lines, ""])
+    return "\n".join(
+        [f"## Why, at demand times {level.demand:g}", "", city(level, finished), "", *lines, ""]
+    )
 
 
 def city(level: Level, finished: Finished) -> str:
@@ -68,25 +74,45 @@ def paragraph(level: Level, finished: Finished, name: str) -> str:
     values = [statistics.by_seed(level.rows, level.demand, each) for each in (name, against)]
     pair = statistics.paired(*values)
     if np.isnan(pair.percent):
-        return f"{name} has no seed in common with {against}, or no vehicle spent time: no comparison."
+        return (
+            f"{name} has no seed in common with {against}, or no vehicle spent time: no comparison."
+        )
     few, gains = pair.seeds < statistics.FEWEST_SEEDS, pair.percent < 0
     clear = pair.significant or few
     verdict = "changes nothing" if not pair.percent else "gains" if gains else "loses"
     if pair.percent and not clear:
         verdict = "shows no significant change"
-    spread = f"± {pair.percent_half:.1f} % over {pair.seeds} seeds" if pair.seeds > 1 else "on one seed"
+    spread = (
+        f"± {pair.percent_half:.1f} % over {pair.seeds} seeds" if pair.seeds > 1 else "on one seed"
+    )
     spread += ", no proof" * few
-    reasons = _reasons(level, finished.scenario, name, against, gains=clear and gains) + _removed(level, name)
+    reasons = _reasons(level, finished.scenario, name, against, gains=clear and gains) + _removed(
+        level, name
+    )
     size = f"{pair.percent:+.1f} % total time spent against {against} {spread}"
-    losers = _losers(level, finished.scenario.network.region_names, name, against) if clear and gains else ""
+    losers = (
+        _losers(level, finished.scenario.network.region_names, name, against)
+        if clear and gains
+        else ""
+    )
     return f"{name} {verdict} ({size}){': ' if reasons else ''}{'; '.join(reasons)}.{losers}"
 
 
-def _reasons(level: Level, scenario: Scenario, name: str, against: str, *, gains: bool) -> list[str]:
+def _reasons(
+    level: Level, scenario: Scenario, name: str, against: str, *, gains: bool
+) -> list[str]:
     """Return what the controller did, and what limits it if it does not gain."""
-    reference, runs, strategy, network = level.results(against), level.results(name), parse(name), scenario.network
+    reference, runs, strategy, network = (
+        level.results(against),
+        level.results(name),
+        parse(name),
+        scenario.network,
+    )
     beyond = load(network, reference)[1]
-    trips, acts = max(sum(run.departures.sum() for run in runs), 1), strategy.controller.name != ALONE
+    trips, acts = (
+        max(sum(run.departures.sum() for run in runs), 1),
+        strategy.controller.name != ALONE,
+    )
     limit = network.u_max - OPEN_SHARE * (network.u_max - network.u_min)
     held = float(np.mean([(run.perimeter[:, network.adjacency] < limit).mean() for run in runs]))
     guided = sum(run.guided.sum() for run in runs) / trips
@@ -98,7 +124,9 @@ def _reasons(level: Level, scenario: Scenario, name: str, against: str, *, gains
         f"its trips wait {waited:.0f} s before they begin": waited >= WAIT_S,
     }
     done = _never_reached(strategy, scenario, runs)
-    done += [words for words, true in deeds.items() if true] or ["it never holds back and never guides"] * acts
+    done += [words for words, true in deeds.items() if true] or [
+        "it never holds back and never guides"
+    ] * acts
     critical, region = np.flatnonzero(beyond > SMALL_SHARE), int(np.argmax(beyond))
     if gains:
         now = load(network, runs)[1][region]
@@ -106,7 +134,10 @@ def _reasons(level: Level, scenario: Scenario, name: str, against: str, *, gains
         return done + [relief] * bool(len(critical))
     mean = level.rows[level.rows["controller"] == name].mean(numeric_only=True)
     full = level.rows.groupby("controller")["gateway_full_share"].mean()
-    split, between = mean.get("split_lanes", 0), [mean.get(f"{k}intergreen_share", 0.0) for k in ("", "programmed_")]
+    split, between = (
+        mean.get("split_lanes", 0),
+        [mean.get(f"{k}intergreen_share", 0.0) for k in ("", "programmed_")],
+    )
     leaking, holds = _leaking(level), held >= SMALL_SHARE
     started = sum(run.departures.sum(axis=(0, 2)) for run in reference)
     entered = sum(run.crossings.sum(axis=(0, 1, 3)) for run in reference)
@@ -114,20 +145,28 @@ def _reasons(level: Level, scenario: Scenario, name: str, against: str, *, gains
     blocks = holds and full[name] - full[against] > FULL_SHARE
     slow = between[0] > between[1] + INTERGREEN_SHARE
     limits = {
-        f"{leaking:.0%} of the boundary flow passes no signal under control": acts and leaking > LEAKING_SHARE,
-        "no region is seen to be critical, so there is nothing to protect": acts and not len(critical),
+        f"{leaking:.0%} of the boundary flow passes no signal under control": acts
+        and leaking > LEAKING_SHARE,
+        "no region is seen to be critical, so there is nothing to protect": acts
+        and not len(critical),
         "most vehicles in the critical regions start there, behind the gateways": holds and inside,
         f"its queues fill the edges before gateways {full[name]:.0%} of the time, not {full[against]:.0%}": blocks,
-        f"{split:.0f} of {mean.get('signal_lanes', 0):.0f} lanes serve movements of several stages": split > 0,
+        f"{split:.0f} of {mean.get('signal_lanes', 0):.0f} lanes serve movements of several stages": split
+        > 0,
         f"its signals are between stages {between[0]:.0%} of the time, the original programmes {between[1]:.0%}": slow,
     }
     return done + [words for words, true in limits.items() if true]
 
 
 def _losers(level: Level, region_names: Sequence[str], name: str, against: str) -> str:
-    """Return a sentence about the regions from which trips take much longer, "" if there are none."""
+    """Return a sentence about the regions from which trips take much longer, "" if there are
+    none."""
     longer = statistics.longer_trips(level, name, against)
-    worst = [f"{region_names[r]} ({longer[r]:+.0f} %)" for r in np.argsort(-longer) if longer[r] > LONGER_PERCENT]
+    worst = [
+        f"{region_names[r]} ({longer[r]:+.0f} %)"
+        for r in np.argsort(-longer)
+        if longer[r] > LONGER_PERCENT
+    ]
     return f" Some lose: trips from {', '.join(worst)} take longer." if worst else ""
 
 
@@ -147,10 +186,18 @@ def _never_reached(strategy: Strategy, scenario: Scenario, runs: Sequence[Result
 
 def _removed(level: Level, name: str) -> list[str]:
     """Return the removed trips as a reason if they are many: their time counts until then."""
-    removed, trips = level.rows.loc[level.rows["controller"] == name, ["removed_veh", "trips"]].sum()
-    return [f"{removed / trips:.1%} of its trips end by removal"] if removed > SMALL_SHARE * trips else []
+    removed, trips = level.rows.loc[
+        level.rows["controller"] == name, ["removed_veh", "trips"]
+    ].sum()
+    return (
+        [f"{removed / trips:.1%} of its trips end by removal"]
+        if removed > SMALL_SHARE * trips
+        else []
+    )
 
 
 def _leaking(level: Level) -> float:
     rows = level.rows
-    return float(rows.loc[rows["controller"] == statistics.compared_with(rows), "leaking_share"].mean())
+    return float(
+        rows.loc[rows["controller"] == statistics.compared_with(rows), "leaking_share"].mean()
+    )

@@ -1,4 +1,5 @@
-"""Microsimulation against the predictions of the regional model: `cosim compare`, and samples of MFDs."""
+"""Microsimulation against the predictions of the regional model: `cosim compare`, and samples of
+MFDs."""
 
 import os
 from collections.abc import Sequence
@@ -52,11 +53,16 @@ def predict(scenario: Scenario, result: Result) -> Result:
     states = [x]
     for interval in zip(*map(torch.from_numpy, given), strict=True):
         states.append(advance(known, states[-1], *interval, **scenario.scheme))
-    return result.assign(accumulation=torch.stack(states).numpy(), backlog=np.zeros_like(result.backlog), plant="nmfd")
+    return result.assign(
+        accumulation=torch.stack(states).numpy(),
+        backlog=np.zeros_like(result.backlog),
+        plant="nmfd",
+    )
 
 
 def compare(found: Finished) -> pd.DataFrame:
-    """Draw the runs of a folder beside predictions; return the errors by strategy, demand level and region.
+    """Draw the runs of a folder beside predictions; return the errors by strategy, demand level and
+    region.
 
     Raises: InputError if the city has changed since the runs
     """
@@ -64,7 +70,10 @@ def compare(found: Finished) -> pd.DataFrame:
     tables = []
     for level in found.levels:
         for controller in level.rows["controller"].unique():
-            network, results = parse(controller).planning(found.scenario).network, level.results(controller)
+            network, results = (
+                parse(controller).planning(found.scenario).network,
+                level.results(controller),
+            )
             scenario, runs = replace(found.scenario, network=network), list(map(observed, results))
             predicted = [predict(scenario, result) for result in results]
             both = zip(predicted, results, strict=True)
@@ -76,12 +85,15 @@ def compare(found: Finished) -> pd.DataFrame:
                 "model": os.path.normpath(network.folder) if network.folder else "",
                 "region": range(network.regions),
                 "critical_veh": network.seen_critical,
-                "most_share": largest_accumulation(run.accumulation for run in runs) / network.seen_critical,
+                "most_share": largest_accumulation(run.accumulation for run in runs)
+                / network.seen_critical,
                 "whole_run_rmse_share": np.sqrt((off**2).mean(axis=0)) / network.seen_critical,
                 "whole_run_bias_share": off.mean(axis=0) / network.seen_critical,
             }
             tables.append(pd.DataFrame(columns).join(predictions(network, runs, scenario.scheme)))
-            drawn = [run.assign(backlog=np.zeros_like(run.backlog)) for run in (results[0], predicted[0])]
+            drawn = [
+                run.assign(backlog=np.zeros_like(run.backlog)) for run in (results[0], predicted[0])
+            ]
             prefix = f"compare-{files.run_name(controller, results[0].seed)}-"
             draw_accumulations(level.folder, scenario, drawn, prefix=prefix)
     return pd.concat(tables, ignore_index=True)
@@ -91,7 +103,10 @@ def prediction_table(rows: pd.DataFrame) -> str:
     """Return prediction errors as text, one line per strategy and demand level."""
     lines = []
     for (demand, controller), group in rows.groupby(["demand", "controller"], sort=False):
-        mean, first = (100 * group.filter(like="rmse_share").mean()).map("{:.1f} %".format), group.iloc[0]
+        mean, first = (
+            (100 * group.filter(like="rmse_share").mean()).map("{:.1f} %".format),
+            group.iloc[0],
+        )
         lines.append(
             {
                 "demand": f"{demand:g}",
@@ -110,13 +125,17 @@ def prediction_table(rows: pd.DataFrame) -> str:
 
 
 def outflow_samples(network: RegionalModel, results: Sequence[Result]) -> list[dict[str, Points]]:
-    """Return the MFD samples of each region: label -> (n, 2) of accumulation [veh] and outflow [veh/s].
+    """Return the MFD samples of each region: label -> (n, 2) of accumulation [veh] and outflow
+    [veh/s].
 
-    Labels are "loading", "unloading", and SPILLBACK for intervals in which a neighbour's congestion limits the outflow
-    (`held_up`). The outflow of an interval is that which the model's g gives: trips ended in the region, and transfers
-    divided by u. In the model x_ii leaves at q x_ii and x_ij at u q x_ij, so q = outflow / (x_ii + u x_i,other).
+    Labels are "loading", "unloading", and SPILLBACK for intervals in which a neighbour's congestion
+    limits the outflow (`held_up`). The outflow of an interval is that which the model's g gives:
+    trips ended in the region, and transfers divided by u. In the model x_ii leaves at q x_ii and
+    x_ij at u q x_ij, so q = outflow / (x_ii + u x_i,other).
     """
-    samples: list[dict] = [{"loading": [], "unloading": [], SPILLBACK: []} for _ in range(network.regions)]
+    samples: list[dict] = [
+        {"loading": [], "unloading": [], SPILLBACK: []} for _ in range(network.regions)
+    ]
     for result in results:
         x = 0.5 * (result.accumulation[1:] + result.accumulation[:-1])
         total, own = x.sum(2), np.diagonal(x, axis1=1, axis2=2)
@@ -125,18 +144,25 @@ def outflow_samples(network: RegionalModel, results: Sequence[Result]) -> list[d
         points = np.stack([total, outflow * total / np.maximum(weight, 1e-9)], axis=2)
         rising = np.diff(result.accumulation.sum(2), axis=0) >= 0
         seen, blocked = total >= FEWEST_VEHICLES, held_up(total, outflow, network.adjacency)
-        masks = {"loading": seen & ~blocked & rising, "unloading": seen & ~blocked & ~rising, SPILLBACK: seen & blocked}
+        masks = {
+            "loading": seen & ~blocked & rising,
+            "unloading": seen & ~blocked & ~rising,
+            SPILLBACK: seen & blocked,
+        }
         for n, clouds in enumerate(samples):
             for label, mask in masks.items():
                 clouds[label].append(points[mask[:, n], n])
     return [{label: np.concatenate(parts) for label, parts in clouds.items()} for clouds in samples]
 
 
-def held_up(accumulation: RegionCounts, outflow: RegionCounts, adjacency: Adjacency) -> Bool[np.ndarray, "T R"]:
+def held_up(
+    accumulation: RegionCounts, outflow: RegionCounts, adjacency: Adjacency
+) -> Bool[np.ndarray, "T R"]:
     """Mark the intervals in which a neighbour that collapsed before the region is collapsed.
 
-    A collapsed region holds more vehicles (T, R) than when its outflow (T, R) was largest so far, and lets out less
-    than COLLAPSED_SHARE of that. Its queues spill back and lower the outflow of the region behind.
+    A collapsed region holds more vehicles (T, R) than when its outflow (T, R) was largest so far,
+    and lets out less than COLLAPSED_SHARE of that. Its queues spill back and lower the outflow of
+    the region behind.
     """
     largest, interval = np.maximum.accumulate(outflow), np.arange(len(outflow))[:, None]
     best = np.maximum.accumulate(np.where(outflow == largest, interval, 0))

@@ -19,7 +19,8 @@ from nmfd.types import Result
 class Level:
     """Finished runs of one scenario at one demand level.
 
-    rows: one per run; key: what all runs depend on; controllers: name -> what only its runs depend on
+    rows: one per run; key: what all runs depend on; controllers: name -> what only its runs depend
+        on
     """
 
     demand: float
@@ -71,17 +72,27 @@ def read(path: Path, scenario: str | None = None) -> Finished:
     """
     rows = finished_rows(pd.read_csv(path / TABLE)) if (path / TABLE).is_file() else pd.DataFrame()
     if rows.empty or "scenario" not in rows:
-        raise InputError(f"{path}: holds no finished runs in SUMO; give a folder of `cosim run` or `cosim evaluate`")
+        raise InputError(
+            f"{path}: holds no finished runs in SUMO; give a folder of `cosim run` or `cosim evaluate`"
+        )
     manifest = read_manifest(path)
     rows = rows[rows["scenario"] == (scenario or rows["scenario"].iloc[0])]
     levels = []
     for demand, part in rows.groupby("demand", sort=True):
         folder, part = part["folder"].iloc[0], part.reset_index(drop=True)
-        levels.append(Level(demand=float(demand), folder=path / folder, rows=part, **manifest["folders"][folder]))
+        levels.append(
+            Level(
+                demand=float(demand), folder=path / folder, rows=part, **manifest["folders"][folder]
+            )
+        )
     run = levels[0].read(*rows.iloc[0][["controller", "seed"]])
     here = (Path(run.scenario_folder) / "scenario.toml").is_file()
-    loaded = load_scenario(run.scenario_folder if here else run.scenario)  # a shipped one, on another machine
-    return Finished(path=path, levels=tuple(levels), scenario=loaded, sessions=tuple(manifest["sessions"]))
+    loaded = load_scenario(
+        run.scenario_folder if here else run.scenario
+    )  # a shipped one, on another machine
+    return Finished(
+        path=path, levels=tuple(levels), scenario=loaded, sessions=tuple(manifest["sessions"])
+    )
 
 
 def finished_rows(rows: pd.DataFrame) -> pd.DataFrame:

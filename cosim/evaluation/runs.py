@@ -50,17 +50,27 @@ def runs_of(
     own = policies or {}
     for strategy in strategies:
         strategy.make(scenario, own.get(strategy.name))  # reports mistakes before the first run
-    keys = {s.name: {**shared, "controller": s.fingerprint(scenario, own.get(s.name))} for s in strategies}
+    keys = {
+        s.name: {**shared, "controller": s.fingerprint(scenario, own.get(s.name))}
+        for s in strategies
+    }
     cost = SECONDS_PER_TRIP * scenario.step * float(flows.sum())
     return [
-        Run(run_name(s.name, seed), keys[s.name], Simulation(scenario, s, seed, demand, own.get(s.name)), folder, cost)
+        Run(
+            run_name(s.name, seed),
+            keys[s.name],
+            Simulation(scenario, s, seed, demand, own.get(s.name)),
+            folder,
+            cost,
+        )
         for seed in seeds
         for s in strategies
     ]
 
 
 def city_key(scenario: Scenario, strategies: Sequence[Strategy]) -> dict[str, object]:
-    """Check that the strategies can run in the city; return what all runs there depend on. Raises InputError."""
+    """Check that the strategies can run in the city; return what all runs there depend on. Raises
+    InputError."""
     chosen = settings(scenario)
     files = city_files(scenario.network)
     city = load_city(*files, scenario.network.regions)
@@ -69,13 +79,22 @@ def city_key(scenario: Scenario, strategies: Sequence[Strategy]) -> dict[str, ob
     used = {strategy.city.get("signals", chosen.signals) for strategy in strategies}
     simple, _ = read_signals(city, own_files(scenario, chosen.additional), HELD)
     everywhere = MAX_PRESSURE in used
-    incidents.check(scenario.ordered_faults, city, "faults", [signal.id for signal in simple] if everywhere else ())
+    incidents.check(
+        scenario.ordered_faults,
+        city,
+        "faults",
+        [signal.id for signal in simple] if everywhere else (),
+    )
     for path in own_files(scenario, (*chosen.background, *chosen.additional)):
         read_xml(path)
     for strategy in strategies:
         check_strategy(strategy, scenario, city)
     sumo = chosen.model_dump(mode="json", exclude_defaults=True)
-    hashes = {key: [file_hash(path) for path in own_files(scenario, sumo[key])] for key in FILES if key in sumo}
+    hashes = {
+        key: [file_hash(path) for path in own_files(scenario, sumo[key])]
+        for key in FILES
+        if key in sumo
+    }
     return {
         "scenario": scenario.name,
         "network": scenario.network.name,

@@ -1,9 +1,10 @@
 """Proof sheet of the signals of a run: what each showed, against its original programmes.
 
-A green lasts MIN_GREEN_S or as long as originally, that of a crossing as long as originally. After a green comes the
-original yellow, YELLOW_S where the programme ends no green. Links are green, and have the right of way, together only
-if the programme shows it. Between the greens of others lies the original time. Of several programmes, the one that fits
-best counts. The sheet shares no code with the controllers, and leaves out signals whose states are no phases (NEMA).
+A green lasts MIN_GREEN_S or as long as originally, that of a crossing as long as originally. After
+a green comes the original yellow, YELLOW_S where the programme ends no green. Links are green, and
+have the right of way, together only if the programme shows it. Between the greens of others lies
+the original time. Of several programmes, the one that fits best counts. The sheet shares no code
+with the controllers, and leaves out signals whose states are no phases (NEMA).
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -20,19 +21,29 @@ KINDS = ("static", "actuated", "delay_based")
 MIN_GREEN_S, YELLOW_S = 5.0, 3.0
 SHEET = {  # variable of a result, column of signals.csv
     "signal": Quantity(("signal",), "", "id of the signal"),
-    "shortest_green": Quantity(("signal",), "s", "shortest green of a link; NaN without one that began and ended"),
+    "shortest_green": Quantity(
+        ("signal",), "s", "shortest green of a link; NaN without one that began and ended"
+    ),
     "shortest_yellow": Quantity(("signal",), "s", "shortest yellow after a green; NaN without one"),
-    "longest_red": Quantity(("signal",), "s", "longest time without green of a link that has green in a programme"),
+    "longest_red": Quantity(
+        ("signal",), "s", "longest time without green of a link that has green in a programme"
+    ),
     "short_greens": Quantity(("signal",), "1", "greens below the minimum"),
     "short_yellows": Quantity(("signal",), "1", "greens without the original yellow after them"),
-    "short_intergreens": Quantity(("signal",), "1", "greens too soon after the green of another link"),
-    "conflicts": Quantity(("signal",), "1", "pairs of links with green, or the right of way, as never originally"),
+    "short_intergreens": Quantity(
+        ("signal",), "1", "greens too soon after the green of another link"
+    ),
+    "conflicts": Quantity(
+        ("signal",), "1", "pairs of links with green, or the right of way, as never originally"
+    ),
 }
 VIOLATIONS = tuple(SHEET)[-4:]
 States = Sequence[tuple[float, str]]  # time [s] and state at every change
 
 
-def proof_sheet(states: Mapping[str, States], files: Iterable[Path], *, end: float, step: float) -> dict:
+def proof_sheet(
+    states: Mapping[str, States], files: Iterable[Path], *, end: float, step: float
+) -> dict:
     """Return the arrays (S,) of SHEET.
 
     states: by signal; files: network and additional files, with the programmes
@@ -49,7 +60,10 @@ def proof_sheet(states: Mapping[str, States], files: Iterable[Path], *, end: flo
                 crossings.setdefault(signal, set()).update(int(index) for index in indices if index)
     rows = {
         signal: min(
-            (Rules(logic, crossings.get(signal, ()), step).judge(states[signal], end) for logic in programmes[signal]),
+            (
+                Rules(logic, crossings.get(signal, ()), step).judge(states[signal], end)
+                for logic in programmes[signal]
+            ),
             key=lambda row: sum(row[-len(VIOLATIONS) :]),
         )
         for signal in sorted(states.keys() & programmes.keys())
@@ -63,7 +77,10 @@ def proof_sheet(states: Mapping[str, States], files: Iterable[Path], *, end: flo
 def sheets(results: Iterable[Result]) -> pd.DataFrame:
     """Return the table signals.csv: one row per run and signal."""
     parts = [
-        result.data[list(SHEET)[1:]].to_dataframe().reset_index().assign(controller=result.controller, seed=result.seed)
+        result.data[list(SHEET)[1:]]
+        .to_dataframe()
+        .reset_index()
+        .assign(controller=result.controller, seed=result.seed)
         for result in results
     ]
     units = {name: f"{name}_s" for name, quantity in SHEET.items() if quantity.unit == "s"}
@@ -73,7 +90,8 @@ def sheets(results: Iterable[Result]) -> pd.DataFrame:
 class Rules:
     """The rules of one signal with K links, from a programme.
 
-    green, yellow: (K,) [s] least; between: (K, K) [s] least, from the end of a green of the first to a green of the
+    green, yellow: (K,) [s] least; between: (K, K) [s] least, from the end of a green of the first
+        to a green of the
     second; apart, yielding: (K, K) bool, never green, never G, together
     """
 
@@ -89,12 +107,18 @@ class Rules:
         steps = [(n, m) for n, others in enumerate(after) for m in others]
 
         def least(first: np.ndarray, then: np.ndarray) -> np.ndarray:
-            """Return the least time (K,) [s] in phases `then` (n, K) after phases `first` (n, K), inf if never."""
+            """Return the least time (K,) [s] in phases `then` (n, K) after phases `first` (n, K),
+            inf if never."""
             times = np.where(then, np.inf, 0.0)
             for _ in phases:
-                onward = [seconds + times[others].min(axis=0) for seconds, others in zip(duration, after, strict=True)]
+                onward = [
+                    seconds + times[others].min(axis=0)
+                    for seconds, others in zip(duration, after, strict=True)
+                ]
                 times = np.where(then, onward, 0.0)
-            return np.min([np.where(first[n] & ~first[m], times[m], np.inf) for n, m in steps], axis=0)
+            return np.min(
+                [np.where(first[n] & ~first[m], times[m], np.inf) for n, m in steps], axis=0
+            )
 
         self.apart, self.yielding = (~(on.T @ on) for on in (green, lights == "G"))
         crossing = np.isin(np.arange(lights.shape[1]), list(crossings))
@@ -102,9 +126,12 @@ class Rules:
         self.green = np.where(crossing & np.isfinite(own), own, np.minimum(own, MIN_GREEN_S))
         self.yellow = np.where(np.isfinite(passed), passed, np.where(crossing, 0.0, YELLOW_S))
         direct, between = np.full((2, *self.apart.shape), np.inf)
-        for start, link in ((m, link) for n, m in steps for link in np.flatnonzero(green[n] & ~green[m])):
-            # Walk from the end of the green. Direct is the way to a link that is among the first ones, or follows them
-            # at once, if it waits for none that goes on; but a crossing is cleared while cars beside it are green.
+        for start, link in (
+            (m, link) for n, m in steps for link in np.flatnonzero(green[n] & ~green[m])
+        ):
+            # Walk from the end of the green. Direct is the way to a link that is among the first
+            # ones, or follows them at once, if it waits for none that goes on; but a crossing is
+            # cleared while cars beside it are green.
             coming = self.apart[link] & ~self.apart.diagonal()
             walks = [(start, 0.0, np.inf, coming, coming)]
             while walks:
@@ -126,14 +153,17 @@ class Rules:
             times[:] = np.floor(times / step + 1e-6) * step - 1e-6
 
     def judge(self, states: States, end: float) -> tuple[float, float, float, int, int, int, int]:
-        """Return the row of SHEET; lights that began before the first state, or last to the end, are not judged."""
+        """Return the row of SHEET; lights that began before the first state, or last to the end,
+        are not judged."""
         time = np.array([time for time, _ in states])[:, None]
         lights = np.array([list(state) for _, state in states])
         green, yellow = np.isin(lights, ["G", "g"]), lights == "y"
         was, was_yellow = _before(green), _before(yellow)
         starts, ends = green & ~was, was & ~green
         ended = _latest(ends, time)
-        since = _before(_latest(starts | ends | (yellow != was_yellow), time))  # beginning of the light before
+        since = _before(
+            _latest(starts | ends | (yellow != was_yellow), time)
+        )  # beginning of the light before
         lasted, over = time - since, was_yellow & ~yellow & (since == _before(ended))
         bare = ends & ~yellow & (self.yellow > 0.0)
         red = np.where(starts, time - np.maximum(_before(ended), time[0]), 0.0).max(axis=0)
@@ -142,7 +172,9 @@ class Rules:
         for link, apart in enumerate(self.apart.T):
             rows = starts[:, link]
             gap = time[rows] - ended[rows]
-            early += np.count_nonzero((apart & ~green[rows] & (gap < self.between[:, link])).any(axis=1))
+            early += np.count_nonzero(
+                (apart & ~green[rows] & (gap < self.between[:, link])).any(axis=1)
+            )
         conflicts = 0
         for on, first in zip(green, lights == "G", strict=True):
             pairs = self.apart & np.outer(on, on) | self.yielding & np.outer(first, first)
@@ -164,7 +196,8 @@ def _before(rows: np.ndarray) -> np.ndarray:
 
 
 def _latest(events: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """Return the time (M, K) [s] of the latest of the events (M, K), -inf before the first. time: (M, 1) [s]"""
+    """Return the time (M, K) [s] of the latest of the events (M, K), -inf before the first. time:
+    (M, 1) [s]"""
     return np.maximum.accumulate(np.where(events, time, -np.inf))
 
 

@@ -28,7 +28,9 @@ from nmfd.runs import config
 from nmfd.runs.files import atomic
 from nmfd.types import Result
 
-FULL_SHARE = 0.8  # of an edge's room: a queue that reaches its upstream end leaves gaps that move backwards
+FULL_SHARE = (
+    0.8  # of an edge's room: a queue that reaches its upstream end leaves gaps that move backwards
+)
 # Attribute of a result, column of runs.csv -> meaning.
 FACTS = config.read(Path(__file__).with_name("columns.toml"))["runs"] | PRESSURE_FACTS
 
@@ -75,19 +77,41 @@ def simulate(
         file = stack.enter_context(atomic(job.trip_file)) if job.trip_file else None
         chosen = settings(scenario).changed(**strategy.city)
         plant = SumoPlant(
-            scenario, settings=chosen, trip_file=file, planning=strategy.planning(scenario), observer=observer, gui=gui
+            scenario,
+            settings=chosen,
+            trip_file=file,
+            planning=strategy.planning(scenario),
+            observer=observer,
+            gui=gui,
         )
         stack.callback(plant.close)
         result = closed_loop.run(plant, controller, scenario, seed=job.seed, progress=progress)
-        result = result.assign(controller=strategy.name, plant="sumo").add({}, RECORD, **plant.record())
+        result = result.assign(controller=strategy.name, plant="sumo").add(
+            {}, RECORD, **plant.record()
+        )
         if gui:
             return result
-        plant_facts, leaks, emissions = plant.facts(), set(plant.actuation.leaks()), plant.trip_facts()
-        programmes, end = own_files(scenario, chosen.additional), chosen.begin + scenario.steps * scenario.step
-        shown, files, totals = plant.actuation.states, [plant.city.net_file, *programmes], plant.edge_totals()
+        plant_facts, leaks, emissions = (
+            plant.facts(),
+            set(plant.actuation.leaks()),
+            plant.trip_facts(),
+        )
+        programmes, end = (
+            own_files(scenario, chosen.additional),
+            chosen.begin + scenario.steps * scenario.step,
+        )
+        shown, files, totals = (
+            plant.actuation.states,
+            [plant.city.net_file, *programmes],
+            plant.edge_totals(),
+        )
         sheet = proof_sheet(shown, files, end=end, step=chosen.step_length)
-        measures, totals["trip_time_by_origin"] = trip_measures(plant.meter.trips(), plant.city.regions)
-        result = settled(result.add({}, {**RECORD, **SHEET, **TOTALS}, **plant.record(), **sheet, **totals))
+        measures, totals["trip_time_by_origin"] = trip_measures(
+            plant.meter.trips(), plant.city.regions
+        )
+        result = settled(
+            result.add({}, {**RECORD, **SHEET, **TOTALS}, **plant.record(), **sheet, **totals)
+        )
         facts = {
             "scenario": job.scenario.name,
             "scenario_folder": str(scenario.folder or ""),
@@ -119,7 +143,8 @@ def regional_outflow(record: Mapping[str, np.ndarray] | Result, step: float) -> 
 
 
 def trip_measures(trips: Sequence[Trip], regions: int) -> tuple[dict[str, float], PerRegion]:
-    """Return counts and times [s] of the trips that were due: of private vehicles, and apart of others.
+    """Return counts and times [s] of the trips that were due: of private vehicles, and apart of
+    others.
 
     And the mean time (R,) [s] of the private ones by region of origin; NaN without any.
     """
@@ -166,7 +191,8 @@ def queue_facts(result: Result, city: City) -> dict[str, float]:
 def estimation_errors(result: Result, critical: PerRegion) -> dict[str, float]:
     """Return the root mean square errors of estimated states, NaN if they were exact.
 
-    Of the accumulation of a region as a share of critical (R,) [veh], and of its parts with vehicles [veh].
+    Of the accumulation of a region as a share of critical (R,) [veh], and of its parts with
+    vehicles [veh].
     """
     if not result.estimated:
         return {"estimate_rmse_share": math.nan, "estimate_cell_rmse_veh": math.nan}
@@ -182,5 +208,7 @@ def _rms(values: ArrayLike) -> float:
 def leaking_share(result: Result, city: City, leaks: Collection[Gateway]) -> float:
     """Return the share of the boundary flow that passes gateways without a signal under control."""
     flow = result.gateway_flow.sum(axis=0)
-    leaking = sum(passed for gateway, passed in zip(city.gateways, flow, strict=True) if gateway in leaks)
+    leaking = sum(
+        passed for gateway, passed in zip(city.gateways, flow, strict=True) if gateway in leaks
+    )
     return float(leaking / max(flow.sum(), 1))

@@ -1,4 +1,5 @@
-"""Tables of an evaluation: means over seeds, changes paired by seed with 95 % intervals, measures by region."""
+"""Tables of an evaluation: means over seeds, changes paired by seed with 95 % intervals, measures
+by region."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,14 +20,17 @@ from nmfd.studies.benchmark import REFERENCE, interval
 from nmfd.types import Result
 
 TTS = "total_time_spent_veh_s"
-COLUMNS = config.read(Path(__file__).with_name("columns.toml"))["evaluation"]  # heading without unit -> meaning
+COLUMNS = config.read(Path(__file__).with_name("columns.toml"))[
+    "evaluation"
+]  # heading without unit -> meaning
 COLUMNS |= dict(COUNTED.values()) | {"outside SUMO": "share of the wall time outside SUMO"}
 FEWEST_SEEDS = 3  # from which a difference may be called significant
 CAPTION = "; ".join(f"{heading}: {text}" for heading, text in COLUMNS.items())
 
 
 class Paired(NamedTuple):
-    """Change from b to a on the seeds that both have: mean and half of the 95 % interval, NaN for one seed."""
+    """Change from b to a on the seeds that both have: mean and half of the 95 % interval, NaN for
+    one seed."""
 
     seeds: int
     percent: float
@@ -38,14 +42,17 @@ class Paired(NamedTuple):
 
 
 def paired(a: Mapping[int, float], b: Mapping[int, float]) -> Paired:
-    """Compare values by seed; NaN without a common seed, and percentages NaN if a value of b is 0."""
+    """Compare values by seed; NaN without a common seed, and percentages NaN if a value of b is
+    0."""
     seeds = sorted(set(a) & set(b))
     percent = [percent_change(a[seed], b[seed]) for seed in seeds]
     mean = float(np.mean(percent)) if seeds else math.nan
     return Paired(len(seeds), mean, interval(percent))
 
 
-def by_seed(rows: pd.DataFrame, level: float, controller: str, column: str = TTS) -> dict[int, float]:
+def by_seed(
+    rows: pd.DataFrame, level: float, controller: str, column: str = TTS
+) -> dict[int, float]:
     """Return seed -> value of a column."""
     part = rows[(rows["demand"] == level) & (rows["controller"] == controller)]
     return dict(zip(part["seed"], part[column], strict=True))
@@ -53,14 +60,20 @@ def by_seed(rows: pd.DataFrame, level: float, controller: str, column: str = TTS
 
 def groups(rows: pd.DataFrame) -> dict[float, list[str]]:
     """Return demand level -> controllers, in the order of the rows."""
-    return {level: list(dict.fromkeys(part["controller"])) for level, part in rows.groupby("demand", sort=True)}
+    return {
+        level: list(dict.fromkeys(part["controller"]))
+        for level, part in rows.groupby("demand", sort=True)
+    }
 
 
 def compared_with(rows: pd.DataFrame) -> str:
-    """Return the reference controller: no-control, or the first one, that every level and enough seeds have."""
+    """Return the reference controller: no-control, or the first one, that every level and enough
+    seeds have."""
     levels, seeds = groups(rows).values(), rows.groupby("controller", sort=False)["seed"].nunique()
     names = list(seeds.index[seeds >= min(FEWEST_SEEDS, seeds.max())])
-    return benchmark.compared_with([name for name in names if all(name in level for level in levels)] or names)
+    return benchmark.compared_with(
+        [name for name in names if all(name in level for level in levels)] or names
+    )
 
 
 def statistics(rows: pd.DataFrame) -> pd.DataFrame:
@@ -70,7 +83,9 @@ def statistics(rows: pd.DataFrame) -> pd.DataFrame:
         against = compared_with(rows[rows["demand"] == level])
         for name in names:
             part = rows[(rows["demand"] == level) & (rows["controller"] == name)]
-            pair = paired(by_seed(rows, level, name), by_seed(rows, level, against) if name != against else {})
+            pair = paired(
+                by_seed(rows, level, name), by_seed(rows, level, against) if name != against else {}
+            )
             out.append(
                 {
                     **part.mean(numeric_only=True),
@@ -99,12 +114,21 @@ def pairs(rows: pd.DataFrame) -> pd.DataFrame:
         for name, other in ((name, other) for name in names for other in names if other != name):
             pair = paired(by_seed(rows, level, name), by_seed(rows, level, other))
             out.append((level, name, other, *pair, pair.significant))
-    columns = ["demand", "controller", "against", "seeds", "change_percent", "half_interval_percent", "significant"]
+    columns = [
+        "demand",
+        "controller",
+        "against",
+        "seeds",
+        "change_percent",
+        "half_interval_percent",
+        "significant",
+    ]
     return pd.DataFrame(out, columns=columns)
 
 
 def shown(table: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return `statistics` of one demand level as two tables of text: outcomes, and costs and decisions."""
+    """Return `statistics` of one demand level as two tables of text: outcomes, and costs and
+    decisions."""
     lines = []
     against = table["against"].iloc[0]
     change = "change" if against == REFERENCE or len(table) == 1 else f"against {against}"
@@ -121,7 +145,9 @@ def shown(table: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
                 "backlog [veh]": f"{row['final_backlog_veh']:,.0f}",
                 "backlog [veh s]": f"{row['total_backlog_veh_s']:.2e}",
                 "teleports": f"{row['teleports']:.0f}",
-                "trip [s]": " / ".join(_seconds(row[f"{kind}_trip_time_s"]) for kind in ("mean", "median", "p95")),
+                "trip [s]": " / ".join(
+                    _seconds(row[f"{kind}_trip_time_s"]) for kind in ("mean", "median", "p95")
+                ),
                 "finished [s]": _seconds(row["mean_finished_trip_time_s"]),
                 "departure delay [s]": _seconds(row["mean_departure_delay_s"]),
                 "delay [s]": _seconds(row["mean_time_loss_s"]),
@@ -155,13 +181,19 @@ def _change(row: Mapping) -> str:
 
 def text(rows: pd.DataFrame) -> str:
     """Return the tables of one scenario for the terminal."""
-    tables = _tables(rows, "Demand times {:g}", lambda each: text_table(each.to_dict("records")) + "\n")
+    tables = _tables(
+        rows, "Demand times {:g}", lambda each: text_table(each.to_dict("records")) + "\n"
+    )
     return "\n".join([*tables, *wrapped(CAPTION)])
 
 
 def markdown(rows: pd.DataFrame) -> str:
     """Return the tables of one scenario as markdown."""
-    tables = _tables(rows, "## Demand times {:g}", lambda each: markdown_table(list(each), each.to_numpy().tolist()))
+    tables = _tables(
+        rows,
+        "## Demand times {:g}",
+        lambda each: markdown_table(list(each), each.to_numpy().tolist()),
+    )
     return "\n\n".join([*tables, CAPTION]) + "\n"
 
 
@@ -171,28 +203,41 @@ def _tables(rows: pd.DataFrame, heading: str, form: Callable[[pd.DataFrame], str
 
 
 def common_runs(level: Level, names: Sequence[str]) -> list[list[Result]]:
-    """Return the runs of each controller on the seeds that all have, without those that lack these measures."""
-    runs = [{run.seed: run for run in level.results(name) if "trip_time_by_origin" in run} for name in names]
+    """Return the runs of each controller on the seeds that all have, without those that lack these
+    measures."""
+    runs = [
+        {run.seed: run for run in level.results(name) if "trip_time_by_origin" in run}
+        for name in names
+    ]
     seeds = sorted(set.intersection(*map(set, runs)))
     return [[of[seed] for seed in seeds] for of in runs]
 
 
 def longer_trips(level: Level, name: str, against: str) -> PerRegion:
-    """Return the change of the mean trip time [%] by origin, (R,), or (0,) without a common seed; NaN without trips."""
-    own, before = (np.array([run.trip_time_by_origin for run in runs]) for runs in common_runs(level, (name, against)))
+    """Return the change of the mean trip time [%] by origin, (R,), or (0,) without a common seed;
+    NaN without trips."""
+    own, before = (
+        np.array([run.trip_time_by_origin for run in runs])
+        for runs in common_runs(level, (name, against))
+    )
     return 100.0 * (own.mean(axis=0) / before.mean(axis=0) - 1.0) if len(own) else np.zeros(0)
 
 
-def by_region(level: Level, city: City, region_names: Sequence[str], names: Sequence[str]) -> pd.DataFrame | None:
+def by_region(
+    level: Level, city: City, region_names: Sequence[str], names: Sequence[str]
+) -> pd.DataFrame | None:
     """Return a row of text per region and one of all; None without a common seed.
 
-    names: controllers, the reference first; means over their common seeds, but the longest queue of all
+    names: controllers, the reference first; means over their common seeds, but the longest queue of
+        all
     """
     runs = common_runs(level, names)
     if not runs[0]:
         return None
     region = city.edge_region
-    means = [np.mean([_numbers(run, region, len(region_names)) for run in of], axis=0) for of in runs]
+    means = [
+        np.mean([_numbers(run, region, len(region_names)) for run in of], axis=0) for of in runs
+    ]
     columns: dict[tuple[str, str], list[str]] = {("", "region"): [*region_names, "all"]}
     for n, heading in enumerate(("trip from here [s]", "CO2 [kg]")):
         for name, values in zip(names, means, strict=True):
@@ -202,9 +247,13 @@ def by_region(level: Level, city: City, region_names: Sequence[str], names: Sequ
             columns[heading, "change"] = [f"{change:+.1f} %" for change in changes]
     for name, of in zip(names, runs, strict=True):
         queue = np.max([run.queue_max for run in of], axis=0)
-        inside = [np.flatnonzero(region == r) for r in range(len(region_names))] + [np.arange(len(region))]
+        inside = [np.flatnonzero(region == r) for r in range(len(region_names))] + [
+            np.arange(len(region))
+        ]
         longest = [edges[np.argmax(queue[edges])] for edges in inside]
-        columns["longest queue [veh], on street", name] = [f"{queue[edge]}, {city.edges[edge]}" for edge in longest]
+        columns["longest queue [veh], on street", name] = [
+            f"{queue[edge]}, {city.edges[edge]}" for edge in longest
+        ]
     return pd.DataFrame(columns)
 
 

@@ -6,8 +6,9 @@
     <out>/runs/candidate-<n>/demand-<level>/    runs of a candidate (nmfd.runs.run_many)
     <out>/policies/<n>.pt                       its policy, if its options train one
 
-The score is the geometric mean of total time spent (veh s) over seeds and demand levels, so that no level counts for
-more because it is heavier. Ranges over more than a decade are searched in the logarithm.
+The score is the geometric mean of total time spent (veh s) over seeds and demand levels, so that no
+level counts for more because it is heavier. Ranges over more than a decade are searched in the
+logarithm.
 """
 
 import math
@@ -72,7 +73,9 @@ class Tuning:
                     f"got {name}={low:g}:{high:g} instead"
                 )
         for end in ("low", "high"):
-            check_tables(self.tuned({name: getattr(span, end) for name, span in self.space.items()}))
+            check_tables(
+                self.tuned({name: getattr(span, end) for name, span in self.space.items()})
+            )
 
     @cached_property
     def space(self) -> dict[str, Range]:
@@ -85,7 +88,8 @@ class Tuning:
         }
 
     def tuned(self, values: Mapping[str, float]) -> Scenario:
-        """Return the scenario with one value per option; numbers of a list without a range keep their value."""
+        """Return the scenario with one value per option; numbers of a list without a range keep
+        their value."""
         table: dict[str, Any] = {}
         for name, value in values.items():
             key, index = _key_and_index(name)
@@ -98,17 +102,22 @@ class Tuning:
                     raise InputError(f"options: {name}: the numbers before it need a range, too")
                 numbers[index : index + 1] = [rounded]
         name, tables = self.strategy.table(self.scenario), self.scenario.controller_options
-        return replace(self.scenario, controller_options={**tables, name: {**tables.get(name, {}), **table}})
+        return replace(
+            self.scenario, controller_options={**tables, name: {**tables.get(name, {}), **table}}
+        )
 
     def value(self, key: str) -> Any:
         """Return an option of the scenario, or its default; None if there is neither."""
         tables, kind = self.scenario.controller_options, self.strategy.controller
         own = {**tables.get(kind.name, {}), **tables.get(self.strategy.table(self.scenario), {})}
         declared = kind.options.model_fields.get(key)
-        return own.get(key, None if declared is None or declared.is_required() else declared.default)
+        return own.get(
+            key, None if declared is None or declared.is_required() else declared.default
+        )
 
     def first(self) -> dict[str, float]:
-        """Return the scenario's options within the ranges; the middle of a range without a value."""
+        """Return the scenario's options within the ranges; the middle of a range without a
+        value."""
         point: dict[str, float] = {}
         for name, span in self.space.items():
             key, index = _key_and_index(name)
@@ -116,7 +125,9 @@ class Tuning:
             if index is not None:
                 value = dict(enumerate(value or ())).get(index)
             middle = math.sqrt(span.low * span.high) if span.log else (span.low + span.high) / 2
-            value = min(max(value, span.low), span.high) if isinstance(value, (int, float)) else middle
+            value = (
+                min(max(value, span.low), span.high) if isinstance(value, (int, float)) else middle
+            )
             point[name] = round(value) if isinstance(span, IntDistribution) else float(value)
         return point
 
@@ -125,10 +136,12 @@ class Tuning:
 
 
 def tune(order: Tuning, *, workers: int = 1, progress: Progress = None) -> pd.DataFrame:
-    """Run the candidates and return the table of tune.csv; the same call resumes, and one with more trials continues.
+    """Run the candidates and return the table of tune.csv; the same call resumes, and one with more
+    trials continues.
 
     A candidate with a failed run has no score.
-    Raises: InputError if the folder holds another search, RunFailed if no candidate of a generation has a score
+    Raises: InputError if the folder holds another search, RunFailed if no candidate of a generation
+    has a score
     """
     city = city_key(order.scenario, [order.strategy])
     with locked(order.out, JOURNAL):
@@ -136,7 +149,9 @@ def tune(order: Tuning, *, workers: int = 1, progress: Progress = None) -> pd.Da
         generation = 4 + math.floor(3 * math.log(len(order.options)))
         while True:
             trials = study.get_trials(deepcopy=False)
-            running = [trial for trial in trials if trial.state == TrialState.RUNNING]  # of an interrupted call
+            running = [
+                trial for trial in trials if trial.state == TrialState.RUNNING
+            ]  # of an interrupted call
             left = order.trials - sum(trial.state != TrialState.WAITING for trial in trials)
             if not running and left <= 0:
                 return _write(order, study)
@@ -145,14 +160,24 @@ def tune(order: Tuning, *, workers: int = 1, progress: Progress = None) -> pd.Da
                 number = len(study.get_trials(deepcopy=False))
                 study.sampler = _sampler(order, number)
                 study.ask(order.space)
-            running = [trial for trial in study.get_trials(deepcopy=False) if trial.state == TrialState.RUNNING]
+            running = [
+                trial
+                for trial in study.get_trials(deepcopy=False)
+                if trial.state == TrialState.RUNNING
+            ]
             runs = _runs(order, running, city, workers)
             rows = run_many(runs, order.out / "runs", workers=workers, progress=progress)
             for trial in running:
-                totals = np.maximum(list(_totals(order, rows, trial.number).values()), 1.0)  # a city may be empty
+                totals = np.maximum(
+                    list(_totals(order, rows, trial.number).values()), 1.0
+                )  # a city may be empty
                 score = float(np.exp(np.log(totals).mean()))
                 failed = math.isnan(score)
-                study.tell(trial.number, None if failed else score, state=TrialState.FAIL if failed else None)
+                study.tell(
+                    trial.number,
+                    None if failed else score,
+                    state=TrialState.FAIL if failed else None,
+                )
             table = _write(order, study)
             if table[SCORE].tail(len(running)).isna().all():
                 raise_failures(rows)
@@ -164,7 +189,8 @@ def _key_and_index(name: str) -> tuple[str, int | None]:
 
 
 def _study(order: Tuning) -> optuna.Study:
-    """Open the search in the folder, or begin it with the scenario's options. Raise InputError if it is another."""
+    """Open the search in the folder, or begin it with the scenario's options. Raise InputError if
+    it is another."""
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     about = {
         "controller": order.strategy.name,
@@ -182,14 +208,19 @@ def _study(order: Tuning) -> optuna.Study:
         study.set_user_attr("search", about)
         study.enqueue_trial(order.first())
     elif changed := [key for key, value in about.items() if kept[key] != value]:
-        raise InputError(f"{order.out}: holds another search ({', '.join(changed)}); choose another folder with --out")
+        raise InputError(
+            f"{order.out}: holds another search ({', '.join(changed)}); choose another folder with --out"
+        )
     return study
 
 
 def _sampler(order: Tuning, number: int) -> CmaEsSampler:
-    """Return the sampler of one candidate: anew for each, so that a resumed generation is the same."""
+    """Return the sampler of one candidate: anew for each, so that a resumed generation is the
+    same."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)  # x0 and sigma0 go in Optuna 6, without a successor yet
+        warnings.simplefilter(
+            "ignore", FutureWarning
+        )  # x0 and sigma0 go in Optuna 6, without a successor yet
         return CmaEsSampler(
             x0=order.first(),
             sigma0=INITIAL_DEVIATION,
@@ -198,16 +229,27 @@ def _sampler(order: Tuning, number: int) -> CmaEsSampler:
         )
 
 
-def _runs(order: Tuning, trials: Sequence[FrozenTrial], city: Mapping[str, object], workers: int) -> list[Run]:
+def _runs(
+    order: Tuning, trials: Sequence[FrozenTrial], city: Mapping[str, object], workers: int
+) -> list[Run]:
     """Train some candidates if their options train a policy; return their runs."""
     scenarios = {trial.number: order.tuned(trial.params) for trial in trials}
     trains = order.strategy.controller.options is training.Training
-    untrained = {number: scenario for number, scenario in scenarios.items() if not order.policy(number).is_file()}
+    untrained = {
+        number: scenario
+        for number, scenario in scenarios.items()
+        if not order.policy(number).is_file()
+    }
     if trains and untrained:
         order.policy(0).parent.mkdir(exist_ok=True)
-        jobs = [Run(str(number), {}, partial(_train, order, number, one)) for number, one in untrained.items()]
+        jobs = [
+            Run(str(number), {}, partial(_train, order, number, one))
+            for number, one in untrained.items()
+        ]
         if failures := [
-            f"policy of candidate {job.name}: {why}" for job, why in processes(jobs, max(workers, 1)) if why
+            f"policy of candidate {job.name}: {why}"
+            for job, why in processes(jobs, max(workers, 1))
+            if why
         ]:
             raise RunFailed("; ".join(failures))
     runs = []
@@ -216,13 +258,20 @@ def _runs(order: Tuning, trials: Sequence[FrozenTrial], city: Mapping[str, objec
             policies = {order.strategy.name: order.policy(number)} if trains else {}
             folder = f"candidate-{number:03d}/demand-{level:g}"
             runs += runs_of(
-                scenario, [order.strategy], order.seeds, demand=level, city=city, policies=policies, folder=folder
+                scenario,
+                [order.strategy],
+                order.seeds,
+                demand=level,
+                city=city,
+                policies=policies,
+                folder=folder,
             )
     return runs
 
 
 def _train(order: Tuning, number: int, scenario: Scenario) -> str:
-    """Train the policy of a candidate; it gets its name when the training is complete. Return "", no failure."""
+    """Train the policy of a candidate; it gets its name when the training is complete. Return "",
+    no failure."""
     file = order.policy(number)
     unfinished = file.with_suffix(".partial.pt")
     training.train(scenario, order.strategy, seed=order.search_seed, out=unfinished)
@@ -232,9 +281,13 @@ def _train(order: Tuning, number: int, scenario: Scenario) -> str:
 
 def _totals(order: Tuning, rows: pd.DataFrame, number: int) -> dict[str, float]:
     """Return column of tune.csv -> total time spent of a run [veh s], NaN if it failed."""
-    spent = {(row["folder"], row["seed"]): row[TTS] for row in finished_rows(rows).to_dict("records")}
+    spent = {
+        (row["folder"], row["seed"]): row[TTS] for row in finished_rows(rows).to_dict("records")
+    }
     return {
-        f"tts_{level:g}_{seed}_veh_s": spent.get((f"candidate-{number:03d}/demand-{level:g}", seed), math.nan)
+        f"tts_{level:g}_{seed}_veh_s": spent.get(
+            (f"candidate-{number:03d}/demand-{level:g}", seed), math.nan
+        )
         for level in order.levels
         for seed in order.seeds
     }
@@ -244,9 +297,13 @@ def _write(order: Tuning, study: optuna.Study) -> pd.DataFrame:
     """Write tune.csv and tune.toml, and return the table."""
     rows = pd.read_csv(order.out / "runs" / TABLE)
     done = [trial for trial in study.get_trials(deepcopy=False) if trial.state.is_finished()]
-    scores = [{"candidate": one.number, SCORE: math.nan if one.value is None else one.value} for one in done]
+    scores = [
+        {"candidate": one.number, SCORE: math.nan if one.value is None else one.value}
+        for one in done
+    ]
     table = pd.DataFrame(
-        score | one.params | _totals(order, rows, one.number) for score, one in zip(scores, done, strict=True)
+        score | one.params | _totals(order, rows, one.number)
+        for score, one in zip(scores, done, strict=True)
     )
     files.write_table(order.out / "tune.csv", table)
     if table[SCORE].notna().any():
@@ -255,6 +312,11 @@ def _write(order: Tuning, study: optuna.Study) -> pd.DataFrame:
         tuned = order.tuned(values).controller_options[order.strategy.table(order.scenario)]
         keys = dict.fromkeys(_key_and_index(name)[0] for name in order.options)
         head = f"# Best of {len(table)} candidates: {row[SCORE]:.4g} veh s; the first: {table[SCORE].iloc[0]:.4g} veh s"
-        lines = [head, f'[controllers."{order.strategy.name}"]', *(f"{key} = {tuned[key]}" for key in keys), ""]
+        lines = [
+            head,
+            f'[controllers."{order.strategy.name}"]',
+            *(f"{key} = {tuned[key]}" for key in keys),
+            "",
+        ]
         files.write_text(order.out / "tune.toml", "\n".join(lines))
     return table

@@ -1,8 +1,9 @@
 """Routes of a generated demand: an iterated assignment by SUMO's duaIterate.py.
 
-All drivers start on a fastest route at free flow. Then, repeatedly, the city is simulated, and drivers choose among the
-routes that were fastest so far by Gawron's probabilities (1998). The mesoscopic model, a tenth of the cost, finds most
-of the equilibrium; a city in car-following gets more iterations in that model, as queues differ.
+All drivers start on a fastest route at free flow. Then, repeatedly, the city is simulated, and
+drivers choose among the routes that were fastest so far by Gawron's probabilities (1998). The
+mesoscopic model, a tenth of the cost, finds most of the equilibrium; a city in car-following gets
+more iterations in that model, as queues differ.
 """
 
 import gzip
@@ -24,7 +25,15 @@ GAP = 0.05  # relative gap at which the assignment ends
 CAR_FOLLOWING_SHARE = 0.5  # of the iterations, in the car-following model after the mesoscopic ones
 GAP_SAMPLE = 2000  # drivers from whom the gap is estimated, at most
 NAME = "peak"  # of the files that duaIterate.py makes
-ALWAYS = "--aggregation 300 --routing-algorithm CH --disable-warnings --disable-summary --continue-on-unbuild".split()
+ALWAYS = [
+    "--aggregation",
+    "300",
+    "--routing-algorithm",
+    "CH",
+    "--disable-warnings",
+    "--disable-summary",
+    "--continue-on-unbuild",
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,18 +80,31 @@ def assign(
         options += ["duarouter--seed", str(seed), "sumo--seed", str(seed)]
         gaps: list[float] = []
         routes, best = dict[str, list[str]](), 0
-        models = [(True, iterations)] + [(False, int(np.ceil(CAR_FOLLOWING_SHARE * iterations)))] * (not mesoscopic)
+        models = [(True, iterations)] + [
+            (False, int(np.ceil(CAR_FOLLOWING_SHARE * iterations)))
+        ] * (not mesoscopic)
         for meso, most in models:
             least = np.inf
             for k in range(most):
                 n, gap = len(gaps), f", gap {100 * gaps[-1]:.0f} %" if gaps else ""
-                progress(f"assignment{'' if meso else ', car-following'}, at most {most} iterations{gap}", k / most)
-                _iterate(folder, n, ["--mesosim", "--meso-junctioncontrol"] * meso + options, where=str(net))
+                progress(
+                    f"assignment{'' if meso else ', car-following'}, at most {most} iterations{gap}",
+                    k / most,
+                )
+                _iterate(
+                    folder,
+                    n,
+                    ["--mesosim", "--meso-junctioncontrol"] * meso + options,
+                    where=str(net),
+                )
                 gaps.append(_relative_gap(folder, net, n, begin=begin, seed=seed))
                 if gaps[-1] <= least:
                     least, best = gaps[-1], n
                     vehicles = read_xml(_routes(folder, n)).iter("vehicle")
-                    routes = {attribute(v, "id"): attribute(child(v, "route"), "edges").split() for v in vehicles}
+                    routes = {
+                        attribute(v, "id"): attribute(child(v, "route"), "edges").split()
+                        for v in vehicles
+                    }
                 if gaps[-1] <= GAP:
                     break
         return Assigned(routes=routes, gaps=gaps, best=best)
@@ -90,17 +112,30 @@ def assign(
 
 def _iterate(folder: Path, n: int, options: Sequence[str], *, where: str) -> None:
     """Run step n of duaIterate.py: routes, except in step 0, and a simulation."""
-    start = ["--skip-first-routing", "--routes", str(_routes(folder, 0))] if n == 0 else ["--trips", f"{NAME}.xml"]
+    start = (
+        ["--skip-first-routing", "--routes", str(_routes(folder, 0))]
+        if n == 0
+        else ["--trips", f"{NAME}.xml"]
+    )
     steps = ["--first-step", str(n), "--last-step", str(n + 1)]
-    if run_tool("assign/duaIterate.py", *start, *steps, *ALWAYS, *options, folder=folder).returncode:
+    if run_tool(
+        "assign/duaIterate.py", *start, *steps, *ALWAYS, *options, folder=folder
+    ).returncode:
         log = folder / "dua.log"
-        lines = log.read_text(encoding="utf-8", errors="replace").splitlines() if log.exists() else []
-        reason = " ".join(next((line for line in lines if "rror" in line), "no reason given").split())
-        raise InputError(f"{where}: duaIterate.py cannot assign routes: {reason}; correct the input")
+        lines = (
+            log.read_text(encoding="utf-8", errors="replace").splitlines() if log.exists() else []
+        )
+        reason = " ".join(
+            next((line for line in lines if "rror" in line), "no reason given").split()
+        )
+        raise InputError(
+            f"{where}: duaIterate.py cannot assign routes: {reason}; correct the input"
+        )
 
 
 def _relative_gap(folder: Path, net: Path, n: int, *, begin: float, seed: int) -> float:
-    """Return the relative gap [-] of iteration n: what a sample of drivers could save, over their least time."""
+    """Return the relative gap [-] of iteration n: what a sample of drivers could save, over their
+    least time."""
     (weights,) = (folder / f"{n:03d}").glob("dump_*.xml.gz")
     root = read_xml(_routes(folder, n))
     vehicles = root.findall("vehicle")
@@ -118,7 +153,13 @@ def _relative_gap(folder: Path, net: Path, n: int, *, begin: float, seed: int) -
         "output-file": folder / "fastest.rou.xml",
         "alternatives-output": folder / "ways.xml",
     }
-    flags = "--weights.expand", "--keep-all-routes", "--no-warnings", "--no-step-log", "--ignore-errors"
+    flags = (
+        "--weights.expand",
+        "--keep-all-routes",
+        "--no-warnings",
+        "--no-step-log",
+        "--ignore-errors",
+    )
     run_sumo("duarouter", options, *flags, where=str(net))
     spent = least = 0.0
     for vehicle in read_xml(folder / "ways.xml").iter("vehicle"):

@@ -1,4 +1,5 @@
-"""Runs of the imported city without control by SUMO's own program: densities of its streets, routes driven."""
+"""Runs of the imported city without control by SUMO's own program: densities of its streets, routes
+driven."""
 
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
@@ -14,7 +15,13 @@ from cosim.importing.case import Progress
 from cosim.importing.streets import Streets
 from cosim.sumo.arrays import EdgeNumbers, PerEdge
 from cosim.sumo.programs import run_sumo
-from cosim.sumo.recorded_trips import JITTER_S, MESOSCOPIC, draw, read_recorded_trips, write_recorded_trips
+from cosim.sumo.recorded_trips import (
+    JITTER_S,
+    MESOSCOPIC,
+    draw,
+    read_recorded_trips,
+    write_recorded_trips,
+)
 from cosim.sumo.xml_files import attribute, child, file_list, read_xml
 from nmfd.arrays import PerRegion, PerTurn
 from nmfd.runs.files import temporary_folder
@@ -22,7 +29,9 @@ from nmfd.runs.files import temporary_folder
 INTERVAL_S = 300.0  # of the densities
 PEAK_INTERVALS = 3  # in a row: those with the most vehicles count for the partition
 RECORDED = ("exit-times", "last-route", "write-unfinished")
-SILENT = dict.fromkeys(("no-step-log", "no-warnings", "ignore-route-errors", "duration-log.statistics"), "true")
+SILENT = dict.fromkeys(
+    ("no-step-log", "no-warnings", "ignore-route-errors", "duration-log.statistics"), "true"
+)
 SILENT |= {f"vehroute-output.{name}": "true" for name in RECORDED}
 
 
@@ -46,9 +55,12 @@ class Baseline:
     slowness: float = np.nan
 
     def density(self, streets: Streets) -> PerEdge:
-        """Return the density (E,) [veh/m of lane] in the quarter of an hour with the most vehicles."""
+        """Return the density (E,) [veh/m of lane] in the quarter of an hour with the most
+        vehicles."""
         total = self.presence.sum(axis=1)
-        first = int(np.argmax(np.convolve(total, np.ones(min(PEAK_INTERVALS, len(total))), mode="valid")))
+        first = int(
+            np.argmax(np.convolve(total, np.ones(min(PEAK_INTERVALS, len(total))), mode="valid"))
+        )
         mean = self.presence[first : first + PEAK_INTERVALS].mean(axis=0) / INTERVAL_S
         return np.where(streets.lane_metres > 0, mean / np.maximum(streets.lane_metres, 1.0), 0.0)
 
@@ -99,10 +111,13 @@ def averaged_runs(
     Raises: InputError with SUMO's own words if it refuses
     """
     begin, end = float(times["begin"]), float(times["end"])
-    background, additional = ([folder / name for name in files[key]] for key in ("background", "additional"))
+    background, additional = (
+        [folder / name for name in files[key]] for key in ("background", "additional")
+    )
     original = read_recorded_trips([folder / name for name in files["routes"]])
     options: dict[str, object] = dict(times)
-    # A vehicle with a new route by a rerouter makes SUMO fail when it writes the times of the edges it has left.
+    # A vehicle with a new route by a rerouter makes SUMO fail when it writes the times of the edges
+    # it has left.
     if any(next(read_xml(path).iter("routeProbReroute"), None) is not None for path in additional):
         options["vehroute-output.exit-times"] = "false"
     runs = []
@@ -113,7 +128,9 @@ def averaged_runs(
             drawn = draw(original, seed=seed, factor=factor, jitter=jitter, begin=begin)
             write_recorded_trips(original, drawn, scratch / "vehicles.rou.xml")
             measure = scratch / "measure.add.xml"
-            data = f'<edgeData id="all" freq="{INTERVAL_S:g}" file="edges.xml" excludeEmpty="true"/>'
+            data = (
+                f'<edgeData id="all" freq="{INTERVAL_S:g}" file="edges.xml" excludeEmpty="true"/>'
+            )
             measure.write_text(f"<additional>{data}</additional>", encoding="utf-8")
             options |= {
                 "net-file": file_list([streets.path]),
@@ -123,12 +140,18 @@ def averaged_runs(
                 "vehroute-output": scratch / "ways.xml",
                 "statistic-output": scratch / "statistic.xml",
             }
-            run_sumo("sumo", SILENT | (MESOSCOPIC if mesoscopic else {}) | options, where=str(streets.path))
+            run_sumo(
+                "sumo",
+                SILENT | (MESOSCOPIC if mesoscopic else {}) | options,
+                where=str(streets.path),
+            )
             runs.append(_measured(scratch, streets, begin, end, {name for _, _, name in drawn}))
     return replace(runs[0], presence=np.mean([run.presence for run in runs], axis=0))
 
 
-def _measured(folder: Path, streets: Streets, begin: float, end: float, vehicles: set[str]) -> Baseline:
+def _measured(
+    folder: Path, streets: Streets, begin: float, end: float, vehicles: set[str]
+) -> Baseline:
     """Read the outputs of a run with these vehicles of the demand."""
     statistic = ElementTree.parse(folder / "statistic.xml").getroot()
     counts = child(statistic, "vehicles")
@@ -154,7 +177,9 @@ def _presence(path: Path, streets: Streets, begin: float, end: float) -> np.ndar
         if element.tag == "interval":
             k = int((float(attribute(element, "begin")) - begin) / INTERVAL_S + 0.5)
             for edge in element:
-                if (n := streets.number.get(attribute(edge, "id"))) is not None and k < len(presence):
+                if (n := streets.number.get(attribute(edge, "id"))) is not None and k < len(
+                    presence
+                ):
                     presence[k, n] += float(attribute(edge, "sampledSeconds"))
             element.clear()
     return presence

@@ -17,12 +17,32 @@ from cosim.sumo.xml_files import file_list, read_xml
 from nmfd.errors import InputError
 from nmfd.runs.files import temporary_folder
 
-FILES = {"additional": "additional-files", "routes": "route-files"}  # root of a file -> option of SUMO
+FILES = {
+    "additional": "additional-files",
+    "routes": "route-files",
+}  # root of a file -> option of SUMO
 DRIVERS = ("vehicle", "trip", "flow")
 OTHERS = ("person", "personFlow", "container", "containerFlow")
-DROPPED = ("poly", "poi", "edgeData", "laneData", "timedEvent", "vTypeProbe", "interval")  # no traffic
-WRITERS = ("Detector", "Loop", "calibrator", "routeProbe")  # ends of names of elements that write files
-WRITING = ("file", "has.ssm.device", "device.toc.file")  # parameters that only make SUMO write files
+DROPPED = (
+    "poly",
+    "poi",
+    "edgeData",
+    "laneData",
+    "timedEvent",
+    "vTypeProbe",
+    "interval",
+)  # no traffic
+WRITERS = (
+    "Detector",
+    "Loop",
+    "calibrator",
+    "routeProbe",
+)  # ends of names of elements that write files
+WRITING = (
+    "file",
+    "has.ssm.device",
+    "device.toc.file",
+)  # parameters that only make SUMO write files
 SAFE_SPEEDS = ("max", "random", "0", "0.0", "0.00")  # departure speeds that can wait for a green
 FLOW = ("begin", "end", "number", "period", "vehsPerHour", "perHour", "probability")
 ZONES = ("fromTaz", "toTaz", "fromJunction", "toJunction")
@@ -41,7 +61,8 @@ class Traffic:
     shared: types, routes, stops, programmes and other contents of the additional files
     switched: signals whose programme a timetable (WAUT) changes
     notes: what was changed or left out -> count
-    left_out: shares of SUMO's vehicles, and of the distance that they would drive [-], that are not taken over
+    left_out: shares of SUMO's vehicles, and of the distance that they would drive [-], that are not
+        taken over
     """
 
     vehicles: tuple[Element, ...]
@@ -75,13 +96,21 @@ def read_traffic(case: SumoInput, streets: Streets, seed: int) -> Traffic:
                 if element.get("depart") in TRIGGERED:
                     background.append(element)
                     notes["vehicles without a time of departure, left alone"] += 1
-                if element.tag == "flow" and end is None and not {"end", "number"} & set(element.keys()):
+                if (
+                    element.tag == "flow"
+                    and end is None
+                    and not {"end", "number"} & set(element.keys())
+                ):
                     end = case.begin + ENDLESS_FLOW_S
-                    notes["s are simulated, as a flow has no end (--end for another time)"] = int(ENDLESS_FLOW_S)
+                    notes["s are simulated, as a flow has no end (--end for another time)"] = int(
+                        ENDLESS_FLOW_S
+                    )
             elif element.tag in OTHERS:
                 background.append(element)
             elif element.tag not in DROPPED:
-                switched |= {name for e in element.iter("wautJunction") if (name := e.get("junctionID"))}
+                switched |= {
+                    name for e in element.iter("wautJunction") if (name := e.get("junctionID"))
+                }
                 shared.append(element)
             files[-1].append(element)
     departures = _read(case, files, seed, end)
@@ -102,7 +131,9 @@ def read_traffic(case: SumoInput, streets: Streets, seed: int) -> Traffic:
             unknown += 1
             continue
         if departed.id in seen:
-            raise InputError(f"{case.source}: vehicle {departed.id}: another one has this id; rename one of them")
+            raise InputError(
+                f"{case.source}: vehicle {departed.id}: another one has this id; rename one of them"
+            )
         seen.add(departed.id)
         metres[1] -= streets.length[edges].sum()
         element = _single(departed, original, names)
@@ -110,13 +141,16 @@ def read_traffic(case: SumoInput, streets: Streets, seed: int) -> Traffic:
             notes["vehicles on the road in the loaded state, begin where they are"] += 1
         elif original is not None and original.tag == "flow":
             notes["vehicles from flows"] += 1
-        # SUMO deletes a vehicle that cannot stop from its departure speed at a signal whose programme never gives
-        # it green; a signal that is switched from outside has no programme that does.
+        # SUMO deletes a vehicle that cannot stop from its departure speed at a signal whose
+        # programme never gives it green; a signal that is switched from outside has no programme
+        # that does.
         if element.get("departSpeed", "max") not in SAFE_SPEEDS:
             element.set("departSpeed", "max")
             notes["fixed speeds at the departure, made the highest safe ones"] += 1
         if departed.line or departed.kind in BOUND:
-            SubElement(element, "param", {"key": QUEUED_AFTER, "value": str(queue[departed.depart])})
+            SubElement(
+                element, "param", {"key": QUEUED_AFTER, "value": str(queue[departed.depart])}
+            )
             background.append(element)
             notes["public transport and other classes left alone"] += 1
         else:
@@ -142,22 +176,40 @@ def read_traffic(case: SumoInput, streets: Streets, seed: int) -> Traffic:
         shared=tuple(shared),
         switched=tuple(sorted(switched)),
         notes=dict(notes),
-        left_out=(unknown / max(len(kept) + len(background) + unknown, 1), metres[1] / max(metres[0], 1.0)),
+        left_out=(
+            unknown / max(len(kept) + len(background) + unknown, 1),
+            metres[1] / max(metres[0], 1.0),
+        ),
     )
 
 
-def _read(case: SumoInput, files: Sequence[Element], seed: int, end: float | None) -> list[Departure]:
-    """Let SUMO read the vehicles. files: contents of the additional files, and of the route files"""
+def _read(
+    case: SumoInput, files: Sequence[Element], seed: int, end: float | None
+) -> list[Departure]:
+    """Let SUMO read the vehicles. files: contents of the additional files, and of the route
+    files"""
     with temporary_folder() as folder:
         paths: dict[str, list[Path]] = {"additional": [], "routes": []}
         for n, root in enumerate(files):
-            for element in [*root.findall("calibrator"), *root.findall("rerouter")]:  # act on every run
+            for element in [
+                *root.findall("calibrator"),
+                *root.findall("rerouter"),
+            ]:  # act on every run
                 root.remove(element)
             paths[root.tag].append(folder / f"{n}.xml")
             ElementTree(root).write(paths[root.tag][-1])
-        options = {"net-file": file_list([case.net.absolute()]), "begin": case.begin, "step-length": case.step_length}
+        options = {
+            "net-file": file_list([case.net.absolute()]),
+            "begin": case.begin,
+            "step-length": case.step_length,
+        }
         options |= {FILES[key]: file_list(names) for key, names in paths.items() if names}
-        options |= {"mesosim": str(case.mesoscopic).lower(), "seed": seed, **case.options, **case.reading}
+        options |= {
+            "mesosim": str(case.mesoscopic).lower(),
+            "seed": seed,
+            **case.options,
+            **case.reading,
+        }
         return read_departures(options, end=end, where=str(case.source))
 
 
@@ -169,7 +221,8 @@ def _edges(element: Element) -> set[str]:
 
 
 def _original(name: str, given: Mapping[str, Element]) -> Element | None:
-    """Return the element that a vehicle comes from: of its id, or that of a flow or a multiplied vehicle."""
+    """Return the element that a vehicle comes from: of its id, or that of a flow or a multiplied
+    vehicle."""
     while name and name not in given:
         name = name.rpartition(".")[0]
     return given.get(name)
@@ -180,18 +233,29 @@ def _single(departure: Departure, original: Element | None, names: Container[str
 
     names: ids of shared routes
     """
-    own = {"id": departure.id, "depart": f"{departure.depart:.10g}", "speedFactor": f"{departure.speed_factor:.6g}"}
+    own = {
+        "id": departure.id,
+        "depart": f"{departure.depart:.10g}",
+        "speedFactor": f"{departure.speed_factor:.6g}",
+    }
     route = Element("route", {"edges": " ".join(departure.edges)})
     if original is None or departure.place is not None:
         lane, position = departure.place or ("best", "base")
-        own |= {"type": departure.type, "departLane": lane, "departPos": position, "departSpeed": "max"}
+        own |= {
+            "type": departure.type,
+            "departLane": lane,
+            "departPos": position,
+            "departSpeed": "max",
+        }
         single = Element("vehicle", own)
         single.append(route)
         return single
     parts = [part for part in original if part.tag not in ("route", "routeDistribution")]
     routed = original.get("route") is not None or len(parts) < len(original)
     out = {*FLOW, *(ZONES if routed else ())}
-    kept = {key: " ".join(value.split()) for key, value in original.attrib.items() if key not in out}
+    kept = {
+        key: " ".join(value.split()) for key, value in original.attrib.items() if key not in out
+    }
     single = Element("vehicle" if routed else "trip", kept | own)
     if departure.type != original.get("type", DEFAULT_TYPE).strip():
         single.set("type", departure.type)
@@ -220,7 +284,8 @@ def _silent(element: Element) -> Element:
 
 
 def departure(element: Element) -> float:
-    """Return the time [s] at which a vehicle, person or flow of them begins, 0 if that is no time."""
+    """Return the time [s] at which a vehicle, person or flow of them begins, 0 if that is no
+    time."""
     try:
         return seconds(element.get("depart") or element.get("begin") or "0", "")
     except InputError:

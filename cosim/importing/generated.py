@@ -1,7 +1,9 @@
-"""A demand for a city without any: a morning peak towards the centre, through traffic and a background.
+"""A demand for a city without any: a morning peak towards the centre, through traffic and a
+background.
 
-The centre is where the signals are. All drivers take a fastest route at free flow, with a delay for every junction and
-a longer one for a signal, as one of DRIVER_CLASSES groups of drivers perceives the times.
+The centre is where the signals are. All drivers take a fastest route at free flow, with a delay for
+every junction and a longer one for a signal, as one of DRIVER_CLASSES groups of drivers perceives
+the times.
 """
 
 from xml.etree.ElementTree import Element, SubElement
@@ -15,20 +17,25 @@ from nmfd.errors import InputError
 
 RAMP_UP_S, FLAT_S, RAMP_DOWN_S = 1800.0, 1800.0, 1800.0
 INWARD_SHARE, THROUGH_SHARE = 0.5, 0.25  # of the trips; the rest is the background
-PEAK_DENSITY = 3.0e-3  # veh/m of lane that the peak would keep on the streets at free flow, at level 1
+PEAK_DENSITY = (
+    3.0e-3  # veh/m of lane that the peak would keep on the streets at free flow, at level 1
+)
 MAX_ORIGINS = 400  # streets where trips begin: bounds the shortest paths to find
 JUNCTION_DELAY_S, SIGNAL_DELAY_S = 3.0, 10.0
 PILOT_TRIPS = 1500  # from which the mean trip time is estimated
 
 
 def morning_peak(streets: Streets, *, level: float, begin: float, seed: int) -> Traffic:
-    """Generate trips on the largest part of the network in which every edge can be reached from every other.
+    """Generate trips on the largest part of the network in which every edge can be reached from
+    every other.
 
     level: 1 keeps PEAK_DENSITY under way if vehicles meet no queue; begin: of the peak [s]
     Raises: InputError for a network that is too small
     """
     if (count := streets.core.sum()) < 4:
-        raise InputError(f"{streets.path}: only {count} streets can be reached from each other; give vehicles instead")
+        raise InputError(
+            f"{streets.path}: only {count} streets can be reached from each other; give vehicles instead"
+        )
     random = np.random.default_rng([seed, 0x7065616B])
     ends = _Ends(streets, random)
     signalled = np.array([signal is not None for signal in streets.link_signals])
@@ -48,11 +55,20 @@ def morning_peak(streets: Streets, *, level: float, begin: float, seed: int) -> 
     depart = begin + np.sort(_times(random.random(count)))
     routes = routed((first, last))
     kept = np.array([bool(route) for route in routes])
-    free = {"departLane": "best", "departSpeed": "max", "departPos": "random_free", "arrivalPos": "random"}
+    free = {
+        "departLane": "best",
+        "departSpeed": "max",
+        "departPos": "random_free",
+        "arrivalPos": "random",
+    }
     vehicles = []
     for n in np.flatnonzero(kept):
-        vehicles.append(Element("vehicle", {"id": f"v{n}", "type": "car", "depart": f"{depart[n]:.2f}", **free}))
-        SubElement(vehicles[-1], "route", {"edges": " ".join(streets.edges[edge] for edge in routes[n])})
+        vehicles.append(
+            Element("vehicle", {"id": f"v{n}", "type": "car", "depart": f"{depart[n]:.2f}", **free})
+        )
+        SubElement(
+            vehicles[-1], "route", {"edges": " ".join(streets.edges[edge] for edge in routes[n])}
+        )
     return Traffic(
         vehicles=tuple(vehicles),
         depart=depart[kept],
@@ -77,7 +93,9 @@ class _Ends:
         away = streets.centre[self._edges] - middle
         self._distance, self._angle = np.hypot(*away.T), np.arctan2(*away.T[::-1])
         radius = np.sqrt(np.average(self._distance**2, weights=weight))
-        starts = random.choice(len(weight), size=min(MAX_ORIGINS, len(weight)), replace=False, p=weight / weight.sum())
+        starts = random.choice(
+            len(weight), size=min(MAX_ORIGINS, len(weight)), replace=False, p=weight / weight.sum()
+        )
         outside = self._distance[starts] > 0.5 * radius
         self._all, self._outer = starts, starts[outside] if outside.sum() >= 2 else starts
         rim = starts[self._distance[starts] >= np.quantile(self._distance[starts], 0.7)]
@@ -87,7 +105,10 @@ class _Ends:
 
     def draw(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         kind = self._random.random(count)
-        inward, through = kind < INWARD_SHARE, (kind >= INWARD_SHARE) & (kind < INWARD_SHARE + THROUGH_SHARE)
+        inward, through = (
+            kind < INWARD_SHARE,
+            (kind >= INWARD_SHARE) & (kind < INWARD_SHARE + THROUGH_SHARE),
+        )
         first = self._random.choice(self._all, size=count)
         last = self._pick(np.arange(len(self._weight)), self._weight, count)
         first[inward] = self._random.choice(self._outer, size=inward.sum())

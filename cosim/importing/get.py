@@ -23,10 +23,14 @@ def published() -> Mapping[str, Mapping[str, str]]:
 
 
 def get(name: str, out: Path) -> str:
-    """Fetch a city into a new folder, whole or not at all; return its licence and the next step. Raises InputError."""
+    """Fetch a city into a new folder, whole or not at all; return its licence and the next step.
+    Raises InputError."""
     cities = published()
     if name not in cities:
-        raise InputError(f"cosim get: expected one of {', '.join(cities)}, got {name!r}" + did_you_mean(name, cities))
+        raise InputError(
+            f"cosim get: expected one of {', '.join(cities)}, got {name!r}"
+            + did_you_mean(name, cities)
+        )
     if out.exists():
         raise InputError(f"--out: {out} exists; choose another folder, or remove it")
     city = cities[name]
@@ -35,7 +39,17 @@ def get(name: str, out: Path) -> str:
     notice = f"{name}: {city['about']}\nLicence: {city['licence']}\nFetched from {source}\n"
     with temporary_folder(f".{out.name}-", where=out.parent) as folder:
         archive = folder / "archive.whl"
-        pip = [sys.executable, "-m", "pip", "download", "--no-deps", "--only-binary", ":all:", "--dest", str(folder)]
+        pip = [
+            sys.executable,
+            "-m",
+            "pip",
+            "download",
+            "--no-deps",
+            "--only-binary",
+            ":all:",
+            "--dest",
+            str(folder),
+        ]
         try:
             if "://" in source:
                 with urllib.request.urlopen(source, timeout=SERVER_TIME_LIMIT_S) as answer:
@@ -56,4 +70,7 @@ def get(name: str, out: Path) -> str:
 
 def listed() -> str:
     """Return the catalogue, a city with its licence on two lines."""
-    return "\n".join(f"{name:<14}{city['about']}\n{'':<14}{city['licence']}" for name, city in published().items())
+    return "\n".join(
+        f"{name:<14}{city['about']}\n{'':<14}{city['licence']}"
+        for name, city in published().items()
+    )

@@ -29,10 +29,16 @@ from nmfd.runs.progress import watched
 from nmfd.runs.tables import text_table
 from nmfd.studies import plots
 
-LARGE_CITY_EDGES = 5000  # for cars: beyond, the run without control is mesoscopic, so that it takes a minute
+LARGE_CITY_EDGES = (
+    5000  # for cars: beyond, the run without control is mesoscopic, so that it takes a minute
+)
 LEFT_OUT = 0.01  # share of vehicles or distance above which a warning follows
 NET = "city.net.xml.gz"
-FILES = {"routes": "vehicles.rou.xml.gz", "background": "background.rou.xml.gz", "additional": "city.add.xml.gz"}
+FILES = {
+    "routes": "vehicles.rou.xml.gz",
+    "background": "background.rou.xml.gz",
+    "additional": "city.add.xml.gz",
+}
 TYPES = ("vType", "vTypeDistribution")
 COMMENT = """Imported from {}. The MFDs are PLACEHOLDERS from lane length and speed limits:
 # cosim identify replaces them by measured ones."""
@@ -82,7 +88,9 @@ def import_city(
     last = None if end is None else seconds(end, "--end")
     for folder in (out, scenario):
         if folder.name in ("", "..") or "," in str(folder):
-            raise InputError(f"--out: expected a folder such as networks/mycity, without a comma, got {folder} instead")
+            raise InputError(
+                f"--out: expected a folder such as networks/mycity, without a comma, got {folder} instead"
+            )
         if folder.exists():
             raise InputError(f"--out: {folder} exists; choose another name, or remove it")
     with ExitStack() as stack:
@@ -92,8 +100,15 @@ def import_city(
             show and show(round(100 * share), 100, stage)
 
         progress("reading")
-        case, scratch = stack.enter_context(sumo_input(place, progress)), stack.enter_context(temporary_folder())
-        case = replace(case, begin=case.begin if first is None else first, end=case.end if last is None else last)
+        case, scratch = (
+            stack.enter_context(sumo_input(place, progress)),
+            stack.enter_context(temporary_folder()),
+        )
+        case = replace(
+            case,
+            begin=case.begin if first is None else first,
+            end=case.end if last is None else last,
+        )
         case = replace(case, routes=(*case.routes, *routes))
         if case.begin < 0 or (case.end is not None and case.end <= case.begin):
             window = f"begin {case.begin:g} s, end {case.end} s"
@@ -105,7 +120,9 @@ def import_city(
         meso = mesoscopic or streets.drivable.sum() > LARGE_CITY_EDGES
         factor, assigned = level, None
         if demand is not None:
-            traffic, assigned = _peak(case, streets, traffic, level, seed, iterations, meso, progress)
+            traffic, assigned = _peak(
+                case, streets, traffic, level, seed, iterations, meso, progress
+            )
             factor = 1.0
         elif not len(traffic.depart):
             raise InputError(
@@ -119,7 +136,9 @@ def import_city(
         net_folder.mkdir()
         folder.mkdir()
         files = _write_traffic(folder, traffic)
-        baseline = averaged_runs(streets, folder, files, model.options(case, clock), factor, meso, seeds, progress)
+        baseline = averaged_runs(
+            streets, folder, files, model.options(case, clock), factor, meso, seeds, progress
+        )
         progress("partition")
         left = quality.left_alone(streets, traffic.switched)
         if count is not None:
@@ -127,24 +146,36 @@ def import_city(
         else:
             labels = finish(streets, own, renumber=False)
         if labels.max() < 1:
-            raise InputError(f"{streets.path}: no two regions can be made that can be reached from each other")
+            raise InputError(
+                f"{streets.path}: no two regions can be made that can be reached from each other"
+            )
         progress("writing")
         network = model.network_of(streets, labels, out.name, baseline)
         content = case.net.read_bytes()
         _zip(net_folder / NET, gzip.decompress(content) if case.net.suffix == ".gz" else content)
-        pd.DataFrame({"edge": streets.edges, "region": labels}).to_csv(net_folder / "regions.csv", index=False)
+        pd.DataFrame({"edge": streets.edges, "region": labels}).to_csv(
+            net_folder / "regions.csv", index=False
+        )
         city = load_city(net_folder / NET, net_folder / "regions.csv", network.regions)
         tables = quality.tables(streets, labels, network.region_names, city, baseline, left)
         verdict = quality.import_verdict(network, tables.gateways, labels, baseline, scenario.name)
         network = replace(network, controllable=verdict.boundaries.shares)
         if max(traffic.left_out) > LEFT_OUT:
-            warning = f"WARNING: {_left_out(traffic)}: this is not the traffic of {case.source.name}"
+            warning = (
+                f"WARNING: {_left_out(traffic)}: this is not the traffic of {case.source.name}"
+            )
             verdict = replace(verdict, sentences=(*verdict.sentences, warning))
         report = _report(case, streets, traffic, clock, tables, baseline, assigned)
         if count is not None and network.regions < count:
-            report.append(f"{network.regions} regions instead of {count}: others could not be reached, or fell apart")
-        elif own is not None and (moved := int((own != labels)[streets.drivable & (own >= 0)].sum())):
-            report.append(f"{moved:,} streets are in other regions than in {regions}: regions must be connected")
+            report.append(
+                f"{network.regions} regions instead of {count}: others could not be reached, or fell apart"
+            )
+        elif own is not None and (
+            moved := int((own != labels)[streets.drivable & (own >= 0)].sum())
+        ):
+            report.append(
+                f"{moved:,} streets are in other regions than in {regions}: regions must be connected"
+            )
         report += verdict.sentences
         load = np.bincount(labels, baseline.density(streets) * streets.lane_metres)
         texts = {
@@ -174,9 +205,13 @@ def import_city(
         pd.DataFrame(tables.gateways).to_csv(net_folder / "gateways.csv", index=False)
         flows = model.region_demand(traffic, labels, clock)
         rows = [(k, i, j, f"{flows[k, i, j]:.6g}") for k, i, j in np.argwhere(flows > 0)]
-        pd.DataFrame(rows, columns=["interval", "from", "to", "veh_s"]).to_csv(folder / "demand.csv", index=False)
+        pd.DataFrame(rows, columns=["interval", "from", "to", "veh_s"]).to_csv(
+            folder / "demand.csv", index=False
+        )
         drawing = plots.figure(6.2, 6.0)
-        maps.region_map(drawing.subplots(), streets, labels, network.region_names, network.positions, tables)
+        maps.region_map(
+            drawing.subplots(), streets, labels, network.region_names, network.positions, tables
+        )
         plots.save(drawing, net_folder / "map.png")
         for temporary, place in ((net_folder, out), (folder, scenario)):
             place.parent.mkdir(parents=True, exist_ok=True)
@@ -197,10 +232,14 @@ def _peak(
 ) -> tuple[Traffic, Assigned]:
     """Generate a morning peak beside the city's other traffic, and assign its routes."""
     if count := len(beside.depart):
-        raise InputError(f"--demand: {case.source} has {count:,} vehicles; omit --demand, or give the network alone")
+        raise InputError(
+            f"--demand: {case.source} has {count:,} vehicles; omit --demand, or give the network alone"
+        )
     peak = morning_peak(streets, level=level, begin=case.begin, seed=seed)
     known = {part.get("id") for element in beside.shared for part in element.iter("vType")}
-    types = tuple(e for e in peak.shared if e.get("id") not in known)  # the city may define a type car
+    types = tuple(
+        e for e in peak.shared if e.get("id") not in known
+    )  # the city may define a type car
     traffic = replace(
         beside,
         vehicles=peak.vehicles,
@@ -228,14 +267,20 @@ def _peak(
             progress=progress,
         )
     for vehicle in traffic.vehicles:
-        if (route := vehicle.find("route")) is not None and (name := vehicle.get("id", "")) in assigned.routes:
+        if (route := vehicle.find("route")) is not None and (
+            name := vehicle.get("id", "")
+        ) in assigned.routes:
             route.set("edges", " ".join(assigned.routes[name]))
     return traffic, assigned
 
 
 def _write_traffic(folder: Path, traffic: Traffic) -> dict[str, list[str]]:
     """Write vehicles, background and what they refer to; return the file names by key of [sumo]."""
-    contents = {"routes": traffic.vehicles, "background": traffic.background, "additional": traffic.shared}
+    contents = {
+        "routes": traffic.vehicles,
+        "background": traffic.background,
+        "additional": traffic.shared,
+    }
     for key, elements in contents.items():
         if elements:
             root = wrapped(elements, "additional" if key == "additional" else "routes")
@@ -278,9 +323,13 @@ def _report(
     ]
     if assigned is not None:
         gap, iteration, count = assigned.gaps[assigned.best], assigned.best + 1, len(assigned.gaps)
-        lines.append(f"routes by duaIterate.py: relative gap {100 * gap:.1f} % in iteration {iteration} of {count}")
+        lines.append(
+            f"routes by duaIterate.py: relative gap {100 * gap:.1f} % in iteration {iteration} of {count}"
+        )
         if gap > GAP:
-            lines.append(f"WARNING: a relative gap above {100 * GAP:g} %: rerouting gains what drivers know already")
+            lines.append(
+                f"WARNING: a relative gap above {100 * GAP:g} %: rerouting gains what drivers know already"
+            )
     changed = list(case.left_out)
     if case.step_length != (step := float(model.options(case, clock)["step-length"])):
         changed.append(f"step-length = {case.step_length:g}, not {step:g}")

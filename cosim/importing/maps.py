@@ -17,13 +17,30 @@ from nmfd.arrays import Positions
 CELLS = 160  # along the longer side of the raster for outlines
 POINT_SPACING_M = 40.0  # between the points that stand for an edge
 SMALLEST_RING_SHARE = 0.02  # of the area of the largest ring
-COLOURS = ("#4e79a7", "#f28e2b", "#59a14f", "#e15759", "#76b7b2", "#b07aa1", "#edc948", "#9c755f", "#ff9da7", "#8cd17d")
+COLOURS = (
+    "#4e79a7",
+    "#f28e2b",
+    "#59a14f",
+    "#e15759",
+    "#76b7b2",
+    "#b07aa1",
+    "#edc948",
+    "#9c755f",
+    "#ff9da7",
+    "#8cd17d",
+)
 
 
 def region_map(
-    ax: Axes, streets: Streets, regions: EdgeNumbers, names: Sequence[str], places: Positions, tables: Tables
+    ax: Axes,
+    streets: Streets,
+    regions: EdgeNumbers,
+    names: Sequence[str],
+    places: Positions,
+    tables: Tables,
 ) -> Axes:
-    """Draw streets in the colour of their region, and gateways, filled if a controllable signal stands there."""
+    """Draw streets in the colour of their region, and gateways, filled if a controllable signal
+    stands there."""
     members = np.flatnonzero(streets.drivable)
     lines = LineCollection(
         [streets.shapes[n] for n in members],
@@ -37,22 +54,46 @@ def region_map(
     ax.set_axis_off()
     for region, (x, y) in enumerate(places):
         colour, title = COLOURS[region % len(COLOURS)], f"{region} {names[region]}"
-        box = {"boxstyle": "round,pad=0.25", "facecolor": "white", "edgecolor": colour, "alpha": 0.85}
+        box = {
+            "boxstyle": "round,pad=0.25",
+            "facecolor": "white",
+            "edgecolor": colour,
+            "alpha": 0.85,
+        }
         ax.text(x, y, title, ha="center", va="center", fontsize="small", zorder=5, bbox=box)
-    for controlled, face, label in ((True, "black", "gateway with a signal"), (False, "white", "without control")):
-        edges = sorted({g["from_edge"] for g in tables.gateways if (g["control"] == CONTROLLED) == controlled})
-        x, y = np.array([streets.shapes[streets.number[edge]][-1] for edge in edges]).reshape(-1, 2).T
+    for controlled, face, label in (
+        (True, "black", "gateway with a signal"),
+        (False, "white", "without control"),
+    ):
+        edges = sorted(
+            {g["from_edge"] for g in tables.gateways if (g["control"] == CONTROLLED) == controlled}
+        )
+        x, y = (
+            np.array([streets.shapes[streets.number[edge]][-1] for edge in edges]).reshape(-1, 2).T
+        )
         if len(x):
-            ax.scatter(x, y, s=14, facecolor=face, edgecolor="black", linewidths=0.8, zorder=4, label=label)
+            ax.scatter(
+                x, y, s=14, facecolor=face, edgecolor="black", linewidths=0.8, zorder=4, label=label
+            )
     if tables.gateways:
-        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.01), ncols=2, frameon=False, fontsize="small")
+        ax.legend(
+            loc="upper center",
+            bbox_to_anchor=(0.5, -0.01),
+            ncols=2,
+            frameon=False,
+            fontsize="small",
+        )
     return ax
 
 
-def rings_round(shapes: Sequence[Points], regions: EdgeNumbers, blocks: float) -> list[list[Points]]:
-    """Return the outlines of every region, the largest first: rings (n, 2) [m] round the places nearest to its edges.
+def rings_round(
+    shapes: Sequence[Points], regions: EdgeNumbers, blocks: float
+) -> list[list[Points]]:
+    """Return the outlines of every region, the largest first: rings (n, 2) [m] round the places
+    nearest to its edges.
 
-    shapes: of E edges, (n, 2) [m]; blocks: share of the map's extent between streets that is still no hole
+    shapes: of E edges, (n, 2) [m]; blocks: share of the map's extent between streets that is still
+        no hole
     """
     points, of = _sampled(shapes)
     low, high = points.min(axis=0), points.max(axis=0)
@@ -68,7 +109,9 @@ def rings_round(shapes: Sequence[Points], regions: EdgeNumbers, blocks: float) -
         rings = ax.contour(x, y, (label == region).astype(float), levels=[0.5]).allsegs[0]
         rings.sort(key=lambda ring: -abs(_area(ring)))
         # Rings round holes run the other way: their area has the other sign.
-        outlines.append([ring for ring in rings if _area(ring) / _area(rings[0]) > SMALLEST_RING_SHARE])
+        outlines.append(
+            [ring for ring in rings if _area(ring) / _area(rings[0]) > SMALLEST_RING_SHARE]
+        )
     return outlines
 
 

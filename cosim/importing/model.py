@@ -21,7 +21,10 @@ from nmfd.runs.config import filled
 
 SIGNAL_SPEED_SHARE = 0.5  # speed with signals over the speed limit
 DEFAULT_CYCLE_S = 90.0
-SHORTEST_STEP_S, LONGEST_STEP_S = 60.0, 180.0  # control intervals; shorter cycles are taken several times
+SHORTEST_STEP_S, LONGEST_STEP_S = (
+    60.0,
+    180.0,
+)  # control intervals; shorter cycles are taken several times
 IDLE_S = 900.0  # before the first departure, at most
 RECOVERY_S = 1800.0  # after the last departure, for the network to empty
 
@@ -41,20 +44,34 @@ class Clock:
 
 def without_idle(case: SumoInput, traffic: Traffic) -> SumoInput:
     """Begin the case later if its first vehicle departs more than IDLE_S after the beginning."""
-    first = min([*traffic.depart[:1], *(departure(element) for element in traffic.background)], default=case.begin)
-    return case if first - case.begin <= IDLE_S else replace(case, begin=float(first // IDLE_S * IDLE_S))
+    first = min(
+        [*traffic.depart[:1], *(departure(element) for element in traffic.background)],
+        default=case.begin,
+    )
+    return (
+        case
+        if first - case.begin <= IDLE_S
+        else replace(case, begin=float(first // IDLE_S * IDLE_S))
+    )
 
 
 def clock(case: SumoInput, streets: Streets, traffic: Traffic) -> Clock:
-    """Return control intervals of the most common signal cycle, until RECOVERY_S after the last departure."""
-    cycles = Counter(round(logic.cycle) for logic in streets.logics.values() if logic.kind == "static")
+    """Return control intervals of the most common signal cycle, until RECOVERY_S after the last
+    departure."""
+    cycles = Counter(
+        round(logic.cycle) for logic in streets.logics.values() if logic.kind == "static"
+    )
     del cycles[0]
     cycle = float(max(sorted(cycles), key=cycles.__getitem__)) if cycles else DEFAULT_CYCLE_S
     step = cycle * np.ceil(SHORTEST_STEP_S / cycle)
     if step > LONGEST_STEP_S:
         step = DEFAULT_CYCLE_S
     last = traffic.depart[-1] if len(traffic.depart) else case.begin
-    return Clock(begin=case.begin, step=float(step), steps=int(np.ceil((last - case.begin + RECOVERY_S) / step)))
+    return Clock(
+        begin=case.begin,
+        step=float(step),
+        steps=int(np.ceil((last - case.begin + RECOVERY_S) / step)),
+    )
 
 
 def region_demand(traffic: Traffic, regions: EdgeNumbers, clock: Clock) -> PairsOverTime:
@@ -66,17 +83,27 @@ def region_demand(traffic: Traffic, regions: EdgeNumbers, clock: Clock) -> Pairs
     return demand
 
 
-def network_of(streets: Streets, regions: EdgeNumbers, name: str, baseline: Baseline) -> RegionalModel:
-    """Return the regional model: adjacency from streets, split ratios from the baseline, guessed MFDs.
+def network_of(
+    streets: Streets, regions: EdgeNumbers, name: str, baseline: Baseline
+) -> RegionalModel:
+    """Return the regional model: adjacency from streets, split ratios from the baseline, guessed
+    MFDs.
 
-    Their free-flow rate is from speed limits and metres per visit, their jam accumulation from lanes.
+    Their free-flow rate is from speed limits and metres per visit, their jam accumulation from
+    lanes.
     """
     count = int(regions.max()) + 1
     lanes = np.bincount(regions, streets.lane_metres, count)
-    speed = np.bincount(regions, streets.lane_metres * streets.speed, count) / np.maximum(lanes, 1.0)
-    across = np.array([np.sqrt(np.ptp(streets.centre[regions == r], axis=0).prod()) for r in range(count)])
+    speed = np.bincount(regions, streets.lane_metres * streets.speed, count) / np.maximum(
+        lanes, 1.0
+    )
+    across = np.array(
+        [np.sqrt(np.ptp(streets.centre[regions == r], axis=0).prod()) for r in range(count)]
+    )
     measured = baseline.metres_per_visit(streets, regions)
-    visit = np.where(np.isnan(measured), 0.7 * np.maximum(across, 100.0), np.maximum(measured, 50.0))
+    visit = np.where(
+        np.isnan(measured), 0.7 * np.maximum(across, 100.0), np.maximum(measured, 50.0)
+    )
     rate, jam = SIGNAL_SPEED_SHARE * speed / visit, np.maximum(JAM_DENSITY * lanes / 1000.0, 10.0)
     network = RegionalModel(
         name=name,
@@ -88,11 +115,14 @@ def network_of(streets: Streets, regions: EdgeNumbers, name: str, baseline: Base
         u_max=0.9,
         placeholder=True,
     )
-    return replace(network, observed_split_ratios=observed_split_ratios(network, baseline.crossings(regions)))
+    return replace(
+        network, observed_split_ratios=observed_split_ratios(network, baseline.crossings(regions))
+    )
 
 
 def options(case: SumoInput, clock: Clock) -> dict[str, str]:
-    """Return SUMO's options; the city's own step length if it divides the control interval, else 1 s."""
+    """Return SUMO's options; the city's own step length if it divides the control interval, else 1
+    s."""
     own = case.step_length
     fits = 0.0 < own <= 1.0 and abs(clock.step / own - round(clock.step / own)) < 1e-9
     return {
@@ -113,11 +143,21 @@ def scenario_text(
     leave: Sequence[str],
     **values: str | float,
 ) -> str:
-    """Return the scenario.toml; `files` maps routes, background and additional to file names beside it.
+    """Return the scenario.toml; `files` maps routes, background and additional to file names beside
+    it.
 
     values: name, network_path, protected (region), factor of the demand, mesoscopic
     """
-    substeps = int(np.ceil(clock.step / min(30.0, 0.5 / max(mfd.rate_up_to_jam(0.0) for mfd in network.mfds))))
+    substeps = int(
+        np.ceil(clock.step / min(30.0, 0.5 / max(mfd.rate_up_to_jam(0.0) for mfd in network.mfds)))
+    )
     lists, times = {**files, "leave_signals": leave}, options(case, clock)
-    known = {"network": network, "clock": clock, "case": case, "times": times, "lists": lists, "substeps": substeps}
+    known = {
+        "network": network,
+        "clock": clock,
+        "case": case,
+        "times": times,
+        "lists": lists,
+        "substeps": substeps,
+    }
     return filled(Path(__file__).with_name("scenario.toml.j2"), **known, **values)

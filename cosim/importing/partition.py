@@ -1,9 +1,11 @@
-"""Regions of similar density by Ward's criterion on the road graph, or the regions of the user's own table.
+"""Regions of similar density by Ward's criterion on the road graph, or the regions of the user's
+own table.
 
-The aims are those of Ji and Geroliminis, "On the spatial partitioning of urban transportation networks" (2012): regions
-that are homogeneous in density, connected and compact. Perimeter control needs more: boundaries at signals. So streets
-that much traffic joins without a controllable signal merge first. In the end every region is connected and can be
-reached from each other, and every edge is in one (`finish`).
+The aims are those of Ji and Geroliminis, "On the spatial partitioning of urban transportation
+networks" (2012): regions that are homogeneous in density, connected and compact. Perimeter control
+needs more: boundaries at signals. So streets that much traffic joins without a controllable signal
+merge first. In the end every region is connected and can be reached from each other, and every edge
+is in one (`finish`).
 """
 
 from collections import Counter
@@ -26,15 +28,27 @@ from nmfd.errors import InputError
 
 SMOOTHING_ROUNDS = 2  # of averaging densities with the neighbours
 HIGHEST_DENSITY = 0.15  # veh/m of lane; denser counts as this dense
-UNSIGNALLED_SHARE = 0.3  # of the mean region, up to which streets merge over connections without a signal
+UNSIGNALLED_SHARE = (
+    0.3  # of the mean region, up to which streets merge over connections without a signal
+)
 SMALLEST_SHARE = 0.4  # of the mean region, in lane metres of the core: smaller clusters dissolve
-DIRECTIONS = ("east", "north-east", "north", "north-west", "west", "south-west", "south", "south-east")
+DIRECTIONS = (
+    "east",
+    "north-east",
+    "north",
+    "north-west",
+    "west",
+    "south-west",
+    "south",
+    "south-east",
+)
 MAX_EXTRA_CLUSTERS = 20  # beyond the requested number, among which enough large ones are searched
 
 
 @dataclass(frozen=True, kw_only=True)
 class Blocks:
-    """B pieces of the main part of a network that no boundary divides: streets with both directions, roundabouts.
+    """B pieces of the main part of a network that no boundary divides: streets with both
+    directions, roundabouts.
 
     of: (E,) block of an edge, -1 outside the main part
     weight: (B,) lane metres; core: (B,) those of edges of the strongly connected core
@@ -50,14 +64,19 @@ class Blocks:
 
 
 def own_regions(streets: Streets, path: Path) -> EdgeNumbers:
-    """Read the region of every edge from a table edge,region; -1 for edges it does not name. Raises InputError."""
+    """Read the region of every edge from a table edge,region; -1 for edges it does not name. Raises
+    InputError."""
     given = read_regions(path)
     if unknown := sorted(given.keys() - streets.number.keys()):
-        raise InputError(f"{path}: edge {unknown[0]} is not in {streets.path}; remove it or give its network")
+        raise InputError(
+            f"{path}: edge {unknown[0]} is not in {streets.path}; remove it or give its network"
+        )
     labels = np.array([given.get(edge, -1) for edge in streets.edges])
     used = np.unique(labels[streets.drivable & (labels >= 0)])
     if len(used) < 2 or len(used) != labels.max() + 1:
-        raise InputError(f"{path}: expected two or more regions 0, 1, ..., each with an edge that cars may use")
+        raise InputError(
+            f"{path}: expected two or more regions 0, 1, ..., each with an edge that cars may use"
+        )
     return labels
 
 
@@ -73,26 +92,40 @@ def partition(
     blocks = make_blocks(streets)
     count = len(blocks.weight)
     if regions > count:
-        raise InputError(f"--regions: expected at most {count}, the streets of {streets.path}, got {regions} instead")
-    controllable = np.array([signal is not None and signal not in uncontrollable for signal in streets.link_signals])
+        raise InputError(
+            f"--regions: expected at most {count}, the streets of {streets.path}, got {regions} instead"
+        )
+    controllable = np.array(
+        [signal is not None and signal not in uncontrollable for signal in streets.link_signals]
+    )
     merged = _without_signals(streets, blocks, baseline.moves(), controllable, regions)
     inside, vehicles = blocks.of >= 0, baseline.density(streets) * streets.lane_metres
-    feature = features(blocks, np.bincount(blocks.of[inside], vehicles[inside], count) / blocks.weight)
+    feature = features(
+        blocks, np.bincount(blocks.of[inside], vehicles[inside], count) / blocks.weight
+    )
     weight = np.bincount(merged, blocks.weight)
-    feature = np.stack([np.bincount(merged, blocks.weight * axis) / weight for axis in feature.T], axis=1)[merged]
+    feature = np.stack(
+        [np.bincount(merged, blocks.weight * axis) / weight for axis in feature.T], axis=1
+    )[merged]
     labels = cluster(blocks, feature, regions)
     return finish(streets, np.where(blocks.of >= 0, labels[blocks.of], -1))
 
 
-def cluster(blocks: Blocks, feature: Float[np.ndarray, "B F"], regions: int) -> Int[np.ndarray, " B"]:
+def cluster(
+    blocks: Blocks, feature: Float[np.ndarray, "B F"], regions: int
+) -> Int[np.ndarray, " B"]:
     """Return the cluster of every block; -1 in clusters that are too small for a region."""
-    from sklearn.cluster import AgglomerativeClustering  # a second, which other commands do not need
+    from sklearn.cluster import (
+        AgglomerativeClustering,
+    )  # a second, which other commands do not need
 
     size = blocks.core if np.count_nonzero(blocks.core) >= regions else blocks.weight
     least = SMALLEST_SHARE * size.sum() / regions
     best, most = np.zeros(len(feature), dtype=int), 0
     for count in range(regions, min(regions + MAX_EXTRA_CLUSTERS, len(feature)) + 1):
-        labels = AgglomerativeClustering(n_clusters=count, connectivity=blocks.joins).fit_predict(feature)
+        labels = AgglomerativeClustering(n_clusters=count, connectivity=blocks.joins).fit_predict(
+            feature
+        )
         large = np.bincount(labels, size) >= least
         if most < large.sum() <= regions:
             best, most = np.where(large[labels], labels, -1), large.sum()
@@ -102,7 +135,8 @@ def cluster(blocks: Blocks, feature: Float[np.ndarray, "B F"], regions: int) -> 
 
 
 def features(blocks: Blocks, density: Float[np.ndarray, " B"]) -> Float[np.ndarray, "B 3"]:
-    """Return density of the neighbourhood and position of each block, each with variance 1 over the city's lanes."""
+    """Return density of the neighbourhood and position of each block, each with variance 1 over the
+    city's lanes."""
     weight, joins = blocks.weight, (blocks.joins > 0).astype(float)
     smooth = np.minimum(density, HIGHEST_DENSITY)
     for _ in range(SMOOTHING_ROUNDS):
@@ -124,7 +158,9 @@ def make_blocks(streets: Streets) -> Blocks:
     of[inside] = np.unique(label[inside], return_inverse=True)[1]
     count = of.max() + 1
     weight = np.bincount(of[inside], lanes[inside], count)
-    middles = [np.bincount(of[inside], (axis * lanes)[inside], count) / weight for axis in streets.centre.T]
+    middles = [
+        np.bincount(of[inside], (axis * lanes)[inside], count) / weight for axis in streets.centre.T
+    ]
     ends = of[streets.links]
     ends = ends[(ends >= 0).all(axis=1) & (ends[:, 0] != ends[:, 1])]
     joins = graph(np.concatenate([ends, ends[:, ::-1]]), count)
@@ -134,9 +170,14 @@ def make_blocks(streets: Streets) -> Blocks:
 
 
 def _without_signals(
-    streets: Streets, blocks: Blocks, moves: Counter[tuple[int, int]], controllable: np.ndarray, regions: int
+    streets: Streets,
+    blocks: Blocks,
+    moves: Counter[tuple[int, int]],
+    controllable: np.ndarray,
+    regions: int,
 ) -> np.ndarray:
-    """Return a group (B,) for every block; blocks that much traffic joins without a controllable signal share one."""
+    """Return a group (B,) for every block; blocks that much traffic joins without a controllable
+    signal share one."""
     flow: Counter[tuple[int, int]] = Counter()
     for (a, b), controlled in zip(streets.links, controllable, strict=True):
         one, other = sorted((blocks.of[a], blocks.of[b]))
@@ -168,8 +209,9 @@ def _opposite(streets: Streets) -> list[tuple[int, int]]:
 def finish(streets: Streets, labels: EdgeNumbers, *, renumber: bool = True) -> EdgeNumbers:
     """Return a region for every edge, from labels of the edges for cars, -1 for none.
 
-    Regions become connected, and each can be reached from each; those that fail join a neighbour. Other edges join an
-    adjoining region or the nearest. Regions are numbered from north to south, or in the order of the labels.
+    Regions become connected, and each can be reached from each; those that fail join a neighbour.
+    Other edges join an adjoining region or the nearest. Regions are numbered from north to south,
+    or in the order of the labels.
     """
     regions = labels.copy()
     regions[~streets.drivable] = -1
@@ -188,7 +230,8 @@ def finish(streets: Streets, labels: EdgeNumbers, *, renumber: bool = True) -> E
 
 
 def connect(streets: Streets, regions: EdgeNumbers) -> EdgeNumbers:
-    """Keep the largest connected piece of every region in the main part; other pieces join their main neighbour."""
+    """Keep the largest connected piece of every region in the main part; other pieces join their
+    main neighbour."""
     regions, inside = regions.copy(), streets.main_part
     links = streets.links[inside[streets.links].all(axis=1)]
     for _ in range(len(regions)):
@@ -206,7 +249,10 @@ def connect(streets: Streets, regions: EdgeNumbers) -> EdgeNumbers:
         # A piece may adjoin loose pieces only: then it waits for the next round.
         both = np.concatenate([links, links[:, ::-1]])
         both = both[loose[both[:, 0]] & ~loose[both[:, 1]]]
-        votes = [(number, regions[both[piece[both[:, 0]] == number, 1]]) for number in np.unique(piece[both[:, 0]])]
+        votes = [
+            (number, regions[both[piece[both[:, 0]] == number, 1]])
+            for number in np.unique(piece[both[:, 0]])
+        ]
         for number, neighbours in votes:
             regions[loose & (piece == number)] = np.argmax(np.bincount(neighbours))
     return regions
@@ -223,7 +269,8 @@ def digraph(streets: Streets, regions: EdgeNumbers) -> Int[np.ndarray, "R R"]:
 
 
 def _not_reachable(streets: Streets, regions: np.ndarray) -> int | None:
-    """Return the smallest region outside the largest set of regions that can be reached from each other."""
+    """Return the smallest region outside the largest set of regions that can be reached from each
+    other."""
     inside = streets.main_part
     used, numbers = np.unique(regions[inside], return_inverse=True)
     links = np.searchsorted(used, regions[streets.links[inside[streets.links].all(axis=1)]])
@@ -233,7 +280,9 @@ def _not_reachable(streets: Streets, regions: np.ndarray) -> int | None:
     return None if not len(outside) else int(used[outside[np.argmin(size[outside])]])
 
 
-def _spread(streets: Streets, regions: np.ndarray, links: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+def _spread(
+    streets: Streets, regions: np.ndarray, links: np.ndarray, wanted: np.ndarray
+) -> np.ndarray:
     """Give the `wanted` edges without a region that of a linked edge, else of the nearest."""
     regions, both = regions.copy(), np.concatenate([links, links[:, ::-1]])
     while True:
@@ -244,7 +293,9 @@ def _spread(streets: Streets, regions: np.ndarray, links: np.ndarray, wanted: np
         regions[edges] = regions[reach[first, 1]]
     missing, known = np.flatnonzero(wanted & (regions < 0)), np.flatnonzero(regions >= 0)
     if len(missing):
-        regions[missing] = regions[known[cKDTree(streets.centre[known]).query(streets.centre[missing])[1]]]
+        regions[missing] = regions[
+            known[cKDTree(streets.centre[known]).query(streets.centre[missing])[1]]
+        ]
     return regions
 
 
@@ -269,11 +320,14 @@ def _gravity(streets: Streets, members: np.ndarray) -> np.ndarray:
 def names(streets: Streets, regions: EdgeNumbers) -> tuple[str, ...]:
     """Name each region by its place: centre, north, south-west 2, ..."""
     places, middle = positions(streets, regions), _gravity(streets, regions >= 0)
-    radius = np.sqrt(np.average(((streets.centre - middle) ** 2).sum(axis=1), weights=streets.lane_metres))
+    radius = np.sqrt(
+        np.average(((streets.centre - middle) ** 2).sum(axis=1), weights=streets.lane_metres)
+    )
     plain: list[str] = []
     for x, y in places - middle:
         central = np.hypot(x, y) < 0.35 * radius
         plain.append("centre" if central else DIRECTIONS[round(np.arctan2(y, x) / (np.pi / 4)) % 8])
     return tuple(
-        name if plain.count(name) == 1 else f"{name} {plain[: n + 1].count(name)}" for n, name in enumerate(plain)
+        name if plain.count(name) == 1 else f"{name} {plain[: n + 1].count(name)}"
+        for n, name in enumerate(plain)
     )

@@ -20,7 +20,8 @@ CONTROLLED = "controlled"  # gateway with a signal that perimeter control uses
 
 
 class Tables(NamedTuple):
-    """Rows of quality.csv (one per region, and one for all) and of gateways.csv (one per movement over a boundary)."""
+    """Rows of quality.csv (one per region, and one for all) and of gateways.csv (one per movement
+    over a boundary)."""
 
     quality: Sequence[Mapping]
     gateways: Sequence[Mapping]
@@ -40,7 +41,10 @@ def tables(
     left_alone: signal -> reason why perimeter control does not use it
     """
     moves = Counter() if baseline is None else baseline.moves()
-    kinds = {signal: "fixed" if logic.kind == STATIC else logic.kind for signal, logic in streets.logics.items()}
+    kinds = {
+        signal: "fixed" if logic.kind == STATIC else logic.kind
+        for signal, logic in streets.logics.items()
+    }
     gateways = [
         {
             "source": g.source,
@@ -57,7 +61,9 @@ def tables(
         for g in city.gateways
     ]
     density = np.zeros(len(regions)) if baseline is None else 1000.0 * baseline.density(streets)
-    approaches = pd.Series({edge: regions[streets.number[edge]] for edge in city.signals}, dtype=int)
+    approaches = pd.Series(
+        {edge: regions[streets.number[edge]] for edge in city.signals}, dtype=int
+    )
     main_region = approaches.groupby(city.signals).agg(lambda part: part.mode()[0])
 
     def row(region: str, name: str, members: EdgeMask, own: Sequence[Mapping]) -> dict:
@@ -81,7 +87,9 @@ def tables(
 
     own = [[g for g in gateways if n in (g["source"], g["target"])] for n in range(len(names))]
     rows = [row(str(n), name, regions == n, own[n]) for n, name in enumerate(names)]
-    return Tables(quality=[*rows, row("all", "all regions", regions >= 0, gateways)], gateways=gateways)
+    return Tables(
+        quality=[*rows, row("all", "all regions", regions >= 0, gateways)], gateways=gateways
+    )
 
 
 def left_alone(streets: Streets, switched: Sequence[str] = ()) -> dict[str, str]:
@@ -89,19 +97,33 @@ def left_alone(streets: Streets, switched: Sequence[str] = ()) -> dict[str, str]
 
     switched: signals whose programme a timetable changes
     """
-    reasons = {signal: "no programme" for signal in streets.link_signals if signal and signal not in streets.logics}
+    reasons = {
+        signal: "no programme"
+        for signal in streets.link_signals
+        if signal and signal not in streets.logics
+    }
     for signal, logic in streets.logics.items():
         if logic.programme == "off" or logic.kind not in HELD:
             reasons[signal] = "switched off" if logic.programme == "off" else f"{logic.kind} signal"
-    return reasons | {signal: "programme follows a timetable" for signal in switched}
+    return reasons | dict.fromkeys(switched, "programme follows a timetable")
 
 
 def import_verdict(
-    network: RegionalModel, gateways: Sequence[Mapping], regions: EdgeNumbers, baseline: Baseline, scenario: str
+    network: RegionalModel,
+    gateways: Sequence[Mapping],
+    regions: EdgeNumbers,
+    baseline: Baseline,
+    scenario: str,
 ) -> Verdict:
     """Judge from the run without control whether perimeter control can help; scenario: its name."""
-    crossings = ((row["source"], row["target"], row["flow_veh"], row["control"] == CONTROLLED) for row in gateways)
-    inside = np.array([np.bincount(regions, row, network.regions) for row in baseline.presence]) / INTERVAL_S
+    crossings = (
+        (row["source"], row["target"], row["flow_veh"], row["control"] == CONTROLLED)
+        for row in gateways
+    )
+    inside = (
+        np.array([np.bincount(regions, row, network.regions) for row in baseline.presence])
+        / INTERVAL_S
+    )
     started = np.zeros(network.regions)
     for (way, _), vehicles in baseline.ways.items():
         if way:

@@ -21,7 +21,8 @@ from nmfd.errors import InputError
 
 @dataclass(frozen=True, kw_only=True)
 class Logic:
-    """Signal programme with its cycle [s]; kind: SUMO's type, or "branching" if phases do not follow in order."""
+    """Signal programme with its cycle [s]; kind: SUMO's type, or "branching" if phases do not
+    follow in order."""
 
     programme: str
     kind: str
@@ -36,7 +37,8 @@ class Streets:
     length [m], lanes (those for cars), speed [m/s]: (E,)
     shapes: E arrays (n, 2) [m]; centre: (E, 2) [m], half way along
     junctions: (E, 2), numbers of the junctions where the edge begins and ends
-    links: (L, 2) edges that a connection joins, both drivable, by lanes for cars; all_links: for any vehicle
+    links: (L, 2) edges that a connection joins, both drivable, by lanes for cars; all_links: for
+        any vehicle
     link_signals: L signals, of each of the links, None without one
     roundabouts: lists of edges
     logics: signal -> the programme that runs, which is the last one
@@ -79,7 +81,9 @@ class Streets:
         return self._largest("strong")
 
     def _largest(self, kind: str) -> EdgeMask:
-        count, part = connected_components(graph(self.links, len(self.edges)), directed=True, connection=kind)
+        count, part = connected_components(
+            graph(self.links, len(self.edges)), directed=True, connection=kind
+        )
         weight = np.bincount(part, self.lane_metres * self.drivable, count)
         return (part == np.argmax(weight)) & self.drivable
 
@@ -101,15 +105,27 @@ class _Edge(NamedTuple):
 
 
 def read_streets(net: Path, additional: Iterable[Path] = ()) -> Streets:
-    """Read a net.xml(.gz), and signal programmes of additional files, which replace those there. Raises InputError."""
+    """Read a net.xml(.gz), and signal programmes of additional files, which replace those there.
+    Raises InputError."""
     with network_root(net) as root:
-        normal = (edge for edge in root.iterfind("edge") if edge.get("function", "normal") in NORMAL)
+        normal = (
+            edge for edge in root.iterfind("edge") if edge.get("function", "normal") in NORMAL
+        )
         rows = {attribute(edge, "id"): _edge(edge) for edge in normal}
-        links = [link.attrib for link in root.iterfind("connection") if not attribute(link, "from").startswith(":")]
+        links = [
+            link.attrib
+            for link in root.iterfind("connection")
+            if not attribute(link, "from").startswith(":")
+        ]
         roundabouts = [ring.get("edges", "").split() for ring in root.iterfind("roundabout")]
-        logics = {attribute(element, "id"): _logic(element, net) for element in root.iterfind("tlLogic")}
+        logics = {
+            attribute(element, "id"): _logic(element, net) for element in root.iterfind("tlLogic")
+        }
     for path in additional:
-        logics |= {attribute(element, "id"): _logic(element, path) for element in read_xml(path).iter("tlLogic")}
+        logics |= {
+            attribute(element, "id"): _logic(element, path)
+            for element in read_xml(path).iter("tlLogic")
+        }
     if not any(row.cars for row in rows.values()):
         raise InputError(f"{net}: has no edge that cars may use; give a road network")
     edges = tuple(sorted(rows))
@@ -120,7 +136,10 @@ def read_streets(net: Path, additional: Iterable[Path] = ()) -> Streets:
         if link["from"] in number and link["to"] in number:
             pair = number[link["from"]], number[link["to"]]
             every.add(pair)
-            if int(link["fromLane"]) in rows[link["from"]].cars and int(link["toLane"]) in rows[link["to"]].cars:
+            if (
+                int(link["fromLane"]) in rows[link["from"]].cars
+                and int(link["toLane"]) in rows[link["to"]].cars
+            ):
                 signal_of[pair] = link.get("tl")
     cars = sorted(signal_of)
     return Streets(
@@ -131,7 +150,9 @@ def read_streets(net: Path, additional: Iterable[Path] = ()) -> Streets:
         lanes=np.array([len(rows[edge].cars) for edge in edges]),
         speed=np.array([rows[edge].speed for edge in edges]),
         shapes=tuple(rows[edge].shape for edge in edges),
-        centre=np.array([points_along(rows[edge].shape, lambda length: length / 2) for edge in edges]),
+        centre=np.array(
+            [points_along(rows[edge].shape, lambda length: length / 2) for edge in edges]
+        ),
         junctions=np.unique(ends, return_inverse=True)[1].reshape(-1, 2),
         links=np.array(cars, dtype=int).reshape(-1, 2),
         all_links=np.array(sorted(every), dtype=int).reshape(-1, 2),

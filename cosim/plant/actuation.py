@@ -21,12 +21,14 @@ OPEN_SHARE = 0.95  # of what a boundary can let through; above it a gate holds n
 
 
 class Actuation:
-    """All signals under control: `command` once per control interval, `play` before every simulation step.
+    """All signals under control: `command` once per control interval, `play` before every
+    simulation step.
 
-    Between them, `update` from time to time shares the command over the gateways again (cosim.plant.room).
+    Between them, `update` from time to time shares the command over the gateways again
+    (cosim.plant.room).
 
-    original_green: (G,) [s] per control interval in the original programme, mean of the gateway's links; NaN where no
-        command arrives
+    original_green: (G,) [s] per control interval in the original programme, mean of the gateway's
+        links; NaN where no command arrives
     states: signal -> time [s] and state at every change, as SUMO shows it
     """
 
@@ -41,15 +43,22 @@ class Actuation:
         incidents: Incidents,
         flows: Mapping[tuple[str, str], float] | None,
     ):
-        """step: control interval [s]; steered: signals for max-pressure; flows: (edge, next edge) -> flow, any unit, if
-        max-pressure runs the signals"""
-        self._session, self._city, self._network, self._incidents = session, city, network, incidents
+        """step: control interval [s]; steered: signals for max-pressure; flows: (edge, next edge)
+        -> flow, any unit, if max-pressure runs the signals"""
+        self._session, self._city, self._network, self._incidents = (
+            session,
+            city,
+            network,
+            incidents,
+        )
         movements = gateway_movements(city)
         phases: dict[str, Sequence[Phase]] = {}  # original ones of the signals that are commanded
         self._pressure, show = None, incidents.show
         self._controls: list[MaxPressure | GatewaySignal | ResponsiveSignal] = []
         if flows is not None:
-            self._pressure = MaxPressure(session, city, steered, flows, show=show, lookahead=settings.lookahead)
+            self._pressure = MaxPressure(
+                session, city, steered, flows, show=show, lookahead=settings.lookahead
+            )
             self._controls.append(self._pressure)
             phases = {signal.id: signal.phases for signal in steered if signal.id in movements}
         left = {*phases, *settings.leave_signals}
@@ -59,15 +68,26 @@ class Actuation:
             if plan.static:
                 self._controls.append(GatewaySignal(plan, links, start=session.time, show=show))
             elif plan.actuated:
-                self._controls.append(ResponsiveSignal(session, plan, links, show=show, release=incidents.release))
+                self._controls.append(
+                    ResponsiveSignal(session, plan, links, show=show, release=incidents.release)
+                )
         phases |= {plan.signal: plan.phases for plan in own if plan.static or plan.actuated}
         self.original_green = _programmed_green(city, phases, step)
-        self.room = Room(session, city, self.original_green, limit=settings.chain_limit, lanes=not settings.mesoscopic)
+        self.room = Room(
+            session,
+            city,
+            self.original_green,
+            limit=settings.chain_limit,
+            lanes=not settings.mesoscopic,
+        )
         self._supervisor = Supervisor(network, step) if settings.chain_limit > 0 else None
-        self.states: dict[str, list[tuple[float, str]]] = {signal: [] for signal in session.signals()}
+        self.states: dict[str, list[tuple[float, str]]] = {
+            signal: [] for signal in session.signals()
+        }
 
     def command(self, perimeter: PerPair, vehicles: PerEdge) -> None:
-        """Set u (R, R) [-] of the control interval that begins. vehicles: (E,) [veh] on the streets"""
+        """Set u (R, R) [-] of the control interval that begins. vehicles: (E,) [veh] on the
+        streets"""
         network = self._network
         share = np.clip((perimeter - network.u_min) / (network.u_max - network.u_min), 0.0, 1.0)
         share[share >= OPEN_SHARE] = 1.0
@@ -85,11 +105,14 @@ class Actuation:
             self._obey()
 
     def realised(self) -> PerPair | None:
-        """Return u (R, R) [-] that the gateways were given since the last command; None for the command itself."""
+        """Return u (R, R) [-] that the gateways were given since the last command; None for the
+        command itself."""
         network, share = self._network, self.room.realised()
         if share is None:
             return None
-        return np.where(network.adjacency, network.u_min + share * (network.u_max - network.u_min), 0.0)
+        return np.where(
+            network.adjacency, network.u_min + share * (network.u_max - network.u_min), 0.0
+        )
 
     def _obey(self) -> None:
         for control in self._controls:
@@ -111,23 +134,39 @@ class Actuation:
                 states.append((now, state))
 
     def green_time(self) -> PerGateway:
-        """Return (G,) [s] of green so far per gateway, mean of its links; NaN where no command arrives."""
-        green = {signal: times for control in self._controls for signal, times in control.green_time().items()}
+        """Return (G,) [s] of green so far per gateway, mean of its links; NaN where no command
+        arrives."""
+        green = {
+            signal: times
+            for control in self._controls
+            for signal, times in control.green_time().items()
+        }
         return np.array(
             [
-                sum(green[g.signal][link] for link in g.links) / len(g.links) if g.signal in green else np.nan
+                sum(green[g.signal][link] for link in g.links) / len(g.links)
+                if g.signal in green
+                else np.nan
                 for g in self._city.gateways
             ]
         )
 
     def as_shown(self, green: PerGateway) -> PerGateway:
-        """Return `green` (G,) [s] of the last interval, the original one where a signal did not obey."""
+        """Return `green` (G,) [s] of the last interval, the original one where a signal did not
+        obey."""
         refused = self._incidents.refused
-        return np.where([gateway.signal in refused for gateway in self._city.gateways], self.original_green, green)
+        return np.where(
+            [gateway.signal in refused for gateway in self._city.gateways],
+            self.original_green,
+            green,
+        )
 
     def pressure_facts(self) -> dict[str, float]:
         """Return max_pressure.FACTS of this run; NaN without max-pressure."""
-        return self._pressure.facts(self._session.time) if self._pressure else dict.fromkeys(FACTS, float("nan"))
+        return (
+            self._pressure.facts(self._session.time)
+            if self._pressure
+            else dict.fromkeys(FACTS, float("nan"))
+        )
 
     def leaks(self) -> list[Gateway]:
         """Return the gateways that no command reaches."""
@@ -139,6 +178,12 @@ def _programmed_green(city: City, phases: Mapping[str, Sequence[Phase]], step: f
     green = np.full(len(city.gateways), np.nan)
     for n, gateway in enumerate(city.gateways):
         if plan := phases.get(gateway.signal or ""):
-            lasting = [phase.duration * (phase.state[link] in GREEN) for phase in plan for link in gateway.links]
-            green[n] = sum(lasting) / len(gateway.links) * step / sum(phase.duration for phase in plan)
+            lasting = [
+                phase.duration * (phase.state[link] in GREEN)
+                for phase in plan
+                for link in gateway.links
+            ]
+            green[n] = (
+                sum(lasting) / len(gateway.links) * step / sum(phase.duration for phase in plan)
+            )
     return green

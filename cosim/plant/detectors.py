@@ -1,10 +1,12 @@
-"""Loop detectors on a share of the links, a share of the vehicles as probes, and the estimate from both.
+"""Loop detectors on a share of the links, a share of the vehicles as probes, and the estimate from
+both.
 
-Loops are SUMO's own, on every lane of an equipped link, at up to three places along it (Vigos, Papageorgiou and Wang,
-"Real-time estimation of vehicle-count within signalized links", Transportation Research C 16, 2008). The density of a
-lane is the mean occupancy of its loops over the length of a vehicle. Vehicles over a boundary are counted at the
-gateways that lead into an equipped link. Region and destination of probes are known at the end of every control
-interval, also while they wait to enter.
+Loops are SUMO's own, on every lane of an equipped link, at up to three places along it (Vigos,
+Papageorgiou and Wang, "Real-time estimation of vehicle-count within signalized links",
+Transportation Research C 16, 2008). The density of a lane is the mean occupancy of its loops over
+the length of a vehicle. Vehicles over a boundary are counted at the gateways that lead into an
+equipped link. Region and destination of probes are known at the end of every control interval, also
+while they wait to enter.
 """
 
 from collections.abc import Sequence
@@ -26,8 +28,8 @@ LAYOUT = 0x6C6F6F70  # seed of the places of the loops: a property of the city, 
 PROBES = 0x70726F62  # keeps the random numbers of the probes apart from others of the same seed
 VEHICLE_LENGTH_M = 5.0  # SUMO's passenger car
 STATIONS, SPACING_M = 3, 50.0  # largest number of loops along a lane, and lane length per loop
-# Standard deviation over mean [-] of the density over the links of a region, and of the readings along one link,
-# measured in a run of grid7 that locked.
+# Standard deviation over mean [-] of the density over the links of a region, and of the readings
+# along one link, measured in a run of grid7 that locked.
 SPREAD_OVER_LINKS, SPREAD_ALONG_LINK = 1.3, 1.0
 READING_PERIOD_S = 3.0
 
@@ -36,7 +38,8 @@ READING_PERIOD_S = 3.0
 class Layout:
     """The places of the loops.
 
-    edges: equipped links, as numbers in the city's edges; positions: of the loops on each of their lanes [m]
+    edges: equipped links, as numbers in the city's edges; positions: of the loops on each of their
+        lanes [m]
     counted: (G,) bool, gateways at which vehicles are counted
     """
 
@@ -46,9 +49,12 @@ class Layout:
 
 
 def lay_out(city: City, share: float) -> Layout:
-    """Return loops on a `share` of the links of every region; a larger share contains a smaller one."""
+    """Return loops on a `share` of the links of every region; a larger share contains a smaller
+    one."""
     random, links = np.random.default_rng(LAYOUT), []
-    place = random.uniform(0.02, 0.98, len(city.edges))  # within the part of the link that a loop stands for
+    place = random.uniform(
+        0.02, 0.98, len(city.edges)
+    )  # within the part of the link that a loop stands for
     for region in range(city.regions):
         own = np.flatnonzero(city.edge_region == region)
         links += list(random.permutation(own)[: int(np.ceil(share * len(own) - 1e-9))])
@@ -79,8 +85,11 @@ def instruments(city: City, layout: Layout, probe_share: float) -> Instruments:
         counted[gateway.source, gateway.target] += there
     return Instruments(
         detector_share=share,
-        # Of samples of links, weighted by lane length: which links hold the queues lasts, their reach changes.
-        detector_error=np.sqrt((SPREAD_OVER_LINKS**2 * (1.0 - share) + SPREAD_ALONG_LINK**2) * squares)
+        # Of samples of links, weighted by lane length: which links hold the queues lasts, their
+        # reach changes.
+        detector_error=np.sqrt(
+            (SPREAD_OVER_LINKS**2 * (1.0 - share) + SPREAD_ALONG_LINK**2) * squares
+        )
         / np.maximum(seen, 1e-9),
         detector_noise=SPREAD_ALONG_LINK * np.sqrt(squares) / np.maximum(seen, 1e-9),
         counted_share=counted / np.maximum(boundary, 1.0),
@@ -90,7 +99,8 @@ def instruments(city: City, layout: Layout, probe_share: float) -> Instruments:
 
 
 def write_loops(city: City, layout: Layout, period: float, path: Path) -> None:
-    """Write the loops as an additional file for SUMO. period: of its own means [s], which go nowhere"""
+    """Write the loops as an additional file for SUMO. period: of its own means [s], which go
+    nowhere"""
     rows = [
         f'  <inductionLoop id="{loop}" lane="{lane}" pos="{position:.2f}" period="{period:g}" file="NUL"/>\n'
         for loop, lane, position, _ in _loops(city, layout)
@@ -112,10 +122,23 @@ class Estimation:
     """
 
     def __init__(
-        self, session: Session, city: City, layout: Layout, meter: Meter, known: Instruments, planning: PlanningModel
+        self,
+        session: Session,
+        city: City,
+        layout: Layout,
+        meter: Meter,
+        known: Instruments,
+        planning: PlanningModel,
     ):
-        """meter: follows the probes; known: of the layout (`instruments`); planning: model of the filter"""
-        self._session, self._meter, self._known, self._layout, self._city = session, meter, known, layout, city
+        """meter: follows the probes; known: of the layout (`instruments`); planning: model of the
+        filter"""
+        self._session, self._meter, self._known, self._layout, self._city = (
+            session,
+            meter,
+            known,
+            layout,
+            city,
+        )
         self._filter, self._flow = Estimator(planning, known), meter.gateway_flow()
         self.accumulation = self._filter.accumulation
         loops = _loops(city, layout)
@@ -137,7 +160,8 @@ class Estimation:
         self.accumulation = self._filter.step(controls, self.readings())
 
     def backlog(self) -> PerPair:
-        """Return (R, R) [veh]: metered trips that wait, and the probes that wait to enter, scaled up."""
+        """Return (R, R) [veh]: metered trips that wait, and the probes that wait to enter, scaled
+        up."""
         return self._meter.held() + self._meter.probe_backlog() / max(self._known.probe_share, 1e-9)
 
     def readings(self) -> Readings:
@@ -148,7 +172,9 @@ class Estimation:
         share = known.detector_share * lane_length / np.maximum(lane_length, 1e-9)
         vehicles = np.bincount(self._region, density * self._length, regions)
         counts, flow = np.zeros((regions, regions)), meter.gateway_flow()
-        for gateway, there, crossed in zip(self._city.gateways, self._layout.counted, flow - self._flow, strict=True):
+        for gateway, there, crossed in zip(
+            self._city.gateways, self._layout.counted, flow - self._flow, strict=True
+        ):
             counts[gateway.source, gateway.target] += crossed if there else 0.0
         departed = meter.probe_departures - self._departed
         self._occupancy, self._samples = np.zeros(len(self._loops)), 0

@@ -1,13 +1,15 @@
 """Perimeter control to green: how commands limit the green of gateway links, signal by signal.
 
-With s the share of its gateway (cosim.plant.room), and m the minimum green, a gateway link keeps m + s (L - m) seconds
+With s the share of its gateway (cosim.plant.room), and m the minimum green, a gateway link keeps m
++ s (L - m) seconds
 
 - of every window of L seconds at a fixed-time signal (GatewaySignal), from its beginning,
-- of every cycle at a signal that SUMO times by detectors (ResponsiveSignal) or max-pressure runs (Ration): L is the
+- of every cycle at a signal that SUMO times by detectors (ResponsiveSignal) or max-pressure runs
+(Ration): L is the
   nominal green in a cycle, or the whole cycle.
 
-Then come the original yellow and red. Green is only taken away: no new conflicts, and s = 1 is the original programme.
-The green that is taken stays red.
+Then come the original yellow and red. Green is only taken away: no new conflicts, and s = 1 is the
+original programme. The green that is taken stays red.
 """
 
 from bisect import bisect_right
@@ -26,12 +28,15 @@ Show = Callable[[str, str], None]  # (signal, state): sets the state
 
 
 class GatewaySignal:
-    """A fixed-time signal with gateway links. next_change: time of the next change of its state [s]"""
+    """A fixed-time signal with gateway links. next_change: time of the next change of its state
+    [s]"""
 
     def __init__(self, programme: Programme, movements: Movements, *, start: float, show: Show):
         """start: simulation time at which the programme was read [s]"""
         self._signal, self._phases, self._show = programme.signal, programme.phases, show
-        self._movements = {link: _Movement(gateway, programme, link) for link, gateway in movements.items()}
+        self._movements = {
+            link: _Movement(gateway, programme, link) for link, gateway in movements.items()
+        }
         self._cycle, self._cycle_start = programme.cycle, start - programme.position
         self._ends = list(accumulate(phase.duration for phase in programme.phases))
         self._shown, self._since, self.next_change = "", start, start
@@ -51,7 +56,10 @@ class GatewaySignal:
         while now >= self._cycle_start + self._cycle:
             self._cycle_start += self._cycle
         phase = min(bisect_right(self._ends, now - self._cycle_start + 1e-6), len(self._ends) - 1)
-        shown, self.next_change = list(self._phases[phase].state), self._cycle_start + self._ends[phase]
+        shown, self.next_change = (
+            list(self._phases[phase].state),
+            self._cycle_start + self._ends[phase],
+        )
         for link, movement in self._movements.items():
             shown[link], change = self._filter(movement, shown[link], phase, now)
             self.next_change = min(self.next_change, change)
@@ -60,9 +68,13 @@ class GatewaySignal:
 
     def green_time(self) -> dict[str, dict[int, float]]:
         """Return signal -> gateway link -> green up to the last change [s]."""
-        return {self._signal: {link: movement.green_time for link, movement in self._movements.items()}}
+        return {
+            self._signal: {link: movement.green_time for link, movement in self._movements.items()}
+        }
 
-    def _filter(self, movement: "_Movement", base: str, phase: int, now: float) -> tuple[str, float]:
+    def _filter(
+        self, movement: "_Movement", base: str, phase: int, now: float
+    ) -> tuple[str, float]:
         """Return the light of a link instead of `base`, and the time of its next change [s]."""
         full = movement.windows.get(phase, 0.0)
         always = full >= self._cycle  # a link without red: its window is the cycle
@@ -71,8 +83,14 @@ class GatewaySignal:
                 movement.open, movement.cut_at = True, NEVER
                 if self._shown:  # the window during which control starts is left whole
                     least = min(MIN_GREEN_S, full)
-                    most = full - movement.yellow if always else full  # its yellow ends with the cycle
-                    kept = full if movement.share >= 1.0 else min(least + round(movement.share * (full - least)), most)
+                    most = (
+                        full - movement.yellow if always else full
+                    )  # its yellow ends with the cycle
+                    kept = (
+                        full
+                        if movement.share >= 1.0
+                        else min(least + round(movement.share * (full - least)), most)
+                    )
                     movement.opened_at, movement.cut_at = now, now + kept
             if now < movement.cut_at:
                 return base, movement.cut_at
@@ -90,7 +108,8 @@ class GatewaySignal:
 class _Movement:
     """State of a gateway link between two changes.
 
-    windows: phase -> length [s] of the green window that begins there, which may pass the cycle's end
+    windows: phase -> length [s] of the green window that begins there, which may pass the cycle's
+        end
     """
 
     def __init__(self, gateway: int, programme: Programme, link: int):
@@ -98,13 +117,21 @@ class _Movement:
         phases, self.yellow = programme.phases, yellow_time(programme.phases, link)
         green = [phase.state[link] in GREEN for phase in phases]
         starts = [n for n in range(len(phases)) if green[n] and not green[n - 1]]
-        self.windows = {0: programme.cycle} if all(green) else {n: run_length(phases, n, link, GREEN) for n in starts}
+        self.windows = (
+            {0: programme.cycle}
+            if all(green)
+            else {n: run_length(phases, n, link, GREEN) for n in starts}
+        )
         self.open, self.opened_at, self.cut_at = False, -NEVER, NEVER
 
 
 def yellow_time(phases: Sequence[Phase], link: int) -> float:
     """Return the longest yellow after a green of a link [s]."""
-    starts = [n for n, phase in enumerate(phases) if phase.state[link] == "y" and phases[n - 1].state[link] in GREEN]
+    starts = [
+        n
+        for n, phase in enumerate(phases)
+        if phase.state[link] == "y" and phases[n - 1].state[link] in GREEN
+    ]
     return max((run_length(phases, n, link, "y") for n in starts), default=DEFAULT_YELLOW_S)
 
 
@@ -115,11 +142,15 @@ def ends_bare(phases: Sequence[Phase]) -> set[int]:
 
 
 def least_times(phases: Sequence[Phase]) -> list[float]:
-    """Return the least time of every phase [s]: of a stage the minimum green, if no crossing is green or cleared."""
+    """Return the least time of every phase [s]: of a stage the minimum green, if no crossing is
+    green or cleared."""
     bare = ends_bare(phases)
     walks = [any(phase.state[link] in GREEN for link in bare) for phase in phases]
     return [
-        min(phase.duration, MIN_GREEN_S if is_stage(phase.state) and not (walks[n] or walks[n - 1]) else NEVER)
+        min(
+            phase.duration,
+            MIN_GREEN_S if is_stage(phase.state) and not (walks[n] or walks[n - 1]) else NEVER,
+        )
         for n, phase in enumerate(phases)
     ]
 
@@ -135,11 +166,15 @@ def run_length(phases: Sequence[Phase], first: int, link: int, lights: Collectio
 class Ration:
     """The green of one gateway link, limited per cycle.
 
-    gateway: its number, whose share it follows; share: [-] of the cycles that begin from now on, 1 is no limit
+    gateway: its number, whose share it follows; share: [-] of the cycles that begin from now on, 1
+        is no limit
     """
 
-    def __init__(self, gateway: int, *, cycle: float, yellow: float, start: float, full: float | None = None):
-        """start: time at which the first cycle begins [s]; full: green of share 1 in a cycle, the cycle if None [s]"""
+    def __init__(
+        self, gateway: int, *, cycle: float, yellow: float, start: float, full: float | None = None
+    ):
+        """start: time at which the first cycle begins [s]; full: green of share 1 in a cycle, the
+        cycle if None [s]"""
         self.gateway, self._green_time = gateway, 0.0
         self._full = cycle if full is None else full
         self._cycle, self._least, self._yellow = cycle, min(MIN_GREEN_S, self._full), yellow
@@ -163,7 +198,11 @@ class Ration:
         Call it also when `light` changes. lasting: a green lasts for the minimum green at least
         """
         green = now - self._since if self._light in GREEN else 0.0
-        self._spent, self._green_time, self._since = self._spent + green, self._green_time + green, now
+        self._spent, self._green_time, self._since = (
+            self._spent + green,
+            self._green_time + green,
+            now,
+        )
         while now >= self._cycle_end - 1e-6:
             self._cycle_end += self._cycle
             self._spent = 0.0
@@ -186,12 +225,19 @@ class Ration:
         if light in GREEN:
             if self._open and left <= 1e-6:
                 self._open, self._yellow_until = False, now + self._yellow
-            elif not self._open and lasting and now >= self._yellow_until - 1e-6 and left >= self._least - 1e-6:
+            elif (
+                not self._open
+                and lasting
+                and now >= self._yellow_until - 1e-6
+                and left >= self._least - 1e-6
+            ):
                 self._open, self._opened_at = True, now
             if self._open:
                 return light, now + left
         elif self._open:
-            self._open = False  # a green after the yellow of the programme has to be a whole one again
+            self._open = (
+                False  # a green after the yellow of the programme has to be a whole one again
+            )
             if light == "y":
                 self._yellow_until = NEVER
         return ("y", self._yellow_until) if now < self._yellow_until - 1e-6 else ("r", NEVER)
@@ -200,8 +246,8 @@ class Ration:
 class ResponsiveSignal:
     """A signal that SUMO times by detectors, with gateway links.
 
-    Its programme runs on underneath, and what is shown follows it one step behind. SUMO's own programme shows itself
-    as long as no green is taken away.
+    Its programme runs on underneath, and what is shown follows it one step behind. SUMO's own
+    programme shows itself as long as no green is taken away.
     """
 
     def __init__(
@@ -214,17 +260,37 @@ class ResponsiveSignal:
         release: Callable[[str, str], None],
     ):
         """release(signal, programme): see Incidents"""
-        self._signal, self._phases, self._programme = programme.signal, programme.phases, programme.id
+        self._signal, self._phases, self._programme = (
+            programme.signal,
+            programme.phases,
+            programme.id,
+        )
         self._session, self._show, self._release = session, show, release
         phases, start = programme.phases, session.time
-        full = {link: sum(p.duration for p in phases if p.state[link] in GREEN) for link in movements}
+        full = {
+            link: sum(p.duration for p in phases if p.state[link] in GREEN) for link in movements
+        }
         self._rations = {
-            link: Ration(gateway, cycle=programme.cycle, yellow=yellow_time(phases, link), start=start, full=full[link])
+            link: Ration(
+                gateway,
+                cycle=programme.cycle,
+                yellow=yellow_time(phases, link),
+                start=start,
+                full=full[link],
+            )
             for link, gateway in movements.items()
         }
         self._least = least_times(phases)
-        self._always = {link for link in movements if all(phase.state[link] in GREEN for phase in phases)}
-        self._base, self._since, self._next, self._held, self._limited = "", start, start, False, False
+        self._always = {
+            link for link in movements if all(phase.state[link] in GREEN for phase in phases)
+        }
+        self._base, self._since, self._next, self._held, self._limited = (
+            "",
+            start,
+            start,
+            False,
+            False,
+        )
 
     def command(self, share: PerGateway) -> None:
         """Set the shares (G,) [-] from the next cycle on."""
@@ -236,7 +302,11 @@ class ResponsiveSignal:
     def play(self, now: float) -> None:
         """Set the state from `now` [s] on, or leave the signal to SUMO."""
         session, signal = self._session, self._signal
-        base = session.state_underneath(signal, self._programme) if self._held else session.signal_state(signal)
+        base = (
+            session.state_underneath(signal, self._programme)
+            if self._held
+            else session.signal_state(signal)
+        )
         if base == self._base and now < self._next - 1e-6:
             return
         before, self._base = self._base, base
@@ -244,8 +314,12 @@ class ResponsiveSignal:
             self._since = now
         shown, self._next = list(base), NEVER
         for link, ration in self._rations.items():
-            begun = not before or before[link] not in GREEN  # a window that begins lasts for SUMO's own minimum
-            own = "G" if not before and base[link] == "y" else base[link]  # a first yellow as that after a green
+            begun = (
+                not before or before[link] not in GREEN
+            )  # a window that begins lasts for SUMO's own minimum
+            own = (
+                "G" if not before and base[link] == "y" else base[link]
+            )  # a first yellow as that after a green
             light, again = ration.show(own, now, lasting=begun or link in self._always)
             self._next = min(self._next, again)
             if light == "y" or base[link] in "Ggy":
@@ -258,12 +332,19 @@ class ResponsiveSignal:
     def green_time(self) -> dict[str, dict[int, float]]:
         """Return signal -> gateway link -> green so far [s]."""
         now = self._session.time
-        return {self._signal: {link: ration.green_time(now) for link, ration in self._rations.items()}}
+        return {
+            self._signal: {link: ration.green_time(now) for link, ration in self._rations.items()}
+        }
 
     def _hold(self, state: str, now: float) -> None:
-        """Show `state` from the first limit on; give the signal back to SUMO in the midst of a stage after the last."""
+        """Show `state` from the first limit on; give the signal back to SUMO in the midst of a
+        stage after the last."""
         # A stage that has just begun could end too early, one step behind SUMO.
-        least = [time for phase, time in zip(self._phases, self._least, strict=True) if phase.state == state]
+        least = [
+            time
+            for phase, time in zip(self._phases, self._least, strict=True)
+            if phase.state == state
+        ]
         limited = self._limited or any(ration.limited for ration in self._rations.values())
         ends = not limited and state == self._base and is_stage(state)
         again = self._since + max(MIN_GREEN_S, *least, 0.0) if ends else NEVER

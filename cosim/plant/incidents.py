@@ -1,4 +1,5 @@
-"""Faults of a simulated city: closed streets, and signals that run their own programme whatever is commanded."""
+"""Faults of a simulated city: closed streets, and signals that run their own programme whatever is
+commanded."""
 
 from collections.abc import Collection, Sequence
 
@@ -12,30 +13,41 @@ from cosim.sumo.signals import GREEN
 from nmfd.errors import InputError
 from nmfd.faults import Fault
 
-CLOSED_SPEED_M_S = 0.001  # speed limit of a closed street: vehicles on it stand, and soon none can enter
+CLOSED_SPEED_M_S = (
+    0.001  # speed limit of a closed street: vehicles on it stand, and soon none can enter
+)
 
 
 def check(faults: Sequence[Fault], city: City, where: str, others: Collection[str] = ()) -> None:
-    """Raise InputError for an edge or signal that the city does not have; others: signals without a gateway."""
+    """Raise InputError for an edge or signal that the city does not have; others: signals without a
+    gateway."""
     signals = {gateway.signal for gateway in city.gateways} | {*others}
     for fault in faults:
         if fault.kind == "closed" and fault.value not in city.edges:
-            raise InputError(f"{where}: closed: edge {fault.value!r} is not in {city.net_file}; name one that cars use")
+            raise InputError(
+                f"{where}: closed: edge {fault.value!r} is not in {city.net_file}; name one that cars use"
+            )
         if fault.kind == "signal" and fault.value not in signals:
-            raise InputError(f"{where}: signal: {fault.value!r} is no signal that is commanded; name one at a gateway")
+            raise InputError(
+                f"{where}: signal: {fault.value!r} is no signal that is commanded; name one at a gateway"
+            )
 
 
 class Incidents:
     """Faults of one run, and all setting of signal states, which they may prevent.
 
-    Call `begin` at the start of every control interval and `play` before every simulation step. A signal that stops or
-    starts to obey shows yellow first where it loses a green.
+    Call `begin` at the start of every control interval and `play` before every simulation step. A
+    signal that stops or starts to obey shows yellow first where it loses a green.
     """
 
     def __init__(self, faults: Sequence[Fault], session: Session, city: City):
         self._faults, self._session, self._city = faults, session, city
         self._limits: dict[str, list[float]] = {}  # closed edge -> speed limits of its lanes before
-        self._own = {fault.value: session.programme_id(fault.value) for fault in faults if fault.kind == "signal"}
+        self._own = {
+            fault.value: session.programme_id(fault.value)
+            for fault in faults
+            if fault.kind == "signal"
+        }
         self._silent: set[str] = set()  # signals that do not obey
         self._failed: set[str] = set()  # signals whose state SUMO refused in this interval
         self._commanded: dict[str, str] = {}  # signal -> last commanded state
@@ -54,7 +66,9 @@ class Incidents:
     def begin(self, k: int) -> None:
         """Start the faults of control interval k, and end those that are over."""
         active = [fault for fault in self._faults if fault.active(k)]
-        closed, silent = ({f.value for f in active if f.kind == kind} for kind in ("closed", "signal"))
+        closed, silent = (
+            {f.value for f in active if f.kind == kind} for kind in ("closed", "signal")
+        )
         for edge in closed - self._limits.keys():
             self._limits[edge] = self._session.limit_speed(edge, [CLOSED_SPEED_M_S])
         for edge in self._limits.keys() - closed:
@@ -84,7 +98,9 @@ class Incidents:
     def problem(self) -> str:
         """Return what was wrong in this interval, "" if nothing was."""
         streets = [f"edge {edge} closed" for edge in sorted(self._limits)]
-        return ", ".join([*streets, *(f"signal {signal} took no programme" for signal in sorted(self.refused))])
+        return ", ".join(
+            [*streets, *(f"signal {signal} took no programme" for signal in sorted(self.refused))]
+        )
 
     def _obeys(self, signal: str) -> bool:
         return signal not in self._silent and signal not in self._yellow_end
@@ -96,7 +112,9 @@ class Incidents:
         if target is None:
             session.restart_programme(signal, self._own[signal])
         coming = session.signal_state(signal) if target is None else target
-        between = "".join("y" if a in GREEN and b not in GREEN else a for a, b in zip(shown, coming, strict=True))
+        between = "".join(
+            "y" if a in GREEN and b not in GREEN else a for a, b in zip(shown, coming, strict=True)
+        )
         if between != shown:
             session.set_signal_state(signal, between)
             self._yellow_end[signal] = session.time + DEFAULT_YELLOW_S

@@ -19,12 +19,20 @@ from cosim.sumo.xml_files import file_list
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
 
-# Equipped drivers take the fastest route by the mean speeds of the last 180 s: at the departure, for which their route
-# must be read no earlier, and every minute from then on.
-REROUTING = (
-    "--route-steps 1 --device.rerouting.pre-period 60 --device.rerouting.period 60 "
-    "--device.rerouting.adaptation-interval 1 --device.rerouting.adaptation-steps 180"
-).split()
+# Equipped drivers take the fastest route by the mean speeds of the last 180 s: at the departure,
+# for which their route must be read no earlier, and every minute from then on.
+REROUTING = [
+    "--route-steps",
+    "1",
+    "--device.rerouting.pre-period",
+    "60",
+    "--device.rerouting.period",
+    "60",
+    "--device.rerouting.adaptation-interval",
+    "1",
+    "--device.rerouting.adaptation-steps",
+    "180",
+]
 GIVEN = ("step-length", "time-to-teleport", "collision.action")  # arguments of Session
 
 
@@ -36,10 +44,12 @@ def own_vehicles(scenario: Scenario, settings: Settings, city: City) -> Recorded
 
 
 class Launch:
-    """Starts SUMO for one run after the other, with files in a temporary folder that `close` removes.
+    """Starts SUMO for one run after the other, with files in a temporary folder that `close`
+    removes.
 
     vehicles: ids of those of the last run; held: its trips under metering
-    trip_file, emission_file: SUMO's tripinfo output, and its emissions by edge at the end of the run
+    trip_file, emission_file: SUMO's tripinfo output, and its emissions by edge at the end of the
+        run
     """
 
     def __init__(
@@ -53,8 +63,14 @@ class Launch:
         trip_file: Path | None,
         gui: bool,
     ):
-        """layout: of the loop detectors; trip_file: of SUMO's tripinfo, to be kept; gui: in the window of sumo-gui"""
-        self._scenario, self._settings, self._city, self._signals = scenario, settings, city, signals
+        """layout: of the loop detectors; trip_file: of SUMO's tripinfo, to be kept; gui: in the
+        window of sumo-gui"""
+        self._scenario, self._settings, self._city, self._signals = (
+            scenario,
+            settings,
+            city,
+            signals,
+        )
         self._layout, self._kept, self._gui = layout, trip_file is not None, gui
         self._temporary = tempfile.TemporaryDirectory(prefix="cosim-", ignore_cleanup_errors=True)
         self._folder = Path(self._temporary.name)
@@ -87,14 +103,20 @@ class Launch:
         """Return (edge, next edge) -> flow [veh/s] of the vehicles."""
         if not self._settings.routes:
             return turning_flows(self._city, self._scenario.demand, self._scenario.step)
-        return recorded.own_flows(self._city, self._recorded, self._shared_routes, self._scenario.demand_factor)
+        return recorded.own_flows(
+            self._city, self._recorded, self._shared_routes, self._scenario.demand_factor
+        )
 
     def close(self) -> None:
         self._temporary.cleanup()
 
     def _options(self) -> list[str]:
         settings = self._settings
-        options = [*outputs.options(self.trip_file, detailed=self._kept), "--begin", str(settings.begin)]
+        options = [
+            *outputs.options(self.trip_file, detailed=self._kept),
+            "--begin",
+            str(settings.begin),
+        ]
         options += ["--ignore-route-errors", str(bool(settings.routes)).lower()]
         if settings.rerouting > 0:
             options += [*REROUTING, "--device.rerouting.probability", str(settings.rerouting)]
@@ -105,7 +127,8 @@ class Launch:
         return [*options, "--additional-files", file_list(self._additional())]
 
     def _additional(self) -> list[Path]:
-        """Return the additional files in SUMO's order of reading: the last programme of a signal runs."""
+        """Return the additional files in SUMO's order of reading: the last programme of a signal
+        runs."""
         scenario, settings, folder = self._scenario, self._settings, self._folder
         steered, others = self._signals
         additional = own_files(scenario, settings.additional)
@@ -128,7 +151,9 @@ class Launch:
         jitter = recorded.JITTER_S if settings.routes and seed else 0.0
         drawn = recorded.draw(originals, seed=seed, factor=factor, jitter=jitter, begin=begin)
         if settings.metering > 0.0:
-            self.held = recorded.write_held_trips(originals, drawn, path, self._shared_routes, self._city.region_of)
+            self.held = recorded.write_held_trips(
+                originals, drawn, path, self._shared_routes, self._city.region_of
+            )
             if settings.routes and not self.held.orders:
                 some = f"those without stops, via edges and attributes other than {', '.join(recorded.ORDERED)}"
                 none = "none of the vehicles in sumo.routes can wait: only"

@@ -1,18 +1,22 @@
-"""Max-pressure control of signals (Varaiya, "Max pressure control of a network of signalized intersections", 2013).
+"""Max-pressure control of signals (Varaiya, "Max pressure control of a network of signalized
+intersections", 2013).
 
-A movement from road l to road m has the weight w(l, m) = x(l, m) - sum_p r(m, p) x(m, p): vehicles that want to make
-it, minus those in the way behind it, by turning shares r. A stage (a green phase of the original programme) has the
-pressure sum c(l, m) max(w(l, m), 0) over its movements, c their saturation flows. The stage with the highest pressure
-gets the green, after the original yellow and all-red. Perimeter control rations the green of the gateway movements
-(cosim.plant.gates.Ration); a movement whose ration is spent exerts no pressure.
+A movement from road l to road m has the weight w(l, m) = x(l, m) - sum_p r(m, p) x(m, p): vehicles
+that want to make it, minus those in the way behind it, by turning shares r. A stage (a green phase
+of the original programme) has the pressure sum c(l, m) max(w(l, m), 0) over its movements, c their
+saturation flows. The stage with the highest pressure gets the green, after the original yellow and
+all-red. Perimeter control rations the green of the gateway movements (cosim.plant.gates.Ration); a
+movement whose ration is spent exerts no pressure.
 
-x counts vehicles per lane; on shared lanes and upstream of the turn lanes, r divides them, from the demand's static
-routes. Vehicles on streets closed to cars, such as buses, press for the stages that serve them. A shared lane counts
-for the stages that serve all of it; if there is none, for the others with the chance that its first vehicle is served.
+x counts vehicles per lane; on shared lanes and upstream of the turn lanes, r divides them, from the
+demand's static routes. Vehicles on streets closed to cars, such as buses, press for the stages that
+serve them. A shared lane counts for the stages that serve all of it; if there is none, for the
+others with the chance that its first vehicle is served.
 
-The next stage is the one with the highest pressure; a link that was red for MAX_RED_S while a vehicle waited there
-comes first. No green outlasts MAX_GREEN_S while others wait. A change costs yellow and red: the pressure of another
-stage counts for the share of green in these and the `lookahead` that follows: the shorter, the fewer the changes.
+The next stage is the one with the highest pressure; a link that was red for MAX_RED_S while a
+vehicle waited there comes first. No green outlasts MAX_GREEN_S while others wait. A change costs
+yellow and red: the pressure of another stage counts for the share of green in these and the
+`lookahead` that follows: the shorter, the fewer the changes.
 """
 
 from collections import defaultdict
@@ -23,7 +27,16 @@ from itertools import permutations
 import numpy as np
 from scipy.sparse import csr_array
 
-from cosim.plant.gates import MIN_GREEN_S, NEVER, Movements, Ration, Show, ends_bare, run_length, yellow_time
+from cosim.plant.gates import (
+    MIN_GREEN_S,
+    NEVER,
+    Movements,
+    Ration,
+    Show,
+    ends_bare,
+    run_length,
+    yellow_time,
+)
 from cosim.sumo.arrays import PerGateway
 from cosim.sumo.net import City, gateway_movements
 from cosim.sumo.session import Phase, Session
@@ -48,7 +61,8 @@ SATURATION = {"G": 1.0, "g": PERMISSIVE}  # light -> saturation flow [lanes]
 
 
 class MaxPressure:
-    """Max-pressure at `signals`: `command` once per control interval, `play` before every simulation step."""
+    """Max-pressure at `signals`: `command` once per control interval, `play` before every
+    simulation step."""
 
     def __init__(
         self,
@@ -66,7 +80,9 @@ class MaxPressure:
         self._roads, self._start = roads, session.time
         movements = gateway_movements(city)
         self._programmed = float(np.mean([_intergreen(signal.phases) for signal in signals]))
-        self._junctions = [Junction(signal, session.time, movements.get(signal.id)) for signal in signals]
+        self._junctions = [
+            Junction(signal, session.time, movements.get(signal.id)) for signal in signals
+        ]
         self._approaches = [Approaches(signal, roads.watched, session.time) for signal in signals]
         self._rationed = [junction for junction in self._junctions if junction.rations]
         self._next = session.time
@@ -83,13 +99,17 @@ class MaxPressure:
         """Return signal -> gateway link -> green so far [s]."""
         now = self._session.time
         return {
-            junction.signal: {link: ration.green_time(now) for link, ration in junction.rations.items()}
+            junction.signal: {
+                link: ration.green_time(now) for link, ration in junction.rations.items()
+            }
             for junction in self._rationed
         }
 
     def facts(self, now: float) -> dict[str, float]:
         """Return FACTS until `now` [s]."""
-        share = float(np.mean([junction.lost for junction in self._junctions])) / max(now - self._start, 1.0)
+        share = float(np.mean([junction.lost for junction in self._junctions])) / max(
+            now - self._start, 1.0
+        )
         return dict(zip(FACTS, (*self._roads.shared, share, self._programmed), strict=True))
 
     def play(self, now: float) -> None:
@@ -100,28 +120,46 @@ class MaxPressure:
         if now < self._next - 1e-6:
             return
         self._next = now + DECISION_PERIOD_S
-        present = np.array([self._session.lane_vehicles(lane) for lane in self._roads.lanes], dtype=float)
+        present = np.array(
+            [self._session.lane_vehicles(lane) for lane in self._roads.lanes], dtype=float
+        )
         pressure = self._pressure(present)
-        for junction, approaches, begin in zip(self._junctions, self._approaches, self._roads.begins, strict=True):
+        for junction, approaches, begin in zip(
+            self._junctions, self._approaches, self._roads.begins, strict=True
+        ):
             approaches.observe(junction.state, now)
             if junction.may_switch(now):
                 waiting = approaches.waiting(present, junction.exhausted_links())
-                stage = self._next_stage(junction, pressure[begin : begin + junction.stages], waiting, approaches, now)
+                stage = self._next_stage(
+                    junction, pressure[begin : begin + junction.stages], waiting, approaches, now
+                )
                 if stage != junction.stage:
                     self._show(junction.signal, junction.switch(stage, now))
 
     def _next_stage(
-        self, junction: "Junction", pressure: np.ndarray, waiting: np.ndarray, approaches: "Approaches", now: float
+        self,
+        junction: "Junction",
+        pressure: np.ndarray,
+        waiting: np.ndarray,
+        approaches: "Approaches",
+        now: float,
     ) -> int:
-        """Return the next stage, or the present one. pressure: (n,) of the stages; waiting: (K,) bool, of the links"""
+        """Return the next stage, or the present one. pressure: (n,) of the stages; waiting: (K,)
+        bool, of the links"""
         own, called = junction.stage, approaches.serves @ waiting > 0
-        in_turn = [n % len(pressure) for n in range(own + 1, own + len(pressure)) if called[n % len(pressure)]]
+        in_turn = [
+            n % len(pressure)
+            for n in range(own + 1, own + len(pressure))
+            if called[n % len(pressure)]
+        ]
         if not in_turn:
             return own
         overdue = approaches.serves @ (waiting * approaches.overdue(now))
         if overdue.any():
             return int(np.argmax(overdue))
-        worth = {n: pressure[n] * self._lookahead / (self._lookahead + junction.loss(n)) for n in in_turn}
+        worth = {
+            n: pressure[n] * self._lookahead / (self._lookahead + junction.loss(n)) for n in in_turn
+        }
         best = max(in_turn, key=worth.__getitem__)
         too_long = now + DECISION_PERIOD_S > junction.stage_since + MAX_GREEN_S + 1e-6
         if worth[best] > pressure[own] or too_long:
@@ -150,9 +188,17 @@ class Junction:
         """gateways: links whose green is rationed"""
         self.signal, self._phases, self._numbers = signal.id, signal.phases, stages_of(signal)
         self.stages, self.stage, phases = len(self._numbers), 0, signal.phases
-        crossed = {k: max(run_length(phases, n, k, GREEN) for n in range(len(phases))) for k in ends_bare(phases)}
+        crossed = {
+            k: max(run_length(phases, n, k, GREEN) for n in range(len(phases)))
+            for k in ends_bare(phases)
+        }
         self._least = [  # of every stage [s]
-            max([MIN_GREEN_S, *(green for k, green in crossed.items() if phases[n].state[k] in GREEN)])
+            max(
+                [
+                    MIN_GREEN_S,
+                    *(green for k, green in crossed.items() if phases[n].state[k] in GREEN),
+                ]
+            )
             for n in self._numbers
         ]
         self._green_since, self.stage_since = now, now
@@ -165,7 +211,9 @@ class Junction:
         self._coming: list[tuple[float, str]] = []
         self.lost, self._base = 0.0, phases[self._numbers[0]].state
         self.state = self._base
-        self.next_change = now if self.rations else NEVER  # until then, commands hold from the first second on
+        self.next_change = (
+            now if self.rations else NEVER
+        )  # until then, commands hold from the first second on
 
     def exhausted_links(self) -> list[int]:
         """Return the gateway links without more green in this cycle."""
@@ -204,7 +252,9 @@ class Junction:
             lasting = all(state[link] in GREEN for _, state in self._coming)
             shown[link], again = ration.show(shown[link], now, lasting=lasting)
             self.next_change = min(self.next_change, again)
-            if ration.opened(now):  # perhaps in the middle of a stage: it gets its minimum green, too
+            if ration.opened(
+                now
+            ):  # perhaps in the middle of a stage: it gets its minimum green, too
                 self._green_since = max(self._green_since, now)
         self.state = "".join(shown)
         return self.state
@@ -212,19 +262,25 @@ class Junction:
 
 def stages_of(signal: Signal) -> tuple[int, ...]:
     """Return the phases to choose from: stages whose green no other stage covers."""
-    level = {n: np.array([LEVELS.index(light) for light in signal.phases[n].state]) for n in signal.stages}
+    level = {
+        n: np.array([LEVELS.index(light) for light in signal.phases[n].state])
+        for n in signal.stages
+    }
     covered = {
-        n for n, m in permutations(level, 2) if (level[n] <= level[m]).all() and (m < n or (level[n] < level[m]).any())
+        n
+        for n, m in permutations(level, 2)
+        if (level[n] <= level[m]).all() and (m < n or (level[n] < level[m]).any())
     }
     return tuple(n for n in level if n not in covered)
 
 
 @lru_cache(maxsize=4096)
 def clearance(phases: tuple[Phase, ...]) -> np.ndarray:
-    """Return the least times (K, K) [s] from the end of a green to the green of another link that was red with it.
+    """Return the least times (K, K) [s] from the end of a green to the green of another link that
+    was red with it.
 
-    Those of the programme, where the other link is among the next ones and waits for no third one that goes on;
-    elsewhere the least after the end of this green.
+    Those of the programme, where the other link is among the next ones and waits for no third one
+    that goes on; elsewhere the least after the end of this green.
     """
     green = np.array([_green(phase.state) for phase in phases])
     apart, bare = ~(green.T @ green), ends_bare(phases)
@@ -243,16 +299,19 @@ def clearance(phases: tuple[Phase, ...]) -> np.ndarray:
             if time >= MIN_GREEN_S and link not in bare:
                 left = left & ~(apart @ on)
     usual = direct.min(axis=1, keepdims=True)
-    return np.where(apart, np.where(direct < NEVER, direct, np.where(usual < NEVER, usual, 0.0)), 0.0)
+    return np.where(
+        apart, np.where(direct < NEVER, direct, np.where(usual < NEVER, usual, 0.0)), 0.0
+    )
 
 
 @lru_cache(maxsize=4096)
 def transition(phases: tuple[Phase, ...], source: int, target: int) -> list[Phase]:
     """Return the phases between two stages.
 
-    The original ones if the programme goes from `source` to `target`; else yellow, as long as in the programme, and
-    red, as long as after `source` and until all is clear, for links that lose their green or their right of way (G,
-    then g). The others stay as they are, so that no conflicting movement is green before the target stage.
+    The original ones if the programme goes from `source` to `target`; else yellow, as long as in
+    the programme, and red, as long as after `source` and until all is clear, for links that lose
+    their green or their right of way (G, then g). The others stay as they are, so that no
+    conflicting movement is green before the target stage.
     """
     between, n = [], (source + 1) % len(phases)
     while phases[n].state == phases[source].state:
@@ -270,7 +329,9 @@ def transition(phases: tuple[Phase, ...], source: int, target: int) -> list[Phas
     }
     if not losing:
         return []
-    coming = {k for k, b in enumerate(after) if b in GREEN and (k in losing or before[k] not in GREEN)}
+    coming = {
+        k for k, b in enumerate(after) if b in GREEN and (k in losing or before[k] not in GREEN)
+    }
     clear = {k: max(clearance(phases)[k, [*coming]], default=0.0) for k in losing}
     walking = losing & ends_bare(phases)  # their red begins while cars beside them are still green
     yellow = max(yellow_time(phases, link) for link in losing)
@@ -278,15 +339,23 @@ def transition(phases: tuple[Phase, ...], source: int, target: int) -> list[Phas
     red = max([red, *(clear[k] - yellow for k in losing - walking)])
     alone = max((clear[k] - yellow - red for k in walking), default=0.0)
     return [
-        Phase(duration=seconds, state="".join(light if k in ends else a for k, a in enumerate(before)))
-        for seconds, light, ends in ((alone, "y", walking), (yellow, "y", losing), (red, "r", losing))
+        Phase(
+            duration=seconds, state="".join(light if k in ends else a for k, a in enumerate(before))
+        )
+        for seconds, light, ends in (
+            (alone, "y", walking),
+            (yellow, "y", losing),
+            (red, "r", losing),
+        )
         if seconds > 0.0
     ]
 
 
 def _intergreen(phases: Sequence[Phase]) -> float:
     """Return the share of the cycle between two stages."""
-    return sum(p.duration for p in phases if not is_stage(p.state)) / sum(p.duration for p in phases)
+    return sum(p.duration for p in phases if not is_stage(p.state)) / sum(
+        p.duration for p in phases
+    )
 
 
 class Approaches:
@@ -297,8 +366,16 @@ class Approaches:
 
     def __init__(self, signal: Signal, watched: Callable[[Link], set[int]], now: float):
         """watched: link -> numbers of the lanes whose vehicles may wait for it"""
-        self.serves = np.array([_green(signal.phases[n].state) for n in stages_of(signal)], dtype=float)
-        pairs = sorted({(link.index, lane) for link in (*signal.links, *signal.others) for lane in watched(link)})
+        self.serves = np.array(
+            [_green(signal.phases[n].state) for n in stages_of(signal)], dtype=float
+        )
+        pairs = sorted(
+            {
+                (link.index, lane)
+                for link in (*signal.links, *signal.others)
+                for lane in watched(link)
+            }
+        )
         self._link, self._lane = np.array(pairs).T
         self._last_green = np.full(self.serves.shape[1], now)
 
@@ -306,7 +383,8 @@ class Approaches:
         self._last_green[_green(state)] = now
 
     def waiting(self, present: np.ndarray, closed: Collection[int]) -> np.ndarray:
-        """Return (K,) bool: a vehicle is on a lane of the link, which is not `closed`. present: (L,) [veh]"""
+        """Return (K,) bool: a vehicle is on a lane of the link, which is not `closed`. present:
+        (L,) [veh]"""
         waits = np.zeros(len(self._last_green), dtype=bool)
         waits[self._link[present[self._lane] > 0]] = True
         waits[list(closed)] = False
@@ -326,14 +404,19 @@ def _green(state: str) -> np.ndarray:
 class Roads:
     """Vehicles by lane -> weights of movements -> pressures of stages, as sparse matrices.
 
-    lanes: (L,) names, those for cars and all others before the signals, such as bus lanes, which have no weight
+    lanes: (L,) names, those for cars and all others before the signals, such as bus lanes, which
+        have no weight
     movements: (edge, next edge) at `signals` -> number; weights: (M, L) [-]
-    gain, apart: saturation flows [lanes] in stages, (S, M) of movements, (S, L) of lanes on streets closed to cars
+    gain, apart: saturation flows [lanes] in stages, (S, M) of movements, (S, L) of lanes on streets
+        closed to cars
     begins: first stage of every signal
-    shared: numbers of lanes for cars before signals, of those that a stage serves in part, and that none serves whole
+    shared: numbers of lanes for cars before signals, of those that a stage serves in part, and that
+        none serves whole
     """
 
-    def __init__(self, city: City, signals: Sequence[Signal], flows: Mapping[tuple[str, str], float]):
+    def __init__(
+        self, city: City, signals: Sequence[Signal], flows: Mapping[tuple[str, str], float]
+    ):
         """flows: (edge, next edge) -> flow, any unit, for the turning shares"""
         self._city, self._flows = city, flows
         cars = [lane for edge in city.edges for lane in city.lane_ids[edge]]
@@ -346,7 +429,9 @@ class Roads:
         for link in links:
             if lane_id(link) in self._cars:
                 self._links.setdefault(link.from_edge, []).append(link)
-        movements = sorted({(link.from_edge, link.to_edge) for links in self._links.values() for link in links})
+        movements = sorted(
+            {(link.from_edge, link.to_edge) for links in self._links.values() for link in links}
+        )
         self.movements = {movement: n for n, movement in enumerate(movements)}
         rows = []
         for edge, target in movements:
@@ -372,12 +457,18 @@ class Roads:
             split |= {lane for parts in served for lane, part in parts.items() if part < WHOLE}
             here = {lane for parts in served for lane, part in parts.items() if part >= WHOLE}
             whole |= here
-            links = {(link.from_edge, link.lane, link.to_edge): link for link in signal.links}.values()
+            links = {
+                (link.from_edge, link.lane, link.to_edge): link for link in signal.links
+            }.values()
             for state, parts in zip(states, served, strict=True):
                 row = defaultdict[int, float](float)
                 for link in links:
                     lane, flow = lane_id(link), SATURATION.get(state[link.index])
-                    if flow and lane in self._cars and (lane not in here or parts.get(lane, 0.0) >= WHOLE):
+                    if (
+                        flow
+                        and lane in self._cars
+                        and (lane not in here or parts.get(lane, 0.0) >= WHOLE)
+                    ):
                         gain = self._lane_shares(lane)[link.to_edge] * min(parts[lane], 1.0) * flow
                         row[self.movements[link.from_edge, link.to_edge]] += gain
                 rows.append(row)
@@ -397,10 +488,14 @@ class Roads:
         for link in signal.links:
             if state[link.index] in GREEN and lane_id(link) in self._cars:
                 to.setdefault(lane_id(link), set()).add(link.to_edge)
-        return {lane: sum(self._lane_shares(lane)[edge] for edge in sorted(edges)) for lane, edges in to.items()}
+        return {
+            lane: sum(self._lane_shares(lane)[edge] for edge in sorted(edges))
+            for lane, edges in to.items()
+        }
 
     def _queue(self, edge: str, to: str, *, arriving: bool = False) -> dict[int, float]:
-        """Return lane -> share of its vehicles from `edge` to `to`. arriving: also from beyond the road"""
+        """Return lane -> share of its vehicles from `edge` to `to`. arriving: also from beyond the
+        road"""
         queue = {}
         share = self._turns(edge)[to]
         for lane in self._city.lane_ids[edge]:
@@ -413,18 +508,24 @@ class Roads:
             before = self._upstream(before)
         if arriving:
             for before, part in self._arriving(last, length).items():
-                queue |= {self.lane_number[lane]: share * part for lane in self._city.lane_ids[before]}
+                queue |= {
+                    self.lane_number[lane]: share * part for lane in self._city.lane_ids[before]
+                }
         return queue
 
     def watched(self, link: Link) -> set[int]:
-        """Return the lanes (numbers) whose vehicles may wait for a link: its own, and those behind a short road."""
+        """Return the lanes (numbers) whose vehicles may wait for a link: its own, and those behind
+        a short road."""
         own = {self.lane_number[lane_id(link)]}
-        if (link.from_edge, link.to_edge) in self.movements and self._city.length[link.from_edge] < SHORT_ROAD_M:
+        if (link.from_edge, link.to_edge) in self.movements and self._city.length[
+            link.from_edge
+        ] < SHORT_ROAD_M:
             own |= self._queue(link.from_edge, link.to_edge, arriving=True).keys()
         return own
 
     def _arriving(self, edge: str, length: float) -> dict[str, float]:
-        """Return edge without a signal, within REACH_M of one -> share of its vehicles that take `edge`."""
+        """Return edge without a signal, within REACH_M of one -> share of its vehicles that take
+        `edge`."""
         shares, todo = {edge: 1.0}, [(edge, length)]
         for onward, there in todo:
             for before in self._city.before[onward] if there < REACH_M else ():
@@ -436,23 +537,35 @@ class Roads:
 
     def _lane_shares(self, lane: str) -> dict[str, float]:
         edge = lane.rpartition("_")[0]
-        return self._shares(edge, sorted({link.to_edge for link in self._links[edge] if lane_id(link) == lane}))
+        return self._shares(
+            edge, sorted({link.to_edge for link in self._links[edge] if lane_id(link) == lane})
+        )
 
     def _turns(self, edge: str) -> dict[str, float]:
         """Return turning shares among all next edges of `edge`, with a signal or not."""
         links = self._links.get(edge)
-        return self._shares(edge, sorted({link.to_edge for link in links}) if links else self._city.successors[edge])
+        return self._shares(
+            edge, sorted({link.to_edge for link in links}) if links else self._city.successors[edge]
+        )
 
     def _shares(self, edge: str, targets: Sequence[str]) -> dict[str, float]:
         """Return turning shares among `targets`, equal ones without flow."""
         flows = np.array([self._flows.get((edge, target), 0.0) for target in targets])
         total = flows.sum()
-        return dict(zip(targets, flows / total if total else flows + 1.0 / max(len(targets), 1), strict=True))
+        return dict(
+            zip(
+                targets, flows / total if total else flows + 1.0 / max(len(targets), 1), strict=True
+            )
+        )
 
     def _upstream(self, edge: str) -> str | None:
         """Return the edge before if the road only gets turn lanes here."""
         before = self._city.before[edge]
-        alone = len(before) == 1 and len(self._city.successors[before[0]]) == 1 and before[0] not in self._links
+        alone = (
+            len(before) == 1
+            and len(self._city.successors[before[0]]) == 1
+            and before[0] not in self._links
+        )
         return before[0] if alone else None
 
     def _end(self, edge: str) -> str:

@@ -1,7 +1,7 @@
 """The exact vehicle ledger of a run: accumulations x_ij, and every crossing of a boundary.
 
-SUMO's tripinfo has the outcome of vehicles that have left (cosim.sumo.outputs): an arrival at the last edge of the
-final route, else a removal.
+SUMO's tripinfo has the outcome of vehicles that have left (cosim.sumo.outputs): an arrival at the
+last edge of the final route, else a removal.
 """
 
 import math
@@ -24,7 +24,13 @@ from nmfd.ledger import LedgerError
 from nmfd.types import State
 
 POLL_PERIOD_S = 3.0  # longest time between two looks at the entry edges
-COMPLETED, REMOVED, UNDER_WAY, WAITING, GIVEN_UP = "completed", "removed", "under way", "waiting", "given up"
+COMPLETED, REMOVED, UNDER_WAY, WAITING, GIVEN_UP = (
+    "completed",
+    "removed",
+    "under way",
+    "waiting",
+    "given up",
+)
 
 
 @dataclass
@@ -47,7 +53,8 @@ class _Vehicle:
 class Event(NamedTuple):
     """A departure (source None), or the entry of a vehicle into another region.
 
-    edge: last one of its route; free: the driver may take another route (no public transport, no stops)
+    edge: last one of its route; free: the driver may take another route (no public transport, no
+        stops)
     """
 
     vehicle: str
@@ -63,8 +70,8 @@ class Trip(NamedTuple):
 
     origin: region; public: public transport
     outcome: COMPLETED, REMOVED on the road, UNDER_WAY, WAITING to enter, or GIVEN_UP before that
-    departure_delay, time, time_loss: [s], waiting to enter; in all, until its end or now; against driving freely, NaN
-        if it is not known yet
+    departure_delay, time, time_loss: [s], waiting to enter; in all, until its end or now; against
+        driving freely, NaN if it is not known yet
     """
 
     origin: int
@@ -79,13 +86,15 @@ class Trip(NamedTuple):
 class Meter:
     """Follows every vehicle from loading to its end.
 
-    Regions change when a vehicle is seen on the first edge behind a gateway (polled), or at the latest when
-    `accumulation` looks at every vehicle. A teleporting vehicle counts where it was last seen.
+    Regions change when a vehicle is seen on the first edge behind a gateway (polled), or at the
+    latest when `accumulation` looks at every vehicle. A teleporting vehicle counts where it was
+    last seen.
 
     Since the beginning [veh]:
     departures (R, R); probe_departures (R, R), of probes; arrivals (R,), completed trips
-    removals (R, R) [i, j], vehicles taken out in i on their way to j; given_up (R, R), trips dropped before they began
-    crossings (R, R, R) [i, h, j] from i to h by a gateway; jumps (R, R, R), without one: teleports, streets closed to
+    removals (R, R) [i, j], vehicles taken out in i on their way to j; given_up (R, R), trips
+    dropped before they began crossings (R, R, R) [i, h, j] from i to h by a gateway; jumps (R, R,
+    R), without one: teleports, streets closed to
         cars, vehicles moved by another program, or too fast to be seen in between
     redirected (R, R, R) [i, j, l], in i, bound for j and from now on for l
     teleports; entry_flow, (source region, first edge behind the boundary) -> vehicles
@@ -106,7 +115,9 @@ class Meter:
         self._metering = metering
         self._session, self._city, self._probes, self._trips = session, city, probes, trips
         self._vehicles: dict[str, _Vehicle] = {}
-        self._gone: dict[str, list[_Vehicle]] = {}  # not in tripinfo yet; several if an id is used again
+        self._gone: dict[
+            str, list[_Vehicle]
+        ] = {}  # not in tripinfo yet; several if an id is used again
         self._teleporting: set[str] = set()
         self._ended: list[Trip] = []
         self._spent = np.zeros(2)  # by their trips [veh s]: other, private
@@ -119,17 +130,20 @@ class Meter:
         self._steps = 0
         self._seen: dict[str, tuple[str, ...]] = dict.fromkeys(entries, ())
         self.teleports, regions = 0, city.regions
-        self._running, self.departures, self.probe_departures, self.removals, self.given_up = np.zeros(
-            (5, regions, regions), dtype=int
+        self._running, self.departures, self.probe_departures, self.removals, self.given_up = (
+            np.zeros((5, regions, regions), dtype=int)
         )
         self.arrivals = np.zeros(regions, dtype=int)
-        self.crossings, self.jumps, self.redirected = np.zeros((3, regions, regions, regions), dtype=int)
+        self.crossings, self.jumps, self.redirected = np.zeros(
+            (3, regions, regions, regions), dtype=int
+        )
         self.entry_flow: Counter[tuple[int, str]] = Counter()
         # Several movements may lead from one region to one edge: they share its flow.
         self._alike = Counter((g.source, g.to_edge) for g in city.gateways)
 
     def state(self, step: int, time: float) -> State:
-        """Return the state at `time` [s] since the start, when control step `step` begins. Raises LedgerError."""
+        """Return the state at `time` [s] since the start, when control step `step` begins. Raises
+        LedgerError."""
         return State(
             step=step,
             time=time,
@@ -142,7 +156,10 @@ class Meter:
     def gateway_flow(self) -> PerGateway:
         """Return (G,) [veh] over each gateway since the beginning."""
         return np.array(
-            [self.entry_flow[g.source, g.to_edge] / self._alike[g.source, g.to_edge] for g in self._city.gateways]
+            [
+                self.entry_flow[g.source, g.to_edge] / self._alike[g.source, g.to_edge]
+                for g in self._city.gateways
+            ]
         )
 
     def observe(self) -> list[Event]:
@@ -160,12 +177,16 @@ class Meter:
             self._teleporting.add(vehicle)
         self._teleporting.difference_update(session.ended_teleport())
         for vehicle in session.departed():
-            if vehicle in self._vehicles and self._vehicles[vehicle].departed:  # its id is used again
+            if (
+                vehicle in self._vehicles and self._vehicles[vehicle].departed
+            ):  # its id is used again
                 self._leave(vehicle)
                 if vehicle in arrived:
                     arrived.remove(vehicle)
             known = self._depart(vehicle)
-            events.append(Event(vehicle, None, known.origin, known.destination, known.edge, known.free))
+            events.append(
+                Event(vehicle, None, known.origin, known.destination, known.edge, known.free)
+            )
         self._steps += 1
         for edge, region in self._entries.items() if self._steps % self._poll_steps == 0 else ():
             present = session.vehicles_on(edge)
@@ -175,15 +196,18 @@ class Meter:
                 self._seen[edge] = present
         for vehicle in arrived:
             self._leave(vehicle)
-        events.sort(key=lambda event: (event.source is not None, event.vehicle))  # set order is not reproducible
+        events.sort(
+            key=lambda event: (event.source is not None, event.vehicle)
+        )  # set order is not reproducible
         return events
 
     def accumulation(self, step: int = 0) -> PerPair:
         """Return x_ij (R, R) [veh], with every vehicle counted where it is now, on junctions too.
 
         step: control step, for messages
-        Raises LedgerError if the count differs from departures minus arrivals and removals, in total or in any (i, j)
-        as followed from crossing to crossing, or if the end of a vehicle is unknown.
+        Raises LedgerError if the count differs from departures minus arrivals and removals, in
+        total or in any (i, j) as followed from crossing to crossing, or if the end of a vehicle is
+        unknown.
         """
         counted = np.zeros_like(self._running)
         self.teleports = max(self.teleports, self._session.teleports())
@@ -196,9 +220,13 @@ class Meter:
             self._cross(known, self._city.region_of.get(self._session.road(vehicle), known.region))
             counted[known.region, known.destination] += 1
         away = self._teleporting.difference(on_road)
-        if len(on_road) + len(away) < self._running.sum():  # the mesoscopic model holds vehicles off a jammed road
+        if (
+            len(on_road) + len(away) < self._running.sum()
+        ):  # the mesoscopic model holds vehicles off a jammed road
             under_way = {vehicle for vehicle, known in self._vehicles.items() if known.departed}
-            away |= under_way.difference(on_road).intersection(self._session.known())  # the others have left
+            away |= under_way.difference(on_road).intersection(
+                self._session.known()
+            )  # the others have left
         for vehicle in away:
             known = self._vehicles[vehicle]
             counted[known.region, known.destination] += 1
@@ -231,26 +259,33 @@ class Meter:
             )
 
     def backlog(self) -> PerPair:
-        """Return (R, R) [veh] due to depart from i for j, but not inserted yet; book those that SUMO dropped."""
+        """Return (R, R) [veh] due to depart from i for j, but not inserted yet; book those that
+        SUMO dropped."""
         pending = self._session.pending()
         waiting = self.held() + self._waiting(pending)
-        ahead = {vehicle for vehicle, known in self._vehicles.items() if not known.departed}.difference(pending)
+        ahead = {
+            vehicle for vehicle, known in self._vehicles.items() if not known.departed
+        }.difference(pending)
         for vehicle in sorted(ahead.difference(self._session.known())) if ahead else ():
             self._leave(vehicle)
         for vehicle, known in self._vehicles.items():
-            if not known.departed and known.due < self._session.time:  # or not, if it waits for a person
+            if (
+                not known.departed and known.due < self._session.time
+            ):  # or not, if it waits for a person
                 self._time(vehicle, known)
         return waiting
 
     def time_spent(self) -> Float[np.ndarray, "2"]:
-        """Return the total time spent since the beginning [veh s], of other and of private vehicles."""
+        """Return the total time spent since the beginning [veh s], of other and of private
+        vehicles."""
         spent = self._spent.copy()
         for trip in self._open():
             spent[int(trip.private)] += trip.time
         return spent
 
     def trips(self) -> list[Trip]:
-        """Return all trips that were due; time losses of those under way are known when the books are closed."""
+        """Return all trips that were due; time losses of those under way are known when the books
+        are closed."""
         return [*self._ended, *self._open()]
 
     def _open(self) -> Iterator[Trip]:
@@ -294,9 +329,13 @@ class Meter:
 
     def _settle(self, ends: Iterable[End]) -> None:
         for end in ends:
-            if end.vehicle not in self._gone:  # removed by another program, which SUMO does not call arrived
+            if (
+                end.vehicle not in self._gone
+            ):  # removed by another program, which SUMO does not call arrived
                 if end.vehicle not in self._vehicles:
-                    raise LedgerError(f"vehicle ledger broken: {end.vehicle} ended a trip, but was never seen to load")
+                    raise LedgerError(
+                        f"vehicle ledger broken: {end.vehicle} ended a trip, but was never seen to load"
+                    )
                 self._under_way(end.vehicle)
                 self._leave(end.vehicle)
             self._book(self._gone[end.vehicle].pop(0), end)
@@ -326,10 +365,14 @@ class Meter:
     def _load(self, vehicle: str) -> _Vehicle:
         if vehicle not in self._vehicles:
             session, route = self._session, self._session.route(vehicle)
-            origin, destination = (self._city.region_of.get(edge, 0) for edge in (route[0], route[-1]))
+            origin, destination = (
+                self._city.region_of.get(edge, 0) for edge in (route[0], route[-1])
+            )
             private = session.is_private(vehicle)
             public = not private and session.is_public(vehicle)
-            known = _Vehicle(origin, destination, route[-1], session.is_free(vehicle), private, public)
+            known = _Vehicle(
+                origin, destination, route[-1], session.is_free(vehicle), private, public
+            )
             self._vehicles[vehicle] = known
             self._time(vehicle, known)
         return self._vehicles[vehicle]
@@ -355,7 +398,8 @@ class Meter:
         return known
 
     def _under_way(self, vehicle: str) -> _Vehicle:
-        """Return a vehicle on the road, even if another program put it there without a departure."""
+        """Return a vehicle on the road, even if another program put it there without a
+        departure."""
         known = self._vehicles.get(vehicle)
         return known if known and known.departed else self._depart(vehicle)
 
@@ -364,7 +408,11 @@ class Meter:
         edge = self._session.route(vehicle)[-1]
         if edge == known.edge:
             return
-        before, known.edge, known.destination = known.destination, edge, self._city.region_of.get(edge, 0)
+        before, known.edge, known.destination = (
+            known.destination,
+            edge,
+            self._city.region_of.get(edge, 0),
+        )
         if known.departed and known.destination != before:
             self.redirected[known.region, before, known.destination] += 1
             self._running[known.region, before] -= 1

@@ -1,8 +1,9 @@
-"""Metering: trips begin in a region no faster than at a commanded rate, and wait outside until then.
+"""Metering: trips begin in a region no faster than at a commanded rate, and wait outside until
+then.
 
-SUMO gets the trips of a metered city one by one, on the same routes, with the same ids and by the same seed as without
-metering. Trips that wait are in the backlog and in the total time spent. Without a command, PI control holds the
-accumulation of every region (velocity form, as in ALINEA):
+SUMO gets the trips of a metered city one by one, on the same routes, with the same ids and by the
+same seed as without metering. Trips that wait are in the backlog and in the total time spent.
+Without a command, PI control holds the accumulation of every region (velocity form, as in ALINEA):
 
     r_i(k) = clip(r_i(k-1) + (KP (n_i(k-1) - n_i(k)) + KI (level n_cr,i - n_i(k))) / dt,  0, n_cr,i / FILLING_S)
 """
@@ -16,21 +17,35 @@ from cosim.sumo.recorded_trips import HeldTrips
 from cosim.sumo.session import Session
 from nmfd.arrays import PerPair, PerRegion
 
-KP, KI = 1.0, 0.3  # share of the excess vehicles that are kept out in the next control interval [-]; not tuned
+KP, KI = (
+    1.0,
+    0.3,
+)  # share of the excess vehicles that are kept out in the next control interval [-]; not tuned
 FILLING_S = 60.0  # in which the largest rate fills a region to its critical accumulation
 
 
 class Metering:
-    """The metered trips of one run: `command` once per control interval, `play` before every simulation step.
+    """The metered trips of one run: `command` once per control interval, `play` before every
+    simulation step.
 
     waited: vehicle -> time that it waited outside [s], of trips that have begun
     """
 
-    def __init__(self, session: Session, trips: HeldTrips, critical: PerRegion, *, level: float, step: float):
-        """critical: (R,) [veh]; level: set point of the PI control, in these [-]; step: control interval [s]"""
-        self._session, self._trips, self._set_point, self._step = session, trips, level * critical, step
+    def __init__(
+        self, session: Session, trips: HeldTrips, critical: PerRegion, *, level: float, step: float
+    ):
+        """critical: (R,) [veh]; level: set point of the PI control, in these [-]; step: control
+        interval [s]"""
+        self._session, self._trips, self._set_point, self._step = (
+            session,
+            trips,
+            level * critical,
+            step,
+        )
         self._most = critical / FILLING_S
-        self._queues: list[deque[int]] = [deque() for _ in critical]  # numbers of trips, by departure
+        self._queues: list[deque[int]] = [
+            deque() for _ in critical
+        ]  # numbers of trips, by departure
         self._due = 0
         self.waited: dict[str, float] = {}
         self._rate, self._credit = self._most.copy(), np.ones(len(critical))
@@ -47,18 +62,24 @@ class Metering:
         self._before = accumulation
 
     def play(self) -> None:
-        now, depart, origin = self._session.time, self._trips.depart, self._trips.origin
-        while self._due < len(depart) and depart[self._due] <= now:
-            self._queues[origin[self._due]].append(self._due)
+        now = self._session.time
+        trips = self._trips
+        waiting = np.array([len(queue) > 0 for queue in self._queues])
+        while self._due < len(trips.depart) and trips.depart[self._due] <= now:
+            self._queues[trips.origin[self._due]].append(self._due)
             self._due += 1
-        # Unused credit is capped, so that quiet time is not followed by a flood.
-        self._credit = np.minimum(self._credit + self._rate * self._session.step_length, np.maximum(1.0, self._rate))
+        gained = self._rate * self._session.step_length
+        self._credit += gained
+        # Fractions of a trip are carried on while trips wait. Without a queue the credit is capped,
+        # so that quiet time is not followed by a flood.
+        capped = np.minimum(self._credit, np.maximum(1.0, gained))
+        self._credit = np.where(waiting, self._credit, capped)
         for region, queue in enumerate(self._queues):
             while queue and self._credit[region] >= 1.0 - 1e-9:
                 self._credit[region] -= 1.0
                 trip = queue.popleft()
-                self._session.begin_trip(self._trips.orders[trip])
-                self.waited[self._trips.orders[trip]["vehID"]] = now - depart[trip]
+                self._session.begin_trip(trips.orders[trip])
+                self.waited[trips.orders[trip]["vehID"]] = now - trips.depart[trip]
 
     def backlog(self) -> PerPair:
         """Return (R, R) [veh]: trips from i to j that wait."""
@@ -71,4 +92,7 @@ class Metering:
     def waiting(self) -> list[tuple[int, float]]:
         """Return region and time [s] at which the trips that wait were due."""
         due = range(self._due, int(np.searchsorted(self._trips.depart, self._session.time)))
-        return [(int(self._trips.origin[n]), float(self._trips.depart[n])) for n in chain(*self._queues, due)]
+        return [
+            (int(self._trips.origin[n]), float(self._trips.depart[n]))
+            for n in chain(*self._queues, due)
+        ]

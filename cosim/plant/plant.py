@@ -27,20 +27,25 @@ from nmfd.model.planning import PlanningModel, planning_model
 from nmfd.model.scenario import Scenario
 from nmfd.types import Controls, Observation, State
 
-GUIDANCE = 0x67756964  # keeps the random numbers of the guided drivers apart from others of the same seed
+GUIDANCE = (
+    0x67756964  # keeps the random numbers of the guided drivers apart from others of the same seed
+)
 
 
 class Observer:
-    """Base class of observers, which read a run and may delay it; an exception of theirs ends the run."""
+    """Base class of observers, which read a run and may delay it; an exception of theirs ends the
+    run."""
 
     def began(self, city: City, state: State) -> None:
         """Take the initial state."""
 
     def sampled(self, time: float, vehicles: PerEdge, speed: PerEdge) -> None:
-        """Take a sample every few seconds: SUMO's time [s], vehicles (E,) [veh], mean speed (E,) [m/s]."""
+        """Take a sample every few seconds: SUMO's time [s], vehicles (E,) [veh], mean speed (E,)
+        [m/s]."""
 
     def recorded(self, controls: Controls, state: State, row: Mapping[str, np.ndarray]) -> None:
-        """Take controls, new state and row of the record (cosim.plant.record) after a control interval."""
+        """Take controls, new state and row of the record (cosim.plant.record) after a control
+        interval."""
 
 
 class SumoPlant:
@@ -62,8 +67,10 @@ class SumoPlant:
     ):
         """Build the network if need be.
 
-        settings: instead of the table [sumo]; trip_file: for SUMO's tripinfo, complete after `trip_facts`
-        gui: show the run in sumo-gui; planning: model of the estimator, that of the scenario if None
+        settings: instead of the table [sumo]; trip_file: for SUMO's tripinfo, complete after
+            `trip_facts`
+        gui: show the run in sumo-gui; planning: model of the estimator, that of the scenario if
+            None
         Raises InputError for a city that does not fit the scenario's network or the settings.
         """
         self._scenario, self._planning = scenario, planning or planning_model(scenario)
@@ -75,7 +82,9 @@ class SumoPlant:
         self._layout = lay_out(self.city, settings.detector_share)
         self._instruments = instruments(self.city, self._layout, settings.probe_share)
         self.steered, self.other_signals = signals = city_signals(self.city, scenario, settings)
-        self._launch = Launch(scenario, settings, self.city, signals, self._layout, trip_file=trip_file, gui=gui)
+        self._launch = Launch(
+            scenario, settings, self.city, signals, self._layout, trip_file=trip_file, gui=gui
+        )
         self._session: Session | None = None
 
     def reset(self, seed: int) -> State:
@@ -89,13 +98,19 @@ class SumoPlant:
         held, critical = self._launch.held, self._planning.network.critical
         self._metering = None
         if held is not None:
-            self._metering = Metering(session, held, critical, level=settings.metering, step=scenario.step)
+            self._metering = Metering(
+                session, held, critical, level=settings.metering, step=scenario.step
+            )
         estimated = settings.measurement == ESTIMATE
         known = probes(self._launch.vehicles, settings.probe_share if estimated else 0.0, seed)
-        self.meter = meter = Meter(session, city, known, self._trips if session.flush else None, self._metering)
+        self.meter = meter = Meter(
+            session, city, known, self._trips if session.flush else None, self._metering
+        )
         self._estimation = None
         if estimated:
-            self._estimation = Estimation(session, city, self._layout, meter, self._instruments, self._planning)
+            self._estimation = Estimation(
+                session, city, self._layout, meter, self._instruments, self._planning
+            )
         self._sampler = StreetSampler(session, city, known if estimated else None)
         self._streets: StreetMeans | None = None
         self._guide = Guide(
@@ -111,7 +126,14 @@ class SumoPlant:
         )
         flows = self._launch.turning_flows() if settings.signals == MAX_PRESSURE else None
         self.actuation = Actuation(
-            session, city, scenario.network, scenario.step, settings, self.steered, self._incidents, flows
+            session,
+            city,
+            scenario.network,
+            scenario.step,
+            settings,
+            self.steered,
+            self._incidents,
+            flows,
         )
         self._junctions = None if settings.mesoscopic else Junctions(session, city)
         self._state = meter.state(0, 0.0)
@@ -120,16 +142,20 @@ class SumoPlant:
         return self._state
 
     def step(self, controls: Controls) -> State:
-        """Simulate one control interval: actuate, simulate, measure and guide in every simulation step; then record."""
+        """Simulate one control interval: actuate, simulate, measure and guide in every simulation
+        step; then record."""
         session, scenario = self.session, self._scenario
         steps = round(scenario.step / session.step_length)
         reading, sampling = (
-            min(max(1, round(seconds / session.step_length)), steps) for seconds in (READING_PERIOD_S, SAMPLE_PERIOD_S)
+            min(max(1, round(seconds / session.step_length)), steps)
+            for seconds in (READING_PERIOD_S, SAMPLE_PERIOD_S)
         )
         self._incidents.begin(self._k)
         self.actuation.command(controls.perimeter, self._sampler.last[0])
         splits = controls.splits
-        if controls.prices is not None or (splits is None and self._settings.guided):  # by travel times alone
+        if controls.prices is not None or (
+            splits is None and self._settings.guided
+        ):  # by travel times alone
             splits = scenario.network.nominal_splits
         self._guide.command(splits, self._streets, controls.prices)
         if self._metering:
@@ -156,7 +182,9 @@ class SumoPlant:
         self._streets = streets = self._sampler.finish(self._incidents.closed)
         realised = self.actuation.realised()
         if self._estimation:
-            self._estimation.update(controls if realised is None else replace(controls, perimeter=realised))
+            self._estimation.update(
+                controls if realised is None else replace(controls, perimeter=realised)
+            )
         self._state = replace(state, problem=self._incidents.problem(), realised=realised)
         row = self._recorder.add(streets)
         self._observer.recorded(controls, self._state, row)
@@ -215,11 +243,15 @@ class SumoPlant:
         co2 = {edge: emitted.get(edge, 0.0) for edge in self.city.edges}
         for (_, edge), turn in self.city.over.items():
             co2[edge] += sum(emitted.get(inside, 0.0) for inside in turn)
-        return {"co2": np.array([*co2.values()], np.float32), "queue_max": self._sampler.longest_queue.astype(np.int32)}
+        return {
+            "co2": np.array([*co2.values()], np.float32),
+            "queue_max": self._sampler.longest_queue.astype(np.int32),
+        }
 
     @property
     def session(self) -> Session:
-        """Return the running simulation. Raises RuntimeError before the first reset and after the end."""
+        """Return the running simulation. Raises RuntimeError before the first reset and after the
+        end."""
         if self._session is None:
             raise RuntimeError("no simulation is running; call reset(seed) first")
         return self._session

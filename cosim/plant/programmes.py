@@ -1,4 +1,5 @@
-"""Signal programmes other than those of the network file: actuated ones, and plans by SUMO's own tools."""
+"""Signal programmes other than those of the network file: actuated ones, and plans by SUMO's own
+tools."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -10,7 +11,15 @@ import numpy as np
 
 from cosim.plant.gates import MIN_GREEN_S, least_times
 from cosim.plant.max_pressure import MAX_GREEN_S
-from cosim.plant.settings import ACTUATED, FIXED, MAX_PRESSURE, Settings, check_lanes, own_files, settings
+from cosim.plant.settings import (
+    ACTUATED,
+    FIXED,
+    MAX_PRESSURE,
+    Settings,
+    check_lanes,
+    own_files,
+    settings,
+)
 from cosim.sumo.net import City
 from cosim.sumo.programs import run_tool
 from cosim.sumo.signals import HELD, STATIC, Signal, phases_of, read_signals
@@ -31,16 +40,22 @@ def check_strategy(strategy: Strategy, scenario: Scenario, city: City) -> None:
         raise InputError(f"controller {strategy.name} cannot run here: {error}") from None
 
 
-def city_signals(city: City, scenario: Scenario, settings: Settings) -> tuple[list[Signal], list[str]]:
+def city_signals(
+    city: City, scenario: Scenario, settings: Settings
+) -> tuple[list[Signal], list[str]]:
     """Return the signals to run another programme, and the names of those that cannot.
 
-    Signals with gateways that stay fixed-time are in neither. Raises InputError if `settings.signals` fits none.
+    Signals with gateways that stay fixed-time are in neither. Raises InputError if
+    `settings.signals` fits none.
     """
     pressure = settings.signals == MAX_PRESSURE
     kinds = HELD if pressure else (STATIC,)
     simple, others = read_signals(city, own_files(scenario, settings.additional), kinds)
     left = {signal.id for signal in simple} & set(settings.leave_signals)
-    simple, others = [signal for signal in simple if signal.id not in left], sorted({*others, *left})
+    simple, others = (
+        [signal for signal in simple if signal.id not in left],
+        sorted({*others, *left}),
+    )
     if settings.signals != FIXED and not simple:
         raise InputError(
             f"{city.net_file}: sumo.signals: {settings.signals} needs {'' if pressure else 'fixed-time '}signals "
@@ -54,13 +69,21 @@ def city_signals(city: City, scenario: Scenario, settings: Settings) -> tuple[li
 def write_actuated(path: Path, signals: Iterable[Signal]) -> None:
     """Write an additional file that makes fixed-time signals gap-based actuated ones of SUMO.
 
-    A stage lasts up to 1.5 times its fixed time: in congestion, the shares of the green are those of the programme.
+    A stage lasts up to 1.5 times its fixed time: in congestion, the shares of the green are those
+    of the programme.
     """
     root = Element("additional")
     for signal in signals:
-        about = {"id": signal.id, "type": "actuated", "programID": "plan", "offset": f"{signal.offset:g}"}
+        about = {
+            "id": signal.id,
+            "type": "actuated",
+            "programID": "plan",
+            "offset": f"{signal.offset:g}",
+        }
         logic = SubElement(root, "tlLogic", about)
-        for n, (phase, low) in enumerate(zip(signal.phases, least_times(signal.phases), strict=True)):
+        for n, (phase, low) in enumerate(
+            zip(signal.phases, least_times(signal.phases), strict=True)
+        ):
             row = SubElement(logic, "phase", duration=f"{phase.duration:g}", state=phase.state)
             high = max(min(1.5 * phase.duration, MAX_GREEN_S), MIN_GREEN_S, low)
             if n in signal.stages and low != high:
@@ -71,7 +94,8 @@ def write_actuated(path: Path, signals: Iterable[Signal]) -> None:
 def write_optimised(
     folder: Path, city: City, others: Sequence[str], trips: Iterable[tuple[float, Sequence[str]]]
 ) -> list[Path]:
-    """Write fixed-time plans by SUMO's own tools: cycles by Webster's formula, then offsets for green waves.
+    """Write fixed-time plans by SUMO's own tools: cycles by Webster's formula, then offsets for
+    green waves.
 
     others: signals that keep their programme; trips: departure [s] and edges, sorted by departure
     Raises InputError if a tool fails.
@@ -80,29 +104,40 @@ def write_optimised(
         f'<vehicle id="{n}" depart="{depart:.2f}"><route edges={quoteattr(" ".join(edges))}/></vehicle>'
         for n, (depart, edges) in enumerate(trips)
     ]
-    (folder / "planned.xml").write_text("\n".join(["<routes>", *rows, "</routes>\n"]), encoding="utf-8")
+    (folder / "planned.xml").write_text(
+        "\n".join(["<routes>", *rows, "</routes>\n"]), encoding="utf-8"
+    )
     plans = [folder / "cycles.add.xml", folder / "offsets.add.xml"]
     for tool, plan, options in (
-        ("tlsCycleAdaptation.py", plans[0], ("-u", "-y", "3", "-p", "webster", f"--skip={','.join(others)}")),
+        (
+            "tlsCycleAdaptation.py",
+            plans[0],
+            ("-u", "-y", "3", "-p", "webster", f"--skip={','.join(others)}"),
+        ),
         ("tlsCoordinator.py", plans[1], ("-a", plans[0].name)),
     ):
         files = "-n", str(city.net_file.resolve()), "-r", "planned.xml", "-o", plan.name
         result = run_tool(tool, *files, *options, folder=folder)
         if result.returncode:
             words = (result.stderr.strip() or "no message").splitlines()[-1]
-            raise InputError(f"{city.net_file}: {tool} cannot plan its signals ({words}); choose other signals")
+            raise InputError(
+                f"{city.net_file}: {tool} cannot plan its signals ({words}); choose other signals"
+            )
         if plan == plans[0]:
             _keep_times(plan, city.net_file)
     # Whole seconds: perimeter control follows programmes second by second.
     whole = re.sub(
-        r'offset="([^"]+)"', lambda m: f'offset="{round(float(m[1]))}"', plans[1].read_text(encoding="utf-8")
+        r'offset="([^"]+)"',
+        lambda m: f'offset="{round(float(m[1]))}"',
+        plans[1].read_text(encoding="utf-8"),
     )
     plans[1].write_text(whole, encoding="utf-8")
     return plans
 
 
 def _keep_times(plan: Path, net_file: Path) -> None:
-    """Lengthen phases of a plan to their least times in the network's programmes, within the same cycle.
+    """Lengthen phases of a plan to their least times in the network's programmes, within the same
+    cycle.
 
     The seconds come from the phases that exceed theirs most.
     """
@@ -110,14 +145,22 @@ def _keep_times(plan: Path, net_file: Path) -> None:
     def key(logic: Element) -> tuple[str, ...]:
         return attribute(logic, "id"), *(phase.state for phase in phases_of(logic))
 
-    least_of = {key(logic): np.array(least_times(phases_of(logic))) for logic in read_xml(net_file).iter("tlLogic")}
+    least_of = {
+        key(logic): np.array(least_times(phases_of(logic)))
+        for logic in read_xml(net_file).iter("tlLogic")
+    }
     root = read_xml(plan)
     for logic in root.iter("tlLogic"):
-        planned, least = np.array([phase.duration for phase in phases_of(logic)]), least_of[key(logic)]
+        planned, least = (
+            np.array([phase.duration for phase in phases_of(logic)]),
+            least_of[key(logic)],
+        )
         seconds = np.maximum(planned, least)
         while seconds.sum() > planned.sum() + 1e-6 and (seconds > least).any():
             longest = np.argmax(seconds - least)
-            seconds[longest] -= min(1.0, seconds.sum() - planned.sum(), seconds[longest] - least[longest])
+            seconds[longest] -= min(
+                1.0, seconds.sum() - planned.sum(), seconds[longest] - least[longest]
+            )
         for row, duration in zip(logic.iter("phase"), seconds, strict=True):
             row.set("duration", f"{duration:g}")
     ElementTree(root).write(plan)

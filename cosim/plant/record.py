@@ -11,7 +11,15 @@ from cosim.plant.sampling import StreetMeans
 from nmfd.runs import config
 from nmfd.types import Quantity, Result
 
-BOOKS = ("departures", "arrivals", "removals", "given_up", "crossings", "jumps", "redirected")  # of the meter
+BOOKS = (
+    "departures",
+    "arrivals",
+    "removals",
+    "given_up",
+    "crossings",
+    "jumps",
+    "redirected",
+)  # of the meter
 RECORD, TOTALS = (
     {name: Quantity(tuple(axes.split()), unit, text) for name, (axes, unit, text) in arrays.items()}
     for arrays in config.read(Path(__file__).with_name("record.toml")).values()
@@ -19,7 +27,8 @@ RECORD, TOTALS = (
 
 
 def settled(result: Result) -> Result:
-    """Return a result with a record whose last state, completed and removed trips follow from the closed books.
+    """Return a result with a record whose last state, completed and removed trips follow from the
+    closed books.
 
     SUMO may report the end of a trip late, or in the last step only (cosim.plant.meter).
     """
@@ -28,8 +37,16 @@ def settled(result: Result) -> Result:
         return np.concatenate([np.zeros_like(counts[:1]), counts]).cumsum(axis=0).astype(float)
 
     moved, redirected = (result.crossings + result.jumps).sum(axis=0), result.redirected.sum(axis=0)
-    inside = (result.departures - result.removals).sum(axis=0) - np.diag(result.arrivals.sum(axis=0))
-    inside = inside + moved.sum(axis=0) - moved.sum(axis=1) + redirected.sum(axis=1) - redirected.sum(axis=2)
+    inside = (result.departures - result.removals).sum(axis=0) - np.diag(
+        result.arrivals.sum(axis=0)
+    )
+    inside = (
+        inside
+        + moved.sum(axis=0)
+        - moved.sum(axis=1)
+        + redirected.sum(axis=1)
+        - redirected.sum(axis=2)
+    )
     return result.assign(
         accumulation=np.concatenate([result.accumulation[:-1], inside[None].astype(float)]),
         completed=since_start(result.arrivals.sum(axis=1)),
@@ -59,7 +76,9 @@ class Recorder:
             "gateway_share": self._actuation.room.gateway_shares(),
             "production": streets.production,
             "mean_accumulation": streets.accumulation,
-            "edge_vehicles": streets.vehicles.astype(np.float16),  # to 0.1 %, as small as an integer
+            "edge_vehicles": streets.vehicles.astype(
+                np.float16
+            ),  # to 0.1 %, as small as an integer
             "gateway_queue": streets.queue,
             "gateway_queue_max": streets.queue_max,
         }

@@ -1,8 +1,9 @@
 """Travel times along streets and over junctions, and searches for the fastest ways at these times.
 
-A few vehicles are on one street at a time, so recent minutes count together, the newest most: on a street by the mean
-speed, over a junction by Little's law, vehicles on it over vehicles that get over it per second. In the mesoscopic
-model, which has no junctions to wait on, the newest control interval counts half.
+A few vehicles are on one street at a time, so recent minutes count together, the newest most: on a
+street by the mean speed, over a junction by Little's law, vehicles on it over vehicles that get
+over it per second. In the mesoscopic model, which has no junctions to wait on, the newest control
+interval counts half.
 """
 
 import math
@@ -28,7 +29,8 @@ FEWEST_TREES = 8  # that are kept, however large the city: one decision needs as
 class TravelTimes:
     """Travel times of one run.
 
-    first, second: (M,), numbers of the edges that each move joins; free: (E,) [s], in free flow; free_turns: (M,) [s]
+    first, second: (M,), numbers of the edges that each move joins; free: (E,) [s], in free flow;
+        free_turns: (M,) [s]
     edges: (E,) [s], present times along edges; turns: (M,) [s], of moves over junctions
     """
 
@@ -39,21 +41,32 @@ class TravelTimes:
         self.first, self.second = np.array([(city.number[e], city.number[f]) for e, f in moves]).T
         self._length = np.array([city.length[edge] for edge in city.edges])
         self._limit = np.array([city.speed[edge] for edge in city.edges])
-        self.free, self.free_turns = self._length / self._limit, np.array([city.turn_time[move] for move in moves])
+        self.free, self.free_turns = (
+            self._length / self._limit,
+            np.array([city.turn_time[move] for move in moves]),
+        )
         self.edges, self.turns = self.free.copy(), self.free_turns.copy()
         inside = {edge: n for n, edge in enumerate(city.inside)}
         self._longest = np.array(list(city.inside.values())) / STANDING_M_S
         # Pairs of moves and internal edges that they lead over, which several moves may share.
-        over = [(n, inside[edge]) for n, move in enumerate(moves) for edge in city.over.get(move, ()) if edge in inside]
+        over = [
+            (n, inside[edge])
+            for n, move in enumerate(moves)
+            for edge in city.over.get(move, ())
+            if edge in inside
+        ]
         self._move, self._via = np.array(over, dtype=int).reshape(-1, 2).T
-        # Weighted sums: time [veh s] and distance [veh m] on edges, time and ways over [veh] on internal ones.
+        # Weighted sums: time [veh s] and distance [veh m] on edges, time and ways over [veh] on
+        # internal ones.
         self._spent, self._driven = np.zeros((2, len(city.edges)))
         self._crossing, self._crossed = np.zeros((2, len(inside)))
 
     def learn(self, seen: StreetMeans) -> None:
         """Update the times from the means of a control interval."""
         if not self._lanes:
-            now = np.where(np.isnan(seen.speed), self.free, self._length / np.maximum(seen.speed, STANDING_M_S))
+            now = np.where(
+                np.isnan(seen.speed), self.free, self._length / np.maximum(seen.speed, STANDING_M_S)
+            )
             self.edges = self.edges + MESO_SMOOTHING * (np.maximum(now, self.free) - self.edges)
             return
         kept, spent = math.exp(-seen.duration / WINDOW_S), seen.timed * seen.duration
@@ -74,7 +87,8 @@ class TravelTimes:
 
 
 class Moves:
-    """Moves between allowed edges as a graph of these edges, from first[n] to second[n] or, reversed, back.
+    """Moves between allowed edges as a graph of these edges, from first[n] to second[n] or,
+    reversed, back.
 
     number: edge -> its node, -1 for edges that are not allowed
     """
@@ -84,17 +98,23 @@ class Moves:
         self.edges = np.flatnonzero(allowed)
         self.number = np.full(len(allowed), -1)
         self.number[self.edges] = np.arange(len(self.edges))
-        rows, columns = (self.number[part] for part in ((second, first) if reverse else (first, second)))
+        rows, columns = (
+            self.number[part] for part in ((second, first) if reverse else (first, second))
+        )
         kept = np.flatnonzero(allowed[first] & allowed[second])
         kept = kept[np.lexsort((columns[kept], rows[kept]))]
         self._kept, self._second, self._columns = kept, second[kept], columns[kept].astype(np.int32)
         self._begins = np.searchsorted(rows[kept], np.arange(len(self.edges) + 1)).astype(np.int32)
         self._ids = self.edges.tolist()
 
-    def costing(self, time: PerEdge, turns: PerMove, ahead: Float[np.ndarray, " nodes"] | None = None) -> csr_array:
-        """Return the graph with costs [s]: of a move (turns, (M,)) and of the edge that it leads to (time, (E,)).
+    def costing(
+        self, time: PerEdge, turns: PerMove, ahead: Float[np.ndarray, " nodes"] | None = None
+    ) -> csr_array:
+        """Return the graph with costs [s]: of a move (turns, (M,)) and of the edge that it leads to
+        (time, (E,)).
 
-        ahead: (nodes,) [s]; costs are less by the time that a move comes nearer, so that a search from t finds cost +
+        ahead: (nodes,) [s]; costs are less by the time that a move comes nearer, so that a search
+            from t finds cost +
         ahead - ahead[t], and detours last (A*)
         """
         cost = np.maximum(time[self._second] + turns[self._kept], 1e-3)
@@ -104,19 +124,29 @@ class Moves:
 
     def leading_to(self, nodes: Int[np.ndarray, " G"]) -> Bool[np.ndarray, "nodes G"]:
         """Return (all nodes, G) bool: each of `nodes` (G,) can be reached from it."""
-        moves = csr_array((np.ones(len(self._columns)), self._columns, self._begins), shape=(len(self.edges),) * 2)
+        moves = csr_array(
+            (np.ones(len(self._columns)), self._columns, self._begins), shape=(len(self.edges),) * 2
+        )
         # Nodes that lead to each other are reached from the same ones: in most cities nearly all.
         _, part = connected_components(moves, connection="strong")
         _, once, which = np.unique(part[nodes], return_index=True, return_inverse=True)
-        return np.isfinite(dijkstra(moves.T.tocsr(), indices=nodes[once], unweighted=True)).T[:, which]
+        return np.isfinite(dijkstra(moves.T.tocsr(), indices=nodes[once], unweighted=True)).T[
+            :, which
+        ]
 
-    def ahead(self, nodes: Int[np.ndarray, " G"], time: PerEdge, turns: PerMove) -> Float[np.ndarray, " nodes"]:
-        """Return (all nodes,) [s], just below the time to the nearest of `nodes` (G,), FAR_S if there is none."""
+    def ahead(
+        self, nodes: Int[np.ndarray, " G"], time: PerEdge, turns: PerMove
+    ) -> Float[np.ndarray, " nodes"]:
+        """Return (all nodes,) [s], just below the time to the nearest of `nodes` (G,), FAR_S if
+        there is none."""
         least = dijkstra(self.costing(time, turns).T.tocsr(), indices=nodes, min_only=True)
-        return np.where(np.isfinite(least), (1.0 - 1e-6) * least, FAR_S)  # below: no move may cost nothing
+        return np.where(
+            np.isfinite(least), (1.0 - 1e-6) * least, FAR_S
+        )  # below: no move may cost nothing
 
     def path(self, before: Int[np.ndarray, " nodes"], first: int, last: int) -> list[int]:
-        """Return the edges from node `first` to node `last` by the predecessors of a search from `last`."""
+        """Return the edges from node `first` to node `last` by the predecessors of a search from
+        `last`."""
         way = [self._ids[first]]
         while first != last:
             first = before[first]
@@ -125,7 +155,8 @@ class Moves:
 
 
 class Searches:
-    """Cache of searches by owner and beginning, at most `most` nodes in all; the least recently used go first."""
+    """Cache of searches by owner and beginning, at most `most` nodes in all; the least recently
+    used go first."""
 
     def __init__(self, most: int = MOST_NODES):
         self._most, self._nodes = most, 0
@@ -134,7 +165,8 @@ class Searches:
     def tree(
         self, owner: object, begin: int, costs: csr_array, most: float
     ) -> tuple[float, Float[np.ndarray, " nodes"], Int[np.ndarray, " nodes"]]:
-        """Return limit [s], costs [s] and predecessors of the search of `owner` from node `begin`, up to `most` [s]."""
+        """Return limit [s], costs [s] and predecessors of the search of `owner` from node `begin`,
+        up to `most` [s]."""
         tree = self._trees.pop((owner, begin), None)
         self._nodes += costs.shape[0] if tree is None else 0
         if tree is None or tree[0] < most:
@@ -159,7 +191,8 @@ class Trees:
         """time: (E,) [s]; turns: (M,) [s]; ahead: (nodes,) [s], see `Moves.costing`"""
         self.time, self.number = time, moves.number
         self._moves, self._costs = moves, moves.costing(time, turns, ahead)
-        # Not this object itself: `searches` would hold it, and both would stay until the garbage is collected.
+        # Not this object itself: `searches` would hold it, and both would stay until the garbage is
+        # collected.
         self._searches, self._owner = searches, object()
 
     def costs(self, begin: int, most: float) -> Float[np.ndarray, " nodes"]:
@@ -169,15 +202,18 @@ class Trees:
     def back(self, begin: int, end: int) -> list[int]:
         """Return the edges from `end` back to `begin`, after `costs` of `begin`."""
         first, last = int(self.number[end]), int(self.number[begin])
-        return self._moves.path(self._searches.tree(self._owner, last, self._costs, 0.0)[2], first, last)
+        return self._moves.path(
+            self._searches.tree(self._owner, last, self._costs, 0.0)[2], first, last
+        )
 
 
 class Ways:
-    """Fastest ways out of one region by each of its G gateways (first[g] -> second[g], into next_region[g]).
+    """Fastest ways out of one region by each of its G gateways (first[g] -> second[g], into
+    next_region[g]).
 
-    Gateways begins[n] to ends[n] - 1 lead into region neighbours[n]. Searches start where drivers are and where they
-    go, on demand and no further than needed. A way that comes back into the region before it leaves for good
-    (`returning`) has the same end, from the last gateway on.
+    Gateways begins[n] to ends[n] - 1 lead into region neighbours[n]. Searches start where drivers
+    are and where they go, on demand and no further than needed. A way that comes back into the
+    region before it leaves for good (`returning`) has the same end, from the last gateway on.
     """
 
     def __init__(
@@ -198,27 +234,40 @@ class Ways:
         everywhere: tuple[Trees, PerGateway, PerGateway] | None = None,
     ):
         """first, second, next_region: (G,), the last one rising
-        inside: moves in the region; outside: reversed moves elsewhere; crossing: (G,) [s], over each gateway
-        leading: (nodes of `inside`, G), first[g] can be reached; reached: (nodes of `outside`, G), from second[g]
-        ahead: (nodes of `outside`,) [s], to the nearest second[g] at times not above `time` (E,) and `turns` (M,) [s]
-        everywhere: ways by all moves, (G,) [s] over each gateway on these, and (G,) [s], not above the time from behind
-            the nearest gateway back to first[g]; None if no way may come back
+        inside: moves in the region; outside: reversed moves elsewhere; crossing: (G,) [s], over
+            each gateway
+        leading: (nodes of `inside`, G), first[g] can be reached; reached: (nodes of `outside`, G),
+            from second[g]
+        ahead: (nodes of `outside`,) [s], to the nearest second[g] at times not above `time` (E,)
+            and `turns` (M,) [s]
+        everywhere: ways by all moves, (G,) [s] over each gateway on these, and (G,) [s], not above
+            the time from behind the nearest gateway back to first[g]; None if no way may come back
         """
         self.time, self._ahead, self._leading, self._reached = time, ahead, leading, reached
-        self._there, self._onward = Trees(inside, time, turns, searches), Trees(outside, time, turns, searches, ahead)
+        self._there, self._onward = (
+            Trees(inside, time, turns, searches),
+            Trees(outside, time, turns, searches, ahead),
+        )
         self._first, self._second, self._entering = first, second, crossing + time[second]
-        self._exits, self._entries, self._everywhere = inside.number[first], outside.number[second], everywhere
+        self._exits, self._entries, self._everywhere = (
+            inside.number[first],
+            outside.number[second],
+            everywhere,
+        )
         self.neighbours, self.begins = np.unique(next_region, return_index=True)
         self.ends = np.append(self.begins[1:], len(next_region))
 
     def cost(self, here: int, target: int, most: float) -> tuple[PerGateway, GatewayMask]:
-        """Return (G,) [s] from the end of `here` to that of `target`, infinite above `most`; (G,), a way exists."""
+        """Return (G,) [s] from the end of `here` to that of `target`, infinite above `most`; (G,),
+        a way exists."""
         last = int(self._onward.number[target])
         open_ways = self._leading[self._there.number[here]] & self._reached[last]
         there = self._to_entries(here, max(most - self._ahead[last], 0.0))
         if (nearest := float(there.min(initial=np.inf))) == np.inf:
             return there, open_ways
-        return there + self._from_entries(target, max(most - min(nearest, most) - self._ahead[last], 0.0)), open_ways
+        return there + self._from_entries(
+            target, max(most - min(nearest, most) - self._ahead[last], 0.0)
+        ), open_ways
 
     def returning(self, here: int, target: int, most: float) -> tuple[float, int]:
         """Return [s] of the fastest way of all, and its last gateway, after `cost`.
@@ -238,7 +287,8 @@ class Ways:
         return float(cost[gateway]), gateway
 
     def route(self, here: int, gateway: int, target: int, *, returning: bool = False) -> list[int]:
-        """Return the edges from `here` to `target` through `gateway`, after `cost`; or those of `returning`."""
+        """Return the edges from `here` to `target` through `gateway`, after `cost`; or those of
+        `returning`."""
         trees = self._everywhere[0] if returning and self._everywhere else self._there
         first, second = int(self._first[gateway]), int(self._second[gateway])
         return trees.back(here, first)[::-1] + self._onward.back(target, second)
@@ -249,4 +299,7 @@ class Ways:
 
     def _from_entries(self, target: int, most: float) -> PerGateway:
         """Return (G,) [s] from the end of second[g] to that of `target`."""
-        return self._onward.costs(target, most)[self._entries] + self._ahead[self._onward.number[target]]
+        return (
+            self._onward.costs(target, most)[self._entries]
+            + self._ahead[self._onward.number[target]]
+        )

@@ -1,4 +1,5 @@
-"""Samples of the streets every few seconds: vehicles, speeds and queues, and their means over a control interval."""
+"""Samples of the streets every few seconds: vehicles, speeds and queues, and their means over a
+control interval."""
 
 from dataclasses import dataclass
 
@@ -19,11 +20,14 @@ class StreetMeans:
     """Means over the samples of one control interval.
 
     duration: [s], of the interval; vehicles: (E,) [veh]
-    speed: (E,) [m/s], that routing goes by (`Session.speeds`); NaN without vehicles, 0 on closed streets
-    timed: (E,) [veh], whose mean is `speed`: all vehicles, or probes, which leave `crossing` and `crossed` at 0
+    speed: (E,) [m/s], that routing goes by (`Session.speeds`); NaN without vehicles, 0 on closed
+        streets
+    timed: (E,) [veh], whose mean is `speed`: all vehicles, or probes, which leave `crossing` and
+        `crossed` at 0
     accumulation: (R,) [veh]; production: (R,) [veh m/s]
     queue, queue_max: (G,) [veh] halting on the edge before a gateway, mean and largest
-    crossing: (I,) [veh] on the internal edges of `City.inside`; crossed: (I,) [veh/s] that got over them
+    crossing: (I,) [veh] on the internal edges of `City.inside`; crossed: (I,) [veh/s] that got over
+        them
     """
 
     duration: float
@@ -49,16 +53,23 @@ class StreetSampler:
     def __init__(self, session: Session, city: City, probes: frozenset[str] | None = None):
         self._session, self._city, self._probes = session, city, probes
         self._inside = {edge: n for n, edge in enumerate(city.inside)}
-        self._upstream = sorted({g.from_edge for g in city.gateways})  # gateways may share the edge before them
-        self._upstream_of = np.array([self._upstream.index(g.from_edge) for g in city.gateways], dtype=int)
+        self._upstream = sorted(
+            {g.from_edge for g in city.gateways}
+        )  # gateways may share the edge before them
+        self._upstream_of = np.array(
+            [self._upstream.index(g.from_edge) for g in city.gateways], dtype=int
+        )
         self.last = np.zeros(len(city.edges)), np.zeros(len(city.edges))
         self.longest_queue = np.zeros(len(city.edges))
         self._begin()
 
     def _begin(self) -> None:
         self._start = self._session.time
-        # Sums over the samples: vehicles, and times their speed; timed vehicles, and times their routing speed.
-        self._vehicles, self._metres, self._timed, self._routed = np.zeros((4, len(self._city.edges)))
+        # Sums over the samples: vehicles, and times their speed; timed vehicles, and times their
+        # routing speed.
+        self._vehicles, self._metres, self._timed, self._routed = np.zeros(
+            (4, len(self._city.edges))
+        )
         self._crossing, self._crossed = np.zeros((2, len(self._inside)))
         self._queues: list[list[int]] = []
 
@@ -84,7 +95,9 @@ class StreetSampler:
             for vehicle in filter(self._probes.__contains__, session.running()):
                 if (n := self._city.number.get(session.road(vehicle))) is not None:
                     self._timed[n] += 1.0
-                    self._routed[n] += max(session.vehicle_speed(vehicle), STANDING_M_S)  # 0 is for closed streets
+                    self._routed[n] += max(
+                        session.vehicle_speed(vehicle), STANDING_M_S
+                    )  # 0 is for closed streets
         self._queues.append([session.halting(edge) for edge in self._upstream])
 
     def finish(self, closed: EdgeMask) -> StreetMeans:
@@ -99,8 +112,10 @@ class StreetSampler:
             vehicles=self._vehicles / samples,
             speed=speed,
             timed=self._timed / samples,
-            accumulation=np.bincount(self._city.edge_region, self._vehicles, self._city.regions) / samples,
-            production=np.bincount(self._city.edge_region, self._metres, self._city.regions) / samples,
+            accumulation=np.bincount(self._city.edge_region, self._vehicles, self._city.regions)
+            / samples,
+            production=np.bincount(self._city.edge_region, self._metres, self._city.regions)
+            / samples,
             queue=queues.mean(axis=0),
             queue_max=queues.max(axis=0),
             crossing=self._crossing / samples,
@@ -110,7 +125,8 @@ class StreetSampler:
         return means
 
     def _travelled(self) -> tuple[list[int], list[str]]:
-        """Return edges (numbers) and internal edges that hold all vehicles: a large city has more edges than these."""
+        """Return edges (numbers) and internal edges that hold all vehicles: a large city has more
+        edges than these."""
         vehicles = self._session.running()
         if 2 * len(vehicles) > len(self._city.edges):
             return list(range(len(self._city.edges))), list(self._inside)

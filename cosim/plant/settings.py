@@ -21,19 +21,33 @@ FILES = ("routes", "background", "additional")
 class Settings(config.Settings):
     """The city in SUMO. Files are relative to the scenario's folder."""
 
-    step_length: float = setting("time step, a divisor of the control interval", 1.0, unit="s", gt=0.0, le=1.0)
-    time_to_teleport: float = setting("waiting time before SUMO moves a vehicle on; -1: never", -1.0, unit="s", ge=-1.0)
+    step_length: float = setting(
+        "time step, a divisor of the control interval", 1.0, unit="s", gt=0.0, le=1.0
+    )
+    time_to_teleport: float = setting(
+        "waiting time before SUMO moves a vehicle on; -1: never", -1.0, unit="s", ge=-1.0
+    )
     begin: Seconds = setting("simulation time at which interval 0 begins", 0.0)
-    mesoscopic: bool = setting("SUMO's queue model without lanes, about ten times as fast; for quick studies", False)
-    routes: Texts = setting("route files of recorded trips; without any, trips are drawn from the demand", ())
-    background: Texts = setting("route files of traffic outside the demand: public transport, persons", ())
+    mesoscopic: bool = setting(
+        "SUMO's queue model without lanes, about ten times as fast; for quick studies", False
+    )
+    routes: Texts = setting(
+        "route files of recorded trips; without any, trips are drawn from the demand", ()
+    )
+    background: Texts = setting(
+        "route files of traffic outside the demand: public transport, persons", ()
+    )
     additional: Texts = setting("additional files: vehicle types, stops, signal programmes", ())
     options: dict[Text, Text] = setting(
-        "SUMO's options that change the traffic, such as max-depart-delay; other keys of [sumo] override them", {}
+        "SUMO's options that change the traffic, such as max-depart-delay; other keys of [sumo] override them",
+        {},
     )
     signals: Signals = setting("control of the signals", FIXED)
     lookahead: float = setting(
-        "green after a change of stage over which max-pressure compares; less: fewer changes", 1.0, unit="s", gt=0.0
+        "green after a change of stage over which max-pressure compares; less: fewer changes",
+        1.0,
+        unit="s",
+        gt=0.0,
     )
     leave_signals: Texts = setting("signals that perimeter control does not change", ())
     chain_limit: Share = setting(
@@ -41,14 +55,26 @@ class Settings(config.Settings):
         "share for all gateways of a boundary",
         0.6,
     )
-    gateways_fixed: bool = setting("signals with gateways stay fixed-time if the others are actuated", True)
-    guided: bool = setting("drivers are guided by travel times if the controller does not guide them", False)
+    gateways_fixed: bool = setting(
+        "signals with gateways stay fixed-time if the others are actuated", True
+    )
+    guided: bool = setting(
+        "drivers are guided by travel times if the controller does not guide them", False
+    )
     compliance: Share = setting("probability that a driver follows the guidance in a region", 1.0)
-    guidance_period: Seconds = setting("time after which a driver is guided again in the same region; 0: never", 0.0)
-    ways_return: bool = setting("guided drivers may leave a region and come back where that is fastest", False)
+    guidance_period: Seconds = setting(
+        "time after which a driver is guided again in the same region; 0: never", 0.0
+    )
+    ways_return: bool = setting(
+        "guided drivers may leave a region and come back where that is fastest", False
+    )
     rerouting: Share = setting("share of the drivers with SUMO's rerouting device", 0.0)
     metering: float = setting(
-        "critical accumulations in a region above which trips wait outside; 0: never", 0.0, unit="-", ge=0.0, le=10.0
+        "critical accumulations in a region above which trips wait outside; 0: never",
+        0.0,
+        unit="-",
+        ge=0.0,
+        le=10.0,
     )
     measurement: Literal["exact", "estimate"] = setting(
         "what controllers and guidance see; estimate: by detectors and probes", EXACT
@@ -72,12 +98,18 @@ def settings(scenario: "Scenario") -> Settings:
     """
     path = scenario.where
     if scenario.initial is not None:
-        raise config.error(path, "initial", "a city in SUMO begins empty; remove it, or use the regional model (nmfd)")
+        raise config.error(
+            path,
+            "initial",
+            "a city in SUMO begins empty; remove it, or use the regional model (nmfd)",
+        )
     result = config.checked(Settings, scenario.sumo, path, "sumo.")
     for key in FILES:
         for file in own_files(scenario, getattr(result, key)):
             if not file.is_file():
-                raise config.error(path, f"sumo.{key}", f"no such file: {file}; give the path of an existing one")
+                raise config.error(
+                    path, f"sumo.{key}", f"no such file: {file}; give the path of an existing one"
+                )
     if abs(scenario.step / result.step_length - round(scenario.step / result.step_length)) > 1e-9:
         expected = f"a divisor of the control interval {scenario.step:g} s"
         raise config.error(path, "sumo.step_length", config.got(expected, result.step_length))

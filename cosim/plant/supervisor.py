@@ -1,8 +1,9 @@
 """The supervisor of gates, which opens them where control does not pay.
 
-A region is held if its entries let in less than HELD_SHARE of what they can. It is overfull above OVERFULL critical
-accumulations, where a gate should empty it. If it was held for PATIENCE_S, is overfull and no emptier than before that
-time, then it fills from inside or past its gates, which only make queues: they open for PATIENCE_S.
+A region is held if its entries let in less than HELD_SHARE of what they can. It is overfull above
+OVERFULL critical accumulations, where a gate should empty it. If it was held for PATIENCE_S, is
+overfull and no emptier than before that time, then it fills from inside or past its gates, which
+only make queues: they open for PATIENCE_S.
 """
 
 import numpy as np
@@ -17,13 +18,16 @@ OVERFULL = 1.2
 
 
 class Supervisor:
-    """The regions whose gates are open against the command; call `opened` once per control interval."""
+    """The regions whose gates are open against the command; call `opened` once per control
+    interval."""
 
     def __init__(self, network: RegionalModel, step: float):
         """step: control interval [s]"""
         self._network, self._patience = network, max(round(PATIENCE_S / step), 1)
         self._before: list[PerRegion] = []  # accumulations of the past intervals [veh]
-        self._held = self._open_for = np.zeros(network.regions, dtype=int)  # control intervals, so far and left
+        self._held = self._open_for = np.zeros(
+            network.regions, dtype=int
+        )  # control intervals, so far and left
 
     def opened(self, share: PerPair, accumulation: PerRegion) -> Bool[np.ndarray, " R"]:
         """Return the regions to open. share: commanded (R, R) [-]; accumulation: (R,) now [veh]"""
@@ -35,5 +39,7 @@ class Supervisor:
         self._open_for[futile] = self._patience
         is_open = self._open_for > 0
         mean = (share * adjacency).sum(axis=0) / np.maximum(adjacency.sum(axis=0), 1)
-        self._held = np.where((mean < HELD_SHARE) & adjacency.any(axis=0) & ~is_open, self._held + 1, 0)
+        self._held = np.where(
+            (mean < HELD_SHARE) & adjacency.any(axis=0) & ~is_open, self._held + 1, 0
+        )
         return is_open

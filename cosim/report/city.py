@@ -17,7 +17,15 @@ from nmfd.model.scenario import Scenario
 from nmfd.runs import shipped
 from nmfd.studies import plots
 
-REGION_COLUMNS = ["region", "name", "edges", "lane_km", "signals", "gateways", "controlled_gateways"]
+REGION_COLUMNS = [
+    "region",
+    "name",
+    "edges",
+    "lane_km",
+    "signals",
+    "gateways",
+    "controlled_gateways",
+]
 
 
 class City:
@@ -32,10 +40,15 @@ class City:
     """
 
     def __init__(self, city: Path | str | Scenario | RegionalModel):
-        """city: a loaded scenario or network, its folder or its name. Raises InputError without a SUMO city."""
+        """city: a loaded scenario or network, its folder or its name. Raises InputError without a
+        SUMO city."""
         if not isinstance(city, Scenario | RegionalModel):
             folder = shipped.found(city, shipped.SCENARIO, shipped.NETWORK)
-            city = load_network(folder) if (folder / "network.toml").is_file() else load_scenario(folder)
+            city = (
+                load_network(folder)
+                if (folder / "network.toml").is_file()
+                else load_scenario(folder)
+            )
         self.scenario = city if isinstance(city, Scenario) else None
         self.network = city.network if isinstance(city, Scenario) else city
         self.name = city.name
@@ -45,9 +58,15 @@ class City:
         self._streets = read_streets(net.city_files(self.network).net_file, additional)
         built = net.city_of(self.network)
         self._regions = np.array([built.region_of.get(edge, -1) for edge in self._streets.edges])
-        of_region = [self._streets.drivable & (self._regions == r) for r in range(self.network.regions)]
-        self._places = np.stack([self._streets.centre[members].mean(axis=0) for members in of_region])
-        reasons = quality.left_alone(self._streets) | dict.fromkeys(left, "left alone by the scenario")
+        of_region = [
+            self._streets.drivable & (self._regions == r) for r in range(self.network.regions)
+        ]
+        self._places = np.stack(
+            [self._streets.centre[members].mean(axis=0) for members in of_region]
+        )
+        reasons = quality.left_alone(self._streets) | dict.fromkeys(
+            left, "left alone by the scenario"
+        )
         names = self.network.region_names
         self._tables = quality.tables(self._streets, self._regions, names, built, None, reasons)
 
@@ -67,7 +86,8 @@ class City:
 
     @cached_property
     def gateways(self) -> pd.DataFrame:
-        """One row per movement over a boundary: edges, lanes, signal with its links, and its control."""
+        """One row per movement over a boundary: edges, lanes, signal with its links, and its
+        control."""
         return pd.DataFrame(self._tables.gateways).drop(columns="flow_veh")
 
     def plot(self, ax: Axes | None = None) -> Axes:

@@ -1,4 +1,5 @@
-"""Figures of an evaluation in SUMO: functions that draw into `ax`, and the files of one demand level."""
+"""Figures of an evaluation in SUMO: functions that draw into `ax`, and the files of one demand
+level."""
 
 from collections import defaultdict
 from collections.abc import Mapping
@@ -13,11 +14,16 @@ from cosim.evaluation.results import Finished, Level
 from nmfd.studies import plots
 from nmfd.studies.benchmark import draw_accumulations, interval
 
-Points = dict[str, dict[float, tuple[float, float]]]  # controller -> level -> mean and half of the interval
+Points = dict[
+    str, dict[float, tuple[float, float]]
+]  # controller -> level -> mean and half of the interval
 
 
-def over_levels(ax: Axes, values: Mapping[str, Mapping[float, tuple[float, float]]], label: str) -> Axes:
-    """Draw a quantity over the demand level: controller -> level -> mean and half of its 95 % interval."""
+def over_levels(
+    ax: Axes, values: Mapping[str, Mapping[float, tuple[float, float]]], label: str
+) -> Axes:
+    """Draw a quantity over the demand level: controller -> level -> mean and half of its 95 %
+    interval."""
     plots.with_intervals(ax, values)
     levels = sorted({level for points in values.values() for level in points})
     ax.axhline(1.0, color="#777777", linestyle="--", linewidth=1.0)
@@ -28,9 +34,14 @@ def over_levels(ax: Axes, values: Mapping[str, Mapping[float, tuple[float, float
 
 
 def ranked(rows: pd.DataFrame) -> list[str]:
-    """Return the controllers of one demand level, the best first: by paired change, else by mean time spent."""
+    """Return the controllers of one demand level, the best first: by paired change, else by mean
+    time spent."""
     table = statistics.statistics(rows).set_index("controller")
-    score = table["change_percent"].where(table.index != table["against"], 0.0).fillna(table[statistics.TTS])
+    score = (
+        table["change_percent"]
+        .where(table.index != table["against"], 0.0)
+        .fillna(table[statistics.TTS])
+    )
     return list(score.sort_values(kind="stable").index)
 
 
@@ -41,7 +52,8 @@ def pair(rows: pd.DataFrame) -> list[str]:
 
 
 def draw_all(finished: Finished) -> None:
-    """Draw the pictures of every demand level into its folder, and those of several levels beside them."""
+    """Draw the pictures of every demand level into its folder, and those of several levels beside
+    them."""
     for level in finished.levels:
         draw_level(level.folder, finished, level)
     if len(finished.levels) > 1:
@@ -51,19 +63,25 @@ def draw_all(finished: Finished) -> None:
 def draw_level(out: Path, finished: Finished, level: Level) -> None:
     """Draw all pictures of one demand level into the folder `out`."""
     rows, network = level.rows, finished.scenario.network
-    seed = int(rows["seed"].value_counts().sort_index().idxmax())  # the first one that most controllers have
+    seed = int(
+        rows["seed"].value_counts().sort_index().idxmax()
+    )  # the first one that most controllers have
     runs = level.results()
     title = f"seed {seed}{', shaded: all seeds' if rows['seed'].nunique() > 1 else ''}"
     draw_accumulations(out, finished.scenario, runs, seed=seed, title=title)
     shown = pair(rows[rows["seed"] == seed])
     there = {run.controller: run for run in runs if run.seed == seed}
     clouds = [(name, model_validation.outflow_samples(network, [there[name]])) for name in shown]
-    samples = [{name: np.concatenate([*of[n].values()]) for name, of in clouds} for n in range(network.regions)]
+    samples = [
+        {name: np.concatenate([*of[n].values()]) for name, of in clouds}
+        for n in range(network.regions)
+    ]
     plots.draw_mfds(out / "mfd.png", network, samples)
 
 
 def draw_levels(out: Path, rows: pd.DataFrame) -> None:
-    """Draw trips served (the frontier) and time spent over several demand levels into the folder `out`."""
+    """Draw trips served (the frontier) and time spent over several demand levels into the folder
+    `out`."""
     against = statistics.compared_with(rows)
     ratios: Points = defaultdict(dict)
     shares: Points = defaultdict(dict)

@@ -28,11 +28,14 @@ from nmfd.studies.benchmark import REFERENCE
 
 CAPTIONS = config.read(Path(__file__).with_name("captions.toml"))
 PICTURES, LEVEL_PICTURES = CAPTIONS["level"], CAPTIONS["levels"]  # file -> caption
-QUANTITIES = CAPTIONS["card"]  # column -> label, unit on the card, format of a value, sign of an improvement, meaning
+QUANTITIES = CAPTIONS[
+    "card"
+]  # column -> label, unit on the card, format of a value, sign of an improvement, meaning
 
 
 class Figure(NamedTuple):
-    """Figure of the card: of the best strategy, before of the reference; better: None if not significant."""
+    """Figure of the card: of the best strategy, before of the reference; better: None if not
+    significant."""
 
     label: str
     value: str
@@ -51,7 +54,9 @@ def write_page(path: Path, runs: Sequence[Finished], *, seed: int | None = None)
     """
     shown, script, div = _map(runs[0], seed)
     loader = PackageLoader("cosim.report", ".")
-    environment = Environment(loader=loader, autoescape=True, trim_blocks=True, undefined=StrictUndefined)
+    environment = Environment(
+        loader=loader, autoescape=True, trim_blocks=True, undefined=StrictUndefined
+    )
     page = environment.get_template("report.html.j2").render(
         name=", ".join(dict.fromkeys(run.scenario.name for run in runs)),
         runs=[_run(run) for run in runs],
@@ -66,14 +71,17 @@ def write_page(path: Path, runs: Sequence[Finished], *, seed: int | None = None)
 
 
 def _map(run: Finished, seed: int | None) -> tuple[int, str, str]:
-    """Return seed, script and HTML of the best run beside its reference, with a slider over their time."""
+    """Return seed, script and HTML of the best run beside its reference, with a slider over their
+    time."""
     level = run.level()
     names = figures.pair(level.rows)
     seeds = [set(statistics.by_seed(level.rows, level.demand, name)) for name in names]
     if not (common := sorted(set.intersection(*seeds))):
         names, common = names[:1], sorted(seeds[0])
     if seed is not None and seed not in common:
-        raise InputError(f"--seed: {' and '.join(names)} have no run with seed {seed}; choose from {common}")
+        raise InputError(
+            f"--seed: {' and '.join(names)} have no run with seed {seed}; choose from {common}"
+        )
     seed = common[0] if seed is None else seed
     picture = CityPicture.of(run.scenario, run.map())
     results = {name: level.read(name, seed) for name in names}
@@ -88,9 +96,15 @@ def _run(run: Finished) -> dict:
     level, rows = run.level(), run.rows
     seeds = ", ".join(map(str, sorted(set(rows["seed"]))))
     heading, shown, name = card(level.rows)
-    manifest = json.dumps({"runs": level.key, "controllers": level.controllers, "sessions": run.sessions}, indent=1)
+    manifest = json.dumps(
+        {"runs": level.key, "controllers": level.controllers, "sessions": run.sessions}, indent=1
+    )
     minutes = level.key["steps"] * level.key["step_s"] / 60
-    pictures = _pictures(partial(figures.draw_levels, rows=rows), LEVEL_PICTURES) if len(run.levels) > 1 else []
+    pictures = (
+        _pictures(partial(figures.draw_levels, rows=rows), LEVEL_PICTURES)
+        if len(run.levels) > 1
+        else []
+    )
     return {
         "name": run.path.resolve().name,
         "heading": f"Demand times {level.demand:g}: " * (len(run.levels) > 1) + heading,
@@ -105,7 +119,8 @@ def _run(run: Finished) -> dict:
 
 
 def card(rows: pd.DataFrame) -> tuple[str, list[Figure], str]:
-    """Return a sentence, the figures that were recorded, and the name of the best strategy of one demand level.
+    """Return a sentence, the figures that were recorded, and the name of the best strategy of one
+    demand level.
 
     It is compared with the reference on the seeds that both have.
     """
@@ -121,10 +136,20 @@ def card(rows: pd.DataFrame) -> tuple[str, list[Figure], str]:
         if name != against and not math.isnan(pair.percent):
             reference = mean(before[seed] for seed in common) / unit
             change, verdict, better = _judged(pair, good)
-            figure = Figure(label, figure.value, meaning, f"{form.format(reference)} {than}", change, verdict, better)
+            figure = Figure(
+                label,
+                figure.value,
+                meaning,
+                f"{form.format(reference)} {than}",
+                change,
+                verdict,
+                better,
+            )
             if column == statistics.TTS:
                 heading = f"{name} compared with {against.replace('-', ' ')}: {change} time spent, {verdict}."
-                figure = figure._replace(label="Vehicle hours saved", value=form.format(reference - value))
+                figure = figure._replace(
+                    label="Vehicle hours saved", value=form.format(reference - value)
+                )
         shown += [] if math.isnan(value) else [figure]
     return heading, shown, name
 
@@ -137,7 +162,9 @@ def _judged(pair: statistics.Paired, good: int) -> tuple[str, str, bool | None]:
     size = f"{abs(pair.percent):.{digits}f}{spread} % {'more' if pair.percent > 0 else 'less'}"
     change = size if pair.percent or half else "no change"
     few = f"no proof ({seeds} seed{'s' * (seeds > 1)})"
-    verdict = few if seeds < statistics.FEWEST_SEEDS else "significant" if clear else "not significant"
+    verdict = (
+        few if seeds < statistics.FEWEST_SEEDS else "significant" if clear else "not significant"
+    )
     return change, verdict, pair.percent * good > 0 if clear else None
 
 
@@ -145,7 +172,9 @@ def _level(run: Finished, level: Level) -> dict:
     """Return what the page shows of a demand level."""
     rows = level.rows
     draw = partial(figures.draw_level, finished=run, level=level)
-    regions = statistics.by_region(level, run.map(), run.scenario.network.region_names, figures.pair(rows))
+    regions = statistics.by_region(
+        level, run.map(), run.scenario.network.region_names, figures.pair(rows)
+    )
     return {
         "title": f"Demand times {level.demand:g}",
         "tables": [_html(table) for table in statistics.shown(statistics.statistics(rows))],

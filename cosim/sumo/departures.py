@@ -1,4 +1,5 @@
-"""Vehicles as SUMO reads them from a city's files, with all that it draws for them. None of them is driven."""
+"""Vehicles as SUMO reads them from a city's files, with all that it draws for them. None of them is
+driven."""
 
 import heapq
 import math
@@ -51,13 +52,17 @@ class Departure:
     place: tuple[str, str] | None = None
 
 
-def read_departures(options: Mapping[str, object], *, end: float | None, where: str) -> list[Departure]:
+def read_departures(
+    options: Mapping[str, object], *, end: float | None, where: str
+) -> list[Departure]:
     """Return the vehicles that depart before `end` [s], in the order in which SUMO builds them.
 
     options: of SUMO, with absolute paths. SUMO runs in a process of its own.
     Raises InputError with SUMO's words and the file `where`.
     """
-    job = Run("departures", {}, partial(_said, {**options, **UNDRIVEN}, math.inf if end is None else end))
+    job = Run(
+        "departures", {}, partial(_said, {**options, **UNDRIVEN}, math.inf if end is None else end)
+    )
     [(_, outcome)] = processes([job], 1)
     if isinstance(outcome, str):
         raise InputError(f"{where}: sumo cannot run it: {outcome}; correct the input")
@@ -92,17 +97,25 @@ def _read(options: Mapping[str, object], end: float) -> list[Departure]:
         vehicle.remove(name)
 
     with temporary_folder() as folder, chdir(folder):  # some devices of vehicles write files
-        start_quietly(["sumo", *(text for key, value in options.items() for text in (f"--{key}", str(value)))])
+        start_quietly(
+            ["sumo", *(text for key, value in options.items() for text in (f"--{key}", str(value)))]
+        )
         numbers, due = count(), list[tuple[float, int, str]]()
         step, now = -math.inf, simulation.getTime()
         last = now
-        for name in vehicle.getIDList():  # in a loaded state; on a junction: at the end of the street before it
-            position = -1.0 if vehicle.getRoadID(name).startswith(":") else vehicle.getLanePosition(name)
+        for name in (
+            vehicle.getIDList()
+        ):  # in a loaded state; on a junction: at the end of the street before it
+            position = (
+                -1.0 if vehicle.getRoadID(name).startswith(":") else vehicle.getLanePosition(name)
+            )
             take(next(numbers), name, now, (str(vehicle.getLaneIndex(name)), f"{position:.2f}"))
         while True:
             for name in simulation.getLoadedIDList():
                 with suppress(REFUSALS):  # SUMO has dropped it
-                    heapq.heappush(due, (round(now - vehicle.getDepartDelay(name), 3), next(numbers), name))
+                    heapq.heappush(
+                        due, (round(now - vehicle.getDepartDelay(name), 3), next(numbers), name)
+                    )
                 last = now
             while due and due[0][0] <= step:
                 depart, number, name = heapq.heappop(due)
@@ -119,9 +132,11 @@ def _read(options: Mapping[str, object], end: float) -> list[Departure]:
 
 
 def _queued(departures: Sequence[Departure], step: float) -> list[Departure]:
-    """Return the departures with times that keep their order in SUMO's queue when they are sorted by time.
+    """Return the departures with times that keep their order in SUMO's queue when they are sorted
+    by time.
 
-    SUMO puts a vehicle behind those that it read before and that depart less than a `step` [s] later.
+    SUMO puts a vehicle behind those that it read before and that depart less than a `step` [s]
+    later.
     """
     times, queued = list[float](), list[Departure]()
     for departure in departures:

@@ -41,7 +41,8 @@ class CityFiles(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Gateway:
-    """A boundary movement from an edge in region `source` over a junction to an edge in region `target`.
+    """A boundary movement from an edge in region `source` over a junction to an edge in region
+    `target`.
 
     signal: the one that controls it, None where it leaks; links: its indices in the signal's state
     lanes: numbers of those that it comes from
@@ -58,16 +59,21 @@ class Gateway:
 
 @dataclass(frozen=True, kw_only=True)
 class City:
-    """A SUMO network cut into regions 0 .. regions - 1; only what cars may use, except in region_of.
+    """A SUMO network cut into regions 0 .. regions - 1; only what cars may use, except in
+    region_of.
 
     edges: normal ones, sorted; length [m], lanes, speed [m/s], lane_ids: by these
-    region_of: normal and internal edge -> region; an internal edge has that of the edge that it leads to
+    region_of: normal and internal edge -> region; an internal edge has that of the edge that it
+        leads to
     successors: edge -> following edges, sorted
-    turn_time: (from_edge, to_edge) -> free-flow time on the junction [s], as far as where a turn waits
-    over: (from_edge, to_edge) -> internal edges of this turn, in order; inside: internal edge of a turn -> length [m]
+    turn_time: (from_edge, to_edge) -> free-flow time on the junction [s], as far as where a turn
+        waits
+    over: (from_edge, to_edge) -> internal edges of this turn, in order; inside: internal edge of a
+        turn -> length [m]
     gateways: sorted by source, target, from_edge, to_edge; signals: edge -> signal at its end
     number: edge -> its place in `edges`; before: edge -> edges that lead there, sorted
-    edge_region, lane_metres, room: by number, (E,) the region, length times lanes [m], and [veh] at JAM_SPACING
+    edge_region, lane_metres, room: by number, (E,) the region, length times lanes [m], and [veh] at
+        JAM_SPACING
     """
 
     net_file: Path
@@ -128,12 +134,15 @@ class _Connection(NamedTuple):
 def network_folder(network: RegionalModel) -> Path:
     """Return the folder of `network`. Raises InputError for one that was not loaded from a file."""
     if network.folder is None:
-        raise InputError(f"network {network.name}: was not loaded from a folder; load it with load_network")
+        raise InputError(
+            f"network {network.name}: was not loaded from a folder; load it with load_network"
+        )
     return network.folder
 
 
 def city_files(network: RegionalModel) -> CityFiles:
-    """Return the SUMO files of `network`. Raises InputError for a wrong table [sumo] or a missing file."""
+    """Return the SUMO files of `network`. Raises InputError for a wrong table [sumo] or a missing
+    file."""
     folder = network_folder(network)
     path = folder / "network.toml"
     content = config.read(path)
@@ -144,7 +153,9 @@ def city_files(network: RegionalModel) -> CityFiles:
     files = CityFiles(folder / table.net, folder / table.regions)
     for key, file in zip(("net", "regions"), files, strict=True):
         if not file.is_file():
-            raise config.error(path, f"sumo.{key}", f"no such file: {file}; give the path of an existing one")
+            raise config.error(
+                path, f"sumo.{key}", f"no such file: {file}; give the path of an existing one"
+            )
     return files
 
 
@@ -156,13 +167,16 @@ def city_of(network: RegionalModel) -> City:
 def load_city(net_file: Path, regions_csv: Path, regions: int) -> City:
     """Read a net.xml (or net.xml.gz) and the region of each of its edges.
 
-    Raises InputError for a broken file, an unknown edge, an edge without a region and a region without edges.
+    Raises InputError for a broken file, an unknown edge, an edge without a region and a region
+    without edges.
     """
     lanes_of, internal, connections = _read_net(Path(net_file))
     given = read_regions(Path(regions_csv), regions)
     for edge in given:
         if edge not in lanes_of and edge not in internal:
-            raise InputError(f"{regions_csv}: edge {edge} is not in {net_file}; remove it or give the network it is of")
+            raise InputError(
+                f"{regions_csv}: edge {edge} is not in {net_file}; remove it or give the network it is of"
+            )
     edges = tuple(sorted(edge for edge, lanes in lanes_of.items() if lanes))
     if missing := [edge for edge in edges if edge not in given]:
         raise InputError(
@@ -173,13 +187,19 @@ def load_city(net_file: Path, regions_csv: Path, regions: int) -> City:
             f"{regions_csv}: region {min(empty)} has no edges; every region from 0 to {regions - 1} needs one"
         )
     cars = {lane for lanes in lanes_of.values() for _, _, lane in lanes}
-    links = [c for c in connections if cars.issuperset((f"{c.source}_{c.lane}", f"{c.target}_{c.to_lane}"))]
+    links = [
+        c
+        for c in connections
+        if cars.issuperset((f"{c.source}_{c.lane}", f"{c.target}_{c.to_lane}"))
+    ]
     over = _turns_over_junctions(links, connections)
     successors: dict[str, list[str]] = {edge: [] for edge in edges}
     for source, target in sorted({(c.source, c.target) for c in links}):
         successors[source].append(target)
     region_of = {edge: given[edge] for edge in edges}
-    all_regions = region_of | {edge: region for edge, region in given.items() if not edge.startswith(":")}
+    all_regions = region_of | {
+        edge: region for edge, region in given.items() if not edge.startswith(":")
+    }
     return City(
         net_file=Path(net_file),
         regions=regions,
@@ -190,20 +210,32 @@ def load_city(net_file: Path, regions_csv: Path, regions: int) -> City:
         lane_ids={e: tuple(lane for _, _, lane in lanes_of[e]) for e in edges},
         speed={e: max(speed for _, speed, _ in lanes_of[e]) for e in edges},
         successors={edge: tuple(after) for edge, after in successors.items()},
-        turn_time={(c.source, c.target): internal[c.via.rpartition("_")[0]][0] if c.via else 0.0 for c in links},
+        turn_time={
+            (c.source, c.target): internal[c.via.rpartition("_")[0]][0] if c.via else 0.0
+            for c in links
+        },
         gateways=_gateways(links, region_of),
         signals={c.source: c.signal for c in links if c.signal},
         over=over,
-        inside={edge: internal[edge][1] for edge in sorted(set().union(*over.values())) if internal[edge][1] > 0.0},
+        inside={
+            edge: internal[edge][1]
+            for edge in sorted(set().union(*over.values()))
+            if internal[edge][1] > 0.0
+        },
     )
 
 
 def check_adjacency(city: City, network: RegionalModel) -> None:
-    """Raise InputError unless the gateways join exactly the regions that network.toml calls adjacent."""
+    """Raise InputError unless the gateways join exactly the regions that network.toml calls
+    adjacent."""
     where = f"{network.folder}/network.toml: regions"
     joined = np.zeros((city.regions, city.regions), dtype=bool)
     for gateway in city.gateways:
-        i, h, ends = gateway.source, gateway.target, f"edge {gateway.from_edge} leads to {gateway.to_edge}"
+        i, h, ends = (
+            gateway.source,
+            gateway.target,
+            f"edge {gateway.from_edge} leads to {gateway.to_edge}",
+        )
         if not network.adjacency[i, h]:
             raise InputError(
                 f"{where}[{i}].adjacent: region {h} is missing, although {ends}; add it, or move the edges to other "
@@ -223,7 +255,10 @@ def edge_shapes(city: City) -> list[Points]:
     with network_root(city.net_file) as root:
         for edge in root.iterfind("edge"):
             lanes = [
-                np.array([point.split(",")[:2] for point in attribute(lane, "shape").split()], dtype=float)
+                np.array(
+                    [point.split(",")[:2] for point in attribute(lane, "shape").split()],
+                    dtype=float,
+                )
                 for lane in edge.iter("lane")
                 if for_cars(lane)
             ]
@@ -234,13 +269,16 @@ def edge_shapes(city: City) -> list[Points]:
 
 
 def points_along(shape: Points, marks: Callable[[float], ArrayLike]) -> Float[np.ndarray, "*n 2"]:
-    """Return points (..., 2) [m] on a line (n, 2) [m]; marks: its length [m] -> their distances from its beginning."""
+    """Return points (..., 2) [m] on a line (n, 2) [m]; marks: its length [m] -> their distances
+    from its beginning."""
     along = np.append(0.0, np.cumsum(np.hypot(*np.diff(shape, axis=0).T)))
     at = marks(float(along[-1]))
     return np.stack([np.interp(at, along, axis) for axis in shape.T], axis=-1)
 
 
-def _read_net(path: Path) -> tuple[dict[str, list[_Lane]], dict[str, tuple[float, float]], list[_Connection]]:
+def _read_net(
+    path: Path,
+) -> tuple[dict[str, list[_Lane]], dict[str, tuple[float, float]], list[_Connection]]:
     """Return edge -> lanes for cars; internal edge -> (time [s], length [m]); connections."""
     lanes_of: dict[str, list[_Lane]] = {}
     internal: dict[str, tuple[float, float]] = {}
@@ -248,27 +286,45 @@ def _read_net(path: Path) -> tuple[dict[str, list[_Lane]], dict[str, tuple[float
     with network_root(path) as root:
         for element in root.iterfind("edge"):
             edge, open_lanes = attribute(element, "id"), filter(for_cars, element.iter("lane"))
-            lanes = [(size(one, "length"), size(one, "speed"), attribute(one, "id")) for one in open_lanes]
+            lanes = [
+                (size(one, "length"), size(one, "speed"), attribute(one, "id"))
+                for one in open_lanes
+            ]
             if element.get("function", "normal") in NORMAL:
                 lanes_of[edge] = lanes
             else:
-                internal[edge] = max(((long / speed, long) for long, speed, _ in lanes), default=(0.0, 0.0))
+                internal[edge] = max(
+                    ((long / speed, long) for long, speed, _ in lanes), default=(0.0, 0.0)
+                )
         for element in root.iterfind("connection"):
-            source, target, via = attribute(element, "from"), attribute(element, "to"), element.get("via")
-            numbers = element.get("linkIndex", "-1"), attribute(element, "fromLane"), attribute(element, "toLane")
+            source, target, via = (
+                attribute(element, "from"),
+                attribute(element, "to"),
+                element.get("via"),
+            )
+            numbers = (
+                element.get("linkIndex", "-1"),
+                attribute(element, "fromLane"),
+                attribute(element, "toLane"),
+            )
             if via and via.rpartition("_")[0] not in internal:
                 raise LookupError(f"connection from {source} by way of {via}: no such edge")
-            connections.append(_Connection(source, target, via, element.get("tl"), *map(int, numbers)))
+            connections.append(
+                _Connection(source, target, via, element.get("tl"), *map(int, numbers))
+            )
     if not lanes_of:
         raise InputError(f"{path}: has no edges; build it with netconvert")
     return lanes_of, internal, connections
 
 
 def size(lane: ElementTree.Element, name: str) -> float:
-    """Return the length [m] or speed [m/s] of a <lane>. Raises ValueError unless it is above 0 and finite."""
+    """Return the length [m] or speed [m/s] of a <lane>. Raises ValueError unless it is above 0 and
+    finite."""
     value = float(attribute(lane, name))
     if not 0.0 < value < math.inf:
-        raise ValueError(f"lane {lane.get('id')}: {name}: expected a number above 0, got {value:g} instead")
+        raise ValueError(
+            f"lane {lane.get('id')}: {name}: expected a number above 0, got {value:g} instead"
+        )
     return value
 
 
@@ -286,18 +342,26 @@ def read_regions(path: Path, regions: int = 10**6) -> dict[str, int]:
         with path.open(encoding="utf-8-sig", newline="") as stream:
             header, *rows = list(csv.reader(stream, skipinitialspace=True)) or [[]]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: cannot be read ({error}); give a table with the columns edge,region") from None
+        raise InputError(
+            f"{path}: cannot be read ({error}); give a table with the columns edge,region"
+        ) from None
     if header != ["edge", "region"]:
-        raise InputError(f"{path}: line 1: expected edge,region, got {','.join(header) or 'nothing'} instead")
+        raise InputError(
+            f"{path}: line 1: expected edge,region, got {','.join(header) or 'nothing'} instead"
+        )
     region_of: dict[str, int] = {}
     for number, row in enumerate(rows, start=2):
         if not row:
             continue
         if len(row) != 2 or not row[1].isdecimal() or len(row[1]) > 9 or int(row[1]) >= regions:
             expected = f"an edge and a region from 0 to {regions - 1}"
-            raise InputError(f"{path}: line {number}: expected {expected}, got {','.join(row)} instead")
+            raise InputError(
+                f"{path}: line {number}: expected {expected}, got {','.join(row)} instead"
+            )
         if row[0] in region_of:
-            raise InputError(f"{path}: line {number}: edge {row[0]} appears twice; remove one of the lines")
+            raise InputError(
+                f"{path}: line {number}: edge {row[0]} appears twice; remove one of the lines"
+            )
         region_of[row[0]] = int(row[1])
     return region_of
 
@@ -305,7 +369,8 @@ def read_regions(path: Path, regions: int = 10**6) -> dict[str, int]:
 def _internal_regions(
     connections: Sequence[_Connection], region_of: Mapping[str, int], internal: Collection[str]
 ) -> dict[str, int]:
-    """Return internal edge -> region of the edge it leads to; without cars, that of any edge of the junction."""
+    """Return internal edge -> region of the edge it leads to; without cars, that of any edge of the
+    junction."""
     regions: dict[str, int] = {}
     of_junction: dict[str, int] = {}
     for connection in connections:
@@ -316,13 +381,16 @@ def _internal_regions(
                 regions[connection.source] = target
     for edge, region in regions.items():
         of_junction.setdefault(edge.rpartition("_")[0], region)
-    return {edge: regions.get(edge, of_junction.get(edge.rpartition("_")[0], 0)) for edge in internal}
+    return {
+        edge: regions.get(edge, of_junction.get(edge.rpartition("_")[0], 0)) for edge in internal
+    }
 
 
 def _turns_over_junctions(
     links: Sequence[_Connection], connections: Sequence[_Connection]
 ) -> dict[tuple[str, str], tuple[str, ...]]:
-    """Return (from_edge, to_edge) -> internal edges in between; two if the turn waits in the middle of a junction."""
+    """Return (from_edge, to_edge) -> internal edges in between; two if the turn waits in the middle
+    of a junction."""
     onward = {(c.source, c.lane): c.via for c in connections if c.source.startswith(":")}
     over: dict[tuple[str, str], tuple[str, ...]] = {}
     for link in links:
@@ -357,7 +425,8 @@ def _gateways(links: list[_Connection], region_of: dict[str, int]) -> tuple[Gate
 
 
 def gateway_movements(city: City) -> dict[str, dict[int, int]]:
-    """Return signal -> link index -> number of the gateway, of the links that lead over a boundary."""
+    """Return signal -> link index -> number of the gateway, of the links that lead over a
+    boundary."""
     movements: dict[str, dict[int, int]] = {}
     for number, gateway in enumerate(city.gateways):
         if gateway.signal is not None:
@@ -368,6 +437,7 @@ def gateway_movements(city: City) -> dict[str, dict[int, int]]:
 def gateway_room_taken(
     edge_vehicles: Float[np.ndarray, "*intervals E"], city: City
 ) -> Float[np.ndarray, "*intervals G"]:
-    """Return (..., G) [-], the share of the room before each gateway that edge_vehicles (..., E) [veh] take."""
+    """Return (..., G) [-], the share of the room before each gateway that edge_vehicles (..., E)
+    [veh] take."""
     before = [city.number[gateway.from_edge] for gateway in city.gateways]
     return edge_vehicles[..., before] / city.room[before]

@@ -48,14 +48,16 @@ class TripReader:
         return self._read(lambda vehicle: True)
 
     def finish(self, gone: Container[str] = ()) -> list[End]:
-        """Return the last ends after the simulation; SUMO lists vehicles under way then, too, `gone` are none of these.
+        """Return the last ends after the simulation; SUMO lists vehicles under way then, too,
+        `gone` are none of these.
 
         Raises RunFailed for a file that is not whole.
         """
         return self._read(gone.__contains__, last=True)
 
     def _read(self, left: Callable[[str], bool], last: bool = False) -> list[End]:
-        """left: a vehicle of which SUMO says that it has not arrived has left, as after a teleport to its end."""
+        """left: a vehicle of which SUMO says that it has not arrived has left, as after a teleport
+        to its end."""
         try:
             with self._path.open("rb") as stream:
                 stream.seek(self._offset)
@@ -64,19 +66,32 @@ class TripReader:
             if last:
                 self._parser.close()
             elements = [event[-1] for event in self._parser.read_events()]
-            trips = [self._trip(e, left) for e in elements if isinstance(e, Element) and e.tag == "tripinfo"]
+            trips = [
+                self._trip(e, left)
+                for e in elements
+                if isinstance(e, Element) and e.tag == "tripinfo"
+            ]
         except BROKEN as error:
             raise unfinished(self._path, error) from None
         return [end for end in trips if end is not None]
 
     def _trip(self, element: Element, left: Callable[[str], bool]) -> End | None:
         vehicle, reason = element.get("id", ""), element.get("vaporized", "")
-        depart, loss = float(attribute(element, "depart")), max(float(element.get("timeLoss", 0.0)), 0.0)
+        depart, loss = (
+            float(attribute(element, "depart")),
+            max(float(element.get("timeLoss", 0.0)), 0.0),
+        )
         ended = float(attribute(element, "arrival")) >= 0 or (depart >= 0 and left(vehicle))
-        edge, time = element.get("arrivalLane", "").rpartition("_")[0], depart + float(attribute(element, "duration"))
+        edge, time = (
+            element.get("arrivalLane", "").rpartition("_")[0],
+            depart + float(attribute(element, "duration")),
+        )
         element.clear()
         if ended:
-            self.completed, self.removed = self.completed + (not reason), self.removed + bool(reason)
+            self.completed, self.removed = (
+                self.completed + (not reason),
+                self.removed + bool(reason),
+            )
             return End(vehicle, time, edge, reason, loss)
         if depart >= 0:
             self.under_way[vehicle] = loss
@@ -84,15 +99,23 @@ class TripReader:
 
 
 def options(trip_file: Path, *, detailed: bool) -> list[str]:
-    """Return SUMO's options for a `trip_file` that `TripReader` can read; detailed: with emissions of every trip."""
-    others = "--tripinfo-output.write-unfinished true --tripinfo-output.write-undeparted true".split()
-    # Not 0: SUMO draws a random number for every vehicle unless it is 0, and others decide who has a rerouting device.
+    """Return SUMO's options for a `trip_file` that `TripReader` can read; detailed: with emissions
+    of every trip."""
+    others = [
+        "--tripinfo-output.write-unfinished",
+        "true",
+        "--tripinfo-output.write-undeparted",
+        "true",
+    ]
+    # Not 0: SUMO draws a random number for every vehicle unless it is 0, and others decide who has
+    # a rerouting device.
     emitting = "--device.emissions.probability", "1" if detailed else "1e-12"
     return ["--tripinfo-output", str(trip_file), *others, *emitting]
 
 
 def write_emission_data(path: Path, target: Path) -> None:
-    """Write an additional file that makes SUMO write emissions by edge over the whole run to `target`."""
+    """Write an additional file that makes SUMO write emissions by edge over the whole run to
+    `target`."""
     data = f'id="cosim" type="emissions" withInternal="true" excludeEmpty="true" file={quoteattr(str(target))}'
     path.write_text(f"<additional><edgeData {data}/></additional>\n", encoding="utf-8")
 
@@ -105,7 +128,10 @@ def edge_emissions(path: Path) -> dict[str, tuple[float, float]]:
     """
     try:
         edges = [edge.attrib for edge in ElementTree.parse(path).iter("edge")]
-        return {edge["id"]: (KG_PER_MG * float(edge["CO2_abs"]), KG_PER_MG * float(edge["fuel_abs"])) for edge in edges}
+        return {
+            edge["id"]: (KG_PER_MG * float(edge["CO2_abs"]), KG_PER_MG * float(edge["fuel_abs"]))
+            for edge in edges
+        }
     except BROKEN as error:
         raise unfinished(path, error) from None
 

@@ -1,4 +1,5 @@
-"""Vehicles of a city: those of its route files, varied by seed and demand factor, or trips made from the demand."""
+"""Vehicles of a city: those of its route files, varied by seed and demand factor, or trips made
+from the demand."""
 
 import math
 import xml.etree.ElementTree as ElementTree
@@ -13,7 +14,15 @@ import numpy as np
 
 from cosim.sumo.arrays import PerTrip, TripNumbers
 from cosim.sumo.net import City
-from cosim.sumo.trips import DRIVER_CLASSES, PEAK_S, PLANNING_SEEDS, Trips, busiest, perception, routes_in
+from cosim.sumo.trips import (
+    DRIVER_CLASSES,
+    PEAK_S,
+    PLANNING_SEEDS,
+    Trips,
+    busiest,
+    perception,
+    routes_in,
+)
 from cosim.sumo.xml_files import attribute, read_xml
 from nmfd.errors import InputError
 from nmfd.runs import files
@@ -21,22 +30,47 @@ from nmfd.runs import files
 STREAM = 7102  # keeps these random numbers apart from others of the same seed
 JITTER_S = 10.0  # departures are moved by up to this, either way, by a seed other than 0
 MESOSCOPIC = {"mesosim": "true", "meso-junction-control": "true"}  # options of SUMO
-PUBLIC = frozenset("bus coach tram rail rail_urban rail_electric rail_fast subway cable_car ship".split())
+PUBLIC = frozenset(
+    [
+        "bus",
+        "coach",
+        "tram",
+        "rail",
+        "rail_urban",
+        "rail_electric",
+        "rail_fast",
+        "subway",
+        "cable_car",
+        "ship",
+    ]
+)
 # Vehicle classes that keep to their lines, or do not use the road as cars do.
-BOUND = PUBLIC.union("aircraft bicycle pedestrian scooter wheelchair container drone".split())
+BOUND = PUBLIC.union(
+    ["aircraft", "bicycle", "pedestrian", "scooter", "wheelchair", "container", "drone"]
+)
 QUEUED_AFTER = "queued_after"  # parameter of buses and the like: cars that depart at the same time and come first
 DrawnTrip = tuple[float, int, str]  # departure [s], number of the vehicle, id
 # Attributes of all vehicles that are made from a demand.
 MADE = {"type": "car", "departLane": "best", "departSpeed": "max", "departPos": "random_free"}
 HELD = "held."  # prefix of the ids of routes that only one vehicle uses
-# Attribute of a vehicle -> argument of Session.begin_trip, whose defaults are those of the attributes.
-ALIKE = "departLane", "departPos", "departSpeed", "arrivalLane", "arrivalPos", "arrivalSpeed", "speedFactor"
+# Attribute of a vehicle -> argument of Session.begin_trip, whose defaults are those of the
+# attributes.
+ALIKE = (
+    "departLane",
+    "departPos",
+    "departSpeed",
+    "arrivalLane",
+    "arrivalPos",
+    "arrivalSpeed",
+    "speedFactor",
+)
 ORDERED = {"type": "typeID"} | {name: name for name in ALIKE}
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedTrips:
-    """N vehicles or trips. depart: (N,) [s], sorted; elements: their XML; types: own ones, others are elsewhere."""
+    """N vehicles or trips. depart: (N,) [s], sorted; elements: their XML; types: own ones, others
+    are elsewhere."""
 
     depart: PerTrip
     elements: tuple[ElementTree.Element, ...]
@@ -63,7 +97,9 @@ def read_recorded_trips(paths: Sequence[Path]) -> RecordedTrips:
     for path in paths:
         root = read_xml(path)
         if root.tag != "routes":
-            raise InputError(f"{path}: expected a SUMO route file, got a file of <{root.tag}> instead")
+            raise InputError(
+                f"{path}: expected a SUMO route file, got a file of <{root.tag}> instead"
+            )
         elements += [(path, element) for element in root]
     departs, ids = np.full(len(elements), np.nan), set()
     for n, (path, element) in enumerate(elements):
@@ -74,7 +110,9 @@ def read_recorded_trips(paths: Sequence[Path]) -> RecordedTrips:
             )
         name = element.get("id")
         if not name or name in ids:
-            raise InputError(f"{path}: {element.tag} {n}: id: expected a unique one, got {name!r} instead")
+            raise InputError(
+                f"{path}: {element.tag} {n}: id: expected a unique one, got {name!r} instead"
+            )
         ids.add(name)
         with suppress(KeyError, ValueError):
             departs[n] = float(element.attrib["depart"])
@@ -91,10 +129,14 @@ def as_recorded(trips: Trips) -> RecordedTrips:
     """Return trips that are made from a demand as vehicles v0, v1, ... by departure."""
     elements = []
     for n, (route, arrival) in enumerate(zip(trips.routes, trips.arrival, strict=True)):
-        elements.append(ElementTree.Element("vehicle", MADE | {"id": f"v{n}", "arrivalPos": f"{arrival:.1f}"}))
+        elements.append(
+            ElementTree.Element("vehicle", MADE | {"id": f"v{n}", "arrivalPos": f"{arrival:.1f}"})
+        )
         ElementTree.SubElement(elements[-1], "route", edges=" ".join(route))
     return RecordedTrips(
-        depart=trips.depart, elements=tuple(elements), types=(ElementTree.Element("vType", id="car", sigma="0.2"),)
+        depart=trips.depart,
+        elements=tuple(elements),
+        types=(ElementTree.Element("vType", id="car", sigma="0.2"),),
     )
 
 
@@ -103,7 +145,11 @@ def check_edges(originals: RecordedTrips, city: City, where: str) -> None:
     for element in originals.elements:
         route = element.find("route")
         ends = [element.get(key) for key in ("from", "to") if element.get(key)]
-        edges = [*ends, *element.get("via", "").split(), *("" if route is None else route.get("edges", "")).split()]
+        edges = [
+            *ends,
+            *element.get("via", "").split(),
+            *("" if route is None else route.get("edges", "")).split(),
+        ]
         for edge in edges:
             if edge not in city.region_of:
                 raise InputError(
@@ -113,7 +159,8 @@ def check_edges(originals: RecordedTrips, city: City, where: str) -> None:
 
 
 def read_routes(paths: Sequence[Path]) -> dict[str, tuple[str, ...]]:
-    """Return id -> edges of the shared routes in additional files; of a distribution, its first route."""
+    """Return id -> edges of the shared routes in additional files; of a distribution, its first
+    route."""
     shared: dict[str, tuple[str, ...]] = {}
     for path in paths:
         root = read_xml(path)
@@ -122,14 +169,22 @@ def read_routes(paths: Sequence[Path]) -> dict[str, tuple[str, ...]]:
             if name and edges:
                 shared[name] = tuple(edges.split())
         for distribution in root.iter("routeDistribution"):
-            routes = [tuple(edges.split()) for r in distribution.iter("route") if (edges := r.get("edges"))]
-            routes += [shared[name] for name in distribution.get("routes", "").split() if name in shared]
+            routes = [
+                tuple(edges.split())
+                for r in distribution.iter("route")
+                if (edges := r.get("edges"))
+            ]
+            routes += [
+                shared[name] for name in distribution.get("routes", "").split() if name in shared
+            ]
             if routes and (name := distribution.get("id")):
                 shared[name] = routes[0]
     return shared
 
 
-def edges_of(element: ElementTree.Element, shared: Mapping[str, Sequence[str]]) -> tuple[Sequence[str], bool]:
+def edges_of(
+    element: ElementTree.Element, shared: Mapping[str, Sequence[str]]
+) -> tuple[Sequence[str], bool]:
     """Return (the edges of a vehicle's route, True), or (the edges that it must pass, False)."""
     route = element.find("route")
     if route is not None:
@@ -142,11 +197,15 @@ def edges_of(element: ElementTree.Element, shared: Mapping[str, Sequence[str]]) 
 def own_flows(
     city: City, originals: RecordedTrips, shared: Mapping[str, Sequence[str]], factor: float
 ) -> Mapping[tuple[str, str], float]:
-    """Return (edge, next edge) -> flow [veh/s] of recorded trips in their busiest quarter of an hour.
+    """Return (edge, next edge) -> flow [veh/s] of recorded trips in their busiest quarter of an
+    hour.
 
     Trips without a route take a fastest one. shared: `read_routes`; factor: multiplies the flows
     """
-    peak = [edges_of(element, shared) for element in originals.elements[busiest(originals.depart, PEAK_S)]]
+    peak = [
+        edges_of(element, shared)
+        for element in originals.elements[busiest(originals.depart, PEAK_S)]
+    ]
     known = set(city.edges)
     turns: Counter[tuple[str, str]] = Counter()
     legs: list[tuple[str, str]] = []
@@ -160,12 +219,16 @@ def own_flows(
         random = np.random.default_rng(PLANNING_SEEDS[0])
         begin, end = np.array([[city.number[edge] for edge in leg] for leg in legs]).T
         noise = perception(len(city.edges), random)
-        for route in routes_in(city, (begin, end), random.integers(DRIVER_CLASSES, size=len(legs)), noise):
+        for route in routes_in(
+            city, (begin, end), random.integers(DRIVER_CLASSES, size=len(legs)), noise
+        ):
             turns.update(pairwise(route))
     return {turn: factor * count / PEAK_S for turn, count in turns.items()}
 
 
-def draw(originals: RecordedTrips, *, seed: int, factor: float, jitter: float, begin: float) -> list[DrawnTrip]:
+def draw(
+    originals: RecordedTrips, *, seed: int, factor: float, jitter: float, begin: float
+) -> list[DrawnTrip]:
     """Return (departure [s], number of the vehicle, its id) of one run, sorted by departure.
 
     factor: vehicles are left out, or drive several times (ids with .1, .2 ...), by seeded choice
@@ -181,7 +244,9 @@ def draw(originals: RecordedTrips, *, seed: int, factor: float, jitter: float, b
     drawn = []
     for n, times in enumerate(copies):
         for copy in range(times):
-            depart = max(float(originals.depart[n] + shifts[copy, n]), min(begin, float(originals.depart[n])))
+            depart = max(
+                float(originals.depart[n] + shifts[copy, n]), min(begin, float(originals.depart[n]))
+            )
             stem, name = names[n], f"{names[n]}.{copy}" if copy else names[n]
             while copy and name in taken:
                 stem += "."
@@ -192,14 +257,21 @@ def draw(originals: RecordedTrips, *, seed: int, factor: float, jitter: float, b
 
 def write_recorded_trips(originals: RecordedTrips, drawn: Sequence[DrawnTrip], path: Path) -> None:
     """Write the vehicles of one run to a SUMO route file."""
-    _write(path, [*originals.types, *(_departing(originals.elements[n], name, depart) for depart, n, name in drawn)])
+    _write(
+        path,
+        [
+            *originals.types,
+            *(_departing(originals.elements[n], name, depart) for depart, n, name in drawn),
+        ],
+    )
 
 
 def merge(path: Path, beside: Sequence[Path], rest: Path) -> list[Path]:
-    """Put the timed vehicles of the files `beside` into the route file `path`, and all else of them into `rest`.
+    """Put the timed vehicles of the files `beside` into the route file `path`, and all else of them
+    into `rest`.
 
-    In one file vehicles queue in the order of their departures and, at the same time, of QUEUED_AFTER, as in the city's
-    own files. Returns both files, types first.
+    In one file vehicles queue in the order of their departures and, at the same time, of
+    QUEUED_AFTER, as in the city's own files. Returns both files, types first.
     """
     queue = list[tuple[float, float, ElementTree.Element]]()  # time, place among those of that time
     others, places = list[ElementTree.Element](), Counter[float]()
@@ -208,7 +280,10 @@ def merge(path: Path, beside: Sequence[Path], rest: Path) -> list[Path]:
         queue.append((depart, places[depart] + 0.5, element))
         places[depart] += 1
     for element in (element for file in beside for element in read_xml(file)):
-        if element.tag in ("vehicle", "trip") and element.get("depart", "").replace(".", "", 1).isdecimal():
+        if (
+            element.tag in ("vehicle", "trip")
+            and element.get("depart", "").replace(".", "", 1).isdecimal()
+        ):
             place = element.find(f"param[@key='{QUEUED_AFTER}']")
             first = math.inf if place is None else float(attribute(place, "value"))
             queue.append((float(attribute(element, "depart")), first, element))
@@ -226,9 +301,11 @@ def write_held_trips(
     shared: Mapping[str, tuple[str, ...]],
     region_of: Mapping[str, int],
 ) -> HeldTrips:
-    """Return the metered trips of one run; write their routes and all other vehicles to a SUMO route file.
+    """Return the metered trips of one run; write their routes and all other vehicles to a SUMO
+    route file.
 
-    A vehicle with stops, via edges or attributes that libsumo.vehicle.add does not take is not metered.
+    A vehicle with stops, via edges or attributes that libsumo.vehicle.add does not take is not
+    metered.
     shared: `read_routes`; region_of: edge -> region
     """
     elements, written = list(originals.types), set[int]()
@@ -256,13 +333,17 @@ def write_held_trips(
     )
 
 
-def _meterable_route(element: ElementTree.Element, shared: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
-    """Return the edges of a vehicle that can be metered, () of others; SUMO connects the two edges of a trip."""
+def _meterable_route(
+    element: ElementTree.Element, shared: Mapping[str, tuple[str, ...]]
+) -> tuple[str, ...]:
+    """Return the edges of a vehicle that can be metered, () of others; SUMO connects the two edges
+    of a trip."""
     if not {"id", "depart", "route", "from", "to", "color", *ORDERED}.issuperset(element.attrib):
         return ()
     own = int(element.tag == "vehicle" and "route" not in element.attrib)  # a route of its own
     if len(element) > own or any(
-        child.tag != "route" or len(child) or not {"edges", "color"}.issuperset(child.attrib) for child in element
+        child.tag != "route" or len(child) or not {"edges", "color"}.issuperset(child.attrib)
+        for child in element
     ):
         return ()
     edges, driven = edges_of(element, shared)
@@ -272,12 +353,16 @@ def _meterable_route(element: ElementTree.Element, shared: Mapping[str, tuple[st
 
 
 def _departing(element: ElementTree.Element, name: str, depart: float) -> ElementTree.Element:
-    copy = ElementTree.Element(element.tag, {**element.attrib, "id": name, "depart": f"{depart:.10g}"})
+    copy = ElementTree.Element(
+        element.tag, {**element.attrib, "id": name, "depart": f"{depart:.10g}"}
+    )
     copy.extend(element)
     copy.text = element.text
     return copy
 
 
 def _write(path: Path, elements: Sequence[ElementTree.Element]) -> None:
-    lines = [f"  {ElementTree.tostring(element, encoding='unicode').strip()}\n" for element in elements]
+    lines = [
+        f"  {ElementTree.tostring(element, encoding='unicode').strip()}\n" for element in elements
+    ]
     files.write_text(path, "".join(["<routes>\n", *lines, "</routes>\n"]))

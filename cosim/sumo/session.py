@@ -21,13 +21,17 @@ from nmfd.errors import InputError, RunFailed
 
 REFUSALS = libsumo.TraCIException  # of one order: the simulation goes on
 ERRORS = (REFUSALS, libsumo.FatalTraCIError)
-KEPT_BYTES = {-1: 64 << 20, -3: 32 << 20}  # by M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of malloc.h: see _keep_freed
+KEPT_BYTES = {
+    -1: 64 << 20,
+    -3: 32 << 20,
+}  # by M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of malloc.h: see _keep_freed
 GUI_OPTIONS = ("--start", "true", "--delay", "20")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Phase:
-    """One phase of a signal programme: duration [s] and one character per link (SUMO's G g y r u o O s)."""
+    """One phase of a signal programme: duration [s] and one character per link (SUMO's G g y r u o
+    O s)."""
 
     duration: float
     state: str
@@ -37,7 +41,8 @@ class Phase:
 class Programme:
     """A signal programme.
 
-    id: among those of the signal; position: in its cycle when it was read [s]; static: fixed-time, phases in order
+    id: among those of the signal; position: in its cycle when it was read [s]; static: fixed-time,
+        phases in order
     actuated: timed by detectors, and always in one of its phases
     """
 
@@ -56,7 +61,8 @@ class Programme:
 class Session:
     """One running simulation.
 
-    time: of the simulation [s]; sumo_time: wall time inside SUMO's own step [s]; command: command line of the same run
+    time: of the simulation [s]; sumo_time: wall time inside SUMO's own step [s]; command: command
+        line of the same run
     A second libsumo.start would silently replace the first simulation: here it is an error.
     """
 
@@ -76,7 +82,8 @@ class Session:
     ):
         """Start the simulation, in the window of sumo-gui if `gui`.
 
-        Raises RuntimeError if another session is open in this process, InputError if SUMO refuses to start.
+        Raises RuntimeError if another session is open in this process, InputError if SUMO refuses
+        to start.
         """
         if Session._open:
             raise RuntimeError("a SUMO session is already open in this process; close it first")
@@ -94,7 +101,10 @@ class Session:
             "no-warnings": "true",
             "duration-log.disable": "true",
         }
-        self.command = ["sumo", *(part for key, value in settings.items() for part in (f"--{key}", str(value)))]
+        self.command = [
+            "sumo",
+            *(part for key, value in settings.items() for part in (f"--{key}", str(value))),
+        ]
         self.command += options
         self._gui, self.flush = gui, _flush_all()  # the latter makes SUMO write its output buffers
         try:
@@ -103,34 +113,59 @@ class Session:
             else:
                 start_quietly(self.command)
         except ERRORS as error:
-            raise InputError(f"{net_file}: SUMO cannot run it with {routes}: {one_line(error)}") from None
+            raise InputError(
+                f"{net_file}: SUMO cannot run it with {routes}: {one_line(error)}"
+            ) from None
         Session._open = True
         self.time = libsumo.simulation.getTime()
-        self._lanes = cache(lambda edge: tuple(f"{edge}_{n}" for n in range(libsumo.edge.getLaneNumber(edge))))
+        self._lanes = cache(
+            lambda edge: tuple(f"{edge}_{n}" for n in range(libsumo.edge.getLaneNumber(edge)))
+        )
         self._bind()
 
     def _bind(self) -> None:
-        """Bind SUMO's functions that need no translation; a Python call around them would cost as much as they do."""
-        simulation, vehicle, edge, lane = libsumo.simulation, libsumo.vehicle, libsumo.edge, libsumo.lane
-        # Vehicles in the last step: read from files; inserted; ended as SUMO says, which tripinfo may deny, without
-        # those that a program removed; taken off the road to be moved on; back on the road, or gone for good.
+        """Bind SUMO's functions that need no translation; a Python call around them would cost as
+        much as they do."""
+        simulation, vehicle, edge, lane = (
+            libsumo.simulation,
+            libsumo.vehicle,
+            libsumo.edge,
+            libsumo.lane,
+        )
+        # Vehicles in the last step: read from files; inserted; ended as SUMO says, which tripinfo
+        # may deny, without those that a program removed; taken off the road to be moved on; back on
+        # the road, or gone for good.
         self.loaded, self.departed = simulation.getLoadedIDList, simulation.getDepartedIDList
         self.arrived = simulation.getArrivedIDList
         self.started_teleport = simulation.getStartingTeleportIDList
         self.ended_teleport = simulation.getEndingTeleportIDList
-        # Vehicles now: on the road, without teleporting ones; all that are loaded and have not arrived; due to depart.
+        # Vehicles now: on the road, without teleporting ones; all that are loaded and have not
+        # arrived; due to depart.
         self.running, self.known = vehicle.getIDList, vehicle.getLoadedIDList
         self.pending = simulation.getPendingVehicles
-        # One vehicle: edge, normal or internal; route; place on it; speed [m/s]; time since it stopped [s]; length [m].
-        self.road, self.route, self.route_index = vehicle.getRoadID, vehicle.getRoute, vehicle.getRouteIndex
+        # One vehicle: edge, normal or internal; route; place on it; speed [m/s]; time since it
+        # stopped [s]; length [m].
+        self.road, self.route, self.route_index = (
+            vehicle.getRoadID,
+            vehicle.getRoute,
+            vehicle.getRouteIndex,
+        )
         self.vehicle_speed = vehicle.getSpeed
         self.standing_time, self.vehicle_length = vehicle.getWaitingTime, vehicle.getLength
-        # One edge: its vehicles, their number, and of these under 0.1 m/s. One lane: the number of its vehicles.
-        self.vehicles_on, self.vehicle_count = edge.getLastStepVehicleIDs, edge.getLastStepVehicleNumber
-        self.halting, self.lane_vehicles = edge.getLastStepHaltingNumber, lane.getLastStepVehicleNumber
+        # One edge: its vehicles, their number, and of these under 0.1 m/s. One lane: the number of
+        # its vehicles.
+        self.vehicles_on, self.vehicle_count = (
+            edge.getLastStepVehicleIDs,
+            edge.getLastStepVehicleNumber,
+        )
+        self.halting, self.lane_vehicles = (
+            edge.getLastStepHaltingNumber,
+            lane.getLastStepVehicleNumber,
+        )
         # One loop detector: share of the last step in which a vehicle was on it [%].
         self.loop_occupancy = libsumo.inductionloop.getLastStepOccupancy
-        # Signals: all of the network; state of one, a character per link; id of its programme; run one of its own.
+        # Signals: all of the network; state of one, a character per link; id of its programme; run
+        # one of its own.
         light = libsumo.trafficlight
         self.signals, self.signal_state = light.getIDList, light.getRedYellowGreenState
         self.programme_id, self.restart_programme = light.getProgram, light.setProgram
@@ -156,10 +191,11 @@ class Session:
         self.time = libsumo.simulation.getTime()
 
     def speeds(self, edge: str) -> tuple[float, float]:
-        """Return two mean speeds [m/s] of an edge, the limit if it is empty: of its vehicles, and of SUMO's routing.
+        """Return two mean speeds [m/s] of an edge, the limit if it is empty: of its vehicles, and
+        of SUMO's routing.
 
-        In the second one, an empty lane counts as one vehicle at the limit, so that a queue for one turn does not deter
-        drivers with another lane.
+        In the second one, an empty lane counts as one vehicle at the limit, so that a queue for one
+        turn does not deter drivers with another lane.
         """
         routing = libsumo.edge.getLastStepMeanSpeed(edge)
         lanes = self._lanes(edge)
@@ -167,7 +203,9 @@ class Session:
             counts = [libsumo.lane.getLastStepVehicleNumber(lane) for lane in lanes]
             if total := sum(counts):  # 0 in the mesoscopic model, which has no lanes
                 speed = libsumo.lane.getLastStepMeanSpeed
-                return sum(n * speed(lane) for n, lane in zip(counts, lanes, strict=True) if n) / total, routing
+                return sum(
+                    n * speed(lane) for n, lane in zip(counts, lanes, strict=True) if n
+                ) / total, routing
         return routing, routing
 
     def teleports(self) -> int:
@@ -180,14 +218,19 @@ class Session:
 
     def is_private(self, vehicle: str) -> bool:
         """Return False for public transport, and for classes that no controller commands."""
-        return libsumo.vehicle.getVehicleClass(vehicle) not in BOUND and not libsumo.vehicle.getLine(vehicle)
+        return libsumo.vehicle.getVehicleClass(
+            vehicle
+        ) not in BOUND and not libsumo.vehicle.getLine(vehicle)
 
     def is_public(self, vehicle: str) -> bool:
         """Return True for public transport: by its class, or a vehicle with a line."""
-        return libsumo.vehicle.getVehicleClass(vehicle) in PUBLIC or bool(libsumo.vehicle.getLine(vehicle))
+        return libsumo.vehicle.getVehicleClass(vehicle) in PUBLIC or bool(
+            libsumo.vehicle.getLine(vehicle)
+        )
 
     def departure(self, vehicle: str) -> tuple[float, float]:
-        """Return the time of the departure, or else now, and the departure delay until then [s]; < 0: not due yet."""
+        """Return the time of the departure, or else now, and the departure delay until then [s]; <
+        0: not due yet."""
         departed = libsumo.vehicle.getDeparture(vehicle)
         return departed if departed >= 0.0 else self.time, libsumo.vehicle.getDepartDelay(vehicle)
 
@@ -208,14 +251,17 @@ class Session:
         """Return the free length at the beginning of a lane [m]."""
         position, length = libsumo.vehicle.getLanePosition, libsumo.vehicle.getLength
         vehicles = libsumo.lane.getLastStepVehicleIDs(lane)
-        return min((position(v) - length(v) for v in vehicles), default=libsumo.lane.getLength(lane))
+        return min(
+            (position(v) - length(v) for v in vehicles), default=libsumo.lane.getLength(lane)
+        )
 
     def set_down(self, vehicle: str, lane: str, position: float) -> bool:
         """Put a vehicle at `position` [m] on a lane of its route; return False if SUMO refuses."""
         return _accepted(libsumo.vehicle.moveTo, vehicle, lane, position)
 
     def fastest(self, edge: str, target: str) -> tuple[float, tuple[str, ...]]:
-        """Return time [s] and edges of a car's fastest way on empty streets, () if there is none."""
+        """Return time [s] and edges of a car's fastest way on empty streets, () if there is
+        none."""
         try:
             stage = libsumo.simulation.findRoute(edge, target)
         except REFUSALS:  # the edge is closed to cars, such as a bus street
@@ -223,7 +269,8 @@ class Session:
         return stage.travelTime, tuple(stage.edges)
 
     def set_route(self, vehicle: str, edges: list[str]) -> bool:
-        """Give a vehicle on edges[0] a new route; return False if SUMO refuses it and keeps the old one."""
+        """Give a vehicle on edges[0] a new route; return False if SUMO refuses it and keeps the old
+        one."""
         return _accepted(libsumo.vehicle.setRoute, vehicle, edges)
 
     def begin_trip(self, order: Mapping[str, str]) -> None:
@@ -248,12 +295,15 @@ class Session:
             id=active,
             phases=tuple(Phase(duration=p.duration, state=p.state) for p in logic.phases),
             position=elapsed - (light.getNextSwitch(signal) - libsumo.simulation.getTime()),
-            static=logic.type == types.TRAFFICLIGHT_TYPE_STATIC and not any(phase.next for phase in logic.phases),
-            actuated=logic.type in (types.TRAFFICLIGHT_TYPE_ACTUATED, types.TRAFFICLIGHT_TYPE_DELAYBASED),
+            static=logic.type == types.TRAFFICLIGHT_TYPE_STATIC
+            and not any(phase.next for phase in logic.phases),
+            actuated=logic.type
+            in (types.TRAFFICLIGHT_TYPE_ACTUATED, types.TRAFFICLIGHT_TYPE_DELAYBASED),
         )
 
     def state_underneath(self, signal: str, programme: str) -> str:
-        """Return the state that a programme of `signal` would show without the states that were set."""
+        """Return the state that a programme of `signal` would show without the states that were
+        set."""
         logic = self._logic(signal, programme)
         return logic.phases[logic.currentPhaseIndex].state
 
@@ -262,10 +312,13 @@ class Session:
         return _accepted(libsumo.trafficlight.setRedYellowGreenState, signal, state)
 
     def limit_speed(self, edge: str, limits: list[float]) -> list[float]:
-        """Set the speed limits [m/s] of an edge, one per lane or one for all; return those before."""
+        """Set the speed limits [m/s] of an edge, one per lane or one for all; return those
+        before."""
         lanes = self._lanes(edge)
         before = [libsumo.lane.getMaxSpeed(lane) for lane in lanes]
-        for lane, limit in zip(lanes, limits * len(lanes) if len(limits) == 1 else limits, strict=True):
+        for lane, limit in zip(
+            lanes, limits * len(lanes) if len(limits) == 1 else limits, strict=True
+        ):
             libsumo.lane.setMaxSpeed(lane, limit)
         return before
 
@@ -284,7 +337,8 @@ def _accepted(order: Callable, *arguments: object) -> bool:
 
 
 def _flush_all() -> Callable[[], None] | None:
-    """Return OutputDevice::flushAll of SUMO, which is not in its API, by its name in the library of Linux and macOS."""
+    """Return OutputDevice::flushAll of SUMO, which is not in its API, by its name in the library of
+    Linux and macOS."""
     try:
         flush = ctypes.CDLL(libsumo._libsumo.__file__)["_ZN12OutputDevice8flushAllEv"]
     except (AttributeError, OSError):
@@ -294,14 +348,16 @@ def _flush_all() -> Callable[[], None] | None:
 
 
 def _keep_freed() -> None:
-    """Make glibc keep freed memory: new pages took a sixth of the time of a guided run in Luxembourg."""
+    """Make glibc keep freed memory: new pages took a sixth of the time of a guided run in
+    Luxembourg."""
     with suppress(AttributeError, OSError, TypeError):
         for option, size in KEPT_BYTES.items():
             ctypes.CDLL(None).mallopt(option, size)
 
 
 def start_quietly(command: list[str]) -> None:
-    """Start libsumo. Raises FatalTraCIError with what SUMO writes to stderr, which the library does not hand on."""
+    """Start libsumo. Raises FatalTraCIError with what SUMO writes to stderr, which the library does
+    not hand on."""
     with tempfile.TemporaryFile() as said:
         sys.stderr.flush()
         stderr = os.dup(2)
@@ -320,7 +376,9 @@ def start_quietly(command: list[str]) -> None:
         with suppress(BrokenPipeError):  # perhaps nobody reads on
             sys.stderr.write(words)
         return
-    lines = [line.removeprefix("Error: ") for line in words.splitlines() if line.startswith("Error: ")]
+    lines = [
+        line.removeprefix("Error: ") for line in words.splitlines() if line.startswith("Error: ")
+    ]
     raise libsumo.FatalTraCIError(lines[0] if lines else one_line(failure))
 
 

@@ -12,7 +12,11 @@ from cosim.sumo.xml_files import attribute, read_xml
 
 GREEN = frozenset("Gg")
 STATIC = "static"  # SUMO's type of fixed-time programmes
-HELD = (STATIC, "actuated", "delay_based")  # types that always show one of their phases: green can be taken away
+HELD = (
+    STATIC,
+    "actuated",
+    "delay_based",
+)  # types that always show one of their phases: green can be taken away
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +38,8 @@ def lane_id(link: Link) -> str:
 class Signal:
     """A signal with one programme of phases in a fixed order.
 
-    links: from streets open to cars, several may share an index; others: from streets closed to them, such as bus lanes
+    links: from streets open to cars, several may share an index; others: from streets closed to
+        them, such as bus lanes
     stages: numbers of the phases that are green for some link and yellow for none
     """
 
@@ -57,10 +62,12 @@ def is_stage(state: str) -> bool:
 def read_signals(
     city: City, additional: Iterable[Path] = (), kinds: Collection[str] = (STATIC,)
 ) -> tuple[list[Signal], list[str]]:
-    """Return the simple signals of the city, and the names of all others, which keep their programmes.
+    """Return the simple signals of the city, and the names of all others, which keep their
+    programmes.
 
-    Simple ones are of these `kinds`, with two stages or more, phases in order, and red, yellow and green only. Of
-    several programmes the last one counts, as in SUMO: first those of the network file, then of `additional` files.
+    Simple ones are of these `kinds`, with two stages or more, phases in order, and red, yellow and
+    green only. Of several programmes the last one counts, as in SUMO: first those of the network
+    file, then of `additional` files.
     """
     root = read_xml(city.net_file)
     links, closed = defaultdict[str, list[Link]](list), defaultdict[str, list[Link]](list)
@@ -68,26 +75,46 @@ def read_signals(
         source, target = attribute(connection, "from"), attribute(connection, "to")
         signal = connection.get("tl")
         if signal is not None and not source.startswith(":"):  # those are pedestrian crossings
-            index, lane = int(attribute(connection, "linkIndex")), int(attribute(connection, "fromLane"))
+            index, lane = (
+                int(attribute(connection, "linkIndex")),
+                int(attribute(connection, "fromLane")),
+            )
             link = Link(index=index, from_edge=source, lane=lane, to_edge=target)
-            (links if source in city.lanes and target in city.lanes else closed)[signal].append(link)
+            (links if source in city.lanes and target in city.lanes else closed)[signal].append(
+                link
+            )
     logics = {
-        attribute(logic, "id"): logic for file in (root, *map(read_xml, additional)) for logic in file.iter("tlLogic")
+        attribute(logic, "id"): logic
+        for file in (root, *map(read_xml, additional))
+        for logic in file.iter("tlLogic")
     }
-    signals = {name: _simple(logic, links[name], closed[name], kinds) for name, logic in sorted(logics.items())}
-    return [signal for signal in signals.values() if signal], [name for name, s in signals.items() if s is None]
+    signals = {
+        name: _simple(logic, links[name], closed[name], kinds)
+        for name, logic in sorted(logics.items())
+    }
+    return [signal for signal in signals.values() if signal], [
+        name for name, s in signals.items() if s is None
+    ]
 
 
 def phases_of(logic: ElementTree.Element) -> tuple[Phase, ...]:
     """Return the phases of a <tlLogic>."""
     rows = logic.iter("phase")
-    return tuple(Phase(duration=float(attribute(row, "duration")), state=attribute(row, "state")) for row in rows)
+    return tuple(
+        Phase(duration=float(attribute(row, "duration")), state=attribute(row, "state"))
+        for row in rows
+    )
 
 
 def _simple(
-    logic: ElementTree.Element, links: Iterable[Link], others: Iterable[Link], kinds: Collection[str]
+    logic: ElementTree.Element,
+    links: Iterable[Link],
+    others: Iterable[Link],
+    kinds: Collection[str],
 ) -> Signal | None:
-    ordered = logic.get("type", STATIC) in kinds and not any(row.get("next") for row in logic.iter("phase"))
+    ordered = logic.get("type", STATIC) in kinds and not any(
+        row.get("next") for row in logic.iter("phase")
+    )
     if not ordered or not links:
         return None
     name, offset, phases = attribute(logic, "id"), float(logic.get("offset", 0.0)), phases_of(logic)

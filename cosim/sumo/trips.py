@@ -20,7 +20,12 @@ DRIVER_CLASSES = 8  # groups of drivers who see different travel times
 CLASS_SPREAD = 0.15  # standard deviation of the logarithm of their travel times
 SHORT_EDGE_M = 30.0  # no trip starts or ends on a shorter edge if its region has longer ones
 POCKET_M = 80.0  # a longer edge is no turn pocket
-PLANNING_SEEDS = (778_001, 778_002, 778_003, 778_004)  # of trips that plans are made for, none of an evaluation
+PLANNING_SEEDS = (
+    778_001,
+    778_002,
+    778_003,
+    778_004,
+)  # of trips that plans are made for, none of an evaluation
 PEAK_S = 900.0  # the Highway Capacity Manual designs for the busiest quarter of the peak hour
 
 
@@ -40,10 +45,14 @@ class Trips:
     arrival: PerTrip
 
 
-def turning_flows(city: City, demand: PairsOverTime, step: float) -> Mapping[tuple[str, str], float]:
-    """Return (edge, next edge) -> flow [veh/s] in the busiest quarter of an hour of `demand` (T, R, R) [veh/s].
+def turning_flows(
+    city: City, demand: PairsOverTime, step: float
+) -> Mapping[tuple[str, str], float]:
+    """Return (edge, next edge) -> flow [veh/s] in the busiest quarter of an hour of `demand` (T, R,
+    R) [veh/s].
 
-    Trips take static routes without delays; the mean of several planning seeds. Unused movements are missing.
+    Trips take static routes without delays; the mean of several planning seeds. Unused movements
+    are missing.
     """
     window = min(PEAK_S, step * len(demand))
     turns: Counter[tuple[str, str]] = Counter()
@@ -66,12 +75,15 @@ def busiest(depart: PerTrip, window: float) -> slice:
 def make_trips(city: City, demand: PairsOverTime, step: float, seed: int) -> Trips:
     """Return individual trips of `demand` (T, R, R) [veh/s], intervals of `step` [s].
 
-    Every pair of regions gets its number of vehicles to within one, at the times at which its cumulated demand passes
-    whole numbers, shifted by a random phase. Edges are drawn by length times lanes. Each route is the fastest one in
-    free flow as one of `DRIVER_CLASSES` groups of drivers sees it. Raises InputError if no way leads from i to j.
+    Every pair of regions gets its number of vehicles to within one, at the times at which its
+    cumulated demand passes whole numbers, shifted by a random phase. Edges are drawn by length
+    times lanes. Each route is the fastest one in free flow as one of `DRIVER_CLASSES` groups of
+    drivers sees it. Raises InputError if no way leads from i to j.
     """
     if demand.shape[1:] != (city.regions, city.regions):
-        raise InputError(f"{city.net_file}: demand for {demand.shape[1]} regions, but the city has {city.regions}")
+        raise InputError(
+            f"{city.net_file}: demand for {demand.shape[1]} regions, but the city has {city.regions}"
+        )
     rng = np.random.default_rng([seed, STREAM])
     depart, origin, destination = _departures(demand, step, rng)
     starts = [_ends(city, region, departing=True) for region in range(city.regions)]
@@ -117,24 +129,31 @@ def _departures(
             count = int(np.floor(cumulated[-1] + phase))
             marks = np.arange(1, count + 1) - phase
             rising = np.concatenate([[True], np.diff(cumulated) > 0])
-            keep = rising | np.concatenate([rising[1:], [False]])  # the end of a pause begins the next rise
+            keep = rising | np.concatenate(
+                [rising[1:], [False]]
+            )  # the end of a pause begins the next rise
             times.append(np.interp(marks, cumulated[keep], clock[keep]))
             origins.append(np.full(count, i))
             destinations.append(np.full(count, j))
-    times, origins, destinations = (np.concatenate(parts) for parts in (times, origins, destinations))
+    times, origins, destinations = (
+        np.concatenate(parts) for parts in (times, origins, destinations)
+    )
     times = np.floor(times * 100) / 100
     order = np.lexsort((destinations, origins, times))
     return times[order], origins[order], destinations[order]
 
 
 def _ends(city: City, region: int, *, departing: bool) -> tuple[list[str], np.ndarray]:
-    """Return the edges where trips of a region start or end, with cumulated weights: if there are any, good ones."""
+    """Return the edges where trips of a region start or end, with cumulated weights: if there are
+    any, good ones."""
     edges = [edge for edge in city.edges if city.region_of[edge] == region]
     onward: Mapping[str, Sequence[str]] = city.successors if departing else city.before
     good = [
         edge
         for edge in edges
-        if _stays(city, edge, onward) and city.length[edge] >= SHORT_EDGE_M and not _is_pocket(city, edge)
+        if _stays(city, edge, onward)
+        and city.length[edge] >= SHORT_EDGE_M
+        and not _is_pocket(city, edge)
     ]
     ends = good if len(good) >= 2 else edges
     weights = np.cumsum([city.length[edge] * city.lanes[edge] for edge in ends])
@@ -174,7 +193,10 @@ def perception(edges: int, rng: np.random.Generator) -> Float[np.ndarray, "class
 
 
 def routes_in(
-    city: City, ends: tuple[TripNumbers, TripNumbers], tastes: TripNumbers, noise: Float[np.ndarray, "classes E"]
+    city: City,
+    ends: tuple[TripNumbers, TripNumbers],
+    tastes: TripNumbers,
+    noise: Float[np.ndarray, "classes E"],
 ) -> list[tuple[str, ...]]:
     """Return `fastest_routes` in a city, as ids of edges."""
     moves = [(a, b) for a, after in city.successors.items() for b in after]
@@ -183,7 +205,9 @@ def routes_in(
         tastes,
         noise,
         time=np.array([city.length[edge] / city.speed[edge] for edge in city.edges]),
-        links=np.array([(city.number[a], city.number[b]) for a, b in moves], dtype=int).reshape(-1, 2),
+        links=np.array([(city.number[a], city.number[b]) for a, b in moves], dtype=int).reshape(
+            -1, 2
+        ),
         turn=np.array([city.turn_time[move] for move in moves]),
     )
     return [tuple(city.edges[edge] for edge in route) for route in routes]
@@ -201,7 +225,8 @@ def fastest_routes(
     """Return the fastest route in free flow of every trip as numbers of edges, () if there is none.
 
     ends: first and last edge (N,) of the trips; tastes: (N,), class of each driver
-    noise: [-], factor of every class of drivers on time [s] of the edges; turn: [s] over the junction of each link
+    noise: [-], factor of every class of drivers on time [s] of the edges; turn: [s] over the
+        junction of each link
     """
     first, last = ends
     routes: list[tuple[int, ...]] = [()] * len(first)
@@ -214,7 +239,9 @@ def fastest_routes(
             if len(chunk):
                 _, before = dijkstra(graph, indices=chunk, return_predecessors=True)
                 for n in members[np.isin(first[members], chunk)]:
-                    routes[n] = _walk(before[np.searchsorted(chunk, first[n])], int(first[n]), int(last[n]))
+                    routes[n] = _walk(
+                        before[np.searchsorted(chunk, first[n])], int(first[n]), int(last[n])
+                    )
     return routes
 
 

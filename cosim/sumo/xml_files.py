@@ -11,7 +11,8 @@ from pathlib import Path
 from nmfd.errors import InputError
 from nmfd.runs.files import check_file
 
-# Errors of a file that is cut off, no XML, in an unknown encoding, or with missing or wrong attributes.
+# Errors of a file that is cut off, no XML, in an unknown encoding, or with missing or wrong
+# attributes.
 BROKEN = (OSError, EOFError, zlib.error, ElementTree.ParseError, LookupError, TypeError, ValueError)
 MAX_INCLUDE_DEPTH = 20  # of files that include each other
 
@@ -25,7 +26,8 @@ def attribute(element: ElementTree.Element, name: str) -> str:
 
 
 def child(element: ElementTree.Element, tag: str) -> ElementTree.Element:
-    """Return the first required element `tag` directly below `element`. Raises ValueError, one of BROKEN."""
+    """Return the first required element `tag` directly below `element`. Raises ValueError, one of
+    BROKEN."""
     below = element.find(tag)
     if below is None:
         raise ValueError(f"{element.tag}: {tag}: missing")
@@ -33,23 +35,33 @@ def child(element: ElementTree.Element, tag: str) -> ElementTree.Element:
 
 
 def read_xml(path: Path, depth: int = 0) -> ElementTree.Element:
-    """Return the root of an XML file with the files that it includes (<include href="..."/>). Raises InputError."""
+    """Return the root of an XML file with the files that it includes (<include href="..."/>).
+    Raises InputError."""
     with stream_of(path) as stream:
         root = ElementTree.parse(stream).getroot()
     if depth > MAX_INCLUDE_DEPTH:
-        raise InputError(f"{path}: include: files include each other without end; remove one of the includes")
+        raise InputError(
+            f"{path}: include: files include each other without end; remove one of the includes"
+        )
     parts: list[ElementTree.Element] = []
     for part in root:
-        parts += read_xml(path.parent / part.get("href", ""), depth + 1) if part.tag == "include" else [part]
+        parts += (
+            read_xml(path.parent / part.get("href", ""), depth + 1)
+            if part.tag == "include"
+            else [part]
+        )
     root[:] = parts
     return root
 
 
 @contextmanager
 def stream_of(
-    path: Path, kind: str = "an XML file that SUMO could read", remedy: str = "correct or replace it"
+    path: Path,
+    kind: str = "an XML file that SUMO could read",
+    remedy: str = "correct or replace it",
 ) -> Iterator[io.BufferedIOBase]:
-    """Yield a binary stream, unzipped if it is a .gz file. Raises InputError, for one of BROKEN in the block, too."""
+    """Yield a binary stream, unzipped if it is a .gz file. Raises InputError, for one of BROKEN in
+    the block, too."""
     check_file(path)
     try:
         with gzip.open(path, "rb") if path.suffix == ".gz" else path.open("rb") as stream:
@@ -62,7 +74,8 @@ def stream_of(
 
 @contextmanager
 def network_root(net: Path) -> Iterator[ElementTree.Element]:
-    """Yield the root of a SUMO network. Raises InputError if it is none, or if the block misses a part of it."""
+    """Yield the root of a SUMO network. Raises InputError if it is none, or if the block misses a
+    part of it."""
     with stream_of(net, "a SUMO network", "build it with netconvert") as stream:
         root = ElementTree.parse(stream).getroot()
         if root.tag != "net":
@@ -71,8 +84,11 @@ def network_root(net: Path) -> Iterator[ElementTree.Element]:
 
 
 def file_list(files: Sequence[Path]) -> str:
-    """Return files as an option of SUMO. Raises InputError for a path with a comma, which separates files there."""
+    """Return files as an option of SUMO. Raises InputError for a path with a comma, which separates
+    files there."""
     for file in files:
         if "," in str(file):
-            raise InputError(f"{file}: SUMO cannot read a file with a comma in its path; rename it, or its folder")
+            raise InputError(
+                f"{file}: SUMO cannot read a file with a comma in its path; rename it, or its folder"
+            )
     return ",".join(map(str, files))

@@ -5,7 +5,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bokeh.models import ColorBar, ColumnDataSource, CustomJS, FixedTicker, HoverTool, LinearColorMapper, ScaleBar
+from bokeh.models import (
+    ColorBar,
+    ColumnDataSource,
+    CustomJS,
+    FixedTicker,
+    HoverTool,
+    LinearColorMapper,
+    ScaleBar,
+)
 from bokeh.plotting import figure
 from bokeh.transform import linear_cmap
 
@@ -19,7 +27,9 @@ DENSEST = 1000.0 / JAM_SPACING  # veh/km and lane
 LINE_OFFSET = 0.006  # of the map's width, by which the two directions of a street are drawn apart
 MAP_HEIGHT = 440  # pixels
 GATE_RADIUS = 6.0  # pixels
-CLOSER = 0.7  # of the map's extent: within so much every gate is shown, and further out every boundary
+CLOSER = (
+    0.7  # of the map's extent: within so much every gate is shown, and further out every boundary
+)
 
 
 class CityMap:
@@ -28,13 +38,31 @@ class CityMap:
     layers: label -> what shows the streets by this quantity; all but the first, DENSITY, are hidden
     """
 
-    def __init__(self, picture: CityPicture, title: str, totals: Mapping[str, tuple], beside: "CityMap | None" = None):
-        """totals: label -> values (E,) of other layers, and the upper end of their scale; beside: map to move with"""
+    def __init__(
+        self,
+        picture: CityPicture,
+        title: str,
+        totals: Mapping[str, tuple],
+        beside: "CityMap | None" = None,
+    ):
+        """totals: label -> values (E,) of other layers, and the upper end of their scale; beside:
+        map to move with"""
         self._picture, self._totals = picture, totals
         self.layers: dict[str, list[Any]] = {}
-        size = {"height": MAP_HEIGHT, "sizing_mode": "stretch_width", "match_aspect": True, "lod_threshold": None}
-        bare = {"tools": "pan,wheel_zoom,reset", "toolbar_location": None, "outline_line_color": None}
-        common = {axis: getattr(beside.plot, axis) for axis in ("x_range", "y_range")} if beside else {}
+        size = {
+            "height": MAP_HEIGHT,
+            "sizing_mode": "stretch_width",
+            "match_aspect": True,
+            "lod_threshold": None,
+        }
+        bare = {
+            "tools": "pan,wheel_zoom,reset",
+            "toolbar_location": None,
+            "outline_line_color": None,
+        }
+        common = (
+            {axis: getattr(beside.plot, axis) for axis in ("x_range", "y_range")} if beside else {}
+        )
         self.plot: Any = figure(title=title, active_scroll="wheel_zoom", **size, **bare, **common)
         self.plot.axis.visible = self.plot.grid.visible = False
         self.regions = self._add_regions()
@@ -47,14 +75,18 @@ class CityMap:
         for part in near_parts:
             part.visible = False
         limit = CLOSER * float(np.ptp(np.concatenate(picture.shapes), axis=0).max())
-        code = CustomJS.from_file(Path(__file__).with_name("gates.js"), far=far_parts, near=near_parts, limit=limit)
+        code = CustomJS.from_file(
+            Path(__file__).with_name("gates.js"), far=far_parts, near=near_parts, limit=limit
+        )
         self.plot.x_range.js_on_change("end", code)
 
     def show(self, frame: Frame) -> None:
         """Draw a frame."""
         patch(self.streets, density=frame.density)
         for source, members in zip(self.gates, self._members, strict=True):
-            share, queue = (np.array([mean(x[n]) for n in members]) for x in (frame.green, frame.queue))
+            share, queue = (
+                np.array([mean(x[n]) for n in members]) for x in (frame.green, frame.queue)
+            )
             patch(
                 source,
                 end=_wedge_end(np.nan_to_num(np.clip(share, 0.0, 1.0), nan=1.0)),
@@ -82,7 +114,9 @@ class CityMap:
             line=[colours.FAINT] * len(rings),
             fill=[colours.LAND] * len(rings),
         )
-        self.plot.patches("xs", "ys", source=source, fill_color="fill", line_color="line", line_width="width")
+        self.plot.patches(
+            "xs", "ys", source=source, fill_color="fill", line_color="line", line_width="width"
+        )
         return source
 
     def _add_streets(self) -> ColumnDataSource:
@@ -101,7 +135,9 @@ class CityMap:
             self._add_layer(source, label, label, top, [0.0, top / 2.0, top])
         return source
 
-    def _add_layer(self, source: ColumnDataSource, column: str, label: str, top: float, ticks: list[float]) -> None:
+    def _add_layer(
+        self, source: ColumnDataSource, column: str, label: str, top: float, ticks: list[float]
+    ) -> None:
         shown, colour = not self.layers, linear_cmap(column, colours.SCALE, 0.0, top)
         bar = colour_bar(colour.transform, label, ticks)
         bar.visible = shown
@@ -127,11 +163,27 @@ class CityMap:
             radius=np.where(signal, GATE_RADIUS, 0.0),
             rim=[colours.INK if one else colours.FAINT for one in signal],
         )
-        halo = self.plot.scatter("x", "y", size="halo", source=source, color=colours.QUEUE, alpha=0.3, line_color=None)
-        discs = self.plot.scatter("x", "y", size="size", source=source, fill_color=colours.PAPER, line_color="rim")
-        share = {"start_angle": np.pi / 2, "end_angle": "end", "direction": "clock", "radius_units": "screen"}
-        wedges = self.plot.wedge("x", "y", "radius", source=source, color=colours.GREEN, line_color=None, **share)
-        self._hover(discs, ("gate", "@way"), ("green / original green", "@green"), ("mean queue [veh]", "@queue{0.0}"))
+        halo = self.plot.scatter(
+            "x", "y", size="halo", source=source, color=colours.QUEUE, alpha=0.3, line_color=None
+        )
+        discs = self.plot.scatter(
+            "x", "y", size="size", source=source, fill_color=colours.PAPER, line_color="rim"
+        )
+        share = {
+            "start_angle": np.pi / 2,
+            "end_angle": "end",
+            "direction": "clock",
+            "radius_units": "screen",
+        }
+        wedges = self.plot.wedge(
+            "x", "y", "radius", source=source, color=colours.GREEN, line_color=None, **share
+        )
+        self._hover(
+            discs,
+            ("gate", "@way"),
+            ("green / original green", "@green"),
+            ("mean queue [veh]", "@queue{0.0}"),
+        )
         return source, [halo, discs, wedges]
 
     def _add_numbers(self) -> None:
@@ -143,8 +195,14 @@ class CityMap:
         self.plot.scatter(x, y, size=24, fill_color=fill, fill_alpha=0.9, line_color=colours.INK)
         middle = {"text_align": "center", "text_baseline": "middle", "text_font_size": "12px"}
         self.plot.text(x, y, text=labels, text_color=ink, **middle)
-        clear = {"background_fill_alpha": 0.0, "border_line_alpha": 0.0, "label_text_font_size": "11px"}
-        scale = ScaleBar(range=self.plot.x_range, unit="m", location="bottom_left", bar_length=0.15, **clear)
+        clear = {
+            "background_fill_alpha": 0.0,
+            "border_line_alpha": 0.0,
+            "label_text_font_size": "11px",
+        }
+        scale = ScaleBar(
+            range=self.plot.x_range, unit="m", location="bottom_left", bar_length=0.15, **clear
+        )
         self.plot.add_layout(scale)
 
     def _hover(self, renderer: Any, *tooltips: tuple[str, str]) -> None:
@@ -154,7 +212,9 @@ class CityMap:
 def patch(source: ColumnDataSource, **columns: Any) -> None:
     """Replace whole columns, numbers as float32, without sending the others again."""
     if len(next(iter(columns.values()))):
-        source.patch({name: [(slice(len(values)), values)] for name, values in _floats(columns).items()})
+        source.patch(
+            {name: [(slice(len(values)), values)] for name, values in _floats(columns).items()}
+        )
 
 
 def mean(values: np.ndarray) -> float:
@@ -165,9 +225,21 @@ def mean(values: np.ndarray) -> float:
 
 def colour_bar(mapper: LinearColorMapper, title: str, ticks: list[float]) -> ColorBar:
     """Return a small horizontal scale to stand below a plot."""
-    size = {"height": 8, "width": 220, "location": (0, 0), "padding": 4, "orientation": "horizontal"}
-    text = {"title_text_font_size": "11px", "title_text_color": colours.FAINT, "major_label_text_font_size": "11px"}
-    return ColorBar(color_mapper=mapper, title=title, ticker=FixedTicker(ticks=ticks), **size, **text)
+    size = {
+        "height": 8,
+        "width": 220,
+        "location": (0, 0),
+        "padding": 4,
+        "orientation": "horizontal",
+    }
+    text = {
+        "title_text_font_size": "11px",
+        "title_text_color": colours.FAINT,
+        "major_label_text_font_size": "11px",
+    }
+    return ColorBar(
+        color_mapper=mapper, title=title, ticker=FixedTicker(ticks=ticks), **size, **text
+    )
 
 
 def _wedge_end(share: np.ndarray | float) -> np.ndarray:
@@ -177,7 +249,10 @@ def _wedge_end(share: np.ndarray | float) -> np.ndarray:
 
 def _floats(columns: dict[str, Any]) -> dict[str, Any]:
     """Return columns with arrays as float32."""
-    return {name: x.astype(np.float32) if isinstance(x, np.ndarray) else x for name, x in columns.items()}
+    return {
+        name: x.astype(np.float32) if isinstance(x, np.ndarray) else x
+        for name, x in columns.items()
+    }
 
 
 def _source(**columns: Any) -> ColumnDataSource:
@@ -185,7 +260,10 @@ def _source(**columns: Any) -> ColumnDataSource:
 
 
 def _lines(shapes: Sequence[Points]) -> dict[str, Any]:
-    return {name: [shape[:, n].astype(np.float32) for shape in shapes] for n, name in enumerate(("xs", "ys"))}
+    return {
+        name: [shape[:, n].astype(np.float32) for shape in shapes]
+        for n, name in enumerate(("xs", "ys"))
+    }
 
 
 def _to_the_right(shape: np.ndarray, distance: float) -> np.ndarray:

@@ -1,4 +1,5 @@
-"""The live page: runs in processes of their own, and the Bokeh server that shows them on this machine."""
+"""The live page: runs in processes of their own, and the Bokeh server that shows them on this
+machine."""
 
 import logging
 import multiprocessing
@@ -35,12 +36,18 @@ REFRESH_MS = 250  # between two pictures
 FRAME_RATE = 8.0  # frames per second of wall time within control intervals, at most
 HOLD_PERIOD_S = 0.05  # between two looks at the page by a run that is held
 OPENING_S = 10.0  # time to open the page of runs that have ended
-PACES = {"as fast as possible": 0.0, "slow": 0.02, "slower": 0.1, "slowest": 0.5}  # wall time per simulated second [s]
+PACES = {
+    "as fast as possible": 0.0,
+    "slow": 0.02,
+    "slower": 0.1,
+    "slowest": 0.5,
+}  # wall time per simulated second [s]
 
 
 @dataclass
 class Seen:
-    """One run as shown so far: frames at the ends of control intervals, the last frame, and summary or failure."""
+    """One run as shown so far: frames at the ends of control intervals, the last frame, and summary
+    or failure."""
 
     name: str
     whole: list[Frame] = field(default_factory=list)
@@ -63,7 +70,8 @@ class Seen:
 class Show:
     """Runs side by side, each in its own process, at a common pace.
 
-    going: event that is clear while the runs are held; delay: shared value, least wall time per simulated second [s]
+    going: event that is clear while the runs are held; delay: shared value, least wall time per
+        simulated second [s]
     """
 
     def __init__(self, jobs: Sequence[Simulation]):
@@ -74,7 +82,9 @@ class Show:
         self.going, self.delay = spawn.Event(), spawn.Value("d", 0.0)
         self.going.set()
         self._processes = [
-            spawn.Process(target=run, args=(n, job, self._messages, self.going, self.delay), daemon=True)
+            spawn.Process(
+                target=run, args=(n, job, self._messages, self.going, self.delay), daemon=True
+            )
             for n, job in enumerate(jobs)
         ]
         for process in self._processes:
@@ -88,14 +98,22 @@ class Show:
     @property
     def now(self) -> float:
         """Return the time [s] that all runs without an error have reached."""
-        return min((seen.latest.time for seen in self.runs if seen.latest and not seen.error), default=0.0)
+        return min(
+            (seen.latest.time for seen in self.runs if seen.latest and not seen.error), default=0.0
+        )
 
     def update(self) -> None:
         """Take what the runs have sent."""
-        ended = [not process.is_alive() for process in self._processes]  # before their last messages are read
+        ended = [
+            not process.is_alive() for process in self._processes
+        ]  # before their last messages are read
         with suppress(queue.Empty):
             while True:
-                n, message = self._messages.get_nowait() if not any(ended) else self._messages.get(timeout=0.05)
+                n, message = (
+                    self._messages.get_nowait()
+                    if not any(ended)
+                    else self._messages.get(timeout=0.05)
+                )
                 if isinstance(message, CityPicture):
                     self.picture = self.picture or message
                 elif isinstance(message, Frame):
@@ -107,7 +125,9 @@ class Show:
                     self.runs[n].row = message
         for seen, gone, process in zip(self.runs, ended, self._processes, strict=True):
             if gone and not seen.over:
-                seen.error = RunFailed(f"{seen.name}: its process ended with exit code {process.exitcode}")
+                seen.error = RunFailed(
+                    f"{seen.name}: its process ended with exit code {process.exitcode}"
+                )
 
     def close(self) -> None:
         """End the runs that are still under way."""
@@ -128,7 +148,8 @@ def run(n: int, job: Simulation, messages: Any, going: Any, delay: Any) -> None:
 
 
 class Reporter(Observer):
-    """The observer of one run: it sends frames and holds the run to the pace; the run stays the same otherwise."""
+    """The observer of one run: it sends frames and holds the run to the pace; the run stays the
+    same otherwise."""
 
     def __init__(self, n: int, scenario: Scenario, messages: Any, going: Any, delay: Any):
         """going, delay: as in `Show`"""
@@ -184,7 +205,9 @@ class Viewer:
         self._traced: tuple[object, ...] = ()
         self._pause = Button(label="Pause", button_type="primary", name="pause", width=90)
         self._pause.on_click(self._toggle)
-        pace = Select(title="Pace", name="pace", width=170, value=next(iter(PACES)), options=list(PACES))
+        pace = Select(
+            title="Pace", name="pace", width=170, value=next(iter(PACES)), options=list(PACES)
+        )
         pace.on_change("value", lambda _, __, new: setattr(show.delay, "value", PACES[new]))
         self._page.regions.on_change("value", lambda _, __, new: self._choose(int(new)))
         document.title = f"{show.picture.name}: {' against '.join(self._page.names)}"
@@ -195,7 +218,9 @@ class Viewer:
     def refresh(self) -> None:
         """Draw what has changed."""
         show, now = self._show, self._show.now
-        self._pause.label = "Finished" if show.over else ("Pause" if show.going.is_set() else "Go on")
+        self._pause.label = (
+            "Finished" if show.over else ("Pause" if show.going.is_set() else "Go on")
+        )
         self._pause.disabled = show.over
         self._page.show([seen.at(now) for seen in show.runs], now)
         runs = [[frame for frame in seen.whole if frame.time <= now] for seen in show.runs]
@@ -217,7 +242,8 @@ def watch(jobs: Sequence[Simulation], *, port: int = 0, browse: bool = False) ->
     """Do simulations side by side with a live page until they have ended and the page is closed.
 
     port: of the page on this machine; 0 for a free one
-    Raises: InputError for a port in use or a strategy that cannot run in the city, RunFailed if a run failed
+    Raises: InputError for a port in use or a strategy that cannot run in the city, RunFailed if a
+    run failed
     """
     logging.getLogger("bokeh").setLevel(logging.ERROR)
     show = Show(jobs)
@@ -246,7 +272,9 @@ def _serve(show: Show, port: int, browse: bool) -> None:
             check_unused_sessions_milliseconds=1000,
         )
     except OSError as error:
-        raise InputError(f"--port {port}: cannot be used ({error.strerror}); choose another one") from None
+        raise InputError(
+            f"--port {port}: cannot be used ({error.strerror}); choose another one"
+        ) from None
     ended_at: float | None = None
 
     def update() -> None:

@@ -1,4 +1,5 @@
-"""The page of one or two runs: maps, curves and numbers, live or with a slider over a finished run."""
+"""The page of one or two runs: maps, curves and numbers, live or with a slider over a finished
+run."""
 
 from collections.abc import Mapping, Sequence
 from html import escape
@@ -31,13 +32,25 @@ KEY = (
 class Page:
     """Maps, curves and numbers of runs side by side."""
 
-    def __init__(self, picture: CityPicture, tones: Mapping[str, str], totals: Mapping[str, Sequence[PerEdge]] = {}):
-        """tones: name of a run -> its colour; totals: label -> values (E,) of every run, other layers of the maps"""
+    def __init__(
+        self,
+        picture: CityPicture,
+        tones: Mapping[str, str],
+        totals: Mapping[str, Sequence[PerEdge]] = {},
+    ):
+        """tones: name of a run -> its colour; totals: label -> values (E,) of every run, other
+        layers of the maps"""
         self.picture, self.names, self.tones = picture, list(tones), tones
         # Above a scale is only TOP_SHARE of the values of all runs; its upper end has two digits.
-        upper = {label: np.quantile(np.concatenate(values), 1.0 - TOP_SHARE) for label, values in totals.items()}
+        upper = {
+            label: np.quantile(np.concatenate(values), 1.0 - TOP_SHARE)
+            for label, values in totals.items()
+        }
         tops = {label: float(f"{end:.2g}") or 1.0 for label, end in upper.items()}
-        short = [name if len(name) <= LONGEST else f"{name[:14]}…{name[15 - LONGEST :]}" for name in tones]
+        short = [
+            name if len(name) <= LONGEST else f"{name[:14]}…{name[15 - LONGEST :]}"
+            for name in tones
+        ]
         titles = short if len(set(short)) == len(short) else self.names
         self.maps: list[CityMap] = []
         for n, name in enumerate(titles):
@@ -45,15 +58,24 @@ class Page:
             self.maps.append(CityMap(picture, name, layers, self.maps[0] if n else None))
         parts_of = [[label, parts] for one in self.maps for label, parts in one.layers.items()]
         labels = list(self.maps[0].layers)
-        self.streets = Select(title="Streets by", name="streets", width=210, value=labels[0], options=labels)
+        self.streets = Select(
+            title="Streets by", name="streets", width=210, value=labels[0], options=labels
+        )
         self.streets.js_on_change("value", CustomJS.from_file(HERE / "layers.js", layers=parts_of))
         self.loads = [Load(picture, f"{name}: load") for name in titles]
         self.curves = Curves(picture, dict(zip(titles, tones.values(), strict=True)))
-        self.numbers = Div(sizing_mode="stretch_width", css_classes=["numbers"], stylesheets=[STYLE])
+        self.numbers = Div(
+            sizing_mode="stretch_width", css_classes=["numbers"], stylesheets=[STYLE]
+        )
         ends = [region for gate in picture.gates for region in (gate.source, gate.target)]
         self.choose(max(range(picture.regions), key=ends.count))
-        options = [(str(n), name if name == str(n) else f"{n} {name}") for n, name in enumerate(picture.region_names)]
-        self.regions = Select(name="region", title="Region", width=150, value=str(self.region), options=options)
+        options = [
+            (str(n), name if name == str(n) else f"{n} {name}")
+            for n, name in enumerate(picture.region_names)
+        ]
+        self.regions = Select(
+            name="region", title="Region", width=150, value=str(self.region), options=options
+        )
 
     def choose(self, region: int) -> None:
         """Select the region whose curves are shown; `trace` draws them."""
@@ -82,7 +104,9 @@ class Page:
         """Return the page as one model, with `bar` above it."""
         curves = self.curves
         pair = [curves.region, curves.plane]
-        beside, below = ([], pair) if len(self.maps) > 1 else ([column(*pair, sizing_mode="stretch_width")], [])
+        beside, below = (
+            ([], pair) if len(self.maps) > 1 else ([column(*pair, sizing_mode="stretch_width")], [])
+        )
         for n, one in enumerate(self.maps):
             one.plot.name = f"map{n}"
         curves.plane.name, curves.trips.name = "plane", "trips"
@@ -101,18 +125,24 @@ class Page:
 
 
 def with_slider(
-    picture: CityPicture, runs: Mapping[str, Sequence[Frame]], tones: Mapping[str, str], totals: Mapping[str, Any] = {}
+    picture: CityPicture,
+    runs: Mapping[str, Sequence[Frame]],
+    tones: Mapping[str, str],
+    totals: Mapping[str, Any] = {},
 ) -> LayoutDOM:
     """Return the page of finished runs, which needs no server.
 
-    It starts where two runs differ most while vehicles drive in both, or where one has most vehicles.
+    It starts where two runs differ most while vehicles drive in both, or where one has most
+    vehicles.
     runs: whole frames by name; tones: colours of these and perhaps others; totals: as in `Page`
     """
     page, whole = Page(picture, {name: tones[name] for name in runs}, totals), list(runs.values())
     last, step = max(map(len, whole)) - 1, picture.step / MINUTE
     padded = [[*frames, *[frames[-1]] * (last + 1 - len(frames))] for frames in whole]
     inside = np.array([[frame.accumulation.sum() for frame in frames] for frames in padded])
-    begin = int(np.argmax(np.ptp(inside, axis=0) * inside.min(axis=0) if len(inside) > 1 else inside[0]))
+    begin = int(
+        np.argmax(np.ptp(inside, axis=0) * inside.min(axis=0) if len(inside) > 1 else inside[0])
+    )
     moving = [
         *((one.streets, ["density"]) for one in page.maps),
         *((source, ["end", "green", "queue", "halo"]) for one in page.maps for source in one.gates),
@@ -123,7 +153,10 @@ def with_slider(
         *((source, ["x", "y"]) for source in (page.curves.critical, page.curves.mfd)),
     ]
     film, choices = (
-        [[source, ColumnDataSource({name: [] for name in names}), names] for source, names in sources]
+        [
+            [source, ColumnDataSource({name: [] for name in names}), names]
+            for source, names in sources
+        ]
         for sources in (moving, of_region)
     )
     words, first = [], page.region
@@ -142,11 +175,22 @@ def with_slider(
     page.trace(whole, begin * picture.step)
     page.show([frames[begin] for frames in padded], begin * picture.step)
     wide = {"sizing_mode": "stretch_width", "styles": {"flex": "1 1 200px"}}
-    slider = Slider(start=0.0, end=last * step, value=begin * step, step=step, title="time [min]", name="time", **wide)
+    slider = Slider(
+        start=0.0,
+        end=last * step,
+        value=begin * step,
+        step=step,
+        title="time [min]",
+        name="time",
+        **wide,
+    )
     play = Toggle(label="Play", name="play", width=90, button_type="primary")
     args = {"slider": slider, "region": page.regions, "film": film, "choices": choices}
     args |= {"titles": page.curves.titles, "texts": texts, "numbers": page.numbers, "words": words}
-    args |= {"present": page.curves.present, "spans": [*(load.now for load in page.loads), *page.curves.now]}
+    args |= {
+        "present": page.curves.present,
+        "spans": [*(load.now for load in page.loads), *page.curves.now],
+    }
     callback = CustomJS.from_file(HERE / "slider.js", **args)
     slider.js_on_change("value", callback)
     page.regions.js_on_change("value", callback)
@@ -162,7 +206,9 @@ def _add_row(tables: Sequence[Sequence[Any]]) -> None:
     for source, table, names in tables:
         for name in names:
             values = source.data[name]
-            table.data[name].append(values.copy() if isinstance(values, np.ndarray) else list(values))
+            table.data[name].append(
+                values.copy() if isinstance(values, np.ndarray) else list(values)
+            )
 
 
 def _wrapped(parts: Sequence[LayoutDOM], narrowest: int = NARROWEST) -> LayoutDOM:
@@ -174,14 +220,28 @@ def _wrapped(parts: Sequence[LayoutDOM], narrowest: int = NARROWEST) -> LayoutDO
 
 def numbers(tones: Mapping[str, str], frames: Sequence[Frame | None], time: float) -> str:
     """Return the totals of the runs at a time [s], as an HTML table."""
-    labels = ("inside [veh]", "waiting [veh]", "completed [veh]", "time spent [veh&nbsp;h]", "removed [veh]")
+    labels = (
+        "inside [veh]",
+        "waiting [veh]",
+        "completed [veh]",
+        "time spent [veh&nbsp;h]",
+        "removed [veh]",
+    )
     heads = "".join(f"<td class=head>{label}</td>" for label in labels)
     lines = []
     for (name, colour), frame in zip(tones.items(), frames, strict=True):
         cells = ""
         if frame is not None:
-            totals = [frame.accumulation.sum(), frame.waiting, frame.completed, frame.time_spent / HOUR, frame.removed]
+            totals = [
+                frame.accumulation.sum(),
+                frame.waiting,
+                frame.completed,
+                frame.time_spent / HOUR,
+                frame.removed,
+            ]
             cells = "".join(f"<td>{value:,.0f}</td>" for value in totals)
             cells += f"<td class=note>{escape(frame.note[:200])}</td>"
-        lines.append(f"<tr><th><span style='color:{colour}'>■</span> {escape(name)}</th>{cells}</tr>")
+        lines.append(
+            f"<tr><th><span style='color:{colour}'>■</span> {escape(name)}</th>{cells}</tr>"
+        )
     return f"<table><tr><th class=time>{time / MINUTE:.1f} min</th>{heads}</tr>{''.join(lines)}</table>"

@@ -29,7 +29,8 @@ ROW = (  # variables of a result that `after` reads
 class Gate:
     """A place where an edge ends at a boundary.
 
-    source, target: regions; place: (x, y) [m]; gateways: their numbers in the city; signal: True if controlled
+    source, target: regions; place: (x, y) [m]; gateways: their numbers in the city; signal: True if
+        controlled
     """
 
     source: int
@@ -46,7 +47,8 @@ class CityPicture:
     name: of the scenario; region_names: R; edges: E ids; shapes: E lines (n, 2) [m]
     lane_km: (E,) length times lanes; lanes, region: (E,)
     outlines: rings (n, 2) [m] of every region; places: (R, 2) [m] of its number
-    protected: regions; critical: (R,) [veh], NaN where not seen; curves: R MFDs (n, 2) in veh and veh/s
+    protected: regions; critical: (R,) [veh], NaN where not seen; curves: R MFDs (n, 2) in veh and
+        veh/s
     step: control interval [s]; steps: number of them
     """
 
@@ -73,7 +75,8 @@ class CityPicture:
 
     @property
     def boundaries(self) -> tuple[Gate, ...]:
-        """One gate from a region to another for all between them, the controlled ones if there are any."""
+        """One gate from a region to another for all between them, the controlled ones if there are
+        any."""
         merged = []
         setback = BOUNDARY_SETBACK * float(np.ptp(np.concatenate(self.shapes), axis=0).max())
         for ends in dict.fromkeys((gate.source, gate.target) for gate in self.gates):
@@ -92,13 +95,17 @@ class CityPicture:
         shapes, network = edge_shapes(city), scenario.network
         region = city.edge_region
         middles = np.array([shape.mean(axis=0) for shape in shapes])
-        axes = [np.linspace(0.0, min(mfd.jam, CURVE_END * mfd.critical), CURVE_POINTS) for mfd in network.mfds]
+        axes = [
+            np.linspace(0.0, min(mfd.jam, CURVE_END * mfd.critical), CURVE_POINTS)
+            for mfd in network.mfds
+        ]
         return cls(
             name=scenario.name,
             region_names=network.region_names,
             edges=city.edges,
             shapes=shapes,
-            lane_km=np.array([city.length[edge] * city.lanes[edge] for edge in city.edges]) / 1000.0,
+            lane_km=np.array([city.length[edge] * city.lanes[edge] for edge in city.edges])
+            / 1000.0,
             lanes=np.array([city.lanes[edge] for edge in city.edges]),
             region=region,
             outlines=rings_round(shapes, region, REGION_REACH),
@@ -106,7 +113,10 @@ class CityPicture:
             gates=_gates(city, dict(zip(city.edges, shapes, strict=True))),
             protected=scenario.protected,
             critical=network.seen_critical,
-            curves=[np.stack([x, mfd.outflow(x)], axis=1) for x, mfd in zip(axes, network.mfds, strict=True)],
+            curves=[
+                np.stack([x, mfd.outflow(x)], axis=1)
+                for x, mfd in zip(axes, network.mfds, strict=True)
+            ],
             step=scenario.step,
             steps=scenario.steps,
         )
@@ -117,9 +127,11 @@ class Frame:
     """The city at one moment; flows and signals are those of the last complete control interval.
 
     time: since the start [s]; intervals: completed ones; whole: True at the end of an interval
-    density: (E,) [veh/km and lane]; accumulation: (R,) [veh]; outflow: (R,) [veh/s]; waiting: to enter [veh]
+    density: (E,) [veh/km and lane]; accumulation: (R,) [veh]; outflow: (R,) [veh/s]; waiting: to
+        enter [veh]
     completed, removed: since the start [veh]
-    time_spent: total since the start [veh s]; perimeter: (R, R) commanded u; green: (G,) share of the original green,
+    time_spent: total since the start [veh s]; perimeter: (R, R) commanded u; green: (G,) share of
+        the original green,
     NaN without control; queue: (G,) halting vehicles; note: a warning
     """
 
@@ -165,7 +177,11 @@ def between(picture: CityPicture, before: Frame, time: float, vehicles: PerEdge)
 
 
 def after(
-    picture: CityPicture, before: Frame, controls: Controls, state: State, row: Mapping[str, np.ndarray]
+    picture: CityPicture,
+    before: Frame,
+    controls: Controls,
+    state: State,
+    row: Mapping[str, np.ndarray],
 ) -> Frame:
     """Return the frame at the end of a control interval."""
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -189,8 +205,11 @@ def after(
 
 
 def frames(picture: CityPicture, result: Any) -> list[Frame]:
-    """Return the frames of a finished run: one at its start and one at the end of every control interval."""
-    parts = {name: getattr(result, name) for name in ("accumulation", "backlog", "completed", "removed")}
+    """Return the frames of a finished run: one at its start and one at the end of every control
+    interval."""
+    parts = {
+        name: getattr(result, name) for name in ("accumulation", "backlog", "completed", "removed")
+    }
     states = [
         State(step=k, time=k * picture.step, **{name: values[k] for name, values in parts.items()})
         for k in range(len(result.accumulation))
@@ -204,7 +223,8 @@ def frames(picture: CityPicture, result: Any) -> list[Frame]:
 
 
 def totals(picture: CityPicture, results: Sequence[Any]) -> dict[str, list[PerEdge]]:
-    """Return label -> values (E,) over whole runs, one of each result, to colour the streets by; {} without them."""
+    """Return label -> values (E,) over whole runs, one of each result, to colour the streets by; {}
+    without them."""
     if any("co2" not in result for result in results):
         return {}
     kilometres = picture.lane_km / picture.lanes

@@ -21,7 +21,8 @@ class Plan:
     """Open-loop controller with the controls of all T intervals, whatever is measured.
 
     perimeter: (-, (T, R, R)); splits: (-, (T, R, R, R)), None without route guidance
-    start: initial plan of the best descent; totals: initial plan -> total time spent after its descent (veh s)
+    start: initial plan of the best descent; totals: initial plan -> total time spent after its
+        descent (veh s)
     lower: bound that the total time spent of no plan falls below (veh s); NaN if unknown
     """
 
@@ -40,11 +41,14 @@ class Plan:
 
     def act(self, observation: Observation) -> Controls:
         k = observation.step
-        return Controls(perimeter=self.perimeter[k], splits=None if self.splits is None else self.splits[k])
+        return Controls(
+            perimeter=self.perimeter[k], splits=None if self.splits is None else self.splits[k]
+        )
 
 
 def model_hash(scenario: Scenario) -> str:
-    """Return the hash of all that a plan depends on: Scenario.hash without controllers and observation noise."""
+    """Return the hash of all that a plan depends on: Scenario.hash without controllers and
+    observation noise."""
     return replace(scenario, controller_options={}, protected=(), measurement_std=0.0).hash
 
 
@@ -52,14 +56,19 @@ def write(plan: Plan, scenario: Scenario, path: Path) -> None:
     """Write `plan` and the hash of its scenario to an .npz file."""
     content = {"perimeter": plan.perimeter, "start": plan.start}
     content |= {"scenario": scenario.name, "model": model_hash(scenario)}
-    content |= {"names": list(plan.totals), "totals": list(plan.totals.values()), "lower": plan.lower}
+    content |= {
+        "names": list(plan.totals),
+        "totals": list(plan.totals.values()),
+        "lower": plan.lower,
+    }
     content |= {} if plan.splits is None else {"splits": plan.splits}
     with atomic(path) as temporary:
         np.savez_compressed(temporary, **content)
 
 
 def read(path: Path, scenario: Scenario, *, guidance: bool) -> Plan:
-    """Read a plan. Raise InputError if it is of another scenario or of the other set of controls."""
+    """Read a plan. Raise InputError if it is of another scenario or of the other set of
+    controls."""
     try:
         with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             plan = Plan(
@@ -73,7 +82,9 @@ def read(path: Path, scenario: Scenario, *, guidance: bool) -> Plan:
     except Exception:
         raise InputError(f"{path}: is no plan; compute one with 'nmfd bound'") from None
     if model != model_hash(scenario):
-        raise InputError(f"{path}: was computed for another demand or network than {scenario.name}'s; compute it again")
+        raise InputError(
+            f"{path}: was computed for another demand or network than {scenario.name}'s; compute it again"
+        )
     if (plan.splits is not None) != guidance:
         raise InputError(f"{path}: is a plan of {plan.name}; choose another file")
     return plan

@@ -1,4 +1,5 @@
-"""Rule-based controllers: no control, route guidance by travel times, PI gating, greedy control, excitation."""
+"""Rule-based controllers: no control, route guidance by travel times, PI gating, greedy control,
+excitation."""
 
 from dataclasses import replace
 
@@ -42,7 +43,8 @@ class RouteGuidance(NoControl):
 
 
 class SetPoint(Options):
-    """Options of controllers that hold the accumulation of protected regions; cosim identify sets it for probing."""
+    """Options of controllers that hold the accumulation of protected regions; cosim identify sets
+    it for probing."""
 
     set_point: PositiveNumbers | None = setting(
         "accumulation to hold in each protected region; by default from the MFD", None, unit="veh"
@@ -59,12 +61,17 @@ class SetPoint(Options):
 class Gating(SetPoint):
     """Options of PI gating.
 
-    The default gains are moderate ones: on the benchmark kp from 0 to 5 and ki from 0.01 to 0.1 differ by less than 2 %
-    in total time spent. They are relative to the critical accumulation, so that they carry over to other cities.
+    The default gains are moderate ones: on the benchmark kp from 0 to 5 and ki from 0.01 to 0.1
+    differ by less than 2 % in total time spent. They are relative to the critical accumulation, so
+    that they carry over to other cities.
     """
 
     outflow_share: float = setting(
-        "outflow at the set point, as a share of the MFD's maximum: less leaves a margin", 1.0, unit="-", ge=0.1, le=1.0
+        "outflow at the set point, as a share of the MFD's maximum: less leaves a margin",
+        1.0,
+        unit="-",
+        ge=0.1,
+        le=1.0,
     )
     kp: float = setting("proportional gain, per relative error", 1.0, unit="-", ge=0.0)
     ki: float = setting("integral gain, per relative error", 0.01, unit="1/s", gt=0.0)
@@ -77,9 +84,10 @@ class PiGating:
 
         u_hp(k) = clip(u_hp(k-1) + kp (n_p(k-1) - n_p(k)) / n_cr + ki dt (n_set - n_p(k)) / n_cr,  u_min, u_max)
 
-    n_cr is the critical accumulation of p, dt the control interval, n_set the option set_point or the accumulation of
-    outflow_share. u_hp(k-1) is the clipped value or, if the city reports it, the mean u that its gates realised, so
-    that the integral does not wind up. All other entries stay at u_max.
+    n_cr is the critical accumulation of p, dt the control interval, n_set the option set_point or
+    the accumulation of outflow_share. u_hp(k-1) is the clipped value or, if the city reports it,
+    the mean u that its gates realised, so that the integral does not wind up. All other entries
+    stay at u_max.
     """
 
     name = "pi-gating"
@@ -89,11 +97,14 @@ class PiGating:
         network, setup = planning.network, options(Gating, planning, self.name)
         if not planning.protected:
             missing = "pi-gating needs at least one protected region, got none; add protected = [<region>, ...]"
-            raise InputError(f"{planning.where}: protected: {missing} with regions from 0 to {network.regions - 1}")
+            raise InputError(
+                f"{planning.where}: protected: {missing} with regions from 0 to {network.regions - 1}"
+            )
         self.regions = np.array(planning.protected)
         self.critical = np.array([network.mfds[region].critical for region in self.regions])
         self.set_point = np.array(
-            setup.set_point or [network.mfds[region].reaching(setup.outflow_share) for region in self.regions]
+            setup.set_point
+            or [network.mfds[region].reaching(setup.outflow_share) for region in self.regions]
         )
         self._kp, self._ki = setup.kp, setup.ki * planning.step
         self._open = network.open_perimeter
@@ -120,7 +131,8 @@ class PiGating:
 
 
 class Greedy:
-    """Greedy controller of Geroliminis, Haddad and Ramezani (2013, table I), at every boundary separately.
+    """Greedy controller of Geroliminis, Haddad and Ramezani (2013, table I), at every boundary
+    separately.
 
     u_ih = u_min if h is congested, n_h > n_cr,h, and i is not, or less so, n_i / jam_i < n_h / jam_h; else u_max.
     """
@@ -147,10 +159,10 @@ class Greedy:
 class Probing:
     """Excitation for identification: gating at random set points, with some gateways at a random u.
 
-    Random controls alone would lock the city early; gating alone moves all gateways of a region together. With
-    guidance, theta lies between the nominal split ratios and a random point of the simplex. The seed of the run draws
-    all of it again every few control intervals. The set points vary around the option set_point, or else the critical
-    accumulation.
+    Random controls alone would lock the city early; gating alone moves all gateways of a region
+    together. With guidance, theta lies between the nominal split ratios and a random point of the
+    simplex. The seed of the run draws all of it again every few control intervals. The set points
+    vary around the option set_point, or else the critical accumulation.
     """
 
     def __init__(self, planning: PlanningModel, *, guidance: bool):
@@ -158,9 +170,13 @@ class Probing:
         self.name = "probing-pcrg" if guidance else "probing-pc"
         self._network, self._guidance, self._gating = planning.network, guidance, None
         middle = options(SetPoint, planning, self.name).set_point
-        middle = middle or tuple(planning.network.mfds[region].critical for region in planning.protected)
+        middle = middle or tuple(
+            planning.network.mfds[region].critical for region in planning.protected
+        )
         if middle:
-            gating = replace(planning, controller_options={PiGating.name: {"set_point": list(middle)}})
+            gating = replace(
+                planning, controller_options={PiGating.name: {"set_point": list(middle)}}
+            )
             self._gating = PiGating(gating)
             self._gating.critical = np.array(middle)
         self._open = planning.network.open_perimeter
@@ -176,7 +192,9 @@ class Probing:
             self._draw()
         self._left -= 1
         perimeter = self._open if self._gating is None else self._gating.act(observation).perimeter
-        return Controls(perimeter=np.where(self._disturbed, self._random_u, perimeter), splits=self._splits)
+        return Controls(
+            perimeter=np.where(self._disturbed, self._random_u, perimeter), splits=self._splits
+        )
 
     def _draw(self) -> None:
         random, network = self._random, self._network
@@ -184,7 +202,9 @@ class Probing:
         if self._gating is not None:
             self._gating.set_point = random.uniform(*SET_POINT_RANGE) * self._gating.critical
         self._random_u = random.uniform(network.u_min, network.u_max, network.adjacency.shape)
-        self._disturbed = network.adjacency & (random.random(network.adjacency.shape) < DISTURBED_SHARE)
+        self._disturbed = network.adjacency & (
+            random.random(network.adjacency.shape) < DISTURBED_SHARE
+        )
         self._splits = None
         if self._guidance:
             point = random.exponential(size=network.split_mask.shape) ** 2 * network.split_mask

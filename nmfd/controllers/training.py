@@ -1,4 +1,5 @@
-"""Training of DPC policies: roll out the regional model under the policy and descend the total time spent.
+"""Training of DPC policies: roll out the regional model under the policy and descend the total time
+spent.
 
 Random initial states and demand keep gradients alive: a rollout that gridlocks has none.
 """
@@ -40,11 +41,18 @@ RANDOM_START_SHARE = 0.5  # of the rollouts start from a random state at a rando
 VALIDATION_PERIOD = 20  # Adam steps
 VALIDATION_ROLLOUTS = 16  # perturbed rollouts in a validation, if training perturbs demand or model
 WORTH_COMPILING = 200  # Adam steps
-# First policy from a gate: Adam steps, states in each, learning rate; width of the gate and largest accumulation, as a
-# share of the set point; opening without a gate.
-GATE_STEPS, GATE_BATCH, GATE_RATE, GATE_WIDTH, GATE_FULLEST, GATE_OPEN = 1000, 256, 2e-3, 0.05, 2.5, 0.95
-# First policy from no control: factor of the weights, logit of u, least theta. Instead of it, a policy that is open
-# whatever happens is kept if none gains WORTH in validation.
+# First policy from a gate: Adam steps, states in each, learning rate; width of the gate and largest
+# accumulation, as a share of the set point; opening without a gate.
+GATE_STEPS, GATE_BATCH, GATE_RATE, GATE_WIDTH, GATE_FULLEST, GATE_OPEN = (
+    1000,
+    256,
+    2e-3,
+    0.05,
+    2.5,
+    0.95,
+)
+# First policy from no control: factor of the weights, logit of u, least theta. Instead of it, a
+# policy that is open whatever happens is kept if none gains WORTH in validation.
 NO_CONTROL_WEIGHT, NO_CONTROL_LOGIT, NO_CONTROL_SPLIT = 0.1, 3.0, 1e-3
 OPEN_LOGIT, WORTH = 12.0, 0.03
 
@@ -53,16 +61,24 @@ def settings(scenario: Scenario, strategy: Strategy, steps: int | None = None) -
     """Return the training settings of a strategy; `steps` overrides. Raise InputError."""
     kind, table = strategy.controller, strategy.table(scenario)
     if kind.options is not Training:
-        raise InputError(f"--controller: {strategy.name!r} cannot be trained; choose dpc-pc or dpc-pcrg")
+        raise InputError(
+            f"--controller: {strategy.name!r} cannot be trained; choose dpc-pc or dpc-pcrg"
+        )
     if table != strategy.name:
         needs = f'needs a table [controllers."{strategy.name}"] in {scenario.where} with its differences'
         raise InputError(f"--controller: {strategy.name!r} {needs}; add one, or train {kind.name}")
     planning = planning_model(scenario, kind.name, table)
     setup = options(Training, planning, kind.name, table)
     if setup.local and kind.guides:
-        raise error(planning.where, f"controllers.{table}.local", "a local policy guides no routes; train dpc-pc")
+        raise error(
+            planning.where,
+            f"controllers.{table}.local",
+            "a local policy guides no routes; train dpc-pc",
+        )
     if setup.prices and not kind.guides:
-        raise error(planning.where, f"controllers.{table}.prices", "prices guide drivers; train dpc-pcrg")
+        raise error(
+            planning.where, f"controllers.{table}.prices", "prices guide drivers; train dpc-pcrg"
+        )
     return setup if steps is None else setup.changed(steps=steps)
 
 
@@ -71,7 +87,9 @@ def check(scenario: Scenario, strategy: Strategy) -> None:
     city, believed = scenario.network, strategy.planning(scenario).network
     still = "nmfd.train(..., anyway=True) trains all the same"
     if city.controllable is not None and not city.controllable.any():
-        raise InputError(f"{_file(city)}: controllable: is 0 at every boundary: {NO_GATEWAY}; {still}")
+        raise InputError(
+            f"{_file(city)}: controllable: is 0 at every boundary: {NO_GATEWAY}; {still}"
+        )
     if believed.placeholder:
         guess = "is true: its MFDs are guesses from lanes and speed limits"
         remedy = f"run 'cosim identify {city.folder}' or put in your own"
@@ -83,15 +101,21 @@ def _file(network: RegionalModel) -> Path | str:
 
 
 def available(device: str) -> str:
-    """Return "cpu" or "cuda"; "auto" is the GPU if there is one. Raise InputError for a missing GPU."""
+    """Return "cpu" or "cuda"; "auto" is the GPU if there is one. Raise InputError for a missing
+    GPU."""
     if device == "cuda" and not torch.cuda.is_available():
-        raise InputError("--device: cuda asked for, but PyTorch finds no GPU here; choose cpu or auto")
-    return "cuda" if device == "auto" and torch.cuda.is_available() else device.replace("auto", "cpu")
+        raise InputError(
+            "--device: cuda asked for, but PyTorch finds no GPU here; choose cpu or auto"
+        )
+    return (
+        "cuda" if device == "auto" and torch.cuda.is_available() else device.replace("auto", "cpu")
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """Cost, sample and constraints of the user's own, as of nmfd.train; by default the total time spent."""
+    """Cost, sample and constraints of the user's own, as of nmfd.train; by default the total time
+    spent."""
 
     cost: Callable[[Trajectories], torch.Tensor] | None = None
     sample: Callable[[Generator, int], tuple] | None = None
@@ -99,10 +123,14 @@ class Task:
 
     def __post_init__(self) -> None:
         if not all(map(callable, filter(None, (self.cost, self.sample)))):
-            raise InputError(f"cost, sample: expected functions, got {self.cost!r} and {self.sample!r}; see nmfd.train")
+            raise InputError(
+                f"cost, sample: expected functions, got {self.cost!r} and {self.sample!r}; see nmfd.train"
+            )
         for pair in self.constraints:
             if not (isinstance(pair, tuple) and len(pair) == 2 and callable(pair[0])):
-                raise InputError(f"constraints: expected pairs (function, weight), got {pair!r}; add the weight")
+                raise InputError(
+                    f"constraints: expected pairs (function, weight), got {pair!r}; add the weight"
+                )
 
     @property
     def own(self) -> str:
@@ -127,24 +155,38 @@ def train(
     anyway: bool = False,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> Any:
-    """Train the policy of `strategy` and write the best in validation to `out`; the same seed gives the same weights.
+    """Train the policy of `strategy` and write the best in validation to `out`; the same seed gives
+    the same weights.
 
-    module: instead of the policy, trained in place and returned with its best weights, without a file
+    module: instead of the policy, trained in place and returned with its best weights, without a
+        file
     resume: continue from the state in `out`.resume
-    compiled: compile the step, about twice as fast after a minute or two; the weights differ by rounding
+    compiled: compile the step, about twice as fast after a minute or two; the weights differ by
+        rounding
     anyway: train even if `check` raises
     progress: called with (done, steps, note) after every step
     """
     setup = settings(scenario, strategy, steps)
     if module is not None:
-        if not isinstance(module, nn.Module) or not any(weights.requires_grad for weights in module.parameters()):
-            raise InputError(f"policy: expected an nn.Module with weights to train, got {module!r:.60}; give one")
+        if not isinstance(module, nn.Module) or not any(
+            weights.requires_grad for weights in module.parameters()
+        ):
+            raise InputError(
+                f"policy: expected an nn.Module with weights to train, got {module!r:.60}; give one"
+            )
         empty = np.zeros(scenario.network.adjacency.shape)
-        ModuleController(module, scenario).act(Observation(step=0, time=0.0, accumulation=empty, backlog=empty))
+        ModuleController(module, scenario).act(
+            Observation(step=0, time=0.0, accumulation=empty, backlog=empty)
+        )
     elif not anyway:
         check(scenario, strategy)
     planning = planning_model(scenario, strategy.controller.name, strategy.table(scenario))
-    configuration = {"controller": strategy.name, "scenario": planning.name, "seed": seed, "compiled": compiled}
+    configuration = {
+        "controller": strategy.name,
+        "scenario": planning.name,
+        "seed": seed,
+        "compiled": compiled,
+    }
     configuration |= vars(setup) | ({"task": task.own} if task.own else {})
     torch.manual_seed(seed)
     generator = Generator().manual_seed(seed)
@@ -152,7 +194,11 @@ def train(
     policy = _first_policy(setup, planning, guidance=guidance) if module is None else module
     device = "cpu" if isinstance(policy, CompactPolicy) else device
     policy = policy.to(device).train()
-    costs = {"detour_cost": setup.detour_cost, "holding_cost": setup.holding_cost, "process_std": recipe.process_std}
+    costs = {
+        "detour_cost": setup.detour_cost,
+        "holding_cost": setup.holding_cost,
+        "process_std": recipe.process_std,
+    }
     rollout = Rollout(planning, next(policy.parameters()).dtype, device, **costs)
     if setup.from_gating and not resume and module is None:
         begin_as_gate(policy, rollout, generator)
@@ -186,7 +232,9 @@ def train(
         cosine = 0.5 * (1.0 + math.cos(math.pi * (step / steps)))
         for group in optimizer.param_groups:
             group["lr"] = recipe.learning_rate or setup.learning_rate * (0.1 + 0.9 * cosine)
-        _descend(policy, objective(generator, recipe.batch, advance), optimizer, setup, step, task.own)
+        _descend(
+            policy, objective(generator, recipe.batch, advance), optimizer, setup, step, task.own
+        )
         if (step + 1) % VALIDATION_PERIOD == 0 or step + 1 == steps:
             best = keep_the_better(best)
             state = {"configuration": configuration, "step": step + 1, "best": best}
@@ -196,9 +244,13 @@ def train(
         if progress:
             progress(step + 1, steps, f"best {best:.4g}" + ("" if task.own else " veh s"))
     if best == bar:
-        print(f"nmfd: no policy gained {WORTH:.0%} on the model: its gates stay open", file=sys.stderr)
+        print(
+            f"nmfd: no policy gained {WORTH:.0%} on the model: its gates stay open", file=sys.stderr
+        )
     if not math.isfinite(best):
-        raise RunFailed(f"{strategy.name}: every validation of {steps} steps diverged; lower the learning rate")
+        raise RunFailed(
+            f"{strategy.name}: every validation of {steps} steps diverged; lower the learning rate"
+        )
     if state_file is not None:
         state_file.unlink(missing_ok=True)
         return out
@@ -235,39 +287,61 @@ def _loss(
     batch: int,
     advance: Callable | None = None,
 ) -> torch.Tensor:
-    """Return the loss of `batch` rollouts under random models, from random states and demands or those of the task."""
+    """Return the loss of `batch` rollouts under random models, from random states and demands or
+    those of the task."""
     most, levels = setup.recipe.largest_start, (setup.demand_low, setup.demand_high)
     rollout.draw_model(batch, setup.mfd_spread, generator, setup.mfd_scale)
     if task.sample:
         given = task.sample(generator, batch)
-        x, demand = (torch.as_tensor(part, dtype=rollout.dtype, device=rollout.device) for part in given)
-        if x.shape != (batch, *rollout.start.shape) or demand.shape[1:] != x.shape or len(demand) < 2:
+        x, demand = (
+            torch.as_tensor(part, dtype=rollout.dtype, device=rollout.device) for part in given
+        )
+        if (
+            x.shape != (batch, *rollout.start.shape)
+            or demand.shape[1:] != x.shape
+            or len(demand) < 2
+        ):
             wanted = f"start ({batch}, R, R) and demand (T, {batch}, R, R) with R = {len(rollout.start)} and T > 1"
-            raise InputError(f"sample: expected {wanted}, got {tuple(x.shape)} and {tuple(demand.shape)}; return these")
+            raise InputError(
+                f"sample: expected {wanted}, got {tuple(x.shape)} and {tuple(demand.shape)}; return these"
+            )
     else:
         spread, share = (0.0, 0.0) if most else (DEMAND_SPREAD, RANDOM_START_SHARE)
         x, demand = rollout.random_start(batch, spread, share, generator, levels)
         x = x + most * torch.rand(x.shape, generator=generator).to(x) if most else x
-        demand = rollout.perturb(demand, torch.rand(batch, generator=generator), setup.noise, generator)
+        demand = rollout.perturb(
+            demand, torch.rand(batch, generator=generator), setup.noise, generator
+        )
     if not (task.cost or task.constraints):
         total = rollout.total_time_spent(policy, x, demand, generator, advance)
-        # The logarithm, because a rollout that is heavily loaded must not count for more than the others.
-        return torch.log(total.clamp(min=1.0)).mean() if setup.recipe.loss == "log" else total.mean()
+        # The logarithm, because a rollout that is heavily loaded must not count for more than the
+        # others.
+        return (
+            torch.log(total.clamp(min=1.0)).mean() if setup.recipe.loss == "log" else total.mean()
+        )
     run = rollout.trajectories(policy, x, demand, generator, advance)
     loss = torch.as_tensor(task.cost(run) if task.cost else run.total_time_spent).mean()
     return loss + sum(weight * penalty(run).mean() for penalty, weight in task.constraints)
 
 
-def _descend(policy: nn.Module, loss: torch.Tensor, optimizer: Adam, setup: Training, step: int, own: str) -> None:
+def _descend(
+    policy: nn.Module, loss: torch.Tensor, optimizer: Adam, setup: Training, step: int, own: str
+) -> None:
     if not loss.requires_grad:
-        raise InputError("cost: has no gradient by the weights of the policy; compute it from the run with torch")
+        raise InputError(
+            "cost: has no gradient by the weights of the policy; compute it from the run with torch"
+        )
     optimizer.zero_grad()
     loss.backward()
     if isinstance(policy, CompactPolicy):
         policy.numbers.grad[[Numbers._fields.index(name) for name in setup.kept]] = 0.0
     decoders = policy.decoders if isinstance(policy, Policy) else []
-    for n, decoder in enumerate(decoders):  # in turn; not by requires_grad, which would compile the step once for each
-        for weights in decoder.parameters() if n != step // setup.recipe.epoch % len(decoders) else ():
+    for n, decoder in enumerate(
+        decoders
+    ):  # in turn; not by requires_grad, which would compile the step once for each
+        for weights in (
+            decoder.parameters() if n != step // setup.recipe.epoch % len(decoders) else ()
+        ):
             weights.grad = None
     size = torch.nn.utils.clip_grad_norm_(policy.parameters(), setup.recipe.clip)
     if own and not size.isfinite():
@@ -279,9 +353,13 @@ def _descend(policy: nn.Module, loss: torch.Tensor, optimizer: Adam, setup: Trai
 
 
 def begin_as_no_control(
-    policy: Policy, network: RegionalModel, weight: float = NO_CONTROL_WEIGHT, logit: float = NO_CONTROL_LOGIT
+    policy: Policy,
+    network: RegionalModel,
+    weight: float = NO_CONTROL_WEIGHT,
+    logit: float = NO_CONTROL_LOGIT,
 ) -> None:
-    """Make `policy` nearly independent of the state, with open gateways, nominal split ratios or no prices.
+    """Make `policy` nearly independent of the state, with open gateways, nominal split ratios or no
+    prices.
 
     weight: factor of the weights; logit: of u
     """
@@ -290,12 +368,15 @@ def begin_as_no_control(
             decoder.weight.mul_(weight)
         policy.perimeter_decoder.bias.fill_(logit)
         if policy.architecture.guidance and not policy.architecture.prices:
-            own = torch.tensor(network.nominal_splits[np.arange(network.regions)[:, None], policy.onward.numpy()])
+            own = torch.tensor(
+                network.nominal_splits[np.arange(network.regions)[:, None], policy.onward.numpy()]
+            )
             policy.splits_decoder.bias.copy_(own.clamp(min=NO_CONTROL_SPLIT).log().flatten())
 
 
 def begin_as_gate(policy: Policy, rollout: Rollout, generator: Generator) -> None:
-    """Fit `policy` to gates that close the entries of protected regions as these fill, half at the set point."""
+    """Fit `policy` to gates that close the entries of protected regions as these fill, half at the
+    set point."""
     network, gate = rollout.planning.network, PiGating(rollout.planning)
     protected = gate.regions.tolist()
     set_point = torch.tensor(gate.set_point, dtype=rollout.dtype, device=rollout.device)
@@ -303,12 +384,20 @@ def begin_as_gate(policy: Policy, rollout: Rollout, generator: Generator) -> Non
     optimizer = Adam(policy.parameters(), lr=GATE_RATE)
     for _ in range(GATE_STEPS):
         x, _ = rollout.random_start(GATE_BATCH, 0.0, 1.0, generator)
-        full = torch.rand(GATE_BATCH, len(protected), generator=generator).to(x) * GATE_FULLEST * set_point
+        full = (
+            torch.rand(GATE_BATCH, len(protected), generator=generator).to(x)
+            * GATE_FULLEST
+            * set_point
+        )
         x[:, protected] *= (full / x[:, protected].sum(-1).clamp(min=1.0)).unsqueeze(-1)
         wanted = torch.full_like(x, GATE_OPEN)
-        wanted[:, :, protected] = torch.sigmoid((set_point - full) / (GATE_WIDTH * set_point)).unsqueeze(1)
+        wanted[:, :, protected] = torch.sigmoid(
+            (set_point - full) / (GATE_WIDTH * set_point)
+        ).unsqueeze(1)
         share = (policy(x)[0] - network.u_min) / (network.u_max - network.u_min)
-        loss = torch.nn.functional.binary_cross_entropy(share.clamp(0.0, 1.0), wanted, weight=counts)
+        loss = torch.nn.functional.binary_cross_entropy(
+            share.clamp(0.0, 1.0), wanted, weight=counts
+        )
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -317,7 +406,8 @@ def begin_as_gate(policy: Policy, rollout: Rollout, generator: Generator) -> Non
 def validate(policy: Policy, rollout: Rollout, seed: int, setup: Training) -> float:
     """Return the TTS (veh s) of the scenario itself, the geometric mean of two noise draws.
 
-    If training perturbs demand or model, also of VALIDATION_ROLLOUTS perturbed rollouts of increasing sigma.
+    If training perturbs demand or model, also of VALIDATION_ROLLOUTS perturbed rollouts of
+    increasing sigma.
     """
     generator, low, high = Generator().manual_seed(seed), setup.demand_low, setup.demand_high
     count = 2 + (VALIDATION_ROLLOUTS if setup.noise or setup.mfd_spread or low < high else 0)
@@ -329,14 +419,21 @@ def validate(policy: Policy, rollout: Rollout, seed: int, setup: Training) -> fl
         factor = low + (high - low) * level[torch.randperm(count, generator=generator)]
         demand = demand * factor.to(demand)[:, None, None]
     with torch.no_grad():
-        total = rollout.total_time_spent(policy, rollout.start.expand_as(demand[0]), demand, generator)
+        total = rollout.total_time_spent(
+            policy, rollout.start.expand_as(demand[0]), demand, generator
+        )
     return torch.log(total).mean().exp().item()
 
 
 def _restore(
-    state_file: Path, configuration: Mapping[str, Any], policy: Policy, optimizer: Adam, generator: Generator
+    state_file: Path,
+    configuration: Mapping[str, Any],
+    policy: Policy,
+    optimizer: Adam,
+    generator: Generator,
 ) -> tuple[int, float]:
-    """Restore the state of a training; return the number of its next step and its best validation."""
+    """Restore the state of a training; return the number of its next step and its best
+    validation."""
     state = read_file(state_file, "nothing to resume; train without --resume")
     for key, value in configuration.items():
         if (before := state["configuration"].get(key)) != value:

@@ -1,11 +1,13 @@
 """Answer of guided drivers to prices in the regional model: a logit over the next regions.
 
-A price c_i multiplies the travel time through region i by 1 + c_i for guided drivers bound for elsewhere
-(nmfd.types.Controls). Around the nominal theta0, with the dispersion s of the regional model (RegionalModel),
+A price c_i multiplies the travel time through region i by 1 + c_i for guided drivers bound for
+elsewhere (nmfd.types.Controls). Around the nominal theta0, with the dispersion s of the regional
+model (RegionalModel),
 
     theta_ihj ~ theta0_ihj exp(-e_hj / s),    e_hj = c_h t_hj + sum_g theta0_hgj e_gj for h != j,
 
-t_hj the mean time to leave h on the way to j, so that e_hj is what the prices add from h on. It is differentiable.
+t_hj the mean time to leave h on the way to j, so that e_hj is what the prices add from h on. It is
+differentiable.
 """
 
 import torch
@@ -19,18 +21,23 @@ MAX_DELAY_FACTOR = 20.0  # largest time to leave a region, relative to free flow
 
 
 class Answer(nn.Module):
-    """Split ratios (-, (..., R, R, R)) in the states x (veh, (..., R, R)) under prices (-, (..., R)); no weights."""
+    """Split ratios (-, (..., R, R, R)) in the states x (veh, (..., R, R)) under prices (-, (...,
+    R)); no weights."""
 
     def __init__(self, network: RegionalModel):
         super().__init__()
         self.dispersion = network.dispersion
-        self.register_buffer("own", torch.tensor(network.nominal_splits, dtype=torch.float32), persistent=False)
+        self.register_buffer(
+            "own", torch.tensor(network.nominal_splits, dtype=torch.float32), persistent=False
+        )
         self._network, self._hops = network, int(network.hops.max())
         self._model = dynamics.parameters(network, dtype=torch.float32)
 
     def forward(self, x: PerPair, prices: PerRegion) -> PerTurn:
         if self._model.adjacency.device != self.own.device:
-            self._model = dynamics.parameters(self._network, dtype=torch.float32, device=self.own.device)
+            self._model = dynamics.parameters(
+                self._network, dtype=torch.float32, device=self.own.device
+            )
         p = self._model
         free = p.mfd.rate_up_to_jam(torch.zeros_like(p.mfd.jam), torch)
         rate = torch.maximum(dynamics.rate(p, x.sum(-1)), free / MAX_DELAY_FACTOR)

@@ -1,7 +1,8 @@
 """Verdict on perimeter control in a city, before any policy is trained.
 
-Control helps only if vehicles on their way into a region that becomes critical pass signals under control. The measure
-is the share of all vehicles filling such a region, from elsewhere or starting there, that a gateway could hold.
+Control helps only if vehicles on their way into a region that becomes critical pass signals under
+control. The measure is the share of all vehicles filling such a region, from elsewhere or starting
+there, that a gateway could hold.
 """
 
 from collections.abc import Iterable
@@ -37,7 +38,9 @@ class Boundaries:
     controllable: Int[np.ndarray, "R R"]
 
     @classmethod
-    def of_gateways(cls, regions: int, gateways: Iterable[tuple[int, int, float, bool]]) -> "Boundaries":
+    def of_gateways(
+        cls, regions: int, gateways: Iterable[tuple[int, int, float, bool]]
+    ) -> "Boundaries":
         """Sum over gateways: source, target, crossings [veh], with a signal under control."""
         sums = np.zeros((4, regions, regions))
         for source, target, vehicles, reached in gateways:
@@ -54,7 +57,8 @@ class Boundaries:
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """Answer in the first of some sentences, and the numbers behind it; protect: the regions to protect."""
+    """Answer in the first of some sentences, and the numbers behind it; protect: the regions to
+    protect."""
 
     sentences: tuple[str, ...]
     boundaries: Boundaries
@@ -63,11 +67,21 @@ class Verdict:
     def text(self) -> str:
         """Return the sentences and a table of the boundaries."""
         each = self.boundaries
-        headings = ["from", "to", "flow [veh]", "controlled [veh]", "share", "gateways", "with signals"]
+        headings = [
+            "from",
+            "to",
+            "flow [veh]",
+            "controlled [veh]",
+            "share",
+            "gateways",
+            "with signals",
+        ]
         columns = (each.flow, each.controlled, each.shares, each.gateways, each.controllable)
         forms = ("{}", "{}", "{:.0f}", "{:.0f}", "{:.0%}", "{}", "{}")
         pairs = np.argwhere(each.gateways > 0)
-        lines = [map(str.format, forms, (i, h, *(part[i, h] for part in columns))) for i, h in pairs]
+        lines = [
+            map(str.format, forms, (i, h, *(part[i, h] for part in columns))) for i, h in pairs
+        ]
         return "\n".join([*self.sentences, "", text_columns(headings, lines)]) + "\n"
 
 
@@ -85,8 +99,8 @@ def verdict(
     """Return the verdict.
 
     most: (R,) [veh], highest accumulation in any run; started: (R,) [veh], departures by region
-    waiting: most vehicles that waited outside at a time [veh]; slowness: trip time over free-flow time [-], NaN if
-        unknown
+    waiting: most vehicles that waited outside at a time [veh]; slowness: trip time over free-flow
+        time [-], NaN if unknown
     where: the runs, such as "in 6 loading runs"; scenario: its folder, for commands
     """
     identify = f"cosim identify {scenario}"
@@ -97,12 +111,16 @@ def verdict(
     passed = f"; {part} passed one" if flow else ""
     guess = ", a guess" if network.placeholder else ""
     ratios = ", ".join(
-        f"{name} above {network.critical_above[r]:.0f} veh, not seen" if np.isnan(ratio) else f"{name} {ratio:.2f}"
+        f"{name} above {network.critical_above[r]:.0f} veh, not seen"
+        if np.isnan(ratio)
+        else f"{name} {ratio:.2f}"
         for r, (name, ratio) in enumerate(zip(names, load, strict=True))
     )
     crowded = waiting > WAITING_SHARE * started.sum() or slowness > SLOW
     traffic = f"up to {waiting:,.0f} vehicles waited outside at a time"
-    traffic += "" if np.isnan(slowness) else f", and a trip took {slowness:.1f} times its free-flow time"
+    traffic += (
+        "" if np.isnan(slowness) else f", and a trip took {slowness:.1f} times its free-flow time"
+    )
     details = [
         f"Of {boundaries.gateways.sum()} gateways {boundaries.controllable.sum()} have a signal that perimeter control "
         f"can use{passed}.",
@@ -120,7 +138,9 @@ def verdict(
     elif not flow:
         answer = "No: no vehicle crosses a boundary."
     elif network.placeholder:
-        answer = "Cannot say yet: the critical accumulations are guesses from lanes and speed limits."
+        answer = (
+            "Cannot say yet: the critical accumulations are guesses from lanes and speed limits."
+        )
         remedies = [f"the model of the city: {identify}"]
     elif not len(critical) and crowded:
         answer = f"Cannot say yet: {traffic}, but no region is seen to become critical."
@@ -143,7 +163,9 @@ def verdict(
         if holdable[best] <= NOTHING:
             answer = f"No: regions become critical, but gateways could hold no more than {share}; try other regions."
         elif holdable[best] < ENOUGH:
-            answer = f"Hardly: regions become critical, but gateways could hold no more than {share}."
+            answer = (
+                f"Hardly: regions become critical, but gateways could hold no more than {share}."
+            )
         else:
             answer = f"It may: {names[best]} becomes critical, and gateways could hold {share}."
     if not answer.startswith(("It may", "Hardly")):

@@ -1,8 +1,9 @@
-"""The regional model (NMFD) in torch, batched and differentiable: the one definition of its equations.
+"""The regional model (NMFD) in torch, batched and differentiable: the one definition of its
+equations.
 
-After Tumu, Shaw Cortez, Drgona, Vrabie and Glavaski, "Differentiable Predictive Control for Large-Scale Urban Road
-Networks", and the multi-region models with perimeter control of Geroliminis, Haddad and Ramezani (2013). Regions
-i, j, h; x_i = sum_j x_ij; N_i the regions adjacent to i:
+After Tumu, Shaw Cortez, Drgona, Vrabie and Glavaski, "Differentiable Predictive Control for
+Large-Scale Urban Road Networks", and the multi-region models with perimeter control of Geroliminis,
+Haddad and Ramezani (2013). Regions i, j, h; x_i = sum_j x_ij; N_i the regions adjacent to i:
 
     q_i    = g_i(x_i) / x_i                            defined at x = 0 (nmfd.model.mfd)
     m_ii   = q_i x_ii                                  trips that end in i
@@ -10,10 +11,12 @@ i, j, h; x_i = sum_j x_ij; N_i the regions adjacent to i:
     dx_ii/dt = d_ii - m_ii + sum_{h in N_i} u_hi m_hii
     dx_ij/dt = d_ij - sum_{h in N_i} u_ih m_ihj + sum_{h in N_i, h != j} u_hi m_hij        j != i
 
-Twins: `acyclic` (no vehicle turns back), and in nmfd.controllers.mpc `ipopt` (in CasADi) and `edge_model` (as edges,
+Twins: `acyclic` (no vehicle turns back), and in nmfd.controllers.mpc `ipopt` (in CasADi) and
+    `edge_model` (as edges,
 with adjoint gradients).
 
-Shapes: `...` is any batch. x (..., R, R) [veh], [i, j] in region i bound for j; demand (..., R, R) [veh/s];
+Shapes: `...` is any batch. x (..., R, R) [veh], [i, j] in region i bound for j; demand (..., R, R)
+    [veh/s];
 perimeter (..., R, R) [-], [i, h]; splits (..., R, R, R) [-], [i, h, j].
 """
 
@@ -32,7 +35,8 @@ from nmfd.tensors import PerPair, PerRegion, PerRollout, PerTurn
 class Parameters:
     """Network parameters as tensors. mfd: of all regions; adjacency, off_diagonal: (R, R), 0 or 1.
 
-    exit_rates: (R, R) [-] or None; capacity: (R, R) [veh/s] under u = 1, or None; storage: (R,) [veh]
+    exit_rates: (R, R) [-] or None; capacity: (R, R) [veh/s] under u = 1, or None; storage: (R,)
+        [veh]
     """
 
     mfd: Mfd
@@ -44,7 +48,10 @@ class Parameters:
 
 
 def parameters(
-    network: RegionalModel, *, dtype: torch.dtype = torch.float64, device: str | torch.device = "cpu"
+    network: RegionalModel,
+    *,
+    dtype: torch.dtype = torch.float64,
+    device: str | torch.device = "cpu",
 ) -> Parameters:
     """Return the parameters of `network` as tensors."""
 
@@ -66,11 +73,13 @@ def rate(p: Parameters, accumulation: PerRegion) -> PerRegion:
     return p.mfd.rate(accumulation, torch)
 
 
-def flows(p: Parameters, x: PerPair, perimeter: PerPair, splits: PerTurn) -> tuple[PerRegion, PerTurn]:
+def flows(
+    p: Parameters, x: PerPair, perimeter: PerPair, splits: PerTurn
+) -> tuple[PerRegion, PerTurn]:
     """Return trip completions m_ii (..., R) and transfer flows (..., R, R, R) [veh/s].
 
-    As published, u_ih m_ihj. Extensions: exit rates k_ij multiply m_ihj and m_ii; with capacities, `passing` replaces
-    u_ih.
+    As published, u_ih m_ihj. Extensions: exit rates k_ij multiply m_ihj and m_ii; with capacities,
+    `passing` replaces u_ih.
     """
     accumulation = x.sum(-1)
     leaving = rate(p, accumulation).unsqueeze(-1) * x
@@ -81,23 +90,30 @@ def flows(p: Parameters, x: PerPair, perimeter: PerPair, splits: PerTurn) -> tup
     if p.capacity is None:
         return completions, (perimeter * p.adjacency).unsqueeze(-1) * splits * wishing
     transfers = splits * wishing
-    return completions, passing(p, transfers.sum(-1), perimeter, accumulation).unsqueeze(-1) * transfers
+    return completions, passing(p, transfers.sum(-1), perimeter, accumulation).unsqueeze(
+        -1
+    ) * transfers
 
 
 def passing(p: Parameters, wish: PerPair, perimeter: PerPair, accumulation: PerRegion) -> PerPair:
-    """Return the share (..., R, R) [-] of the desired flow `wish` (..., R, R) [veh/s] that passes each boundary.
+    """Return the share (..., R, R) [-] of the desired flow `wish` (..., R, R) [veh/s] that passes
+    each boundary.
 
-    The limit is u_ih times capacity times the room in h, 1 - x_h / storage_h (as in Geroliminis, Haddad and Ramezani,
-    2013), accumulation (..., R) [veh].
+    The limit is u_ih times capacity times the room in h, 1 - x_h / storage_h (as in Geroliminis,
+    Haddad and Ramezani, 2013), accumulation (..., R) [veh].
     """
     room = (1.0 - accumulation / p.storage).clamp(min=LEAST_ROOM)
     return passing_share(wish, perimeter * p.capacity * room.unsqueeze(-2))
 
 
-def admitted(backlog: PerPair, demand: PerPair, metering: PerRegion | None, step: float) -> tuple[PerPair, PerPair]:
-    """Return the demand (..., R, R) [veh/s] admitted within `step` [s], and the backlog (..., R, R) [veh] after it.
+def admitted(
+    backlog: PerPair, demand: PerPair, metering: PerRegion | None, step: float
+) -> tuple[PerPair, PerPair]:
+    """Return the demand (..., R, R) [veh/s] admitted within `step` [s], and the backlog (..., R, R)
+    [veh] after it.
 
-    metering: (..., R) [veh/s], largest departure rate of each region, shared in proportion; None: no limit
+    metering: (..., R) [veh/s], largest departure rate of each region, shared in proportion; None:
+        no limit
     """
     if metering is None:
         return demand + backlog / step, torch.zeros_like(backlog)
@@ -111,13 +127,21 @@ def derivative(
 ) -> tuple[PerPair, PerRegion]:
     """Return dx_ij/dt (..., R, R) and trip completions (..., R) [veh/s]."""
     completions, transfers = flows(p, x, perimeter, splits)
-    return demand - torch.diag_embed(completions) - transfers.sum(-2) + transfers.sum(-3), completions
+    return demand - torch.diag_embed(completions) - transfers.sum(-2) + transfers.sum(
+        -3
+    ), completions
 
 
 def integrated(
-    slope: Callable[[Any], Any], x: Any, step: float, *, integrator: str = "euler", substeps: int = 1
+    slope: Callable[[Any], Any],
+    x: Any,
+    step: float,
+    *,
+    integrator: str = "euler",
+    substeps: int = 1,
 ) -> Any:
-    """Return x after `step` [s] of dx/dt = slope(x), in equal substeps of forward Euler or classical Runge-Kutta.
+    """Return x after `step` [s] of dx/dt = slope(x), in equal substeps of forward Euler or
+    classical Runge-Kutta.
 
     With Euler x stays >= 0 if step * q <= substeps and demand >= 0.
     """
@@ -139,9 +163,15 @@ SCHEMES = {"euler": ((1.0,), (0.0,)), "rk4": ((1 / 6, 1 / 3, 1 / 3, 1 / 6), (0.0
 
 
 def counted(
-    slope: Callable[[Any], tuple[Any, Any]], x: Any, step: float, *, integrator: str = "euler", substeps: int = 1
+    slope: Callable[[Any], tuple[Any, Any]],
+    x: Any,
+    step: float,
+    *,
+    integrator: str = "euler",
+    substeps: int = 1,
 ) -> tuple[Any, Any]:
-    """Return `integrated`, and the integral of the flow that `slope` gives beside dx/dt, for the ledger."""
+    """Return `integrated`, and the integral of the flow that `slope` gives beside dx/dt, for the
+    ledger."""
     step, ended = step / substeps, 0.0
     for _ in range(substeps):
         change, total, completed = 0.0 * x, 0.0 * x, 0.0
@@ -153,14 +183,27 @@ def counted(
 
 
 def advance(
-    p: Parameters, x: PerPair, demand: PerPair, perimeter: PerPair, splits: PerTurn, step: float, **scheme: Any
+    p: Parameters,
+    x: PerPair,
+    demand: PerPair,
+    perimeter: PerPair,
+    splits: PerTurn,
+    step: float,
+    **scheme: Any,
 ) -> PerPair:
-    """Return x after one control interval of `step` [s] under constant inputs; scheme: see `integrated`."""
+    """Return x after one control interval of `step` [s] under constant inputs; scheme: see
+    `integrated`."""
     return integrated(lambda x: derivative(p, x, demand, perimeter, splits)[0], x, step, **scheme)
 
 
 def advance_counted(
-    p: Parameters, x: PerPair, demand: PerPair, perimeter: PerPair, splits: PerTurn, step: float, **scheme: Any
+    p: Parameters,
+    x: PerPair,
+    demand: PerPair,
+    perimeter: PerPair,
+    splits: PerTurn,
+    step: float,
+    **scheme: Any,
 ) -> tuple[PerPair, PerRollout]:
     """Return `advance` and the trips (...) [veh] completed meanwhile."""
 

@@ -1,8 +1,10 @@
-"""Identification of the regional model from observed runs: all parameters at once, by prediction error.
+"""Identification of the regional model from observed runs: all parameters at once, by prediction
+error.
 
-MFDs fitted to outflow samples absorb what happens at the boundaries: a region that cannot send vehicles on looks
-collapsed. Here MFDs, exit rates, boundary capacities and storage minimise the error of rollouts over several control
-intervals, from each observed state under observed demand and controls (Ljung, System Identification, 1999, ch. 7).
+MFDs fitted to outflow samples absorb what happens at the boundaries: a region that cannot send
+vehicles on looks collapsed. Here MFDs, exit rates, boundary capacities and storage minimise the
+error of rollouts over several control intervals, from each observed state under observed demand and
+controls (Ljung, System Identification, 1999, ch. 7).
 """
 
 import math
@@ -38,7 +40,8 @@ RIDGE = 1e-3  # weight of squared log changes: parameters that the data do not d
 class Observed:
     """One run of T control intervals.
 
-    accumulation: (T+1, R, R) [veh]; demand: (T, R, R) [veh/s], entered vehicles; perimeter: (T, R, R) [-];
+    accumulation: (T+1, R, R) [veh]; demand: (T, R, R) [veh/s], entered vehicles; perimeter: (T, R,
+        R) [-];
     splits: (T, R, R, R) [-]; crossings: (T, R, R) [veh], [i, h] from i to h
     """
 
@@ -50,28 +53,41 @@ class Observed:
 
 
 class _Model(torch.nn.Module):
-    """Parametrisation of `dynamics.Parameters` in which every choice of free numbers is a valid network."""
+    """Parametrisation of `dynamics.Parameters` in which every choice of free numbers is a valid
+    network."""
 
-    def __init__(self, network: RegionalModel, runs: Sequence[Observed], step: float, fastest: float):
+    def __init__(
+        self, network: RegionalModel, runs: Sequence[Observed], step: float, fastest: float
+    ):
         super().__init__()
 
         def free(values: Any) -> torch.nn.Parameter:
-            return torch.nn.Parameter(torch.as_tensor(np.asarray(values), dtype=torch.float32).clone())
+            return torch.nn.Parameter(
+                torch.as_tensor(np.asarray(values), dtype=torch.float32).clone()
+            )
 
-        self.adjacency, self._fastest = torch.tensor(network.adjacency, dtype=torch.float32), fastest
+        self.adjacency, self._fastest = (
+            torch.tensor(network.adjacency, dtype=torch.float32),
+            fastest,
+        )
         self._u_max = network.u_max
         largest = largest_accumulation(run.accumulation for run in runs)
         flow = np.max([run.crossings.max(axis=0) for run in runs], axis=0) / step
-        self.free_rate = free(np.log([min(mfd.rate_up_to_jam(0.0), 0.5 * fastest) for mfd in network.mfds]))
+        self.free_rate = free(
+            np.log([min(mfd.rate_up_to_jam(0.0), 0.5 * fastest) for mfd in network.mfds])
+        )
         self.drop, self.bend = free(np.full(network.regions, 0.5)), free(np.zeros(network.regions))
         self.jam = free(np.log(np.maximum(0.7 * largest, 1.0)))
         self.exit_rates = free(np.zeros(network.adjacency.shape))
-        self._first_capacity = torch.tensor(np.log(np.maximum(1.2 * flow, 0.05)), dtype=torch.float32)
+        self._first_capacity = torch.tensor(
+            np.log(np.maximum(1.2 * flow, 0.05)), dtype=torch.float32
+        )
         self.capacity = free(self._first_capacity)
         self.storage = free(np.log(np.maximum(2.0 * largest, 1.0)))
 
     def shape(self) -> tuple[Tensor, ...]:
-        """Return c, first, second, jam of q = c (1 - first y - second y^2), y = x / jam, q(jam) >= LEAST_RATE c."""
+        """Return c, first, second, jam of q = c (1 - first y - second y^2), y = x / jam, q(jam) >=
+        LEAST_RATE c."""
         drop = (1.0 - LEAST_RATE) * torch.sigmoid(self.drop)
         first = 2.0 * drop * torch.sigmoid(self.bend)
         return self.free_rate.exp(), first, drop - first, self.jam.exp()
@@ -124,20 +140,26 @@ def fit(
 ) -> RegionalModel:
     """Return `network` with the MFDs, exit rates, capacities and storage that predict `runs` best.
 
-    Its MFDs are the initial guess and their critical accumulations the scale of the errors. The rate q of each region
-    falls and stays positive up to the jam accumulation, and step * q * exit rate <= 1 for the integration step.
+    Its MFDs are the initial guess and their critical accumulations the scale of the errors. The
+    rate q of each region falls and stays positive up to the jam accumulation, and step * q * exit
+    rate <= 1 for the integration step.
     """
     with one_thread():  # the same order of sums everywhere
         torch.manual_seed(seed)
         generator = torch.Generator().manual_seed(seed)
         model = _Model(network, runs, step, substeps / step)
         horizon = min(HORIZON, max(len(run.demand) for run in runs))
-        data, scheme = windows(runs, horizon), {"step": step, "substeps": substeps, "integrator": integrator}
+        data, scheme = (
+            windows(runs, horizon),
+            {"step": step, "substeps": substeps, "integrator": integrator},
+        )
         scale = torch.tensor(network.critical, dtype=torch.float32)
         optimizer = torch.optim.Adam(model.parameters(), lr=LEARNING_RATE)
         for iteration in range(iterations):
             for group in optimizer.param_groups:
-                group["lr"] = LEARNING_RATE * (0.05 + 0.95 * 0.5 * (1.0 + math.cos(math.pi * iteration / iterations)))
+                group["lr"] = LEARNING_RATE * (
+                    0.05 + 0.95 * 0.5 * (1.0 + math.cos(math.pi * iteration / iterations))
+                )
             batch = torch.randint(len(data[0]), (min(BATCH, len(data[0])),), generator=generator)
             loss = _misfit(model.regional(), [part[batch] for part in data], scale, scheme)
             optimizer.zero_grad()
@@ -150,19 +172,29 @@ def fit(
 
 
 def windows(runs: Sequence[Observed], horizon: int) -> list[Tensor]:
-    """Return states (N, horizon + 1, R, R), demands, perimeters and splits (N, horizon, ...) of all windows."""
+    """Return states (N, horizon + 1, R, R), demands, perimeters and splits (N, horizon, ...) of all
+    windows."""
 
-    cut, long = np.lib.stride_tricks.sliding_window_view, [run for run in runs if len(run.demand) >= horizon]
+    cut, long = (
+        np.lib.stride_tricks.sliding_window_view,
+        [run for run in runs if len(run.demand) >= horizon],
+    )
 
     def stack(name: str, length: int) -> Tensor:
         parts = [cut(getattr(run, name), length, axis=0) for run in long]
         return torch.tensor(np.moveaxis(np.concatenate(parts), -1, 1), dtype=torch.float32)
 
-    return [stack("accumulation", horizon + 1), *(stack(name, horizon) for name in ("demand", "perimeter", "splits"))]
+    return [
+        stack("accumulation", horizon + 1),
+        *(stack(name, horizon) for name in ("demand", "perimeter", "splits")),
+    ]
 
 
-def _misfit(p: dynamics.Parameters, data: Sequence[Tensor], scale: Tensor, scheme: Mapping[str, Any]) -> Tensor:
-    """Return the mean Huber loss of x_i and x_ij over the horizon, in units of `scale` (R,) [veh]."""
+def _misfit(
+    p: dynamics.Parameters, data: Sequence[Tensor], scale: Tensor, scheme: Mapping[str, Any]
+) -> Tensor:
+    """Return the mean Huber loss of x_i and x_ij over the horizon, in units of `scale` (R,)
+    [veh]."""
     total, horizon, huber = torch.zeros(()), data[1].shape[1], torch.nn.SmoothL1Loss(beta=OUTLIER)
     for k, x in enumerate(_rollout(p, data, scheme), start=1):
         error = (x - data[0][:, k]) / scale.unsqueeze(-1)
@@ -171,7 +203,9 @@ def _misfit(p: dynamics.Parameters, data: Sequence[Tensor], scale: Tensor, schem
     return total / horizon
 
 
-def _rollout(p: dynamics.Parameters, data: Sequence[Tensor], scheme: Mapping[str, Any]) -> Iterator[Tensor]:
+def _rollout(
+    p: dynamics.Parameters, data: Sequence[Tensor], scheme: Mapping[str, Any]
+) -> Iterator[Tensor]:
     """Yield the states (N, R, R) [veh] after each interval, from the first states of `windows`."""
     observed, demand, perimeter, splits = data
     x = observed[:, 0]
@@ -181,10 +215,13 @@ def _rollout(p: dynamics.Parameters, data: Sequence[Tensor], scheme: Mapping[str
 
 
 def _network(network: RegionalModel, model: _Model, runs: Sequence[Observed]) -> RegionalModel:
-    """Return the fitted network, with exit rates scaled to 1 on the average of a region's vehicles."""
+    """Return the fitted network, with exit rates scaled to 1 on the average of a region's
+    vehicles."""
     with torch.no_grad():
         p = model.regional()
-    assert p.exit_rates is not None and p.capacity is not None and p.storage is not None
+    assert p.exit_rates is not None
+    assert p.capacity is not None
+    assert p.storage is not None
     rates = p.exit_rates.double().numpy()
     weight = sum(run.accumulation.sum(axis=0) for run in runs)
     weight[weight.sum(axis=1) == 0] = 1.0  # empty in all runs
@@ -202,7 +239,8 @@ def _network(network: RegionalModel, model: _Model, runs: Sequence[Observed]) ->
 def prediction_errors(
     network: RegionalModel, runs: Sequence[Observed], intervals: int, **scheme: Any
 ) -> Float[np.ndarray, "N R"]:
-    """Return predicted minus observed accumulation (N, R) [veh], `intervals` ahead of each observed state.
+    """Return predicted minus observed accumulation (N, R) [veh], `intervals` ahead of each observed
+    state.
 
     scheme: step [s], substeps, integrator
     """

@@ -1,8 +1,8 @@
 """Outflow MFDs: the published cubic, piecewise linear ones, and the protocol of any other.
 
-Beyond the jam accumulation the outflow is constant. This tail is not published. The benchmark's cubic rises again
-beyond 10,019 vehicles: a jammed region would recover by itself. With g(jam) beyond the jam accumulation the published
-figures are consistent.
+Beyond the jam accumulation the outflow is constant. This tail is not published. The benchmark's
+cubic rises again beyond 10,019 vehicles: a jammed region would recover by itself. With g(jam)
+beyond the jam accumulation the published figures are consistent.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -15,7 +15,8 @@ from jaxtyping import Real
 from nmfd.errors import InputError
 
 Samples = Real[np.ndarray, " N"]
-# Geometric guess of a curve: the shape of the published one, g = c (ALPHA y^2 + BETA y + 1) x with y = x / jam.
+# Geometric guess of a curve: the shape of the published one, g = c (ALPHA y^2 + BETA y + 1) x with
+# y = x / jam.
 ALPHA, BETA = 0.98405, -1.97190
 JAM_DENSITY = 80.0  # veh per lane-km: 60 % of the lanes full of standing vehicles
 
@@ -29,23 +30,29 @@ def of_numbers(kind: "type[Mfd]", **numbers: Any) -> Any:
 
 @runtime_checkable
 class Mfd(Protocol):
-    """Outflow of one region against its accumulation; or of R regions, if its numbers are arrays (R,).
+    """Outflow of one region against its accumulation; or of R regions, if its numbers are arrays
+    (R,).
 
-    A kind of curve is a frozen dataclass of floats, or tuples of floats, with `jam` [veh] and `rate_up_to_jam`. One
-    formula serves all plants, training and MPC: it takes the functions of NumPy, torch or CasADi from `xp`, under
-    NumPy's names (minimum, maximum, exp, ...).
+    A kind of curve is a frozen dataclass of floats, or tuples of floats, with `jam` [veh] and
+    `rate_up_to_jam`. One formula serves all plants, training and MPC: it takes the functions of
+    NumPy, torch or CasADi from `xp`, under NumPy's names (minimum, maximum, exp, ...).
     """
 
     jam: Any
 
     def rate_up_to_jam(self, accumulation: Any, xp: Any = np) -> Any:
-        """Return the outflow per vehicle q(n) = g(n)/n [1/s] for n [veh] up to the jam, falling and finite at 0."""
+        """Return the outflow per vehicle q(n) = g(n)/n [1/s] for n [veh] up to the jam, falling and
+        finite at 0."""
         ...
 
     def slope_up_to_jam(self, accumulation: Any) -> Any:
-        """Return dq/dn [1/(veh s)] of NumPy's arrays; by finite differences unless a kind states it."""
+        """Return dq/dn [1/(veh s)] of NumPy's arrays; by finite differences unless a kind states
+        it."""
         step = 1e-6 * self.jam
-        above, below = self.rate_up_to_jam(accumulation + step), self.rate_up_to_jam(accumulation - step)
+        above, below = (
+            self.rate_up_to_jam(accumulation + step),
+            self.rate_up_to_jam(accumulation - step),
+        )
         return (above - below) / (2.0 * step)
 
     def scaled(self, wide: Any, high: Any) -> "Mfd":
@@ -112,7 +119,9 @@ class Cubic(Mfd):
         for name, value in vars(self).items():
             if not np.isfinite(value) or (name == "jam" and value <= 0):
                 allowed = "a number above 0" if name == "jam" else "a number"
-                raise InputError(f"Mfd: {name}: expected {allowed}, got {value:g} instead; give a finite one")
+                raise InputError(
+                    f"Mfd: {name}: expected {allowed}, got {value:g} instead; give a finite one"
+                )
 
     def rate_up_to_jam(self, accumulation: Any, xp: Any = np) -> Any:
         return (self.a * accumulation + self.b) * accumulation + self.c
@@ -143,7 +152,9 @@ class PiecewiseLinear(Mfd):
         rising = len(n) == count + 1 > 1 and (np.diff(n) > 0).all()
         if not (rising and np.isfinite([*n, *self.outflows]).all()):
             wanted = "as many finite outflows as accumulations, which rise from above 0"
-            raise InputError(f"PiecewiseLinear: expected {wanted}, got {self.accumulations} and {self.outflows}")
+            raise InputError(
+                f"PiecewiseLinear: expected {wanted}, got {self.accumulations} and {self.outflows}"
+            )
 
     @property
     def jam(self) -> Any:
@@ -152,12 +163,16 @@ class PiecewiseLinear(Mfd):
     def rate_up_to_jam(self, accumulation: Any, xp: Any = np) -> Any:
         kinks = self._kinks()
         q = next(kinks)[1] + 0.0 * accumulation
-        for kink, change in kinks:  # beyond n_k the outflow changes by (n - n_k) times the change of slope
+        for (
+            kink,
+            change,
+        ) in kinks:  # beyond n_k the outflow changes by (n - n_k) times the change of slope
             q = q + change * (1.0 - kink / xp.maximum(accumulation, kink))
         return q
 
     def _kinks(self) -> Iterator[tuple[Any, Any]]:
-        """Yield the accumulations at which the slope of the outflow changes, from 0, and these changes [1/s]."""
+        """Yield the accumulations at which the slope of the outflow changes, from 0, and these
+        changes [1/s]."""
         left, low, before = 0.0, 0.0, 0.0
         for right, high in zip(self.accumulations, self.outflows, strict=True):
             slope = (high - low) / (right - left)
@@ -165,14 +180,19 @@ class PiecewiseLinear(Mfd):
             left, low, before = right, high, slope
 
 
-def trapezoid(*, free: float, capacity: float, wave: float, jam: float, least: float = 0.05) -> PiecewiseLinear:
-    """Return g(n) = min(free n, capacity, wave (jam - n)), constant below `least` times the capacity.
+def trapezoid(
+    *, free: float, capacity: float, wave: float, jam: float, least: float = 0.05
+) -> PiecewiseLinear:
+    """Return g(n) = min(free n, capacity, wave (jam - n)), constant below `least` times the
+    capacity.
 
-    free, wave: outflow per vehicle of an empty region, and by which it falls before the jam [1/s]; capacity [veh/s]
+    free, wave: outflow per vehicle of an empty region, and by which it falls before the jam [1/s];
+        capacity [veh/s]
     """
     last = jam - least * capacity / wave
     return PiecewiseLinear(
-        accumulations=(capacity / free, jam - capacity / wave, last), outflows=(capacity, capacity, least * capacity)
+        accumulations=(capacity / free, jam - capacity / wave, last),
+        outflows=(capacity, capacity, least * capacity),
     )
 
 
@@ -187,23 +207,30 @@ class _Scaled(Mfd):
 
 
 class _Several(Mfd):
-    """Regions with curves of different kinds, each an array over all regions with weights 0 and 1."""
+    """Regions with curves of different kinds, each an array over all regions with weights 0 and
+    1."""
 
     def __init__(self, kinds: list[tuple[Any, Mfd]]):
         self.kinds, self.jam = kinds, sum(weight * curve.jam for weight, curve in kinds)
 
     def rate_up_to_jam(self, accumulation: Any, xp: Any = np) -> Any:
-        return sum(w * curve.rate_up_to_jam(xp.minimum(accumulation, curve.jam), xp) for w, curve in self.kinds)
+        return sum(
+            w * curve.rate_up_to_jam(xp.minimum(accumulation, curve.jam), xp)
+            for w, curve in self.kinds
+        )
 
 
 def stacked(mfds: Sequence[Mfd], array: Callable[[Sequence[float]], Any]) -> Mfd:
-    """Return the curves of R regions as one, whose numbers are arrays (R,), made by `array`, such as np.array."""
+    """Return the curves of R regions as one, whose numbers are arrays (R,), made by `array`, such
+    as np.array."""
     keys = [(type(m), *map(np.shape, vars(m).values())) for m in mfds]
     kinds: dict[tuple, tuple[Any, Mfd]] = {}
     for key, first in zip(keys, mfds, strict=True):
         if key in kinds:
             continue
-        alike = [m if k == key else first for m, k in zip(mfds, keys, strict=True)]  # the others get any numbers
+        alike = [
+            m if k == key else first for m, k in zip(mfds, keys, strict=True)
+        ]  # the others get any numbers
         columns = {name: [vars(m)[name] for m in alike] for name in vars(first)}
         numbers = {
             name: tuple(map(array, zip(*column, strict=True)))
@@ -223,20 +250,25 @@ def guess(rate: float, jam: float) -> Cubic:
 
 
 def guess_beyond(curve: Mfd, jam: float, seen: float, *, max_rate: float = np.inf) -> Cubic:
-    """Return the guess with the outflow of `curve`, fitted to data without a falling branch, at their end `seen` [veh].
+    """Return the guess with the outflow of `curve`, fitted to data without a falling branch, at
+    their end `seen` [veh].
 
-    jam: of the region's lanes [veh], raised so that the critical accumulation is above `seen`; max_rate: [1/s]
+    jam: of the region's lanes [veh], raised so that the critical accumulation is above `seen`;
+        max_rate: [1/s]
     """
     jam *= max(1.0, 1.0001 * seen / guess(1.0, jam).critical)
     return guess(float(min(curve.outflow(seen) / guess(1.0, jam).outflow(seen), max_rate)), jam)
 
 
-def fit(accumulation: Samples, outflow: Samples, *, max_rate: float = np.inf, bins: int = 24) -> Cubic:
-    """Fit a curve to samples (n,) [veh], (n,) [veh/s] by least squares over the medians of bins of accumulation.
+def fit(
+    accumulation: Samples, outflow: Samples, *, max_rate: float = np.inf, bins: int = 24
+) -> Cubic:
+    """Fit a curve to samples (n,) [veh], (n,) [veh/s] by least squares over the medians of bins of
+    accumulation.
 
-    The rate q(x) = a x^2 + b x + c is positive, falling up to the jam accumulation and at most `max_rate` [1/s] (the
-    inverse of the integration step). The jam accumulation is at most the largest sample: beyond the data the outflow
-    is constant. Raises ValueError without samples.
+    The rate q(x) = a x^2 + b x + c is positive, falling up to the jam accumulation and at most
+    `max_rate` [1/s] (the inverse of the integration step). The jam accumulation is at most the
+    largest sample: beyond the data the outflow is constant. Raises ValueError without samples.
     """
     x, g = np.asarray(accumulation, dtype=float), np.asarray(outflow, dtype=float)
     good = np.isfinite(x) & np.isfinite(g) & (x > 0)
@@ -245,7 +277,9 @@ def fit(accumulation: Samples, outflow: Samples, *, max_rate: float = np.inf, bi
     x, g = x[good], g[good]
     number = np.minimum((bins * x / x.max()).astype(int), bins - 1)
     used = np.unique(number)
-    middle_x, middle_g = (np.array([np.median(values[number == n]) for n in used]) for values in (x, g))
+    middle_x, middle_g = (
+        np.array([np.median(values[number == n]) for n in used]) for values in (x, g)
+    )
     jams = (float(share * x.max()) for share in np.linspace(0.2, 1.0, 17))
     candidates = (_fit_cubic(middle_x, middle_g, jam, max_rate) for jam in jams)
     return min(candidates, key=lambda curve: ((curve.outflow(middle_x) - middle_g) ** 2).sum())
@@ -254,8 +288,8 @@ def fit(accumulation: Samples, outflow: Samples, *, max_rate: float = np.inf, bi
 def _fit_cubic(x: np.ndarray, g: np.ndarray, jam: float, max_rate: float) -> Cubic:
     from scipy.optimize import minimize  # slow to import
 
-    # Scaled: g = (A y^2 + B y + C) y with y = x / jam, at most 1. Falling: B <= 0 and 2 A + B <= 0 (q' is linear).
-    # Positive at the jam: A + B + C >= floor.
+    # Scaled: g = (A y^2 + B y + C) y with y = x / jam, at most 1. Falling: B <= 0 and 2 A + B <= 0
+    # (q' is linear). Positive at the jam: A + B + C >= floor.
     y, scale = np.minimum(x / jam, 1.0), g.max()
     design = np.stack([y**3, y**2, y], axis=1)
     limits = np.array([[0, -1, 0], [-2, -1, 0], [1, 1, 1], [0, 0, 1], [0, 0, -1]], dtype=float)

@@ -1,4 +1,5 @@
-"""Planning model of a controller: its belief about the city, which may differ from the simulated city.
+"""Planning model of a controller: its belief about the city, which may differ from the simulated
+city.
 
 It shares no array with the scenario, so that a controller cannot change the plant.
 """
@@ -55,20 +56,26 @@ class Options(Settings):
 Declared = TypeVar("Declared", bound=Options)
 
 
-def options(declaration: type[Declared], planning: PlanningModel, name: str, table: str = "") -> Declared:
-    """Return the checked options of controller `name`; errors name `table` instead. Raise InputError."""
+def options(
+    declaration: type[Declared], planning: PlanningModel, name: str, table: str = ""
+) -> Declared:
+    """Return the checked options of controller `name`; errors name `table` instead. Raise
+    InputError."""
     prefix = f"controllers.{table or name}."
-    checked = config.checked(declaration, planning.controller_options.get(name, {}), planning.where, prefix)
+    checked = config.checked(
+        declaration, planning.controller_options.get(name, {}), planning.where, prefix
+    )
     if problem := checked.misfit(planning):
         raise config.error(planning.where, prefix + problem.key, str(problem))
     return checked
 
 
 def planning_model(scenario: Scenario, controller: str = "", table: str = "") -> PlanningModel:
-    """Return the planning model of `controller`, with the options of `table` over its own. Raise InputError.
+    """Return the planning model of `controller`, with the options of `table` over its own. Raise
+    InputError.
 
-    Its network is the option `model`, else the guided model of the city if the controller guides routes, else the
-    scenario's.
+    Its network is the option `model`, else the guided model of the city if the controller guides
+    routes, else the scenario's.
     """
     table, tables = table or controller, scenario.controller_options
     merged = {**tables.get(controller, {}), **tables.get(table, {})}
@@ -89,7 +96,8 @@ def planning_model(scenario: Scenario, controller: str = "", table: str = "") ->
 
 
 def other_model(scenario: Scenario, folder: Path, where: str = "") -> RegionalModel:
-    """Return the regional model in `folder`. Raise InputError, which names `where`, if it is of another city."""
+    """Return the regional model in `folder`. Raise InputError, which names `where`, if it is of
+    another city."""
     model = load_network(folder)
     if not np.array_equal(model.adjacency, scenario.network.adjacency):
         what = f"network {model.name} has other regions or boundaries than {scenario.network.name}"

@@ -11,7 +11,8 @@ from nmfd.types import Controls, Observation, State
 
 
 class NmfdPlant:
-    """The regional model as a plant; deterministic but for `process_std`, so that without it seeds change nothing.
+    """The regional model as a plant; deterministic but for `process_std`, so that without it seeds
+    change nothing.
 
     >>> scenario = nmfd.load_scenario("economic_mpc")
     >>> plant, network = nmfd.NmfdPlant(scenario), scenario.network
@@ -36,23 +37,36 @@ class NmfdPlant:
         """Advance by one control interval. Raises LedgerError if vehicles appear or vanish."""
         metering = None if controls.metering is None else torch.from_numpy(controls.metering)
         demand, self._backlog = dynamics.admitted(
-            self._backlog, torch.from_numpy(self._scenario.demand[self._k]), metering, self._scenario.step
+            self._backlog,
+            torch.from_numpy(self._scenario.demand[self._k]),
+            metering,
+            self._scenario.step,
         )
-        splits = self._scenario.network.nominal_splits if controls.splits is None else controls.splits
+        splits = (
+            self._scenario.network.nominal_splits if controls.splits is None else controls.splits
+        )
         ended = self._advance(demand.numpy(), controls.perimeter, splits)
         self._entered += float(demand.sum()) * self._scenario.step + self._disturb()
         self._ended += ended
         self._k += 1
         state = self._state()
         inside, least = float(self._x.sum()), float(self._x.min())
-        ledger.check(state.step, state.time, entered=self._entered, ended=self._ended, inside=inside, least=least)
+        ledger.check(
+            state.step,
+            state.time,
+            entered=self._entered,
+            ended=self._ended,
+            inside=inside,
+            least=least,
+        )
         return state
 
     def observe(self) -> Observation | None:
         """Return None: controllers observe the state with noise."""
 
     def _disturb(self) -> float:
-        """Add the process noise to each x_ij that is not empty; return the vehicles that it adds in all [veh]."""
+        """Add the process noise to each x_ij that is not empty; return the vehicles that it adds in
+        all [veh]."""
         if not self._scenario.process_std:
             return 0.0
         before = self._accumulation()
@@ -86,15 +100,17 @@ class NmfdPlant:
         """Advance `_x` by one control interval; return the completed trips [veh]."""
         inflow, u, theta = (torch.from_numpy(values) for values in (demand, perimeter, splits))
         scheme = self._scenario.scheme
-        self._x, ended = dynamics.advance_counted(self._parameters, self._x, inflow, u, theta, **scheme)
+        self._x, ended = dynamics.advance_counted(
+            self._parameters, self._x, inflow, u, theta, **scheme
+        )
         return float(ended)
 
 
 class AcyclicPlant(NmfdPlant):
     """The acyclic regional model as a plant.
 
-    forced_moves: vehicles since the reset [veh] without an allowed next region, sent to the least-bad one, counted at
-        the rate at the beginning of each control interval
+    forced_moves: vehicles since the reset [veh] without an allowed next region, sent to the
+        least-bad one, counted at the rate at the beginning of each control interval
     """
 
     forced_moves: float
@@ -118,7 +134,11 @@ class AcyclicPlant(NmfdPlant):
         model = self._model
         theta, forced = acyclic.shares(model, splits)
         if forced.any():
-            passing = acyclic.transfers(model, self._x, acyclic.outflow(model, self._x), perimeter, theta)
+            passing = acyclic.transfers(
+                model, self._x, acyclic.outflow(model, self._x), perimeter, theta
+            )
             self.forced_moves += self._scenario.step * float(passing[model.fallback[forced]].sum())
-        self._x, ended = acyclic.advance_counted(model, self._x, demand, perimeter, theta, **self._scenario.scheme)
+        self._x, ended = acyclic.advance_counted(
+            model, self._x, demand, perimeter, theta, **self._scenario.scheme
+        )
         return ended

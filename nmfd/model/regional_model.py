@@ -18,19 +18,26 @@ from nmfd.model.mfd import Cubic, Mfd
 from nmfd.runs import config, shipped
 from nmfd.runs.config import Problem, Regions, Rows, Settings, Share, filled, got, setting
 
-# Flow over a boundary with a capacity: a smooth minimum of desired flow and limit, (desired^-n + limit^-n)^(-1/n), 84 %
-# of either where they are equal, because demand within a control interval is not even.
+# Flow over a boundary with a capacity: a smooth minimum of desired flow and limit, (desired^-n +
+# limit^-n)^(-1/n), 84 % of either where they are equal, because demand within a control interval is
+# not even.
 SHARPNESS = 4
 LEAST_ROOM = 0.03  # of the capacity, into a region however full: no boundary closes for good
 LEAST_LIMIT = 1e-6  # veh/s, against a division by zero
 
 MOST_VEHICLES = 1e9  # in a region
 DISPERSION_S = 60.0  # of the travel times that drivers perceive; assumed
-FOR_ALL = ("exit_rates", "capacity", "storage", "controllable")  # given for every region or for none
+FOR_ALL = (
+    "exit_rates",
+    "capacity",
+    "storage",
+    "controllable",
+)  # given for every region or for none
 
 
 def passing_share(wish: Any, limit: Any) -> Any:
-    """Return the share [-] of a desired flow that passes a boundary of this limit [veh/s]; any library's arrays."""
+    """Return the share [-] of a desired flow that passes a boundary of this limit [veh/s]; any
+    library's arrays."""
     return (1.0 + (wish / (limit + LEAST_LIMIT)) ** SHARPNESS) ** (-1.0 / SHARPNESS)
 
 
@@ -43,13 +50,18 @@ class RegionalModel:
     adjacency: (R, R) bool, [i, h]: roads lead from i to h; false on the diagonal
     mfds: R outflow MFDs
     u_min, u_max: bounds of the perimeter control [-]
-    observed_split_ratios: {(i, j): {h: share}}, measured; elsewhere vehicles cross the fewest boundaries
-    exit_rates: (R, R) [-], [i, j]: rate of vehicles in i bound for j relative to g_i(x_i)/x_i; None: 1
-    capacity: (R, R) [veh/s], [i, h]: largest flow from i into an empty region h under u_max; None: u_ih is a share of
-        the desired flow
-    storage: (R,) [veh], accumulation that leaves no room for vehicles from other regions; with `capacity`
-    controllable: (R, R) [-], [i, h]: share of the flow that passes signals under control; None if unknown
-    critical_above: {region: largest accumulation [veh]} where data show no falling branch; the MFD is a guess beyond
+    observed_split_ratios: {(i, j): {h: share}}, measured; elsewhere vehicles cross the fewest
+        boundaries
+    exit_rates: (R, R) [-], [i, j]: rate of vehicles in i bound for j relative to g_i(x_i)/x_i;
+        None: 1
+    capacity: (R, R) [veh/s], [i, h]: largest flow from i into an empty region h under u_max; None:
+        u_ih is a share of the desired flow
+    storage: (R,) [veh], accumulation that leaves no room for vehicles from other regions; with
+        `capacity`
+    controllable: (R, R) [-], [i, h]: share of the flow that passes signals under control; None if
+        unknown
+    critical_above: {region: largest accumulation [veh]} where data show no falling branch; the MFD
+        is a guess beyond
     dispersion: of the logit by which guided drivers answer prices (nmfd.model.answer) [s]
     placeholder: the MFDs are guesses that no run has measured
     doubts: warnings about the fit of each region; () if unknown
@@ -63,7 +75,9 @@ class RegionalModel:
     mfds: tuple[Mfd, ...]
     u_min: float
     u_max: float
-    observed_split_ratios: Mapping[tuple[int, int], Mapping[int, float]] = field(default_factory=dict)
+    observed_split_ratios: Mapping[tuple[int, int], Mapping[int, float]] = field(
+        default_factory=dict
+    )
     exit_rates: PerPair | None = None
     capacity: PerPair | None = None
     storage: PerRegion | None = None
@@ -81,7 +95,10 @@ class RegionalModel:
     @property
     def titles(self) -> tuple[str, ...]:
         """Number and name of each region, such as "3 centre"; "region 3" if that is the name."""
-        return tuple(f"region {n}" if name == str(n) else f"{n} {name}" for n, name in enumerate(self.region_names))
+        return tuple(
+            f"region {n}" if name == str(n) else f"{n} {name}"
+            for n, name in enumerate(self.region_names)
+        )
 
     @property
     def critical(self) -> PerRegion:
@@ -91,7 +108,9 @@ class RegionalModel:
     @property
     def seen_critical(self) -> PerRegion:
         """Critical accumulations (R,) [veh], NaN where data show no falling branch."""
-        return np.where([r in self.critical_above for r in range(self.regions)], np.nan, self.critical)
+        return np.where(
+            [r in self.critical_above for r in range(self.regions)], np.nan, self.critical
+        )
 
     @cached_property
     def hops(self) -> Hops:
@@ -101,7 +120,8 @@ class RegionalModel:
 
     @cached_property
     def split_mask(self) -> TurnMask:
-        """Turns with theta_ihj > 0 allowed (R, R, R) bool: h adjacent to i, and j reachable from h without i."""
+        """Turns with theta_ihj > 0 allowed (R, R, R) bool: h adjacent to i, and j reachable from h
+        without i."""
         mask = np.zeros((self.regions,) * 3, dtype=bool)
         roads = csr_array(self.adjacency)
         for i in range(self.regions):
@@ -111,7 +131,8 @@ class RegionalModel:
 
     @cached_property
     def nominal_splits(self) -> PerTurn:
-        """Theta without guidance (R, R, R) [-], [i, h, j]: observed, otherwise equal shares of shortest paths."""
+        """Theta without guidance (R, R, R) [-], [i, h, j]: observed, otherwise equal shares of
+        shortest paths."""
         closer = self.hops[None, :, :] == self.hops[:, None, :] - 1
         theta = (self.adjacency[:, :, None] & closer & self.split_mask).astype(float)
         for (i, j), shares in self.observed_split_ratios.items():
@@ -134,17 +155,27 @@ class RegionalModel:
     @cached_property
     def hash(self) -> str:
         """Hash of all that the dynamics depend on; a policy is valid for one network only."""
-        mfds = [[*([] if isinstance(m, Cubic) else [type(m).__name__]), *vars(m).values()] for m in self.mfds]
+        mfds = [
+            [*([] if isinstance(m, Cubic) else [type(m).__name__]), *vars(m).values()]
+            for m in self.mfds
+        ]
         content = [self.adjacency.astype(int).tolist(), mfds, self.u_min, self.u_max]
         content += [self.nominal_splits.round(12).tolist()]
-        options = {"exit_rates": self.exit_rates, "capacity": self.capacity, "storage": self.storage}
-        content += [[name, option.tolist()] for name, option in options.items() if option is not None]
+        options = {
+            "exit_rates": self.exit_rates,
+            "capacity": self.capacity,
+            "storage": self.storage,
+        }
+        content += [
+            [name, option.tolist()] for name, option in options.items() if option is not None
+        ]
         content += [["dispersion", self.dispersion]] if self.dispersion != DISPERSION_S else []
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
 
 def _reachable(roads: csr_array) -> Adjacency:
-    """Return (R, R) bool, [h, j]: j is reachable from h; by components where possible, which is much faster."""
+    """Return (R, R) bool, [h, j]: j is reachable from h; by components where possible, which is
+    much faster."""
     parts, label = csgraph.connected_components(roads, connection="weak")
     if parts == csgraph.connected_components(roads, connection="strong", return_labels=False):
         return label[:, None] == label
@@ -160,7 +191,9 @@ class PerimeterTable(Settings):
     @model_validator(mode="after")
     def _ordered(self) -> "PerimeterTable":
         if self.min >= self.max:
-            raise Problem("", f"min must be less than max, got min = {self.min:g} and max = {self.max:g}")
+            raise Problem(
+                "", f"min must be less than max, got min = {self.min:g} and max = {self.max:g}"
+            )
         return self
 
 
@@ -170,7 +203,9 @@ class MfdTable(Settings):
     a: float = setting("cubic coefficient", unit="veh^-2 s^-1")
     b: float = setting("quadratic coefficient", unit="veh^-1 s^-1")
     c: float = setting("linear coefficient", unit="s^-1", gt=0.0)
-    jam: float = setting("accumulation beyond which the outflow is constant", unit="veh", gt=0.0, le=MOST_VEHICLES)
+    jam: float = setting(
+        "accumulation beyond which the outflow is constant", unit="veh", gt=0.0, le=MOST_VEHICLES
+    )
 
     @model_validator(mode="after")
     def _valid(self) -> "MfdTable":
@@ -187,11 +222,15 @@ class RegionTable(Settings):
     """Region; regions are numbered from 0 in the order of the file."""
 
     name: config.Name | None = setting("name; by default the number", None)
-    position: Annotated[tuple[float, float], Field(strict=False)] = setting("place on the map, in any unit")
+    position: Annotated[tuple[float, float], Field(strict=False)] = setting(
+        "place on the map, in any unit"
+    )
     adjacent: Regions = setting("regions into which roads lead from here")
     mfd: MfdTable | None = setting("own MFD instead of [mfd]", None)
     exit_rates: config.PositiveNumbers | None = setting(
-        "rate at which vehicles leave, relative to the MFD, per destination; for all regions or none", None, unit="-"
+        "rate at which vehicles leave, relative to the MFD, per destination; for all regions or none",
+        None,
+        unit="-",
     )
     capacity: config.PositiveNumbers | None = setting(
         "largest flow into each adjacent region while that is empty, at the largest u, in the order of adjacent; with "
@@ -200,7 +239,11 @@ class RegionTable(Settings):
         unit="veh/s",
     )
     storage: float | None = setting(
-        "accumulation at which no vehicle can enter; with capacity", None, unit="veh", gt=0.0, le=MOST_VEHICLES
+        "accumulation at which no vehicle can enter; with capacity",
+        None,
+        unit="veh",
+        gt=0.0,
+        le=MOST_VEHICLES,
     )
     controllable: Annotated[tuple[Share, ...], Field(strict=False)] | None = setting(
         "share of the flow into each adjacent region that passes signals under control, in the order of adjacent; for "
@@ -209,7 +252,10 @@ class RegionTable(Settings):
         unit="-",
     )
     critical_above: float | None = setting(
-        "largest accumulation in data without a falling branch; the critical one is above it", None, unit="veh", ge=0.0
+        "largest accumulation in data without a falling branch; the critical one is above it",
+        None,
+        unit="veh",
+        ge=0.0,
     )
     doubts: config.Texts = setting("warnings of cosim identify about the fit", ())
     observed_split_ratios: dict[str, dict[str, Share]] = setting(
@@ -223,10 +269,16 @@ class NetworkTable(Settings):
     """Regional model of a city."""
 
     name: config.Name = setting("name of the model")
-    placeholder: bool = setting("MFDs are guesses from lanes and speed limits; no policy is trained on them", False)
+    placeholder: bool = setting(
+        "MFDs are guesses from lanes and speed limits; no policy is trained on them", False
+    )
     perimeter: PerimeterTable = setting("bounds of the control")
     dispersion: float = setting(
-        "spread of travel times by which guided drivers answer prices (logit)", DISPERSION_S, unit="s", ge=1.0, le=1e4
+        "spread of travel times by which guided drivers answer prices (logit)",
+        DISPERSION_S,
+        unit="s",
+        ge=1.0,
+        le=1e4,
     )
     mfd: MfdTable | None = setting("MFD of every region without one of its own", None)
     regions: Rows[RegionTable] = setting("one table per region", min_length=1)
@@ -241,21 +293,39 @@ class NetworkTable(Settings):
                 allowed = f"a list of distinct whole numbers from 0 to {count - 1} without {i}, the region itself"
                 raise Problem(f"{where}.adjacent", got(allowed, list(row.adjacent)))
             if row.mfd is None and self.mfd is None:
-                raise Problem(f"{where}.mfd", "missing; add a table [regions.mfd], or [mfd] for all regions")
+                raise Problem(
+                    f"{where}.mfd", "missing; add a table [regions.mfd], or [mfd] for all regions"
+                )
             if (row.storage is None) != (row.capacity is None):
-                raise Problem(f"{where}.capacity", "capacity and storage belong together; add or remove one")
+                raise Problem(
+                    f"{where}.capacity", "capacity and storage belong together; add or remove one"
+                )
             for key in FOR_ALL:
-                if getattr(row, key) is None and any(getattr(other, key) is not None for other in self.regions):
+                if getattr(row, key) is None and any(
+                    getattr(other, key) is not None for other in self.regions
+                ):
                     raise Problem(f"{where}.{key}", "missing; give it for every region or for none")
-            lengths = {"exit_rates": count, "capacity": len(row.adjacent), "controllable": len(row.adjacent)}
+            lengths = {
+                "exit_rates": count,
+                "capacity": len(row.adjacent),
+                "controllable": len(row.adjacent),
+            }
             for key, length in lengths.items():
                 if (values := getattr(row, key)) is not None and len(values) != length:
-                    raise Problem(f"{where}.{key}", got(f"a list of {length} numbers", list(values)))
+                    raise Problem(
+                        f"{where}.{key}", got(f"a list of {length} numbers", list(values))
+                    )
             for destination, shares in row.observed_split_ratios.items():
-                known = destination in map(str, range(count)) and set(shares) <= set(map(str, row.adjacent))
+                known = destination in map(str, range(count)) and set(shares) <= set(
+                    map(str, row.adjacent)
+                )
                 if not known or abs(sum(shares.values()) - 1.0) > 1e-3:
-                    allowed = f"destination = {{ one of {list(row.adjacent)} = share, ... }} with sum 1"
-                    raise Problem(f"{where}.observed_split_ratios.{destination}", got(allowed, shares))
+                    allowed = (
+                        f"destination = {{ one of {list(row.adjacent)} = share, ... }} with sum 1"
+                    )
+                    raise Problem(
+                        f"{where}.observed_split_ratios.{destination}", got(allowed, shares)
+                    )
         return self
 
 
@@ -302,7 +372,9 @@ def load_network(folder: Path | str) -> RegionalModel:
         capacity=numbers("capacity", by_pair=True),
         storage=numbers("storage"),
         controllable=numbers("controllable", by_pair=True),
-        critical_above={i: row.critical_above for i, row in enumerate(rows) if row.critical_above is not None},
+        critical_above={
+            i: row.critical_above for i, row in enumerate(rows) if row.critical_above is not None
+        },
         dispersion=table.dispersion,
         placeholder=table.placeholder,
         folder=folder,
@@ -310,7 +382,11 @@ def load_network(folder: Path | str) -> RegionalModel:
     )
     if (network.hops < 0).any():
         i, j = np.argwhere(network.hops < 0)[0]
-        raise config.error(path, "regions", f"region {j} cannot be reached from region {i}; connect them with adjacent")
+        raise config.error(
+            path,
+            "regions",
+            f"region {j} cannot be reached from region {i}; connect them with adjacent",
+        )
     for (i, j), observed in network.observed_split_ratios.items():
         for h in observed:
             if not network.split_mask[i, h, j]:
@@ -320,7 +396,8 @@ def load_network(folder: Path | str) -> RegionalModel:
 
 
 def check_step(network: RegionalModel, step: float, where: str) -> None:
-    """Raise InputError unless forward Euler with `step` [s] keeps accumulations non-negative (step * q <= 1)."""
+    """Raise InputError unless forward Euler with `step` [s] keeps accumulations non-negative (step
+    * q <= 1)."""
     for region, mfd in enumerate(network.mfds):
         fastest = float(mfd.rate(np.linspace(0.0, mfd.jam, 2001)).max())
         if network.exit_rates is not None:
@@ -328,12 +405,17 @@ def check_step(network: RegionalModel, step: float, where: str) -> None:
         if step * fastest > 1.0:
             problem = f"an integration step of {step:g} s is too long for region {region} of network {network.name}"
             allowed = f"allowed is at most {1.0 / fastest:.3g} s: raise substeps or shorten step"
-            raise InputError(f"{where}: step: {problem}, whose vehicles leave at {fastest:.3g} 1/s; {allowed}")
+            raise InputError(
+                f"{where}: step: {problem}, whose vehicles leave at {fastest:.3g} 1/s; {allowed}"
+            )
 
 
 def network_toml(network: RegionalModel, sumo: Mapping[str, str], comment: str) -> str:
     """Return network.toml of `network` with this table [sumo]."""
     ratios = sorted(network.observed_split_ratios.items())
-    observed = [[(j, shares) for (i, j), shares in ratios if i == region] for region in range(network.regions)]
+    observed = [
+        [(j, shares) for (i, j), shares in ratios if i == region]
+        for region in range(network.regions)
+    ]
     values = {"network": network, "sumo": sumo, "comment": comment, "observed": observed}
     return filled(Path(__file__).with_name("network.toml.j2"), **values)

@@ -18,7 +18,18 @@ from nmfd.errors import InputError
 from nmfd.faults import Fault, parse
 from nmfd.model.regional_model import RegionalModel, check_step, load_network
 from nmfd.runs import config, files, shipped
-from nmfd.runs.config import Name, Numbers, Problem, Regions, Rows, Settings, Text, Texts, setting, whole
+from nmfd.runs.config import (
+    Name,
+    Numbers,
+    Problem,
+    Regions,
+    Rows,
+    Settings,
+    Text,
+    Texts,
+    setting,
+    whole,
+)
 
 LONGEST_STEP_S = 86_400.0
 MOST_STEPS = 10**6
@@ -28,13 +39,15 @@ KINDS = ("demand", "demand-total", "mfd-scale", "mfd-axis", "trip-lengths")  # o
 
 @dataclass(frozen=True, kw_only=True)
 class Horizon:
-    """Network, control intervals and options, which a scenario shares with the planning models of its controllers.
+    """Network, control intervals and options, which a scenario shares with the planning models of
+    its controllers.
 
     name: of the scenario
     step: control interval [s]
     steps: T
     measurement_std: standard deviation of the Gaussian noise on each observed x_ij [veh]
-    integrator, substeps: "euler" or "rk4", and its steps per control interval, of the regional model
+    integrator, substeps: "euler" or "rk4", and its steps per control interval, of the regional
+        model
     protected: regions that gating protects
     controller_options: controller -> its table in [controllers], checked by that controller
     initial: (R, R) [veh], [i, j]: vehicles in i bound for j at the start; None: empty
@@ -69,7 +82,8 @@ class Scenario(Horizon):
     """T control intervals of a simulated network.
 
     demand: (T, R, R) [veh/s], [k, i, j]: vehicles that start in i bound for j during interval k
-    process_std: standard deviation of the Gaussian noise on each x_ij of the regional plants after an interval [veh]
+    process_std: standard deviation of the Gaussian noise on each x_ij of the regional plants after
+        an interval [veh]
     demand_factor: factor already applied to the demand, for a city with vehicles of its own
     faults: injected into every run (nmfd.faults)
     sumo: table [sumo], checked by cosim
@@ -89,46 +103,64 @@ class Scenario(Horizon):
     @cached_property
     def hash(self) -> str:
         """Hash of all that a run depends on, whatever the names of its files."""
-        content = [self.network.hash, self.step, self.steps, self.measurement_std, self.integrator, self.substeps]
+        content = [
+            self.network.hash,
+            self.step,
+            self.steps,
+            self.measurement_std,
+            self.integrator,
+            self.substeps,
+        ]
         content += [self.protected, self.controller_options]
         content += [self.faults] if self.faults else []
         content += [["process_std", self.process_std]] if self.process_std else []
         content += [self.initial.tolist()] if self.initial is not None else []
         text = json.dumps(content, sort_keys=True, default=str)
-        return hashlib.sha256(text.encode() + np.ascontiguousarray(self.demand).tobytes()).hexdigest()[:16]
+        return hashlib.sha256(
+            text.encode() + np.ascontiguousarray(self.demand).tobytes()
+        ).hexdigest()[:16]
 
     @cached_property
     def ordered_faults(self) -> tuple[Fault, ...]:
         """`faults`, parsed. Raises InputError."""
-        return tuple(parse(text, f"{self.where}: faults", self.network.regions) for text in self.faults)
+        return tuple(
+            parse(text, f"{self.where}: faults", self.network.regions) for text in self.faults
+        )
 
 
 def with_demand(scenario: Scenario, *, steps: int | None = None, factor: float = 1.0) -> Scenario:
-    """Return at most the first `steps` control intervals of `scenario`, with `factor` times its demand."""
+    """Return at most the first `steps` control intervals of `scenario`, with `factor` times its
+    demand."""
     if steps is not None and steps < 1:
         raise InputError(f"steps: expected 1 or more control intervals, got {steps} instead")
     steps = scenario.steps if steps is None else min(steps, scenario.steps)
     return replace(
-        scenario, steps=steps, demand=factor * scenario.demand[:steps], demand_factor=factor * scenario.demand_factor
+        scenario,
+        steps=steps,
+        demand=factor * scenario.demand[:steps],
+        demand_factor=factor * scenario.demand_factor,
     )
 
 
 def pairs_with_demand(demand: PairsOverTime) -> Bool[np.ndarray, "R R"]:
-    """Return the pairs of regions with demand (T, R, R) at any time: noise perturbs these, all the time."""
+    """Return the pairs of regions with demand (T, R, R) at any time: noise perturbs these, all the
+    time."""
     return (demand > 0).any(axis=0)
 
 
 def perturbed(scenario: Scenario, sigma: float, seed: int, kind: str = "demand") -> Scenario:
-    """Return `scenario` with another demand or other MFDs; n are standard normal draws. Raise InputError.
+    """Return `scenario` with another demand or other MFDs; n are standard normal draws. Raise
+    InputError.
 
-    demand: max(0, d_ij(k) + sigma n_ij(k)) [veh/s]. Clipping passes only the positive half of the noise while no demand
-        is planned, which adds 0.4 sigma veh/s per pair.
+    demand: max(0, d_ij(k) + sigma n_ij(k)) [veh/s]. Clipping passes only the positive half of the
+        noise while no demand is planned, which adds 0.4 sigma veh/s per pair.
     demand-total: the same, scaled to the planned trips of every pair
-    mfd-scale, mfd-axis: outflow, or accumulation axis and storage, of every region times exp(sigma n_i)
+    mfd-scale, mfd-axis: outflow, or accumulation axis and storage, of every region times exp(sigma
+        n_i)
     trip-lengths: exit rates times exp(sigma n_ij), as if trips were longer or shorter
 
-    The same seed gives the same n for every sigma (common random numbers). No outflow rises above the largest that the
-    integration step allows.
+    The same seed gives the same n for every sigma (common random numbers). No outflow rises above
+    the largest that the integration step allows.
     """
     if kind not in KINDS:
         raise InputError(f"kind: expected one of {', '.join(KINDS)}, got {kind!r}; correct it")
@@ -140,14 +172,22 @@ def perturbed(scenario: Scenario, sigma: float, seed: int, kind: str = "demand")
             demand *= scenario.demand.sum(axis=0) / np.maximum(demand.sum(axis=0), 1e-9)
         return replace(scenario, demand=demand)
     rates = np.ones(network.adjacency.shape) if network.exit_rates is None else network.exit_rates
-    highest = scenario.substeps / scenario.step / np.array([mfd.rate_up_to_jam(0.0) for mfd in network.mfds])
+    highest = (
+        scenario.substeps
+        / scenario.step
+        / np.array([mfd.rate_up_to_jam(0.0) for mfd in network.mfds])
+    )
     if kind == "trip-lengths":
-        rates = np.minimum(rates * np.exp(sigma * random.standard_normal(rates.shape)), highest[:, None])
+        rates = np.minimum(
+            rates * np.exp(sigma * random.standard_normal(rates.shape)), highest[:, None]
+        )
         return replace(scenario, network=replace(network, exit_rates=rates))
     factor = np.exp(sigma * random.standard_normal(network.regions))
     high = np.minimum(factor if kind == "mfd-scale" else 1.0, highest / rates.max(axis=1)).tolist()
     wide = factor if kind == "mfd-axis" else np.ones_like(factor)
-    mfds = tuple(mfd.scaled(*by) for mfd, *by in zip(network.mfds, wide.tolist(), high, strict=True))
+    mfds = tuple(
+        mfd.scaled(*by) for mfd, *by in zip(network.mfds, wide.tolist(), high, strict=True)
+    )
     storage = None if network.storage is None else wide * network.storage
     return replace(scenario, network=replace(network, mfds=mfds, storage=storage))
 
@@ -166,8 +206,14 @@ class DemandTable(Settings):
     def rate(self, time: Intervals) -> Intervals:
         """Return the flow [veh/s] at `time` (T,) [s]."""
         end = self.start + self.ramp_up + self.flat + self.ramp_down
-        rising = (time - self.start) / self.ramp_up if self.ramp_up > 0 else np.where(time >= self.start, 1.0, 0.0)
-        falling = (end - time) / self.ramp_down if self.ramp_down > 0 else np.where(time < end, 1.0, 0.0)
+        rising = (
+            (time - self.start) / self.ramp_up
+            if self.ramp_up > 0
+            else np.where(time >= self.start, 1.0, 0.0)
+        )
+        falling = (
+            (end - time) / self.ramp_down if self.ramp_down > 0 else np.where(time < end, 1.0, 0.0)
+        )
         return self.peak * np.clip(np.minimum(rising, falling), 0.0, 1.0)
 
 
@@ -175,24 +221,44 @@ class ScenarioTable(Settings):
     """A network, its demand and noise, and the horizon."""
 
     name: Name = setting("name of the scenario")
-    base: Text | None = setting("folder or shipped name of a scenario that gives the keys omitted here", None)
+    base: Text | None = setting(
+        "folder or shipped name of a scenario that gives the keys omitted here", None
+    )
     network: Text = setting("folder or shipped name of the network")
     step: float = setting("control interval", unit="s", gt=0.0, le=LONGEST_STEP_S)
     steps: int = whole("control intervals", low=1, high=MOST_STEPS)
-    integrator: Literal["euler", "rk4"] = setting("integration scheme of the regional model", "euler")
-    substeps: int = whole("integration steps of the regional model per control interval", 1, low=1, high=1000)
+    integrator: Literal["euler", "rk4"] = setting(
+        "integration scheme of the regional model", "euler"
+    )
+    substeps: int = whole(
+        "integration steps of the regional model per control interval", 1, low=1, high=1000
+    )
     protected: Regions = setting("regions that gating protects", ())
-    demand: Rows[DemandTable] | None = setting("one table per flow; optional beside demand_file", None)
-    demand_file: Text | None = setting("csv with the columns interval, from, to, veh_s, added to [[demand]]", None)
+    demand: Rows[DemandTable] | None = setting(
+        "one table per flow; optional beside demand_file", None
+    )
+    demand_file: Text | None = setting(
+        "csv with the columns interval, from, to, veh_s, added to [[demand]]", None
+    )
     demand_factor: float = setting("factor of the whole demand", 1.0, unit="-", ge=0.0, le=1000.0)
     measurement_std: float = setting(
-        "standard deviation of the noise on each observed accumulation by destination", 0.0, unit="veh", ge=0.0, le=1e6
+        "standard deviation of the noise on each observed accumulation by destination",
+        0.0,
+        unit="veh",
+        ge=0.0,
+        le=1e6,
     )
     process_std: float = setting(
-        "standard deviation of the noise on the state after each interval; not in SUMO", 0.0, unit="veh", ge=0.0, le=1e6
+        "standard deviation of the noise on the state after each interval; not in SUMO",
+        0.0,
+        unit="veh",
+        ge=0.0,
+        le=1e6,
     )
     initial: Annotated[tuple[Numbers, ...], Field(strict=False)] = setting(
-        "vehicles at the start, regional model only: one row per region, by destination", (), unit="veh"
+        "vehicles at the start, regional model only: one row per region, by destination",
+        (),
+        unit="veh",
     )
     faults: Texts = setting("injected into every run: KIND[:VALUE][@FROM-TO]", ())
     controllers: dict[str, dict[str, Any]] = setting("options of controllers", {})
@@ -206,7 +272,8 @@ class ScenarioTable(Settings):
 
 
 def read_scenario(folder: Path | str, settings: Mapping[str, Any] | None = None) -> Scenario:
-    """Read `folder`/scenario.toml and its network, or a shipped scenario by its name. Raises InputError.
+    """Read `folder`/scenario.toml and its network, or a shipped scenario by its name. Raises
+    InputError.
 
     settings: dotted key -> value, which replace those of the file, such as {"sumo.compliance": 0.5}
     """
@@ -214,15 +281,26 @@ def read_scenario(folder: Path | str, settings: Mapping[str, Any] | None = None)
     path = folder / "scenario.toml"
     tables = read_tables(folder)
     for key, value in (settings or {}).items():
-        for part in reversed(re.findall(r'"[^"]*"|[^.]+', key)):  # parts with dots stand in double quotes
+        for part in reversed(
+            re.findall(r'"[^"]*"|[^.]+', key)
+        ):  # parts with dots stand in double quotes
             value = {part.strip('"'): value}
         tables = _completed(value, tables)
     table = config.checked(ScenarioTable, tables, path)
     network = load_network(folder / table.network)
     check_step(network, table.step / table.substeps, str(path))
-    values = {key: value for key, value in vars(table).items() if key in Scenario.__dataclass_fields__}
-    values |= {"network": network, "demand": table.demand_factor * _demand(table, network, folder), "folder": folder}
-    values |= {"controller_options": table.controllers, "initial": np.array(table.initial) if table.initial else None}
+    values = {
+        key: value for key, value in vars(table).items() if key in Scenario.__dataclass_fields__
+    }
+    values |= {
+        "network": network,
+        "demand": table.demand_factor * _demand(table, network, folder),
+        "folder": folder,
+    }
+    values |= {
+        "controller_options": table.controllers,
+        "initial": np.array(table.initial) if table.initial else None,
+    }
     scenario = Scenario(**values)
     if max(table.protected, default=0) >= network.regions:
         allowed = f"a list of distinct whole numbers from 0 to {network.regions - 1}"
@@ -230,13 +308,16 @@ def read_scenario(folder: Path | str, settings: Mapping[str, Any] | None = None)
     lengths = {len(row) for row in table.initial} | {len(table.initial)}
     if table.initial and (lengths != {network.regions} or scenario.start.min() < 0):
         allowed = f"{network.regions} lists of {network.regions} numbers from 0 up"
-        raise config.error(path, "initial", config.got(allowed, [list(row) for row in table.initial]))
+        raise config.error(
+            path, "initial", config.got(allowed, [list(row) for row in table.initial])
+        )
     _ = scenario.ordered_faults
     return scenario
 
 
 def read_tables(folder: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
-    """Return `folder`/scenario.toml, completed by the scenario that it names as `base`. Raises InputError.
+    """Return `folder`/scenario.toml, completed by the scenario that it names as `base`. Raises
+    InputError.
 
     above: folders of the scenarios based on this one
     """
@@ -245,12 +326,16 @@ def read_tables(folder: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
     base = own.pop("base", None)
     _relocate(own, folder, folders[0])
     if folder.resolve() in (other.resolve() for other in above):
-        raise config.error(file, "base", "the scenarios are each other's base; remove one of the keys")
+        raise config.error(
+            file, "base", "the scenarios are each other's base; remove one of the keys"
+        )
     if base is None:
         return own
     if not isinstance(base, str) or not base.isprintable():
         raise config.error(file, "base", config.got("the folder of a scenario in quotes", base))
-    return _completed(own, read_tables(shipped.found(base, shipped.SCENARIO, beside=folder), folders))
+    return _completed(
+        own, read_tables(shipped.found(base, shipped.SCENARIO, beside=folder), folders)
+    )
 
 
 def _relocate(own: dict, folder: Path, here: Path) -> None:
@@ -303,7 +388,8 @@ def _demand(table: ScenarioTable, network: RegionalModel, folder: Path) -> Pairs
 
 
 def _demand_rows(path: Path, regions: int) -> tuple[np.ndarray, ...]:
-    """Return interval, origin, destination (N,) and flow (N,) [veh/s] of a csv file. Raises InputError."""
+    """Return interval, origin, destination (N,) and flow (N,) [veh/s] of a csv file. Raises
+    InputError."""
     files.check_file(path, "give a csv file")
     try:
         text = path.read_text(encoding="utf-8").splitlines()
@@ -313,8 +399,15 @@ def _demand_rows(path: Path, regions: int) -> tuple[np.ndarray, ...]:
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read as demand ({error}); give a csv file") from None
     interval, origin, to, rate = rows.T
-    whole_numbers = (rows[:, :3] == np.floor(rows[:, :3])).all(axis=1) & (rows[:, :3] >= 0).all(axis=1)
-    good = whole_numbers & (np.maximum(origin, to) < regions) & (rate >= 0.0) & (rate <= MOST_FLOW_VEH_S)
+    whole_numbers = (rows[:, :3] == np.floor(rows[:, :3])).all(axis=1) & (rows[:, :3] >= 0).all(
+        axis=1
+    )
+    good = (
+        whole_numbers
+        & (np.maximum(origin, to) < regions)
+        & (rate >= 0.0)
+        & (rate <= MOST_FLOW_VEH_S)
+    )
     if not good.all():
         line = int(np.argmin(good))
         raise InputError(

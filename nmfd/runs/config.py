@@ -1,4 +1,5 @@
-"""Settings: pydantic models whose fields carry text and unit, and the validation of TOML files against them."""
+"""Settings: pydantic models whose fields carry text and unit, and the validation of TOML files
+against them."""
 
 import re
 import tomllib
@@ -15,7 +16,8 @@ S = TypeVar("S", bound="Settings")
 
 
 def setting(text: str, default: Any = ..., *, unit: str = "", **limits: Any) -> Any:
-    """Return the field of a setting; limits: ge, gt, le, lt, min_length, max_length, alias of pydantic.Field."""
+    """Return the field of a setting; limits: ge, gt, le, lt, min_length, max_length, alias of
+    pydantic.Field."""
     if unit:
         limits["json_schema_extra"] = {"unit": unit}
     return Field(default, description=text, **limits)
@@ -35,7 +37,8 @@ class Problem(ValueError):
 
 
 class Settings(BaseModel):
-    """Table of settings; unknown keys, texts for numbers and numbers that are not finite are errors."""
+    """Table of settings; unknown keys, texts for numbers and numbers that are not finite are
+    errors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -46,7 +49,9 @@ class Settings(BaseModel):
         for key in values if isinstance(values, Mapping) else ():
             if key not in keys:
                 hint = did_you_mean(str(key), keys)
-                raise Problem(key, f"unknown key{hint}; allowed here: {', '.join(keys)}; remove or correct it")
+                raise Problem(
+                    key, f"unknown key{hint}; allowed here: {', '.join(keys)}; remove or correct it"
+                )
         return values
 
     def changed(self: S, **changes: Any) -> S:
@@ -68,7 +73,9 @@ def _distinct(values: tuple) -> tuple:
 
 DISTINCT = AfterValidator(_distinct), Field(strict=False)
 Text = Annotated[str, Field(min_length=1, max_length=1000), AfterValidator(_printable)]
-Name = Annotated[str, Field(min_length=1, max_length=100), AfterValidator(_printable)]  # names become file names
+Name = Annotated[
+    str, Field(min_length=1, max_length=100), AfterValidator(_printable)
+]  # names become file names
 Texts = Annotated[tuple[Text, ...], *DISTINCT]
 Region = Annotated[int, Field(ge=0)]
 Regions = Annotated[tuple[Region, ...], *DISTINCT]
@@ -89,12 +96,16 @@ def read(path: Path) -> dict[str, Any]:
         hint = did_you_mean(path.parent.name, near)
         raise InputError(f"{path}: no such file{hint}; give the path of an existing one") from None
     except OSError as problem:
-        raise InputError(f"{path}: cannot be read ({problem.strerror}); give a readable file") from None
+        raise InputError(
+            f"{path}: cannot be read ({problem.strerror}); give a readable file"
+        ) from None
     except (ValueError, RecursionError) as problem:  # also text in another encoding
         raise InputError(f"{path}: is not valid TOML: {problem}; correct it") from None
 
 
-def checked(declaration: type[S], values: Mapping[str, Any], where: Path | str, prefix: str = "") -> S:
+def checked(
+    declaration: type[S], values: Mapping[str, Any], where: Path | str, prefix: str = ""
+) -> S:
     """Validate a table. Raise InputError that begins with "where: prefix + key: "."""
     try:
         return declaration.model_validate(values)
@@ -118,19 +129,25 @@ def quoted(text: str) -> str:
 
 
 def filled(template: Path, **values: Any) -> str:
-    """Return the TOML file that a template of Jinja makes of `values`; its filters are `quoted` and numbers(form)."""
+    """Return the TOML file that a template of Jinja makes of `values`; its filters are `quoted` and
+    numbers(form)."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined  # few commands write a file
 
     loader = FileSystemLoader(template.parent)
     how: Any = {"trim_blocks": True, "keep_trailing_newline": True, "undefined": StrictUndefined}
     environment = Environment(loader=loader, **how)
-    environment.filters |= {"quoted": quoted, "numbers": lambda row, form: ", ".join(form % number for number in row)}
+    environment.filters |= {
+        "quoted": quoted,
+        "numbers": lambda row, form: ", ".join(form % number for number in row),
+    }
     return environment.get_template(template.name).render(values)
 
 
 def _first_problem(invalid: ValidationError) -> str:
     first = invalid.errors(include_url=False)[0]
-    path = "".join(f"[{place}]" if isinstance(place, int) else f".{place}" for place in first["loc"]).lstrip(".")
+    path = "".join(
+        f"[{place}]" if isinstance(place, int) else f".{place}" for place in first["loc"]
+    ).lstrip(".")
     problem = first.get("ctx", {}).get("error")
     if isinstance(problem, Problem):
         return f"{'.'.join(filter(None, (path, problem.key)))}: {problem}"

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
 @contextmanager
 def atomic(path: Path) -> Iterator[Path]:
-    """Yield a temporary file name in the folder of `path`, which becomes `path` if the block succeeds.
+    """Yield a temporary file name in the folder of `path`, which becomes `path` if the block
+    succeeds.
 
     It has the suffix of `path`, by which matplotlib and NumPy choose the format.
     """
@@ -38,7 +39,8 @@ def atomic(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def temporary_folder(prefix: str = "cosim-", where: Path | None = None) -> Iterator[Path]:
-    """Yield a new folder in `where`, or in the system's place for such folders, and remove it at the end."""
+    """Yield a new folder in `where`, or in the system's place for such folders, and remove it at
+    the end."""
     with tempfile.TemporaryDirectory(prefix=prefix, dir=where, ignore_cleanup_errors=True) as name:
         yield Path(name)
 
@@ -55,7 +57,8 @@ def write_table(path: Path, frame: "pd.DataFrame", **options: str) -> None:
 
 
 def check_file(path: Path, remedy: str = "give a file") -> None:
-    """Raise InputError for a folder, pipe or device, which would be read for ever; a missing file is none of these."""
+    """Raise InputError for a folder, pipe or device, which would be read for ever; a missing file
+    is none of these."""
     if os.path.exists(path) and not os.path.isfile(path):
         raise InputError(f"{path}: is not a file; {remedy}")
 
@@ -67,7 +70,8 @@ def file_hash(path: Path) -> str:
 
 
 def relative(path: Path, folder: Path) -> str:
-    """Return `path` relative to `folder`, with / between its parts; absolute on another drive of Windows."""
+    """Return `path` relative to `folder`, with / between its parts; absolute on another drive of
+    Windows."""
     try:
         return Path(os.path.relpath(path, folder)).as_posix()
     except ValueError:
@@ -85,7 +89,8 @@ def run_name(controller: str, seed: int) -> str:
 
 
 def default_folder(scenario: str) -> Path:
-    """Return runs/<scenario>-<timestamp> in the current folder, a name that is not taken; scenario: its name."""
+    """Return runs/<scenario>-<timestamp> in the current folder, a name that is not taken; scenario:
+    its name."""
     stem = f"{file_name(scenario)}-{datetime.now():%Y%m%d-%H%M%S}"
     names = (stem, *(f"{stem}-{n}" for n in range(2, 1000)))
     return next(Path("runs", name) for name in names if not Path("runs", name).exists())

@@ -1,4 +1,5 @@
-"""Progress as a bar of tqdm, on a terminal and in a notebook, and how long it still takes as a line anywhere."""
+"""Progress as a bar of tqdm, on a terminal and in a notebook, and how long it still takes as a line
+anywhere."""
 
 import math
 import sys
@@ -7,7 +8,9 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-with warnings.catch_warnings(action="ignore"):  # of a notebook without ipywidgets, which gets no bar
+with warnings.catch_warnings(
+    action="ignore"
+):  # of a notebook without ipywidgets, which gets no bar
     from tqdm.auto import tqdm
 
 Progress = Callable[..., None] | bool | None
@@ -16,11 +19,13 @@ LONG_S = 30.0  # what takes longer is announced
 
 
 @contextmanager
-def watched(label: str, progress: Progress = None, *, said: bool = False) -> Iterator[Callable[..., None] | None]:
+def watched(
+    label: str, progress: Progress = None, *, said: bool = False
+) -> Iterator[Callable[..., None] | None]:
     """Yield the function that shows progress.
 
-    progress: the user's own function; None for a bar on a terminal or in a notebook, and a line on stderr about the
-        time left after the first steps of every long stage; False for neither
+    progress: the user's own function; None for a bar on a terminal or in a notebook, and a line on
+        stderr about the time left after the first steps of every long stage; False for neither
     said: the caller has said how long it takes, so this line is left out
     """
     if progress is False:
@@ -42,6 +47,9 @@ def watched(label: str, progress: Progress = None, *, said: bool = False) -> Ite
                 left = (total - done) * (now - begun) / max(done - first, 1)
                 if now - begun > MEASURED_S and left > LONG_S:
                     begun = math.nan
-                    tqdm.write(f"{label}{note and ', '}{note}: about {left / 60:.0f} min left", file=sys.stderr)
+                    tqdm.write(
+                        f"{label}{note and ', '}{note}: about {left / 60:.0f} min left",
+                        file=sys.stderr,
+                    )
 
             yield show

@@ -1,4 +1,5 @@
-"""Many independent runs in a folder: finished ones are skipped, each result is written whole or not at all.
+"""Many independent runs in a folder: finished ones are skipped, each result is written whole or not
+at all.
 
 <folder>/manifest.json                       keys of all runs; commands, commits, versions and seeds of all sessions
 <folder>/runs.csv                            one row per run (nmfd.metrics.summary), the reason of a failure in the last
@@ -46,7 +47,10 @@ if TYPE_CHECKING:
 
 MANIFEST, TABLE, LOCK = "manifest.json", "runs.csv", ".lock"
 DASK_PATIENCE_S = 10.0  # for the scheduler to answer
-POLL_S, EXIT_S = 0.2, 5.0  # longest wait: Windows lets Ctrl-C through after it; for a process to end after its outcome
+POLL_S, EXIT_S = (
+    0.2,
+    5.0,
+)  # longest wait: Windows lets Ctrl-C through after it; for a process to end after its outcome
 PRELOADED = "xarray", "dask.array"  # which a Result imports, if they are there
 STARTING = threading.Lock()  # held while a process starts
 SERVED: set[str] = set()  # modules of the jobs that the server has imported
@@ -58,10 +62,11 @@ class Run:
     """A run to do.
 
     name: stem of its file (`files.run_name`)
-    key: everything the result depends on, as JSON types: hashes, settings, versions. Its item "controller" holds what
-        only runs of this controller depend on; all else is the same for all runs of a folder
-    job: a picklable function without arguments that returns the Result, or the reason why there is none; `processes`
-        takes any outcome for a Result
+    key: everything the result depends on, as JSON types: hashes, settings, versions. Its item
+        "controller" holds what only runs of this controller depend on; all else is the same for all
+        runs of a folder
+    job: a picklable function without arguments that returns the Result, or the reason why there is
+        none; `processes` takes any outcome for a Result
     folder: below that of all runs; expected: wall time [s], 0 if unknown
     """
 
@@ -78,29 +83,45 @@ class Run:
 
 
 def run_many(
-    runs: Sequence[Run], out: Path | str, *, workers: int = 1, scheduler: str | None = None, progress: Progress = None
+    runs: Sequence[Run],
+    out: Path | str,
+    *,
+    workers: int = 1,
+    scheduler: str | None = None,
+    progress: Progress = None,
 ) -> "pd.DataFrame":
     """Do the `runs` whose files are not in the folder `out`, and return one row per run.
 
-    Columns are those of `nmfd.metrics.summary`, `folder` if there are several, and `failure`: "" of a finished run,
-    else the reason with file and line. Finished runs of earlier calls that share the keys come last.
+    Columns are those of `nmfd.metrics.summary`, `folder` if there are several, and `failure`: "" of
+    a finished run, else the reason with file and line. Finished runs of earlier calls that share
+    the keys come last.
 
     workers: runs at a time, each in a process of its own; 0: one after the other in this process
-    scheduler: address of a Dask scheduler, whose workers do the runs; it takes TLS certificates from Dask's own
-        configuration
+    scheduler: address of a Dask scheduler, whose workers do the runs; it takes TLS certificates
+        from Dask's own configuration
     progress: None for a bar, False for none, or a function of done, total and the name of a run
     Raises: InputError if another process has the folder, or it is not a folder of runs
     """
     out = Path(out)
     with locked(out):
         keys = _write_manifest(out, runs, workers)
-        rows = {file: _row(file, result) for file, key in keys.items() if (result := _finished(out / file, key))}
+        rows = {
+            file: _row(file, result)
+            for file, key in keys.items()
+            if (result := _finished(out / file, key))
+        }
         todo = [run for run in runs if run.file not in rows]
         minutes = sum(run.expected for run in todo) / max(workers, 1) / 60.0
         if said := minutes > 0.5 and scheduler is None:
-            print(f"{len(todo)} runs take about {minutes:.0f} min, {workers} at a time", file=sys.stderr)
+            print(
+                f"{len(todo)} runs take about {minutes:.0f} min, {workers} at a time",
+                file=sys.stderr,
+            )
         try:
-            with watched("runs", progress, said=said) as show, closing(_outcomes(todo, workers, scheduler)) as ended:
+            with (
+                watched("runs", progress, said=said) as show,
+                closing(_outcomes(todo, workers, scheduler)) as ended,
+            ):
                 if show and todo:
                     show(0, len(todo))
                 for done, (run, outcome) in enumerate(ended, 1):
@@ -112,7 +133,9 @@ def run_many(
                     if show:
                         show(done, len(todo), run.name)
         except KeyboardInterrupt:
-            raise KeyboardInterrupt(f"finished runs are in {out}; the same command with --out {out} goes on") from None
+            raise KeyboardInterrupt(
+                f"finished runs are in {out}; the same command with --out {out} goes on"
+            ) from None
         finally:
             table = _table([rows[file] for file in keys if file in rows])
             write_table(out / TABLE, table)
@@ -124,7 +147,11 @@ def raise_failures(rows: "pd.DataFrame") -> None:
     failed = rows[rows["failure"] != ""]
     if len(failed):
         labels = failed["controller"] + ", seed " + failed["seed"].astype(str)
-        raise RunFailed("; ".join(f"{label}: {why}" for label, why in zip(labels, failed["failure"], strict=True)))
+        raise RunFailed(
+            "; ".join(
+                f"{label}: {why}" for label, why in zip(labels, failed["failure"], strict=True)
+            )
+        )
 
 
 def attempt(job: Callable[[], Result | str]) -> Result | str:
@@ -138,7 +165,9 @@ def attempt(job: Callable[[], Result | str]) -> Result | str:
         return f"{type(error).__name__}: {error} ({Path(last.filename).name}:{last.lineno})"
 
 
-def _outcomes(todo: Sequence[Run], workers: int, scheduler: str | None) -> Generator[tuple[Run, Result | str]]:
+def _outcomes(
+    todo: Sequence[Run], workers: int, scheduler: str | None
+) -> Generator[tuple[Run, Result | str]]:
     """Yield every run with its result or the reason of its failure, as they end."""
     if scheduler is not None and todo:
         with _dask(scheduler) as executor:
@@ -159,7 +188,8 @@ def _alone(job: Callable[[], Result | str], folder: str) -> Result | str:
 
 
 def processes(todo: Sequence[Run], workers: int, folder: str = "") -> Generator[tuple[Run, Any]]:
-    """Yield every run with its outcome from a process of its own in `folder`, `workers` at a time."""
+    """Yield every run with its outcome from a process of its own in `folder`, `workers` at a
+    time."""
     waiting, live = list(reversed(todo)), dict[connection.Connection, tuple[Run, BaseProcess]]()
     try:
         while waiting or live:
@@ -178,16 +208,19 @@ def processes(todo: Sequence[Run], workers: int, folder: str = "") -> Generator[
             process.join()
 
 
-def _start(job: Callable[[], Result | str], folder: str) -> tuple[connection.Connection, BaseProcess]:
+def _start(
+    job: Callable[[], Result | str], folder: str
+) -> tuple[connection.Connection, BaseProcess]:
     """Start a process, and return it behind the channel for a job and its outcome.
 
-    Where the system can, it is forked from a server that has imported the module of `job`, and that later jobs of this
-    module use, too.
+    Where the system can, it is forked from a server that has imported the module of `job`, and that
+    later jobs of this module use, too.
     """
     method, environment = "forkserver" if hasattr(os, "fork") else "spawn", dict(os.environ)
     context: Any = multiprocessing.get_context(method)
     module = getattr(job, "func", job).__module__
-    # Without the user's script, which would do everything again; the server shows a traceback of a request cut short.
+    # Without the user's script, which would do everything again; the server shows a traceback of a
+    # request cut short.
     with STARTING, uninterrupted():
         if method == "forkserver":
             if module not in SERVED:
@@ -196,7 +229,10 @@ def _start(job: Callable[[], Result | str], folder: str) -> tuple[connection.Con
             context.set_forkserver_preload([__name__, *PRELOADED, *sorted(SERVED)])
             resource_tracker.ensure_running()  # first, as it lets Ctrl-C through
             blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-            os.environ |= {"PYTHONSAFEPATH": "1", "PYTHONPATH": os.pathsep.join(sys.path)}  # to find the same modules
+            os.environ |= {
+                "PYTHONSAFEPATH": "1",
+                "PYTHONPATH": os.pathsep.join(sys.path),
+            }  # to find the same modules
             try:
                 forkserver.ensure_running()
             finally:
@@ -223,7 +259,8 @@ def _stop_server() -> None:
 
 
 def _work(channel: connection.Connection, folder: str, environment: Mapping[str, str]) -> None:
-    """Send back the outcome of the job that comes through `channel`, as long as its other end is there."""
+    """Send back the outcome of the job that comes through `channel`, as long as its other end is
+    there."""
 
     def end_with_parent() -> None:
         multiprocessing.parent_process().join()  # type: ignore[union-attr]
@@ -252,7 +289,8 @@ def _outcome(channel: connection.Connection, process: BaseProcess) -> Result | s
 
 @contextmanager
 def _dask(address: str) -> Iterator[Executor]:
-    """Connect to a Dask scheduler; its workers see the same files under the same paths. Raises InputError."""
+    """Connect to a Dask scheduler; its workers see the same files under the same paths. Raises
+    InputError."""
     need("--scheduler", "dask", "distributed")
     from distributed import Client  # of an extra
 
@@ -273,9 +311,11 @@ def _dask(address: str) -> Iterator[Executor]:
 
 @contextmanager
 def locked(out: Path, mark: str = MANIFEST) -> Iterator[None]:
-    """Make the folder, hold it against other processes, and remove it if nothing comes into it. Raises InputError.
+    """Make the folder, hold it against other processes, and remove it if nothing comes into it.
+    Raises InputError.
 
-    mark: file that a folder with other files must hold. A command holds its folder around its runs, tables and figures
+    mark: file that a folder with other files must hold. A command holds its folder around its runs,
+        tables and figures
     """
     remedy = "choose another folder with --out"
     if out.exists() and not out.is_dir():
@@ -291,7 +331,9 @@ def locked(out: Path, mark: str = MANIFEST) -> Iterator[None]:
                 if [path.name for path in out.glob("*")] == [LOCK]:
                     shutil.rmtree(out, ignore_errors=True)
     except Timeout:
-        raise InputError(f"{out}: another process is writing to it; wait for its end, or {remedy}") from None
+        raise InputError(
+            f"{out}: another process is writing to it; wait for its end, or {remedy}"
+        ) from None
 
 
 def read_manifest(folder: Path) -> dict:
@@ -300,12 +342,15 @@ def read_manifest(folder: Path) -> dict:
         content = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
         content["folders"].items(), content["sessions"][0]
     except (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError):
-        raise InputError(f"{folder / MANIFEST}: is no manifest of runs; choose another folder with --out") from None
+        raise InputError(
+            f"{folder / MANIFEST}: is no manifest of runs; choose another folder with --out"
+        ) from None
     return content
 
 
 def _write_manifest(out: Path, runs: Sequence[Run], workers: int) -> dict[str, dict]:
-    """Add `runs` and this session to the manifest; return file -> key of these runs, then of others in the folders."""
+    """Add `runs` and this session to the manifest; return file -> key of these runs, then of others
+    in the folders."""
     manifest = read_manifest(out) if (out / MANIFEST).is_file() else {"folders": {}, "sessions": []}
     folders = manifest["folders"]
     for run in runs:
@@ -317,12 +362,19 @@ def _write_manifest(out: Path, runs: Sequence[Run], workers: int) -> dict[str, d
     seeds = sorted({_place(run.file)[2] for run in runs})
     manifest["sessions"].append({**provenance(), "seeds": seeds, "workers": workers})
     write_text(out / MANIFEST, json.dumps(manifest, indent=2) + "\n")
-    there = [path.relative_to(out).as_posix() for name in folders for path in sorted((out / name).glob("[!.]*-*.nc"))]
+    there = [
+        path.relative_to(out).as_posix()
+        for name in folders
+        for path in sorted((out / name).glob("[!.]*-*.nc"))
+    ]
     keys = {}
     for file in (*(run.file for run in runs), *there):
         folder, controller, _ = _place(file)
         if controller in folders[folder]["controllers"]:
-            keys[file] = {**folders[folder]["key"], "controller": folders[folder]["controllers"][controller]}
+            keys[file] = {
+                **folders[folder]["key"],
+                "controller": folders[folder]["controllers"][controller],
+            }
     return keys
 
 
@@ -342,7 +394,11 @@ def _finished(path: Path, key: Mapping) -> Result | None:
 
 def _row(file: str, outcome: Result | str) -> dict:
     row = dict(zip(("folder", "controller", "seed"), _place(file), strict=True))
-    return {**row, "failure": outcome} if isinstance(outcome, str) else {**row, **summary(outcome), "failure": ""}
+    return (
+        {**row, "failure": outcome}
+        if isinstance(outcome, str)
+        else {**row, **summary(outcome), "failure": ""}
+    )
 
 
 def _place(file: str) -> tuple[str, str, int]:
@@ -383,8 +439,16 @@ def _checkout() -> tuple[str | None, bool | None]:
     """Return the commit of this package, and whether files differ from it, at the first call."""
 
     def git(*arguments: str) -> str:
-        command = ["git", "--no-optional-locks", "-C", str(Path(__file__).resolve().parent), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
+        command = [
+            "git",
+            "--no-optional-locks",
+            "-C",
+            str(Path(__file__).resolve().parent),
+            *arguments,
+        ]
+        return subprocess.run(
+            command, capture_output=True, text=True, timeout=10, check=True
+        ).stdout.strip()
 
     try:  # an installed copy may lie inside another checkout: the commit counts only if this file is tracked
         git("ls-files", "--error-unmatch", Path(__file__).name)

@@ -1,7 +1,7 @@
 """Scenarios and networks of the package: found by name from any folder, never written to.
 
-In a checkout they are its folders scenarios and networks, in an installed package those in nmfd/data; the same relative
-paths lead from one to another in both.
+In a checkout they are its folders scenarios and networks, in an installed package those in
+nmfd/data; the same relative paths lead from one to another in both.
 """
 
 import itertools
@@ -11,7 +11,10 @@ from pathlib import Path
 
 from nmfd.errors import InputError, did_you_mean
 
-SCENARIO, NETWORK = "scenario", "network"  # kinds of folders: in folders of that name + "s", with NAME.toml in each
+SCENARIO, NETWORK = (
+    "scenario",
+    "network",
+)  # kinds of folders: in folders of that name + "s", with NAME.toml in each
 _HERE = Path(str(resources.files("nmfd")))
 _DATA = _HERE / "data"  # as pyproject.toml maps it
 
@@ -29,9 +32,9 @@ def folders(kind: str) -> list[Path]:
 def found(name: Path | str, *kinds: str, beside: Path | None = None) -> Path:
     """Return the folder of one of these kinds, or the file, `name`.
 
-    name: a path, from `beside` if given; or the name of a folder, with or without networks/ or scenarios/ before it, of
-        the package or of this folder or one above; or a path below it (grid7_peak/dpc-pc.pt). A path to nothing is
-        returned unchanged
+    name: a path, from `beside` if given; or the name of a folder, with or without networks/ or
+        scenarios/ before it, of the package or of this folder or one above; or a path below it
+        (grid7_peak/dpc-pc.pt). A path to nothing is returned unchanged
     Raises: InputError for a single word that names nothing
     """
     path, word = Path(name) if beside is None else beside / name, Path(name)
@@ -40,12 +43,22 @@ def found(name: Path | str, *kinds: str, beside: Path | None = None) -> Path:
     if word.is_absolute() or ".." in word.parts:
         return path
     here = Path.cwd()
-    for place, kind in itertools.product((root(), *([here, *here.parents] if beside is None else [])), kinds):
+    for place, kind in itertools.product(
+        (root(), *([here, *here.parents] if beside is None else [])), kinds
+    ):
         short = word.relative_to(f"{kind}s") if word.parts[:1] == (f"{kind}s",) else word
         folder = place / f"{kind}s" / short
-        if short.parts and os.path.exists(folder / f"{kind}.toml" if len(short.parts) == 1 else folder):
+        if short.parts and os.path.exists(
+            folder / f"{kind}.toml" if len(short.parts) == 1 else folder
+        ):
             return folder
-    if beside is not None or not kinds or len(word.parts) != 1 or word.suffix or os.path.exists(path):
+    if (
+        beside is not None
+        or not kinds
+        or len(word.parts) != 1
+        or word.suffix
+        or os.path.exists(path)
+    ):
         return path
     places = [(place, kind) for kind in kinds for place in (root() / f"{kind}s", Path())]
     near = [file.parent.name for place, kind in places for file in place.glob(f"*/{kind}.toml")]
@@ -56,21 +69,25 @@ def found(name: Path | str, *kinds: str, beside: Path | None = None) -> Path:
 
 
 def installed(path: Path) -> bool:
-    """Return True if `path` lies in the data of an installed package, which the user may not write to."""
+    """Return True if `path` lies in the data of an installed package, which the user may not write
+    to."""
     return path.resolve().is_relative_to(_DATA.resolve())
 
 
 def beside(folder: Path, file: str, option: str, *, scenario: bool = False) -> Path:
     """Return the path of `file` in `folder`.
 
-    option: names another place; scenario: True if the user's own scenario may be based on `folder` instead
+    option: names another place; scenario: True if the user's own scenario may be based on `folder`
+        instead
     Raises: InputError if the folder cannot be written to, or is of the installed package
     """
     remedy = f"give {option}"
     if scenario:
         remedy += f', or make a folder of your own whose scenario.toml has name = "..." and base = "{folder.name}"'
     if installed(folder):
-        raise InputError(f"{folder.name}: came with the package, where nothing is written; {remedy}")
+        raise InputError(
+            f"{folder.name}: came with the package, where nothing is written; {remedy}"
+        )
     if folder.is_dir() and not os.access(folder, os.W_OK):
         raise InputError(f"{folder}: cannot be written to; {remedy}")
     return folder / file

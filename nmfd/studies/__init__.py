@@ -1,1 +1,2 @@
-"""Studies on the regional model: benchmark, robustness, bound, measured MFDs, and their pictures."""
+"""Studies on the regional model: benchmark, robustness, bound, measured MFDs, and their
+pictures."""

@@ -1,8 +1,10 @@
-"""The benchmark: controllers x seeds on a regional plant, with a table and the paper's figures; its robustness.
+"""The benchmark: controllers x seeds on a regional plant, with a table and the paper's figures; its
+robustness.
 
-For robustness every controller is made for the nominal scenario (MPC has its forecast, the policies their training) and
-meets another demand, or other MFDs (nmfd.model.scenario.perturbed); its improvement is over no control in the same
-perturbed scenario. The acyclic plant alone is no mismatch: on economic_mpc totals differ from the NMFD by 2e-6.
+For robustness every controller is made for the nominal scenario (MPC has its forecast, the policies
+their training) and meets another demand, or other MFDs (nmfd.model.scenario.perturbed); its
+improvement is over no control in the same perturbed scenario. The acyclic plant alone is no
+mismatch: on economic_mpc totals differ from the NMFD by 2e-6.
 """
 
 import math
@@ -34,11 +36,20 @@ CAPTION = (
     "time of all decisions of a run; step: first / median / longest decision; decisions of all seeds: "
     + "; ".join(f"{heading}: {what}" for heading, what in COUNTED.values())
 )
-BOUND_CAPTION = "; above the optimum: at most, by the lower bound with the same controls (nmfd bound)"
+BOUND_CAPTION = (
+    "; above the optimum: at most, by the lower bound with the same controls (nmfd bound)"
+)
 SIGMAS_VEH_S = (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0)  # of the noise on the demand
 SPREADS = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4)  # of the MFDs and trip lengths
 PERTURBED_PLANT = "acyclic"
-KEPT = ("controller", "seed", "plant", "total_time_spent_veh_s", "final_accumulation_veh", "fallbacks")
+KEPT = (
+    "controller",
+    "seed",
+    "plant",
+    "total_time_spent_veh_s",
+    "final_accumulation_veh",
+    "fallbacks",
+)
 ROBUSTNESS_CAPTION = (
     "improvement of total time spent over no-control in the same perturbed scenario [%], mean ± 95 % interval; "
     "trips: mean of all perturbed scenarios [veh]; sigma of {kind}: {meaning}"
@@ -46,7 +57,8 @@ ROBUSTNESS_CAPTION = (
 
 
 def compared_with(controllers: Iterable[str]) -> str:
-    """Return the controller that others are compared with: no control, or the first if that is not among them."""
+    """Return the controller that others are compared with: no control, or the first if that is not
+    among them."""
     names = list(controllers)
     return REFERENCE if REFERENCE in names else names[0]
 
@@ -60,14 +72,16 @@ def closed_loop_of(
     policy: Path | None = None,
     actual: Scenario | None = None,
 ) -> Result:
-    """Run the controller of `strategy`, which is made for `scenario`, in this one or the perturbed one `actual`."""
+    """Run the controller of `strategy`, which is made for `scenario`, in this one or the perturbed
+    one `actual`."""
     controller, actual = strategy.make(scenario, policy), actual or scenario
     result = closed_loop.run(PLANTS[plant](actual), controller, actual, seed=seed)
     return result.assign(controller=strategy.name, plant=plant)
 
 
 def workers_for(strategies: Sequence[Strategy], workers: int) -> int:
-    """Return `workers` for `run_many`: 0, this process, for one, unless the user's own controllers may crash."""
+    """Return `workers` for `run_many`: 0, this process, for one, unless the user's own controllers
+    may crash."""
     own = any(strategy.controller.own for strategy in strategies)
     return workers if own or workers > 1 else 0
 
@@ -81,7 +95,9 @@ def key_of(
     """
     for fault in scenario.ordered_faults:
         if fault.kind in faults.CITY:
-            raise InputError(f"{scenario.name}: faults: {fault.kind} is a fault of a city in SUMO; omit it")
+            raise InputError(
+                f"{scenario.name}: faults: {fault.kind} is a fault of a city in SUMO; omit it"
+            )
     own = {}
     for strategy in strategies:
         policy = policies.get(strategy.name)
@@ -93,14 +109,21 @@ def key_of(
 
 
 def lower_bound(scenario: Scenario, strategy: Strategy, plant: str) -> float:
-    """Return the lower bound [veh s] in the plan file of the scenario for the controls of `strategy`; NaN without.
+    """Return the lower bound [veh s] in the plan file of the scenario for the controls of
+    `strategy`; NaN without.
 
     Controllers of the user's own may meter, and plants of the user's own are other models.
     """
     metered = scenario.controller_options.get(strategy.table(scenario), {}).get("metering", False)
     file = (scenario.folder or Path()) / f"bound-{'pcrg' if strategy.guides else 'pc'}.npz"
     renormalised = plant == "acyclic" and bool(scenario.network.observed_split_ratios)
-    if strategy.controller.own or metered or plant not in PLANTS or renormalised or not file.is_file():
+    if (
+        strategy.controller.own
+        or metered
+        or plant not in PLANTS
+        or renormalised
+        or not file.is_file()
+    ):
         return math.nan
     try:
         return open_loop.read(file, scenario, guidance=strategy.guides).lower
@@ -132,7 +155,9 @@ def summary_table(rows: "pd.DataFrame") -> str:
                 "max [veh]": f"{mean['max_accumulation_veh']:,.0f}",
                 "completed [veh]": f"{mean['completed_veh']:,.0f}",
                 "control [s]": f"{mean['evaluation_time_s']:.3g}",
-                "step [ms]": decision_ms(mean | {"control_step_ms_max": group["control_step_ms_max"].max()}),
+                "step [ms]": decision_ms(
+                    mean | {"control_step_ms_max": group["control_step_ms_max"].max()}
+                ),
                 **{heading: int(group[column].sum()) for column, (heading, _) in COUNTED.items()},
             }
         )
@@ -194,32 +219,46 @@ def draw_scenario(folder: Path, scenario: Scenario) -> list[Path]:
 
 
 def interval(values: Sequence[float]) -> float:
-    """Half of the 95 % interval of the mean of `values` (Student's t); NaN of a single one, or where one is NaN."""
+    """Half of the 95 % interval of the mean of `values` (Student's t); NaN of a single one, or
+    where one is NaN."""
     if len(values) < 2 or any(map(math.isnan, values)):
         return math.nan
-    return float(stdtrit(len(values) - 1, 0.975)) * statistics.stdev(values) / math.sqrt(len(values))
+    return (
+        float(stdtrit(len(values) - 1, 0.975)) * statistics.stdev(values) / math.sqrt(len(values))
+    )
 
 
-def run_perturbed(strategy: Strategy, seed: int, *, scenario: Scenario, sigma: float, kind: str) -> Result:
+def run_perturbed(
+    strategy: Strategy, seed: int, *, scenario: Scenario, sigma: float, kind: str
+) -> Result:
     """Run one closed loop in a perturbed scenario; return its figures, without arrays.
 
-    seed: number of the draw of the perturbation and of the noise on measurements; sigma, kind: see `perturbed`
+    seed: number of the draw of the perturbation and of the noise on measurements; sigma, kind: see
+        `perturbed`
     """
     import xarray
 
     actual = perturbed(scenario, sigma, seed, kind)
-    row = summary(closed_loop_of(strategy, seed, scenario=scenario, plant=PERTURBED_PLANT, actual=actual))
+    row = summary(
+        closed_loop_of(strategy, seed, scenario=scenario, plant=PERTURBED_PLANT, actual=actual)
+    )
     facts = {"kind": kind, "sigma": sigma, "trips_veh": scenario.step * float(actual.demand.sum())}
     return Result(xarray.Dataset(attrs=facts | {column: row[column] for column in KEPT}))
 
 
 def improvements(rows: "pd.DataFrame", controller: str) -> dict[float, tuple[float, float]]:
-    """Return sigma -> mean and 95 % half interval of the improvement of `controller` over no control [%]."""
+    """Return sigma -> mean and 95 % half interval of the improvement of `controller` over no
+    control [%]."""
     totals = _finished(rows).pivot_table("total_time_spent_veh_s", ["sigma", "seed"], "controller")
     gains: dict[float, list[float]] = {}
-    for (sigma, _), own, reference in totals.reindex(columns=[controller, REFERENCE]).dropna().itertuples():
+    for (sigma, _), own, reference in (
+        totals.reindex(columns=[controller, REFERENCE]).dropna().itertuples()
+    ):
         gains.setdefault(sigma, []).append(-percent_change(own, reference))
-    return {sigma: (math.fsum(values) / len(values), interval(values)) for sigma, values in gains.items()}
+    return {
+        sigma: (math.fsum(values) / len(values), interval(values))
+        for sigma, values in gains.items()
+    }
 
 
 def draw_robustness(folder: Path, rows: "pd.DataFrame") -> None:
@@ -239,18 +278,29 @@ def improvement_table(rows: "pd.DataFrame") -> str:
     done = _finished(rows)
     if done.empty:
         return "no run is finished"
-    kind, trips = done["kind"].iloc[0], done[done["controller"] == REFERENCE].groupby("sigma")["trips_veh"].mean()
+    kind, trips = (
+        done["kind"].iloc[0],
+        done[done["controller"] == REFERENCE].groupby("sigma")["trips_veh"].mean(),
+    )
     lines = [["trips", *(f"{total:,.0f}" for total in trips)]]
     for name in _compared(rows):
         gains = improvements(rows, name)
-        cells = {sigma: f"{mean:.1f} ± {half:.1f}" for sigma, (mean, half) in gains.items() if not math.isnan(mean)}
+        cells = {
+            sigma: f"{mean:.1f} ± {half:.1f}"
+            for sigma, (mean, half) in gains.items()
+            if not math.isnan(mean)
+        }
         lines.append([name, *(cells.get(sigma, "-") for sigma in trips.index)])
     caption = ROBUSTNESS_CAPTION.format(kind=kind, meaning=_meaning(kind))
     return text_columns(["sigma", *(f"{sigma:g}" for sigma in trips.index)], lines, caption)
 
 
 def _meaning(kind: str) -> str:
-    return "noise on the demand [veh/s]" if kind.startswith("demand") else "spread of the logarithm [-]"
+    return (
+        "noise on the demand [veh/s]"
+        if kind.startswith("demand")
+        else "spread of the logarithm [-]"
+    )
 
 
 def _finished(rows: "pd.DataFrame") -> "pd.DataFrame":

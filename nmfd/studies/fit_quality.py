@@ -15,16 +15,26 @@ from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import files
 from nmfd.runs.tables import text_table, wrapped
 
-Samples = Sequence[Mapping[str, Points]]  # by region, label -> (n, 2) of accumulation [veh] and outflow [veh/s]
+Samples = Sequence[
+    Mapping[str, Points]
+]  # by region, label -> (n, 2) of accumulation [veh] and outflow [veh/s]
 States = Sequence[StatesOverTime]  # accumulations of each run
 SPILLBACK = "held up by a neighbour"  # label of samples that the region's own MFD does not explain
 SAMPLES = 10  # of a region: with fewer it keeps its MFD
 HYSTERESIS_BINS = 12  # of accumulation
 EXPLAINED = 0.3  # R2 below which the curve explains hardly more than the mean outflow
-FALL = 0.05  # of the largest outflow: a smaller fall up to the jam accumulation is no falling branch
+FALL = (
+    0.05  # of the largest outflow: a smaller fall up to the jam accumulation is no falling branch
+)
 AHEAD_S = 900.0  # of the longer prediction
 CRITICAL_DENSITIES = 8.0, 60.0  # veh per lane-km, of cities
-FEW, POOR, ENDLESS, ODD, ALONE = "few samples", "R2", "no falling branch", "critical density", "one seed"
+FEW, POOR, ENDLESS, ODD, ALONE = (
+    "few samples",
+    "R2",
+    "no falling branch",
+    "critical density",
+    "one seed",
+)
 MEANINGS = {  # beginning of a doubt -> meaning and remedy
     FEW: f"fewer than {SAMPLES} samples, the MFD is unchanged; give a higher demand (cosim: --levels)",
     POOR: f"below {EXPLAINED:g} the curve explains hardly anything of the outflow and misleads controllers; give more "
@@ -43,28 +53,49 @@ HELD_OUT = (
 
 
 def with_guesses(
-    model: RegionalModel, samples: Samples, lane_km: PerRegion, accumulations: States = (), *, fastest: float = np.inf
+    model: RegionalModel,
+    samples: Samples,
+    lane_km: PerRegion,
+    accumulations: States = (),
+    *,
+    fastest: float = np.inf,
 ) -> RegionalModel:
-    """Return `model` with `critical_above` where its curve hardly falls up to the largest accumulation.
+    """Return `model` with `critical_above` where its curve hardly falls up to the largest
+    accumulation.
 
-    The curve is a guess from lanes (R,) [km] there, unless the region is nearly empty. fastest: largest rate of any
-    vehicle [1/s]
+    The curve is a guess from lanes (R,) [km] there, unless the region is nearly empty. fastest:
+    largest rate of any vehicle [1/s]
     """
-    empty, most, above, mfds = nearly_empty(samples), _largest(samples, accumulations), {}, list(model.mfds)
+    empty, most, above, mfds = (
+        nearly_empty(samples),
+        _largest(samples, accumulations),
+        {},
+        list(model.mfds),
+    )
     for n, curve in enumerate(model.mfds):
-        if n in empty or most[n] <= curve.critical or curve.outflow(most[n]) > (1.0 - FALL) * curve.capacity:
+        if (
+            n in empty
+            or most[n] <= curve.critical
+            or curve.outflow(most[n]) > (1.0 - FALL) * curve.capacity
+        ):
             above[n] = float(most[n])
             if n not in empty:
                 rate = fastest if model.exit_rates is None else fastest / model.exit_rates[n].max()
-                mfds[n] = mfd.guess_beyond(curve, mfd.JAM_DENSITY * lane_km[n], above[n], max_rate=rate)
-    storage = None if model.storage is None else np.maximum(model.storage, [curve.jam for curve in mfds])
+                mfds[n] = mfd.guess_beyond(
+                    curve, mfd.JAM_DENSITY * lane_km[n], above[n], max_rate=rate
+                )
+    storage = (
+        None if model.storage is None else np.maximum(model.storage, [curve.jam for curve in mfds])
+    )
     return replace(model, mfds=tuple(mfds), storage=storage, critical_above=above)
 
 
 def _largest(samples: Samples, accumulations: States) -> PerRegion:
     if len(accumulations):
         return largest_accumulation(accumulations)
-    return np.array([np.concatenate(list(cloud.values()))[:, 0].max(initial=0.0) for cloud in samples])
+    return np.array(
+        [np.concatenate(list(cloud.values()))[:, 0].max(initial=0.0) for cloud in samples]
+    )
 
 
 def region_fits(
@@ -76,10 +107,11 @@ def region_fits(
 ) -> pd.DataFrame:
     """Return the fit of each region, a row each.
 
-    Columns: region, name; critical_veh or critical_above_veh, jam_veh, storage_veh, max_outflow_veh_s of the model;
-    samples; r2; spread of samples around the curve, as a share of its maximum; hysteresis [-]; most_share, the largest
-    accumulation in any run over the critical one [-]; doubts, each of which begins with a key of MEANINGS. NaN where
-    unknown.
+    Columns: region, name; critical_veh or critical_above_veh, jam_veh, storage_veh,
+        max_outflow_veh_s of the model;
+    samples; r2; spread of samples around the curve, as a share of its maximum; hysteresis [-];
+    most_share, the largest accumulation in any run over the critical one [-]; doubts, each of which
+    begins with a key of MEANINGS. NaN where unknown.
 
     accumulations: (T+1, R, R) [veh]; seeds: of the loading runs; lane_km: (R,)
     """
@@ -93,8 +125,10 @@ def region_fits(
         doubts = {
             f"{FEW} ({len(points)})": len(points) < SAMPLES,
             f"{POOR} {r2:.2f}": len(points) >= SAMPLES and not r2 >= EXPLAINED,  # NaN too
-            f"{ENDLESS} (critical above {above:.0f} veh, not seen)": region in network.critical_above,
-            f"{ODD} {density[region]:.3g} veh per lane-km": density[region] < dense[0] or density[region] > dense[1],
+            f"{ENDLESS} (critical above {above:.0f} veh, not seen)": region
+            in network.critical_above,
+            f"{ODD} {density[region]:.3g} veh per lane-km": density[region] < dense[0]
+            or density[region] > dense[1],
             ALONE: seeds < 2,
         }
         rows.append(
@@ -108,7 +142,9 @@ def region_fits(
                 "max_outflow_veh_s": curve.capacity,
                 "samples": len(points),
                 "r2": r2,
-                "spread": np.sqrt((residuals**2).mean()) / curve.capacity if len(points) else np.nan,
+                "spread": np.sqrt((residuals**2).mean()) / curve.capacity
+                if len(points)
+                else np.nan,
                 "hysteresis": hysteresis(cloud),
                 "most_share": most[region] / critical[region],
                 "doubts": tuple(text for text, there in doubts.items() if there),
@@ -128,19 +164,32 @@ def nearly_empty(samples: Samples) -> list[int]:
 
 
 def hysteresis(cloud: Mapping[str, Points]) -> float:
-    """Return the excess of outflow while loading over unloading at the same accumulation, as a share of it [-].
+    """Return the excess of outflow while loading over unloading at the same accumulation, as a
+    share of it [-].
 
     Mean over bins of accumulation with both, weighted by outflow; NaN without such bins.
     """
     parts = [cloud.get(label, np.empty((0, 2))) for label in ("loading", "unloading")]
     most = np.concatenate(parts)[:, 0].max(initial=1e-9)
-    numbers = [np.minimum((HYSTERESIS_BINS * part[:, 0] / most).astype(int), HYSTERESIS_BINS - 1) for part in parts]
-    bins = [n for n in range(HYSTERESIS_BINS) if all((number == n).sum() >= 3 for number in numbers)]
-    both = np.array([[part[number == n, 1].mean() for n in bins] for part, number in zip(parts, numbers, strict=True)])
+    numbers = [
+        np.minimum((HYSTERESIS_BINS * part[:, 0] / most).astype(int), HYSTERESIS_BINS - 1)
+        for part in parts
+    ]
+    bins = [
+        n for n in range(HYSTERESIS_BINS) if all((number == n).sum() >= 3 for number in numbers)
+    ]
+    both = np.array(
+        [
+            [part[number == n, 1].mean() for n in bins]
+            for part, number in zip(parts, numbers, strict=True)
+        ]
+    )
     return float((both[0] - both[1]).sum() / both.mean(axis=0).sum()) if bins else float("nan")
 
 
-def fit_table(network: RegionalModel, fits: pd.DataFrame, known: Mapping[str, str] = MEANINGS) -> str:
+def fit_table(
+    network: RegionalModel, fits: pd.DataFrame, known: Mapping[str, str] = MEANINGS
+) -> str:
     """Return the fits as text, followed by the meanings of the doubts."""
     table = text_table(
         [
@@ -163,21 +212,30 @@ def fit_table(network: RegionalModel, fits: pd.DataFrame, known: Mapping[str, st
         ]
     )
     doubts = [doubt for doubts in fits["doubts"] for doubt in doubts]
-    lines = [f"WARNING, {kind}: {text}" for kind, text in known.items() if any(d.startswith(kind) for d in doubts)]
+    lines = [
+        f"WARNING, {kind}: {text}"
+        for kind, text in known.items()
+        if any(d.startswith(kind) for d in doubts)
+    ]
     return "\n".join([table, *wrapped("\n".join(lines))])
 
 
 def predictions(network: RegionalModel, runs: Sequence[Observed], scheme: dict) -> pd.DataFrame:
-    """Return the RMSE of predicted accumulations as shares of the critical ones [-], a row per region.
+    """Return the RMSE of predicted accumulations as shares of the critical ones [-], a row per
+    region.
 
     Where a critical accumulation was not seen, it is the largest one that was.
 
-    Columns: next_interval_rmse_share and ahead_rmse_share, of the regional model one interval and ahead_s [s] ahead;
-    next_interval_persistence_rmse_share and ahead_persistence_rmse_share, of the prediction that nothing changes.
+    Columns: next_interval_rmse_share and ahead_rmse_share, of the regional model one interval and
+        ahead_s [s] ahead;
+    next_interval_persistence_rmse_share and ahead_persistence_rmse_share, of the prediction that
+    nothing changes.
 
     scheme: step [s], substeps and integrator
     """
-    largest = np.array([network.critical_above.get(r, one) for r, one in enumerate(network.critical)])
+    largest = np.array(
+        [network.critical_above.get(r, one) for r, one in enumerate(network.critical)]
+    )
     ahead = min(max(1, round(AHEAD_S / scheme["step"])), max(len(run.demand) for run in runs))
     columns = {}
     for when, intervals in (("next_interval", 1), ("ahead", ahead)):
@@ -190,13 +248,18 @@ def predictions(network: RegionalModel, runs: Sequence[Observed], scheme: dict) 
 
 
 def prediction_text(errors: pd.DataFrame, step: float) -> str:
-    """Return the means of `predictions` in runs that the fit did not use, as text; step: control interval [s]."""
+    """Return the means of `predictions` in runs that the fit did not use, as text; step: control
+    interval [s]."""
     means = (100.0 * errors.filter(like="rmse_share").mean()).map("{:.1f} %".format)
     whens = zip((step, errors["ahead_s"][0]), means[::2], means[1::2], strict=True)
-    return HELD_OUT + ", ".join(f"{model} {when:g} s ahead (unchanged: {same})" for when, model, same in whens)
+    return HELD_OUT + ", ".join(
+        f"{model} {when:g} s ahead (unchanged: {same})" for when, model, same in whens
+    )
 
 
 def write_fits(path: Path, fits: pd.DataFrame, held_out: pd.DataFrame | None = None) -> None:
     """Write fit.csv, a row per region; held_out: `predictions` in runs that the fit did not use."""
     errors = pd.DataFrame() if held_out is None else held_out.add_prefix("held_out_")
-    files.write_table(path, fits.assign(doubts=fits["doubts"].map("; ".join)).join(errors), float_format="%.6g")
+    files.write_table(
+        path, fits.assign(doubts=fits["doubts"].map("; ".join)).join(errors), float_format="%.6g"
+    )

@@ -1,12 +1,14 @@
-"""The terminal cost of MPC: the value function of a DPC policy, learned from rollouts of the regional model.
+"""The terminal cost of MPC: the value function of a DPC policy, learned from rollouts of the
+regional model.
 
     python scenarios/economic_mpc/terminal_cost.py mpc-pcrg-terminal
 
-States are those that the scenario goes through under several controllers, mixed in pairs and scattered. From each of
-them the policy is rolled out until the scenario ends, with automatic differentiation: the sum of the vehicles, and how
-it changes with every x_ij (Czarnecki et al., "Sobolev training for neural networks", 2017; on values alone the
-derivatives that MPC goes by come out wrong). From the second round on MPC has driven with what was learned before: it
-leads into states of its own.
+States are those that the scenario goes through under several controllers, mixed in pairs and
+scattered. From each of them the policy is rolled out until the scenario ends, with automatic
+differentiation: the sum of the vehicles, and how it changes with every x_ij (Czarnecki et al.,
+    "Sobolev training for neural networks", 2017; on values alone the
+derivatives that MPC goes by come out wrong). From the second round on MPC has driven with what was
+learned before: it leads into states of its own.
 """
 
 import argparse
@@ -36,7 +38,10 @@ from nmfd.runs.files import atomic
 from nmfd.tensors import one_thread
 from nmfd.types import Controller
 
-TERMINAL = {"mpc-pc-terminal": "dpc-pc", "mpc-pcrg-terminal": "dpc-pcrg"}  # MPC -> policy of its value function
+TERMINAL = {
+    "mpc-pc-terminal": "dpc-pc",
+    "mpc-pcrg-terminal": "dpc-pcrg",
+}  # MPC -> policy of its value function
 ROLLOUTS = 128  # at a time
 MOST_SCATTER = 0.25  # of the logarithm of every x_ij
 WIDTH = 128  # of both hidden layers
@@ -44,7 +49,9 @@ BATCH = 256  # states per Adam step
 RATE, LAST = 2e-3, 0.02  # learning rate of Adam; what is left of it at the end
 VALUES = 0.3  # weight of the squared error of values, beside the Huber loss of derivatives
 
-Batch = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]  # x (N, R, J), step (N,), value (N,), slope
+Batch = tuple[
+    torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor
+]  # x (N, R, J), step (N,), value (N,), slope
 
 
 def learn(
@@ -58,9 +65,11 @@ def learn(
     policy: Path | None = None,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> Terminal:
-    """Learn the terminal cost of `controller`, a key of TERMINAL; the same seed gives the same numbers.
+    """Learn the terminal cost of `controller`, a key of TERMINAL; the same seed gives the same
+    numbers.
 
-    samples: states per round; steps: Adam steps per round; policy: file of the DPC policy that takes over after the
+    samples: states per round; steps: Adam steps per round; policy: file of the DPC policy that
+        takes over after the
     horizon, the scenario's own if None
     """
     follows, guidance = parse(TERMINAL[controller]), parse(controller).guides
@@ -89,26 +98,38 @@ def learn(
             if terminal is not None:  # twice as often as the others
                 own = 2 * [driven(EconomicMpc(planning, guidance=guidance, terminal=terminal))]
             else:
-                own = [driven(NoControl(planning)), *([driven(PiGating(planning))] if planning.protected else [])]
+                own = [
+                    driven(NoControl(planning)),
+                    *([driven(PiGating(planning))] if planning.protected else []),
+                ]
             visited = torch.tensor(np.stack(both + own), dtype=rollout.dtype)
             seen = 0
             while seen < samples:
                 found.append(_sampled(rollout, after, visited, generator))
                 seen += ROLLOUTS
                 tell(min(seen, samples), f"{seen} states")
-            terminal = _fitted(planning, rollout, found, controller, steps, generator, tell, samples)
+            terminal = _fitted(
+                planning, rollout, found, controller, steps, generator, tell, samples
+            )
         assert terminal is not None  # there is a round
         return terminal
 
 
-def _sampled(rollout: Rollout, policy: Policy, visited: Demands, generator: torch.Generator) -> Batch:
-    """ROLLOUTS states, when they are, and value and derivative of the policy there. visited: (C, T, R, R) [veh]"""
+def _sampled(
+    rollout: Rollout, policy: Policy, visited: Demands, generator: torch.Generator
+) -> Batch:
+    """ROLLOUTS states, when they are, and value and derivative of the policy there. visited: (C, T,
+    R, R) [veh]"""
     drivers, steps = visited.shape[:2]
     step = torch.randint(steps, (ROLLOUTS,), generator=generator)
-    one, other = (visited[torch.randint(drivers, (ROLLOUTS,), generator=generator), step] for _ in range(2))
+    one, other = (
+        visited[torch.randint(drivers, (ROLLOUTS,), generator=generator), step] for _ in range(2)
+    )
     share = torch.rand(ROLLOUTS, 1, 1, generator=generator)
     scatter = MOST_SCATTER * torch.rand(ROLLOUTS, 1, 1, generator=generator)
-    begin = (share * one + (1.0 - share) * other) * torch.exp(scatter * torch.randn(one.shape, generator=generator))
+    begin = (share * one + (1.0 - share) * other) * torch.exp(
+        scatter * torch.randn(one.shape, generator=generator)
+    )
     begin.requires_grad_(True)
     demand = torch.cat([rollout.demand, torch.zeros_like(rollout.demand)])
     x, value, exact = begin, torch.zeros(ROLLOUTS), torch.zeros_like(begin)
@@ -149,16 +170,23 @@ def _fitted(
         stays = (torch.sigmoid(out[:, :-1] - LATE) * x).sum(-1)
         return left * (horizon * stays + OFFSET * out[:, -1])
 
-    of_values, of_slopes = value.std(), slope.abs().mean()  # a few slopes are a hundred times as steep: before a lock
+    of_values, of_slopes = (
+        value.std(),
+        slope.abs().mean(),
+    )  # a few slopes are a hundred times as steep: before a lock
     optimizer = torch.optim.Adam(network.parameters(), lr=RATE)
     for done in range(steps):
         for group in optimizer.param_groups:
-            group["lr"] = RATE * (LAST + (1.0 - LAST) * 0.5 * (1.0 + math.cos(math.pi * done / steps)))
+            group["lr"] = RATE * (
+                LAST + (1.0 - LAST) * 0.5 * (1.0 + math.cos(math.pi * done / steps))
+            )
         chosen = torch.randint(len(x), (BATCH,), generator=generator)
         at = x[chosen].flatten(1).requires_grad_(True)
         foreseen = valued(at, step[chosen])
         (rises,) = torch.autograd.grad(foreseen.sum(), at, create_graph=True)
-        missed = torch.nn.functional.smooth_l1_loss(rises / of_slopes, slope[chosen].flatten(1) / of_slopes)
+        missed = torch.nn.functional.smooth_l1_loss(
+            rises / of_slopes, slope[chosen].flatten(1) / of_slopes
+        )
         loss = missed + VALUES * ((foreseen - value[chosen]) / of_values).square().mean()
         optimizer.zero_grad()
         loss.backward()
@@ -180,15 +208,22 @@ def write(terminal: Terminal, path: Path) -> None:
     """Write an .npz file."""
     layers = zip(WEIGHTS, terminal.weights, terminal.biases, strict=True)
     arrays = {
-        f"{name}_{kind}": a.astype(np.float32) for name, w, b in layers for kind, a in (("weight", w), ("bias", b))
+        f"{name}_{kind}": a.astype(np.float32)
+        for name, w, b in layers
+        for kind, a in (("weight", w), ("bias", b))
     }
-    others = {name: getattr(terminal, name) for name in ("steps", "used", "scale", "network_hash", "controller")}
+    others = {
+        name: getattr(terminal, name)
+        for name in ("steps", "used", "scale", "network_hash", "controller")
+    }
     with atomic(path) as temporary:
         np.savez_compressed(temporary, **others, **arrays)
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("controller", choices=list(TERMINAL))
     parser.add_argument("--seed", type=int, default=0)
     options, folder = parser.parse_args(), Path(__file__).parent

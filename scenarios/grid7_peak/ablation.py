@@ -1,10 +1,11 @@
-"""Which part of the controls over max-pressure gains what: prices, gate and metering, one by one and together.
+"""Which part of the controls over max-pressure gains what: prices, gate and metering, one by one
+and together.
 
     python scenarios/grid7_peak/ablation.py runs/ablation --demand 1.6,2 --first-seed 3400 --seeds 2
 
-The pricing rule, DPC and the tuned PI gate can be written in the same numbers (nmfd/controllers/dpc/compact.py), so
-that every combination is a rule with other numbers. Every row of CELLS is one
-`cosim evaluate` with a run folder of its own; ablation.csv has the runs of all.
+The pricing rule, DPC and the tuned PI gate can be written in the same numbers
+(nmfd/controllers/dpc/compact.py), so that every combination is a rule with other numbers. Every row
+of CELLS is one `cosim evaluate` with a run folder of its own; ablation.csv has the runs of all.
 """
 
 import subprocess
@@ -19,9 +20,13 @@ from nmfd.controllers.dpc.compact import Numbers
 
 OVER = "+max-pressure+guidance-period-60"
 SCENARIO, MODEL = nmfd.load_scenario("grid7_peak"), nmfd.load_network("grid7_max_pressure")
-RULE = Numbers(*SCENARIO.controller_options[f"pricing-rule{OVER}+metering"]["numbers"])  # its gate is open
+RULE = Numbers(
+    *SCENARIO.controller_options[f"pricing-rule{OVER}+metering"]["numbers"]
+)  # its gate is open
 TRAINED = nmfd.controller(f"dpc-pcrg{OVER}+metering", SCENARIO).policy.numbers.tolist()
-DPC = Numbers(*(round(number, 4) for number in TRAINED))._replace(**dict(zip(Numbers._fields[:3], RULE, strict=False)))
+DPC = Numbers(*(round(number, 4) for number in TRAINED))._replace(
+    **dict(zip(Numbers._fields[:3], RULE, strict=False))
+)
 TUNED, SPAN = SCENARIO.controller_options[f"pi-gating+guided{OVER}"], MODEL.u_max - MODEL.u_min
 PI = {  # the same gate in units of a rule
     "set_point": round(TUNED["set_point"][0] / MODEL.mfds[SCENARIO.protected[0]].critical, 3),
@@ -60,13 +65,24 @@ def main(out: Path, cells: str, demand: str, first_seed: int, seeds: int, worker
     """Run the cells CELLS, and write OUT/ablation.csv."""
     for cell in cells.split(","):
         strategy, numbers = CELLS[cell]
-        command = [sys.executable, "-m", "cosim", "evaluate", "grid7_peak", "--controllers", strategy]
+        command = [
+            sys.executable,
+            "-m",
+            "cosim",
+            "evaluate",
+            "grid7_peak",
+            "--controllers",
+            strategy,
+        ]
         command += ["--demand", demand, "--first-seed", str(first_seed), "--seeds", str(seeds)]
         command += ["--workers", str(workers), "--out", str(out / cell)]
         if numbers is not None:
             command += ["--set", f'controllers."{strategy}".numbers={list(numbers)}']
         subprocess.run(command, check=True)
-    runs = [pd.read_csv(table).assign(cell=table.parent.name) for table in sorted(out.glob("*/runs.csv"))]
+    runs = [
+        pd.read_csv(table).assign(cell=table.parent.name)
+        for table in sorted(out.glob("*/runs.csv"))
+    ]
     pd.concat(runs).to_csv(out / "ablation.csv", index=False)
 
 

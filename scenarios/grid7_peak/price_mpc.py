@@ -1,12 +1,14 @@
-"""MPC with the outputs of the DPC policy over max-pressure: gates, prices and metering, on the same regional model.
+"""MPC with the outputs of the DPC policy over max-pressure: gates, prices and metering, on the same
+regional model.
 
     cd scenarios/grid7_peak
     cosim evaluate grid7_peak --controllers price_mpc.py:PriceMpc+max-pressure+guidance-period-60+metering --demand 1.6
 
-Every interval it lowers the mean total time spent of MODELS rollouts over HORIZON intervals, each with a regional model
-of its own, by ITERATIONS of Adam on u and prices held over the horizon, from those of the last interval. Spread of the
-models and metering level are those that the policy was trained with (scenario.toml). The costs are the best of six
-pairs in SUMO at twice the demand on seed 1100 (reference/README.md).
+Every interval it lowers the mean total time spent of MODELS rollouts over HORIZON intervals, each
+with a regional model of its own, by ITERATIONS of Adam on u and prices held over the horizon, from
+those of the last interval. Spread of the models and metering level are those that the policy was
+trained with (scenario.toml). The costs are the best of six pairs in SUMO at twice the demand on
+seed 1100 (reference/README.md).
 """
 
 import time
@@ -29,7 +31,8 @@ COSTS = {"detour_cost": 100.0, "holding_cost": 600.0}  # s, options of DPC, too
 
 
 class Held(nn.Module):
-    """Constant u (R, R) and prices (R,); departure rates by the room up to `level` critical accumulations."""
+    """Constant u (R, R) and prices (R,); departure rates by the room up to `level` critical
+    accumulations."""
 
     def __init__(self, planning: PlanningModel, level: float):
         super().__init__()
@@ -59,7 +62,9 @@ class PriceMpc:
 
     def __init__(self, planning: PlanningModel):
         self.planning = planning
-        self.setup = planning.controller_options["dpc-pcrg+max-pressure+guidance-period-60+metering"]
+        self.setup = planning.controller_options[
+            "dpc-pcrg+max-pressure+guidance-period-60+metering"
+        ]
         self.rollout = Rollout(planning, **COSTS)
         self.reset()
 
@@ -68,7 +73,9 @@ class PriceMpc:
 
     def act(self, observation: Observation) -> Controls:
         begin, k, policy = time.perf_counter(), observation.step, self.policy
-        demand = torch.cat([self.rollout.demand[k:], torch.zeros_like(self.rollout.demand)])[:HORIZON]
+        demand = torch.cat([self.rollout.demand[k:], torch.zeros_like(self.rollout.demand)])[
+            :HORIZON
+        ]
         demand[0] += torch.tensor(observation.backlog, dtype=demand.dtype) / self.planning.step
         x = torch.tensor(observation.accumulation, dtype=demand.dtype).clamp(min=0.0)
         batch = x.expand(MODELS, -1, -1), demand.unsqueeze(1).expand(-1, MODELS, -1, -1)
@@ -78,10 +85,15 @@ class PriceMpc:
         random, best, kept = torch.Generator(), np.inf, policy.state_dict()
         for n in range(ITERATIONS + 1):
             random.manual_seed(k)  # the same models in every iteration
-            self.rollout.draw_model(MODELS, self.setup["mfd_spread"], random, self.setup["mfd_scale"])
+            self.rollout.draw_model(
+                MODELS, self.setup["mfd_spread"], random, self.setup["mfd_scale"]
+            )
             spent = self.rollout.total_time_spent(policy, *batch, random).mean()
             if spent.item() < best:
-                best, kept = spent.item(), {name: value.clone() for name, value in policy.state_dict().items()}
+                best, kept = (
+                    spent.item(),
+                    {name: value.clone() for name, value in policy.state_dict().items()},
+                )
             if n == ITERATIONS or time.perf_counter() - begin > 0.8 * self.planning.step:
                 break
             adam.zero_grad()

@@ -2,9 +2,10 @@
 
     python scenarios/grid7_peak/price_response.py runs/price-response
 
-Prices of every region are drawn at random every six minutes. The dispersion is the one with the largest likelihood of
-the next regions that vehicles took (crossings of boundaries by destination), given the state at the beginning of each
-interval. Printed beside it: the gain in likelihood over nominal split ratios, relative to that of the best constants.
+Prices of every region are drawn at random every six minutes. The dispersion is the one with the
+largest likelihood of the next regions that vehicles took (crossings of boundaries by destination),
+given the state at the beginning of each interval. Printed beside it: the gain in likelihood over
+nominal split ratios, relative to that of the best constants.
 """
 
 import sys
@@ -25,7 +26,8 @@ SEEDS, LEVELS = (1120, 1121), (1.0, 1.3)
 
 
 class RandomPrices:
-    """Prices of half of the regions, from 0 to MOST_PRICE, drawn anew every HOLD control intervals."""
+    """Prices of half of the regions, from 0 to MOST_PRICE, drawn anew every HOLD control
+    intervals."""
 
     name = "random-prices"
 
@@ -44,11 +46,15 @@ class RandomPrices:
 
 
 def likelihood(runs: list[Result], answer: Answer, dispersion: float) -> tuple[float, float]:
-    """Return the mean log-likelihood of a crossing under the answer, and under the best constant split ratios (-)."""
+    """Return the mean log-likelihood of a crossing under the answer, and under the best constant
+    split ratios (-)."""
     answer.dispersion = dispersion
     total, taken = 0.0, np.zeros(answer.own.shape)
     for run in runs:
-        x, prices = (torch.tensor(run.data[name].values, dtype=torch.float32) for name in ("accumulation", "prices"))
+        x, prices = (
+            torch.tensor(run.data[name].values, dtype=torch.float32)
+            for name in ("accumulation", "prices")
+        )
         splits = answer(x[:-1], prices).double().clamp(min=1e-3).numpy()
         crossings = run.data["crossings"].values * (answer.own.numpy() > 0)
         total, taken = total + (crossings * np.log(splits)).sum(), taken + crossings.sum(0)
@@ -67,7 +73,9 @@ def main(folder: Path) -> None:
     nominal, constant = likelihood(runs, answer, 1e6)
     for dispersion in (30, 60, 100, 150, 200, 300, 400, 500, 700, 1000):
         value, _ = likelihood(runs, answer, dispersion)
-        print(f"{dispersion:5} s: {value:.4f} per crossing, {(value - nominal) / (constant - nominal):.2f} of the gain")
+        print(
+            f"{dispersion:5} s: {value:.4f} per crossing, {(value - nominal) / (constant - nominal):.2f} of the gain"
+        )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,5 @@
-"""No control as Sirmatel and Geroliminis (2018) have it: every gate open, and drivers who look at travel times.
+"""No control as Sirmatel and Geroliminis (2018) have it: every gate open, and drivers who look at
+travel times.
 
 nmfd benchmark seven_region_2018 --controllers no-control,scenarios/seven_region_2018/logit.py:LogitDrivers
 """
@@ -13,8 +14,11 @@ CHOICES = 3  # published: the shortest sequences of regions that a driver choose
 PER_SECOND = 1 / 60.0  # of travel time: ours, the paper does not say how much drivers care
 
 
-def sequences(adjacency: np.ndarray, here: int, end: int, before: tuple[int, ...] = ()) -> Iterator[tuple[int, ...]]:
-    """All ways from region `here` to `end` through regions that are not in `before`, each with both ends."""
+def sequences(
+    adjacency: np.ndarray, here: int, end: int, before: tuple[int, ...] = ()
+) -> Iterator[tuple[int, ...]]:
+    """All ways from region `here` to `end` through regions that are not in `before`, each with both
+    ends."""
     if here == end:
         yield (here,)
         return
@@ -25,7 +29,8 @@ def sequences(adjacency: np.ndarray, here: int, end: int, before: tuple[int, ...
 
 
 class LogitDrivers:
-    """Of those in i bound for j, a share proportional to exp(-PER_SECOND t) takes each of the CHOICES fastest ways.
+    """Of those in i bound for j, a share proportional to exp(-PER_SECOND t) takes each of the
+    CHOICES fastest ways.
 
     t: the sum over the regions of a way of the time that vehicles spend in it now, n / G(n) [s]
     """
@@ -48,7 +53,9 @@ class LogitDrivers:
     def act(self, observation: Observation) -> Controls:
         """Open gates, and where drivers go."""
         inside = np.maximum(observation.accumulation.sum(axis=1), 0.0)
-        spent = np.array([1.0 / mfd.rate(n) for mfd, n in zip(self._network.mfds, inside, strict=True)])
+        spent = np.array(
+            [1.0 / mfd.rate(n) for mfd, n in zip(self._network.mfds, inside, strict=True)]
+        )
         splits = np.zeros((self._network.regions,) * 3)
         for (i, j), ways in self._ways.items():
             time = self._visits[i, j] @ spent

@@ -1,4 +1,5 @@
-"""What the fast paths are measured against: the same decisions, written down as plainly as they are published."""
+"""What the fast paths are measured against: the same decisions, written down as plainly as they are
+published."""
 
 from collections.abc import Callable
 
@@ -10,7 +11,8 @@ from nmfd.model.regional_model import RegionalModel
 
 
 def dpc(policy: Policy) -> Callable:
-    """A policy called as in training, gradients and all, its outputs checked and normalised pair by pair."""
+    """A policy called as in training, gradients and all, its outputs checked and normalised pair by
+    pair."""
 
     def decide(accumulation: np.ndarray):
         perimeter, splits = policy(torch.tensor(accumulation, dtype=torch.float32))
@@ -28,7 +30,14 @@ def dpc(policy: Policy) -> Callable:
     return decide
 
 
-def euler(network: RegionalModel, x: np.ndarray, demand: np.ndarray, u: np.ndarray, theta: np.ndarray, step: float):
+def euler(
+    network: RegionalModel,
+    x: np.ndarray,
+    demand: np.ndarray,
+    u: np.ndarray,
+    theta: np.ndarray,
+    step: float,
+):
     """x (R, R) [veh] after `step` [s], from the equations of nmfd.model.dynamics, term by term."""
     regions, neighbours = network.regions, [np.flatnonzero(row) for row in network.adjacency]
     q = [float(mfd.rate(x[i].sum())) for i, mfd in enumerate(network.mfds)]

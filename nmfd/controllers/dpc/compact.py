@@ -1,31 +1,36 @@
 """Gates, prices and metering by a few readable numbers: compact DPC policies, and rules.
 
-A compact policy is trained through the regional model (dpc-pc, dpc-pcrg with `compact`). A rule, gating-rule or, with
-prices, pricing-rule, has numbers that were tuned in SUMO (`cosim tune`) or chosen by hand; it reads them from
-scenario.toml.
+A compact policy is trained through the regional model (dpc-pc, dpc-pcrg with `compact`). A rule,
+gating-rule or, with prices, pricing-rule, has numbers that were tuned in SUMO (`cosim tune`) or
+chosen by hand; it reads them from scenario.toml.
 
-With z_i = n_i / n_cr,i, the entries h -> p of every protected region p, and the prices of all ways through p, are
+With z_i = n_i / n_cr,i, the entries h -> p of every protected region p, and the prices of all ways
+through p, are
 
     u_hp = u_min + (u_max - u_min) s(4 (v_p + relief max(z_h - 1, 0))),    v_p = gain e_p,    e_p = set_point - z_p
     c_p  = price max(z_p - price_from, 0)                                  s(x) = 1 / (1 + e^-x)
 
-All other entries are open; the prices of the other regions are elsewhere max(z_i - elsewhere_from, 0). `relief` opens
-a gate for a region beyond its own critical accumulation. With metering,
+All other entries are open; the prices of the other regions are elsewhere max(z_i - elsewhere_from,
+0). `relief` opens a gate for a region beyond its own critical accumulation. With metering,
 
     r_i = n_cr,i max(min(metering - z_i, metering_gain (metering_protected - max_p z_p)), 0) / FILL_TIME_S
 
-trips may begin in region i per second; `metering_protected` = 0 omits the second term. A gate moves a queue into the
-regions around the protected one, which may lock instead; trips that have not begun block no vehicle.
+trips may begin in region i per second; `metering_protected` = 0 omits the second term. A gate moves
+a queue into the regions around the protected one, which may lock instead; trips that have not begun
+block no vehicle.
 
-With `integral` the gate is PI gating (nmfd.controllers.rules), initially open, v_p = 1/2, with relief on top:
+With `integral` the gate is PI gating (nmfd.controllers.rules), initially open, v_p = 1/2, with
+relief on top:
 
     v_p(k) = clip(v_p(k-1) + gain (e_p(k) - e_p(k-1)) + integral e_p(k), -1/2, 1/2)
     u_hp = u_min + (u_max - u_min) clip(1/2 + v_p + relief max(z_h - 1, 0), 0, 1).
 
-It corrects errors of the regional model, so that rollouts of that model do not use it: `integral` is tuned in SUMO
-(`cosim tune`), not trained. The straight line closes earlier than s as the region fills.
+It corrects errors of the regional model, so that rollouts of that model do not use it: `integral`
+is tuned in SUMO (`cosim tune`), not trained. The straight line closes earlier than s as the region
+fills.
 
-The regional model answers prices by a logit (nmfd.model.answer); the policy is trained like a network.
+The regional model answers prices by a logit (nmfd.model.answer); the policy is trained like a
+network.
 """
 
 from typing import Annotated, NamedTuple
@@ -67,7 +72,8 @@ MEANING = (
 
 
 class CompactPolicy(Policy):
-    """Policy with the parameters `numbers` (11,) for the protected regions `architecture.compact`."""
+    """Policy with the parameters `numbers` (11,) for the protected regions
+    `architecture.compact`."""
 
     def _build(self, network: RegionalModel) -> None:
         self.numbers = nn.Parameter(torch.tensor(Numbers()))
@@ -75,7 +81,8 @@ class CompactPolicy(Policy):
         self.register_buffer("held", torch.tensor(held), persistent=False)
 
     def listed(self, x: PerPair, memory: Memory | None = None) -> tuple[PerPair, None]:
-        """Return the perimeter in the states x, and None; memory: what `remember` returned for them."""
+        """Return the perimeter in the states x, and None; memory: what `remember` returned for
+        them."""
         numbers, full = self._read(), self._full(x)
         gate = numbers.gain * (numbers.set_point - full) if memory is None else memory[..., 0, :]
         want = gate.unsqueeze(-2) + numbers.relief * (full - 1.0).clamp(min=0.0).unsqueeze(-1)
@@ -84,7 +91,8 @@ class CompactPolicy(Policy):
         return (self.box.low + (self.box.high - self.box.low) * share) * self.box.allowed, None
 
     def remember(self, x: PerPair, memory: Memory | None) -> Memory | None:
-        """Return v and e after states x, from `memory` before them; None without integral action."""
+        """Return v and e after states x, from `memory` before them; None without integral
+        action."""
         numbers = self._read()
         if not numbers.integral:
             return None
@@ -99,17 +107,22 @@ class CompactPolicy(Policy):
             return None
         numbers, full = self._read(), self._full(x)
         elsewhere = numbers.elsewhere * (full - numbers.elsewhere_from).clamp(min=0.0)
-        return torch.where(self.held, numbers.price * (full - numbers.price_from).clamp(min=0.0), elsewhere)
+        return torch.where(
+            self.held, numbers.price * (full - numbers.price_from).clamp(min=0.0), elsewhere
+        )
 
     def metering(self, x: PerPair) -> PerRegion | None:
-        """Return the largest rates of departures in each region (veh/s, (..., R)); None without metering."""
+        """Return the largest rates of departures in each region (veh/s, (..., R)); None without
+        metering."""
         if not self.architecture.metering:
             return None
         numbers, full = self._read(), self._full(x)
         room = numbers.metering - full
         if numbers.metering_protected:
             fullest = torch.where(self.held, full, torch.zeros_like(full)).amax(-1, keepdim=True)
-            room = torch.minimum(room, numbers.metering_gain * (numbers.metering_protected - fullest))
+            room = torch.minimum(
+                room, numbers.metering_gain * (numbers.metering_protected - fullest)
+            )
         return self.scale.squeeze(-1) * room.clamp(min=0.0) / FILL_TIME_S
 
     def bound(self) -> None:
@@ -140,7 +153,9 @@ def rule(planning: PlanningModel, *, guidance: bool) -> DpcController:
     """Return the pricing rule or, without guidance, the gating rule. Raise InputError."""
     name = "pricing-rule" if guidance else "gating-rule"
     setup = options(Rule, planning, name)
-    architecture = Architecture(guidance=guidance, compact=planning.protected, metering=setup.metering)
+    architecture = Architecture(
+        guidance=guidance, compact=planning.protected, metering=setup.metering
+    )
     policy = CompactPolicy(planning.network, architecture)
     policy.numbers.data.copy_(torch.tensor(Numbers(*setup.numbers)))
     controller = DpcController(policy)

@@ -20,9 +20,10 @@ class Recipe:
     activation: "gelu" or "soft-exponential"; decoder_layers: hidden layers of each decoder
     loss: mean over the rollouts of the "log" of the total time spent, or of the "sum" itself
     epoch: Adam steps after which the decoders take turns
-    process_std: standard deviation of the noise on each x_ij that is not empty, after every interval (veh)
-    largest_start: initial x_ij are uniform up to it, under the demand of the scenario (veh); 0: random states at random
-        times for half of the rollouts, and every flow is scaled
+    process_std: standard deviation of the noise on each x_ij that is not empty (veh), added
+        after every interval
+    largest_start: initial x_ij are uniform up to it, under the demand of the scenario (veh); 0:
+        random states at random times for half of the rollouts, and every flow is scaled
     """
 
     learning_rate: float | None = None
@@ -37,11 +38,12 @@ class Recipe:
     largest_start: float = 0.0
 
 
-# Tumu et al., by section. Training: learning rate (no schedule is named), weight decay, batch, sizes of 128,
-# alternation by epoch; no clipping is named. Policy Network: SoftExponential, decoders that are networks of hidden
-# layers. Problem Formulation: plain sum of the accumulations, noise on the state. Conclusion: one scenario.
-# Not stated: the number of steps, the length of an epoch (here ten batches), hidden layers (here two, one in each
-# decoder), and initial states (here those of Region Scaling Results, the only ones that are named).
+# Tumu et al., by section. Training: learning rate (no schedule is named), weight decay, batch,
+# sizes of 128, alternation by epoch; no clipping is named. Policy Network: SoftExponential,
+# decoders that are networks of hidden layers. Problem Formulation: plain sum of the accumulations,
+# noise on the state. Conclusion: one scenario. Not stated: the number of steps, the length of an
+# epoch (here ten batches), hidden layers (here two, one in each decoder), and initial states (here
+# those of Region Scaling Results, the only ones that are named).
 PUBLISHED = Recipe(
     learning_rate=1e-4,
     weight_decay=1e-6,
@@ -59,49 +61,101 @@ PUBLISHED = Recipe(
 class Training(Options):
     """Options of a DPC policy and of its training, `nmfd train SCENARIO --controller NAME`."""
 
-    local: bool = setting("one small network for every boundary, which fits other cities; perimeter control", False)
-    compact: bool = setting("gates and prices of a few readable numbers instead of a network; on the CPU", False)
-    numbers: NumbersOption | None = setting(f"initial numbers of a compact policy: {MEANING}", None, unit="-")
+    local: bool = setting(
+        "one small network for every boundary, which fits other cities; perimeter control", False
+    )
+    compact: bool = setting(
+        "gates and prices of a few readable numbers instead of a network; on the CPU", False
+    )
+    numbers: NumbersOption | None = setting(
+        f"initial numbers of a compact policy: {MEANING}", None, unit="-"
+    )
     kept: Texts = setting("numbers of a compact policy that training leaves as they are", ())
-    prices: bool = setting("a network chooses prices of the ways through regions instead of split ratios", False)
-    metering: bool = setting("the policy makes trips wait while regions are full; for +metering", False)
+    prices: bool = setting(
+        "a network chooses prices of the ways through regions instead of split ratios", False
+    )
+    metering: bool = setting(
+        "the policy makes trips wait while regions are full; for +metering", False
+    )
     steps: int = whole("Adam steps", 400, low=1, high=10**7)
-    learning_rate: float = setting("of Adam; falls to a tenth along a cosine", 1e-3, unit="-", gt=0.0, le=1.0)
-    demand_low: float = setting("least factor of all demand, drawn per rollout", 1.0, unit="-", gt=0.0, le=1.0)
+    learning_rate: float = setting(
+        "of Adam; falls to a tenth along a cosine", 1e-3, unit="-", gt=0.0, le=1.0
+    )
+    demand_low: float = setting(
+        "least factor of all demand, drawn per rollout", 1.0, unit="-", gt=0.0, le=1.0
+    )
     demand_high: float = setting("largest factor of all demand", 1.0, unit="-", ge=1.0, le=100.0)
-    noise: Flow = setting("largest standard deviation of Gaussian noise on the demand; drawn per rollout", 0.0)
-    mfd_spread: Share = setting("standard deviation of the logarithm of the MFD of every region, per rollout", 0.0)
+    noise: Flow = setting(
+        "largest standard deviation of Gaussian noise on the demand; drawn per rollout", 0.0
+    )
+    mfd_spread: Share = setting(
+        "standard deviation of the logarithm of the MFD of every region, per rollout", 0.0
+    )
     mfd_scale: float = setting(
-        "factor of the MFDs' accumulation axes; below 1 for a city that may lock early", 1.0, unit="-", ge=0.1, le=1.0
+        "factor of the MFDs' accumulation axes; below 1 for a city that may lock early",
+        1.0,
+        unit="-",
+        ge=0.1,
+        le=1.0,
     )
     holding_cost: float = setting(
-        "time lost by a vehicle that a gate holds, so that gates close for a gain only", 0.0, unit="s", ge=0.0, le=1e6
+        "time lost by a vehicle that a gate holds, so that gates close for a gain only",
+        0.0,
+        unit="s",
+        ge=0.0,
+        le=1e6,
     )
-    detour_cost: float = setting("time lost by a vehicle off the nominal splits", 0.0, unit="s", ge=0.0, le=1e6)
-    preset: Literal["ours", "published"] = setting("recipe of the training; published: that of Tumu et al.", "ours")
-    preset_without: Texts = setting(f"parts of the preset that stay ours: {', '.join(vars(PUBLISHED))}", ())
+    detour_cost: float = setting(
+        "time lost by a vehicle off the nominal splits", 0.0, unit="s", ge=0.0, le=1e6
+    )
+    preset: Literal["ours", "published"] = setting(
+        "recipe of the training; published: that of Tumu et al.", "ours"
+    )
+    preset_without: Texts = setting(
+        f"parts of the preset that stay ours: {', '.join(vars(PUBLISHED))}", ()
+    )
     from_no_control: bool = setting("the initial policy is nearly no control", False)
-    from_gating: bool = setting("the initial policy is nearly a gate at the set point of pi-gating", False)
+    from_gating: bool = setting(
+        "the initial policy is nearly a gate at the set point of pi-gating", False
+    )
 
     @model_validator(mode="after")
     def _fits_together(self) -> "Training":
         if self.from_gating and self.from_no_control:
-            raise Problem("from_gating", "a policy cannot begin as a gate and as no control; omit one")
+            raise Problem(
+                "from_gating", "a policy cannot begin as a gate and as no control; omit one"
+            )
         if self.compact and (self.local or self.from_gating or self.from_no_control):
-            raise Problem("compact", "begins with its numbers; omit local, from_gating, from_no_control")
+            raise Problem(
+                "compact", "begins with its numbers; omit local, from_gating, from_no_control"
+            )
         if self.numbers and not (self.compact and min(self.numbers) >= 0.0):
-            raise Problem("numbers", "expected 8 to 11 numbers >= 0 of a compact policy; add compact = true")
+            raise Problem(
+                "numbers", "expected 8 to 11 numbers >= 0 of a compact policy; add compact = true"
+            )
         if self.kept and not (self.compact and set(self.kept) <= set(Numbers._fields)):
-            names = got(f"numbers of a compact policy, of {', '.join(Numbers._fields)}", list(self.kept))
+            names = got(
+                f"numbers of a compact policy, of {', '.join(Numbers._fields)}", list(self.kept)
+            )
             raise Problem("kept", f"{names}; correct them or add compact = true")
         if self.local and self.metering:
             raise Problem("metering", "a local policy controls gates only; omit it")
         if self.compact and self.prices:
             raise Problem("prices", "a compact policy has prices anyway; omit it")
-        if self.preset != "ours" and (self.compact or self.local or self.from_gating or self.from_no_control):
-            raise Problem("preset", "begins with a random network; omit compact, local, from_gating, from_no_control")
-        if self.preset_without and (self.preset == "ours" or not set(self.preset_without) <= set(vars(PUBLISHED))):
-            problem = got(f"parts of the preset published, of {', '.join(vars(PUBLISHED))}", list(self.preset_without))
+        if self.preset != "ours" and (
+            self.compact or self.local or self.from_gating or self.from_no_control
+        ):
+            raise Problem(
+                "preset",
+                "begins with a random network; omit compact, local, from_gating, from_no_control",
+            )
+        if self.preset_without and (
+            self.preset == "ours" or not set(self.preset_without) <= set(vars(PUBLISHED))
+        ):
+            problem = got(
+                f"parts of the preset published, of {', '.join(vars(PUBLISHED))}",
+                list(self.preset_without),
+            )
             raise Problem("preset_without", f"{problem}; correct them or add preset")
         return self
 

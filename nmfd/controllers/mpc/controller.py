@@ -1,8 +1,10 @@
-"""Economic model predictive control: the least total time spent over a horizon of the regional model.
+"""Economic model predictive control: the least total time spent over a horizon of the regional
+model.
 
-As in Tumu et al.: perimeter control alone ("mpc-pc") or with route guidance ("mpc-pcrg"), the demand known ahead,
-nothing beyond the horizon unless there is a terminal cost (terminal.py). Unlike there: single shooting, so that only
-the controls are unknown, with exact gradients by the adjoint method (edge_model) and projected gradients
+As in Tumu et al.: perimeter control alone ("mpc-pc") or with route guidance ("mpc-pcrg"), the
+demand known ahead, nothing beyond the horizon unless there is a terminal cost (terminal.py). Unlike
+there: single shooting, so that only the controls are unknown, with exact gradients by the adjoint
+    method (edge_model) and projected gradients
 (projected_gradient). Nearly all controls end at a bound; a few gradients find out which.
 """
 
@@ -18,7 +20,14 @@ from pydantic import model_validator
 
 from nmfd.arrays import PerPair, PerTurn
 from nmfd.controllers.mpc import edge_model
-from nmfd.controllers.mpc.edge_model import Decision, Demands, PerCell, Plan, Turns, affected_vehicles
+from nmfd.controllers.mpc.edge_model import (
+    Decision,
+    Demands,
+    PerCell,
+    Plan,
+    Turns,
+    affected_vehicles,
+)
 from nmfd.controllers.mpc.ipopt import Ipopt
 from nmfd.controllers.mpc.projected_gradient import AT_REST, TIME_LIMIT, Late, Minimum, minimise
 from nmfd.controllers.mpc.terminal import Terminal, read
@@ -29,15 +38,20 @@ from nmfd.runs.config import Problem, error, setting, whole
 from nmfd.types import Controls, Observation, Status
 
 MAX_ITERATIONS = 1000  # of the solver, per decision
-JAM_ROUNDING = 0.005  # of the smallest jam accumulation: width of the rounded kink of the MFD in the solver
-# Relative tolerance: to first order, no admissible plan saves more of the total time spent. A tenth of it changes the
-# benchmark's total time spent by less than 1 %. At its limits the solver may stop at ACCEPTABLE_TOLERANCE.
+JAM_ROUNDING = (
+    0.005  # of the smallest jam accumulation: width of the rounded kink of the MFD in the solver
+)
+# Relative tolerance: to first order, no admissible plan saves more of the total time spent. A tenth
+# of it changes the benchmark's total time spent by less than 1 %. At its limits the solver may stop
+# at ACCEPTABLE_TOLERANCE.
 TOLERANCE = 1e-6
 ACCEPTABLE_TOLERANCE = 1e-5
 TERMINAL_TOLERANCE = 1e-4  # with a terminal cost, which is no more exact
 FAILED = Status.SOLVER_FAILURE | Status.FALLBACK
 DEADLINE_SHARE = 0.9  # of the deadline for the solver
-METRIC_OFFSET_VEH = 5.0  # added to the vehicles that a control affects, which scale the solver's steps
+METRIC_OFFSET_VEH = (
+    5.0  # added to the vehicles that a control affects, which scale the solver's steps
+)
 
 
 class Mpc(Options):
@@ -45,21 +59,29 @@ class Mpc(Options):
 
     horizon: int = whole("horizon of the plan, in control intervals", 8, low=2, high=1000)
     control_horizon: int | None = whole(
-        "intervals with controls of their own, of which the last hold on; by default all", None, low=1, high=1000
+        "intervals with controls of their own, of which the last hold on; by default all",
+        None,
+        low=1,
+        high=1000,
     )
     solver: Literal["projected-gradient", "ipopt"] = setting(
-        "ipopt: the published formulation, as a reference, a hundred times slower", "projected-gradient"
+        "ipopt: the published formulation, as a reference, a hundred times slower",
+        "projected-gradient",
     )
 
     @model_validator(mode="after")
     def _fits_together(self) -> "Mpc":
         if self.control_horizon is not None and self.solver == "ipopt":
-            raise Problem("control_horizon", "ipopt has controls of its own in every interval; omit one of the keys")
+            raise Problem(
+                "control_horizon",
+                "ipopt has controls of its own in every interval; omit one of the keys",
+            )
         return self
 
 
 class Admissible:
-    """Set of admissible plans (K, E + V): u within bounds, theta in simplices, or nominal without guidance."""
+    """Set of admissible plans (K, E + V): u within bounds, theta in simplices, or nominal without
+    guidance."""
 
     def __init__(self, network: RegionalModel, model: Turns, *, guidance: bool):
         self._network, self._model, self._guidance = network, model, guidance
@@ -67,17 +89,24 @@ class Admissible:
 
     def open(self, moves: int) -> Plan:
         """Return the plan without control: open perimeter, nominal splits."""
-        return np.tile(np.concatenate([np.full(self._edges, self._network.u_max), self._model.own]), (moves, 1))
+        return np.tile(
+            np.concatenate([np.full(self._edges, self._network.u_max), self._model.own]), (moves, 1)
+        )
 
     def project(self, plan: Plan) -> Plan:
         """Return the nearest admissible plan."""
         perimeter = np.clip(plan[:, : self._edges], self._network.u_min, self._network.u_max)
         splits = plan[:, self._edges :]
-        splits = self._simplices(splits) if self._guidance else np.broadcast_to(self._model.own, splits.shape)
+        splits = (
+            self._simplices(splits)
+            if self._guidance
+            else np.broadcast_to(self._model.own, splits.shape)
+        )
         return np.concatenate([perimeter, splits], axis=1)
 
     def _simplices(self, splits: np.ndarray) -> np.ndarray:
-        """Return the nearest shares (K, V) >= 0 with sum 1 over the turns of every cell (Michelot, 1986)."""
+        """Return the nearest shares (K, V) >= 0 with sum 1 over the turns of every cell (Michelot,
+        1986)."""
         groups, value = self._groups(len(splits)), splits.ravel()
         count = groups.max(initial=-1) + 1
         positive = np.ones(len(value), dtype=bool)
@@ -92,7 +121,9 @@ class Admissible:
     def gap(self, plan: Plan, gradient: Plan) -> float:
         """Return what the best admissible plan saves on the linearised objective."""
         u, of_u = plan[:, : self._edges], gradient[:, : self._edges]
-        saved = float((of_u * (u - np.where(of_u > 0, self._network.u_min, self._network.u_max))).sum())
+        saved = float(
+            (of_u * (u - np.where(of_u > 0, self._network.u_min, self._network.u_max))).sum()
+        )
         if not self._guidance or not len(self._model.turns):
             return saved
         splits, of_splits = plan[:, self._edges :], gradient[:, self._edges :]
@@ -107,7 +138,8 @@ class Admissible:
         return (cells * np.arange(moves)[:, None] + self._model.source).ravel()
 
     def controls(self, decision: Decision) -> tuple[PerPair, PerTurn | None]:
-        """Return perimeter (R, R) and splits (R, R, R), or None, of one interval (E + V,) of a plan."""
+        """Return perimeter (R, R) and splits (R, R, R), or None, of one interval (E + V,) of a
+        plan."""
         perimeter = self._network.open_perimeter
         perimeter[tuple(self._model.edges.T)] = decision[: self._edges]
         if not self._guidance:
@@ -118,30 +150,40 @@ class Admissible:
 
     def decision(self, perimeter: PerPair, splits: PerTurn) -> Decision:
         """Return one interval (E + V,) of a plan from perimeter (R, R) and splits (R, R, R)."""
-        return np.concatenate([perimeter[tuple(self._model.edges.T)], splits[tuple(self._model.turns.T)]])
+        return np.concatenate(
+            [perimeter[tuple(self._model.edges.T)], splits[tuple(self._model.turns.T)]]
+        )
 
 
 class EconomicMpc:
     """Economic MPC on a regional model and a demand forecast.
 
-    The solver starts from its last plan, shifted by one interval, or from no control if that is better. If it stops
-    short of its tolerance, the status says so and its best plan is used, which is no worse than the initial one. If it
-    fails or meets its deadline first, the shifted last plan is used as long as it lasts; then PI gating, or the open
-    perimeter without a protected region. The backlog counts as demand of the first interval.
+    The solver starts from its last plan, shifted by one interval, or from no control if that is
+    better. If it stops short of its tolerance, the status says so and its best plan is used, which
+    is no worse than the initial one. If it fails or meets its deadline first, the shifted last plan
+    is used as long as it lasts; then PI gating, or the open perimeter without a protected region.
+    The backlog counts as demand of the first interval.
     """
 
-    def __init__(self, planning: PlanningModel, *, guidance: bool, terminal: Terminal | None = None):
+    def __init__(
+        self, planning: PlanningModel, *, guidance: bool, terminal: Terminal | None = None
+    ):
         """Raise InputError for a wrong option. terminal: cost beyond the horizon"""
-        self.name = ("mpc-pcrg" if guidance else "mpc-pc") + ("-terminal" if terminal is not None else "")
+        self.name = ("mpc-pcrg" if guidance else "mpc-pc") + (
+            "-terminal" if terminal is not None else ""
+        )
         self._terminal = terminal
         self.options = options(Mpc, planning, self.name)
         network, horizon = planning.network, self.options.horizon
         used = np.flatnonzero(planning.destinations)
         self._used = used if len(used) else np.arange(network.regions)
         self._demand, self._step, self._steps = planning.forecast, planning.step, planning.steps
-        # With one Euler step per interval, the last controls move vehicles that do not arrive within the horizon.
+        # With one Euler step per interval, the last controls move vehicles that do not arrive
+        # within the horizon.
         blind = planning.integrator == "euler" and planning.substeps == 1 and terminal is None
-        self._moves = min(horizon - 1 if blind else horizon, self.options.control_horizon or horizon)
+        self._moves = min(
+            horizon - 1 if blind else horizon, self.options.control_horizon or horizon
+        )
         self._model = edge_model.build(network, self._used, guidance=guidance, **planning.scheme)
         rounded = replace(self._model, rounding=JAM_ROUNDING * min(mfd.jam for mfd in network.mfds))
         self.vehicle_steps = partial(edge_model.vehicle_steps, self._model)  # exact
@@ -154,7 +196,11 @@ class EconomicMpc:
         self._ipopt = None
         if self.options.solver == "ipopt":
             if terminal is not None:
-                raise error(planning.where, f"controllers.{self.name}.solver", "ipopt has no terminal cost; omit it")
+                raise error(
+                    planning.where,
+                    f"controllers.{self.name}.solver",
+                    "ipopt has no terminal cost; omit it",
+                )
             limits = {"max_iter": MAX_ITERATIONS, "max_wall_time": DEADLINE_SHARE * self.deadline}
             self._ipopt = Ipopt(planning, guidance=guidance, horizon=horizon, limits=limits)
         self.reset()
@@ -176,10 +222,18 @@ class EconomicMpc:
             minimum = self._solve(start, demand, last, deadline, beyond)
         except Late:
             return self._fallback(observation, last, TIME_LIMIT)
-        except (ArithmeticError, ValueError, RuntimeError) as failure:  # of NumPy and SciPy, LinAlgError too
+        except (
+            ArithmeticError,
+            ValueError,
+            RuntimeError,
+        ) as failure:  # of NumPy and SciPy, LinAlgError too
             return self._fallback(observation, last, f"solver failed ({type(failure).__name__})")
         known = np.isfinite(minimum.gap)
-        reason = None if known and minimum.gap <= ACCEPTABLE_TOLERANCE * minimum.value else minimum.reason
+        reason = (
+            None
+            if known and minimum.gap <= ACCEPTABLE_TOLERANCE * minimum.value
+            else minimum.reason
+        )
         if reason is not None and (minimum.point is last or not known) and reason != AT_REST:
             return self._fallback(observation, last, reason)
         self._plan, self._left, self._gates = minimum.point, self._moves - 1, False
@@ -206,7 +260,8 @@ class EconomicMpc:
         return Controls(perimeter=perimeter, splits=splits, status=status, note=note)
 
     def forecast(self, observation: Observation) -> tuple[PerCell, Demands]:
-        """Return the cells (veh, (C,)) now and their demand (veh/s, (horizon, C)), numbered as in edge_model."""
+        """Return the cells (veh, (C,)) now and their demand (veh/s, (horizon, C)), numbered as in
+        edge_model."""
         first, horizon = min(observation.step, self._steps), self.options.horizon
         known = self._demand[first : first + horizon]
         demand = np.zeros((horizon, *known.shape[1:]))
@@ -215,8 +270,11 @@ class EconomicMpc:
         start = np.maximum(observation.accumulation, 0.0)[:, self._used].ravel()
         return start, demand[:, :, self._used].reshape(horizon, -1)
 
-    def _solve(self, start: PerCell, demand: Demands, plan: Plan, deadline: float, beyond: Callable | None) -> Minimum:
-        """Return the best plan from `plan` on, with its value (veh) by the rounded model. Raise Late."""
+    def _solve(
+        self, start: PerCell, demand: Demands, plan: Plan, deadline: float, beyond: Callable | None
+    ) -> Minimum:
+        """Return the best plan from `plan` on, with its value (veh) by the rounded model. Raise
+        Late."""
         if self._ipopt is not None:
             return self._by_ipopt(self._ipopt, start, demand)
         return minimise(
@@ -224,22 +282,31 @@ class EconomicMpc:
             self.admissible.project,
             self.admissible.gap,
             plan,
-            metric=(affected_vehicles(self._model, start, demand, plan, deadline=deadline) + METRIC_OFFSET_VEH) ** 2,
+            metric=(
+                affected_vehicles(self._model, start, demand, plan, deadline=deadline)
+                + METRIC_OFFSET_VEH
+            )
+            ** 2,
             tolerance=self._tolerance,
             iterations=MAX_ITERATIONS,
             seconds=deadline - time.perf_counter(),
         )
 
     def _by_ipopt(self, solver: Ipopt, start: PerCell, demand: Demands) -> Minimum:
-        """Return the plan of IPOPT, made admissible: it meets bounds and sums up to its tolerance only."""
+        """Return the plan of IPOPT, made admissible: it meets bounds and sums up to its tolerance
+        only."""
         state, forecast = np.zeros(solver.shape), np.zeros((len(demand), *solver.shape))
         state[:, self._used] = start.reshape(len(state), -1)
         forecast[:, :, self._used] = demand.reshape(len(demand), len(state), -1)
         perimeter, splits, reason = solver.solve(state, forecast)
-        rows = [self.admissible.decision(u, theta) for u, theta in zip(perimeter, splits, strict=True)]
+        rows = [
+            self.admissible.decision(u, theta) for u, theta in zip(perimeter, splits, strict=True)
+        ]
         plan = self.admissible.project(np.stack(rows[: self._moves]))
         value, gradient = self._rounded(start, demand, plan)
-        return Minimum(point=plan, value=value, gap=self.admissible.gap(plan, gradient), reason=reason)
+        return Minimum(
+            point=plan, value=value, gap=self.admissible.gap(plan, gradient), reason=reason
+        )
 
 
 def load(path: Path, planning: PlanningModel, *, guidance: bool) -> EconomicMpc:

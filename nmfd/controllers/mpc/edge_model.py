@@ -1,8 +1,9 @@
 """Regional model in edge-list form with exact gradients, for optimisation over many regions.
 
-A turn (i, h, j) is the movement of the vehicles in i bound for j over the boundary to h. Only turns and destinations in
-use are listed, so that a planar city costs R^2 and not R^3. The equations are those of `nmfd.model.dynamics`. The
-gradient of the total time spent follows by the adjoint method, at about the cost of two more rollouts.
+A turn (i, h, j) is the movement of the vehicles in i bound for j over the boundary to h. Only turns
+and destinations in use are listed, so that a planar city costs R^2 and not R^3. The equations are
+those of `nmfd.model.dynamics`. The gradient of the total time spent follows by the adjoint method,
+at about the cost of two more rollouts.
 """
 
 import math
@@ -30,7 +31,8 @@ Decision = Float[np.ndarray, " D"]
 
 @dataclass(frozen=True, kw_only=True)
 class Turns:
-    """Network with J destinations in use, as C = R J cells x_ij, E edges u_ih and V turns theta_ihj.
+    """Network with J destinations in use, as C = R J cells x_ij, E edges u_ih and V turns
+    theta_ihj.
 
     destinations: (J,); cell (i, n) of the n-th destination has number i J + n
     edges: (i, h) of every edge, (E, 2); turns: (i, h, j), (V, 3)
@@ -39,8 +41,10 @@ class Turns:
     region: (C,); ends: cells in which trips end (i = j), (C,)
     mfd: of all regions
     exit_rates: (-, (C,)); capacity: under u = 1 (veh/s, (E,)) or None; storage: (veh, (R,)) or None
-    step: control interval (s); substeps, integrator: integration steps in it, and their scheme (dynamics.SCHEMES)
-    rounding: width of the rounded kink of the MFDs at the jam accumulation (veh); 0 for the exact model
+    step: control interval (s); substeps, integrator: integration steps in it, and their scheme
+        (dynamics.SCHEMES)
+    rounding: width of the rounded kink of the MFDs at the jam accumulation (veh); 0 for the exact
+        model
     """
 
     destinations: Int[np.ndarray, " J"]
@@ -62,8 +66,11 @@ class Turns:
     rounding: float = 0.0
 
 
-def build(network: RegionalModel, destinations: Int[np.ndarray, " J"], *, guidance: bool, **scheme: Any) -> Turns:
-    """Return the turns of vehicles bound for `destinations` (J,): all with guidance, else the nominal ones.
+def build(
+    network: RegionalModel, destinations: Int[np.ndarray, " J"], *, guidance: bool, **scheme: Any
+) -> Turns:
+    """Return the turns of vehicles bound for `destinations` (J,): all with guidance, else the
+    nominal ones.
 
     scheme: step, substeps and integrator of `Turns`
     """
@@ -98,8 +105,8 @@ def build(network: RegionalModel, destinations: Int[np.ndarray, " J"], *, guidan
 def rate(model: Turns, accumulation: PerRegion) -> tuple[PerRegion, PerRegion]:
     """Return q_i (1/s, (R,)) and dq_i/dx_i (1/(veh s), (R,)) of the accumulations x_i (veh, (R,)).
 
-    With rounding r, min(x, jam) is (x + jam - sqrt((x - jam)^2 + r^2)) / 2: off by r/2 at the jam accumulation, and by
-    less than r^2 / (4 |x - jam|) elsewhere.
+    With rounding r, min(x, jam) is (x + jam - sqrt((x - jam)^2 + r^2)) / 2: off by r/2 at the jam
+    accumulation, and by less than r^2 / (4 |x - jam|) elsewhere.
     """
     jam = model.mfd.jam
     above = accumulation - jam
@@ -111,8 +118,11 @@ def rate(model: Turns, accumulation: PerRegion) -> tuple[PerRegion, PerRegion]:
     return q, (model.mfd.slope_up_to_jam(body) * share * jam - q * (1.0 - share)) / top
 
 
-def derivative(model: Turns, x: PerCell, demand: PerCell, perimeter: PerEdge, splits: PerTurn) -> tuple[PerCell, tuple]:
-    """Return dx/dt (veh/s, (C,)) of x (veh, (C,)) under demand (veh/s, (C,)), and the record for `pull_derivative`."""
+def derivative(
+    model: Turns, x: PerCell, demand: PerCell, perimeter: PerEdge, splits: PerTurn
+) -> tuple[PerCell, tuple]:
+    """Return dx/dt (veh/s, (C,)) of x (veh, (C,)) under demand (veh/s, (C,)), and the record for
+    `pull_derivative`."""
     cells = len(x)
     accumulation = x.reshape(len(model.mfd.jam), -1).sum(axis=1)
     q, change_of_q = rate(model, accumulation)
@@ -122,7 +132,9 @@ def derivative(model: Turns, x: PerCell, demand: PerCell, perimeter: PerEdge, sp
     boundary = None
     share = perimeter
     if model.capacity is not None:
-        boundary = _boundary(model, np.bincount(model.edge, wish, len(model.edges)), perimeter, accumulation)
+        boundary = _boundary(
+            model, np.bincount(model.edge, wish, len(model.edges)), perimeter, accumulation
+        )
         share = boundary[0]
     transfers = share[model.edge] * wish
     change = demand - np.where(model.ends, leaving, 0.0)
@@ -131,9 +143,13 @@ def derivative(model: Turns, x: PerCell, demand: PerCell, perimeter: PerEdge, sp
     return change, (x, leaving, q, change_of_q, wish, share, boundary)
 
 
-def _boundary(model: Turns, wish: PerEdge, perimeter: PerEdge, accumulation: PerRegion) -> tuple[PerEdge, ...]:
-    """Return the share of `wish` (veh/s, (E,)) that passes, and its derivatives by wish, u and accumulation ahead."""
-    assert model.capacity is not None and model.storage is not None
+def _boundary(
+    model: Turns, wish: PerEdge, perimeter: PerEdge, accumulation: PerRegion
+) -> tuple[PerEdge, ...]:
+    """Return the share of `wish` (veh/s, (E,)) that passes, and its derivatives by wish, u and
+    accumulation ahead."""
+    assert model.capacity is not None
+    assert model.storage is not None
     ahead = model.edges[:, 1]
     free = 1.0 - accumulation[ahead] / model.storage[ahead]
     room, open_capacity = np.maximum(free, LEAST_ROOM), model.capacity
@@ -147,8 +163,11 @@ def _boundary(model: Turns, wish: PerEdge, perimeter: PerEdge, accumulation: Per
     return share, of_ratio / limit, of_limit * open_capacity * room, of_limit * of_ahead
 
 
-def pull_derivative(model: Turns, adjoint: PerCell, splits: PerTurn, record: tuple) -> tuple[PerCell, PerEdge, PerTurn]:
-    """Return the gradients by x (C,), perimeter (E,) and splits (V,), if that by dx/dt is `adjoint` (C,)."""
+def pull_derivative(
+    model: Turns, adjoint: PerCell, splits: PerTurn, record: tuple
+) -> tuple[PerCell, PerEdge, PerTurn]:
+    """Return the gradients by x (C,), perimeter (E,) and splits (V,), if that by dx/dt is `adjoint`
+    (C,)."""
     x, leaving, q, change_of_q, wish, share, boundary = record
     regions, edges = len(model.mfd.jam), len(model.edges)
     gain = adjoint[model.target] - adjoint[model.source]
@@ -160,14 +179,25 @@ def pull_derivative(model: Turns, adjoint: PerCell, splits: PerTurn, record: tup
         of_wish = of_wish + (of_share * by_wish)[model.edge]
         of_perimeter = of_share * by_perimeter
         of_accumulation = np.bincount(model.edges[:, 1], of_share * by_ahead, regions)
-    of_leaving = np.bincount(model.source, splits * of_wish, len(x)) - np.where(model.ends, adjoint, 0.0)
-    of_region = of_accumulation + change_of_q * (of_leaving * model.exit_rates * x).reshape(regions, -1).sum(axis=1)
+    of_leaving = np.bincount(model.source, splits * of_wish, len(x)) - np.where(
+        model.ends, adjoint, 0.0
+    )
+    of_region = of_accumulation + change_of_q * (of_leaving * model.exit_rates * x).reshape(
+        regions, -1
+    ).sum(axis=1)
     return q * of_leaving + of_region[model.region], of_perimeter, of_wish * leaving[model.source]
 
 
-def advance(model: Turns, x: PerCell, demand: PerCell, perimeter: PerEdge, splits: PerTurn) -> tuple[PerCell, list]:
+def advance(
+    model: Turns, x: PerCell, demand: PerCell, perimeter: PerEdge, splits: PerTurn
+) -> tuple[PerCell, list]:
     """Return x (C,) after one integration step, and the records for `pull_advance`."""
-    step, total, slope, records = model.step / model.substeps, np.zeros_like(x), np.zeros_like(x), []
+    step, total, slope, records = (
+        model.step / model.substeps,
+        np.zeros_like(x),
+        np.zeros_like(x),
+        [],
+    )
     for weight, place in zip(*SCHEMES[model.integrator], strict=True):
         slope, record = derivative(model, x + step * place * slope, demand, perimeter, splits)
         records.append(record)
@@ -175,11 +205,20 @@ def advance(model: Turns, x: PerCell, demand: PerCell, perimeter: PerEdge, split
     return x + step * total, records
 
 
-def pull_advance(model: Turns, adjoint: PerCell, splits: PerTurn, records: list) -> tuple[PerCell, Decision]:
-    """Return the gradients by x (C,) and decision (E + V,) before a step, if that by x after it is `adjoint`."""
-    of_x, of_decision, of_node = adjoint, np.zeros(len(model.edges) + len(splits)), np.zeros_like(adjoint)
+def pull_advance(
+    model: Turns, adjoint: PerCell, splits: PerTurn, records: list
+) -> tuple[PerCell, Decision]:
+    """Return the gradients by x (C,) and decision (E + V,) before a step, if that by x after it is
+    `adjoint`."""
+    of_x, of_decision, of_node = (
+        adjoint,
+        np.zeros(len(model.edges) + len(splits)),
+        np.zeros_like(adjoint),
+    )
     step, ahead = model.step / model.substeps, 0.0  # ahead: from the node before to this one (s)
-    for record, weight, place in reversed(list(zip(records, *SCHEMES[model.integrator], strict=True))):
+    for record, weight, place in reversed(
+        list(zip(records, *SCHEMES[model.integrator], strict=True))
+    ):
         of_slope = step * weight * adjoint + ahead * of_node
         of_node, *more = pull_derivative(model, of_slope, splits, record)
         of_x, of_decision, ahead = of_x + of_node, of_decision + np.concatenate(more), step * place
@@ -196,10 +235,12 @@ def vehicle_steps(
     deadline: float = math.inf,
     beyond: Callable[[PerCell], tuple[float, PerCell]] | None = None,
 ) -> tuple[float, Plan | None]:
-    """Return the vehicles summed over the ends of H control intervals, and the gradient (K, E + V) or None.
+    """Return the vehicles summed over the ends of H control intervals, and the gradient (K, E + V)
+    or None.
 
     start: (veh, (C,)); demand: (veh/s, (H, C))
-    plan: u of the edges and theta of the turns in every interval (-, (K, E + V)); the last stays in force
+    plan: u of the edges and theta of the turns in every interval (-, (K, E + V)); the last stays in
+        force
     deadline: by time.perf_counter (s)
     beyond: terminal cost of the final state (veh intervals) and its gradient
     Raises: Late
@@ -224,10 +265,14 @@ def vehicle_steps(
     return total, of_plan
 
 
-def affected_vehicles(model: Turns, start: PerCell, demand: Demands, plan: Plan, *, deadline: float = math.inf) -> Plan:
-    """Return the vehicles that every number of the plan affects (veh, (K, E + V)); arguments as in `vehicle_steps`.
+def affected_vehicles(
+    model: Turns, start: PerCell, demand: Demands, plan: Plan, *, deadline: float = math.inf
+) -> Plan:
+    """Return the vehicles that every number of the plan affects (veh, (K, E + V)); arguments as in
+    `vehicle_steps`.
 
-    For an edge, the vehicles that want to cross it in that interval; for a turn, those that leave its cell.
+    For an edge, the vehicles that want to cross it in that interval; for a turn, those that leave
+    its cell.
     """
     edges, affected = len(model.edges), np.zeros_like(plan)
     for k, _, records in _steps(model, start, demand, plan, deadline):
@@ -240,7 +285,8 @@ def affected_vehicles(model: Turns, start: PerCell, demand: Demands, plan: Plan,
 def _steps(
     model: Turns, x: PerCell, demand: Demands, plan: Plan, deadline: float
 ) -> Iterator[tuple[int, PerCell, list]]:
-    """Yield the row of the plan in force, x after, and the records of every integration step. Raises: Late"""
+    """Yield the row of the plan in force, x after, and the records of every integration step.
+    Raises: Late"""
     edges = len(model.edges)
     for interval in np.repeat(np.arange(len(demand)), model.substeps):
         _look(deadline)

@@ -1,6 +1,7 @@
 """Spectral projected gradients with a certificate, for smooth functions on simple convex sets.
 
-Birgin, Martinez and Raydan, "Nonmonotone spectral projected gradient methods on convex sets", SIAM J. Optim. 10 (2000).
+Birgin, Martinez and Raydan, "Nonmonotone spectral projected gradient methods on convex sets", SIAM
+J. Optim. 10 (2000).
 """
 
 import time
@@ -27,7 +28,8 @@ class Minimum:
     """Result of a search.
 
     point, value: the best
-    gap: bound on value minus minimum if the function is convex; else to first order, at a point that is no better
+    gap: bound on value minus minimum if the function is convex; else to first order, at a point
+        that is no better
     reason: why the search stopped short of its tolerance, or None
     """
 
@@ -52,9 +54,11 @@ def minimise(
 
     function: point -> value and gradient; it may raise Late
     project: point -> nearest admissible point
-    gap: (point, gradient) -> largest decrease of the linear model over admissible points (Frank-Wolfe)
-    metric: weights of the squared length of a step, about proportional to the second derivatives; the nearest point in
-        this metric must be that of `project`, as for bounds, and for simplices of one weight each
+    gap: (point, gradient) -> largest decrease of the linear model over admissible points
+        (Frank-Wolfe)
+    metric: weights of the squared length of a step, about proportional to the second derivatives;
+        the nearest point in this metric must be that of `project`, as for bounds, and for simplices
+        of one weight each
     seconds: time limit, checked after every evaluation (s)
     """
     deadline = time.perf_counter() + seconds
@@ -95,11 +99,16 @@ def minimise(
                 return stopped(TIME_LIMIT)
             if share < MIN_STEP_SHARE:
                 return stopped(AT_REST)
-            lowest = -0.5 * share**2 * slope / (other_value - value - share * slope)  # of the parabola through both
+            lowest = (
+                -0.5 * share**2 * slope / (other_value - value - share * slope)
+            )  # of the parabola through both
             share = lowest if 0.1 * share <= lowest <= 0.5 * share else 0.5 * share
         moved, turned = other - point, other_gradient - gradient
         curvature = float((moved * turned).sum())
-        length = min(float((metric * moved**2).sum()) / curvature if curvature > 0 else 4.0 * length, MAX_STEP)
+        length = min(
+            float((metric * moved**2).sum()) / curvature if curvature > 0 else 4.0 * length,
+            MAX_STEP,
+        )
         point, value, gradient = other, other_value, other_gradient
         recent.append(value)
     return stopped(reason)

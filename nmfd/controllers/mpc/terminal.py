@@ -2,9 +2,10 @@
 
     V(x, k) = (T - k) sum_ij s(o_ij) x_ij + (1 - k / T) OFFSET o_0        s(a) = 1 / (1 + e^(LATE - a))
 
-approximates the sum of all vehicles over the intervals k + 1 .. T - 1 under the policy, from the state x in interval k;
-every vehicle stays for a share s of the remaining time. (o_ij, o_0) is a small network of x in critical accumulations
-and of the time. scenarios/economic_mpc/terminal_cost.py learns it, on values and derivatives.
+approximates the sum of all vehicles over the intervals k + 1 .. T - 1 under the policy, from the
+state x in interval k; every vehicle stays for a share s of the remaining time. (o_ij, o_0) is a
+small network of x in critical accumulations and of the time.
+scenarios/economic_mpc/terminal_cost.py learns it, on values and derivatives.
 """
 
 import math
@@ -29,7 +30,8 @@ WEIGHTS = ("first", "second", "last")
 class Terminal:
     """Value function V of one scenario, evaluated by NumPy in some forty microseconds.
 
-    steps: T; used: destinations of the cells, (R,); scale: (veh, (C,)); weights, biases: of three layers
+    steps: T; used: destinations of the cells, (R,); scale: (veh, (C,)); weights, biases: of three
+        layers
     network_hash: of the regional model of the rollouts; controller: name of the MPC that uses it
     """
 
@@ -42,7 +44,8 @@ class Terminal:
     controller: str
 
     def __call__(self, x: PerCell, step: int) -> tuple[float, PerCell]:
-        """Return V (veh intervals) of the cells x (veh, (C,)) at the beginning of interval `step`, and dV/dx (C,)."""
+        """Return V (veh intervals) of the cells x (veh, (C,)) at the beginning of interval `step`,
+        and dV/dx (C,)."""
         step = min(step, self.steps)
         left, share = float(self.steps - step), step / self.steps
         (first, second, last), (of_first, of_second, of_last) = self.weights, self.biases
@@ -69,7 +72,8 @@ def _gelu(a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def read(path: Path, planning: PlanningModel, controller: str) -> Terminal:
-    """Read an .npz file of terminal_cost.py. Raise InputError if it is of another regional model or controller."""
+    """Read an .npz file of terminal_cost.py. Raise InputError if it is of another regional model or
+    controller."""
     try:
         with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             content = {name: file[name] for name in file.files}
@@ -84,9 +88,13 @@ def read(path: Path, planning: PlanningModel, controller: str) -> Terminal:
         )
     except Exception:
         raise InputError(f"{path}: is no value function") from None
-    if terminal.network_hash != planning.network.hash or not np.array_equal(terminal.used, planning.destinations):
+    if terminal.network_hash != planning.network.hash or not np.array_equal(
+        terminal.used, planning.destinations
+    ):
         other = "was learned for another regional model or other destinations than those of"
         raise InputError(f"{path}: network_hash: {other} {planning.network.name!r}")
     if terminal.controller != controller:
-        raise InputError(f"{path}: is the value function of {terminal.controller}, not of {controller}")
+        raise InputError(
+            f"{path}: is the value function of {terminal.controller}, not of {controller}"
+        )
     return terminal
