@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from nmfd import faults
-from nmfd.errors import InputError
+from nmfd.model.commands import admissible
 from nmfd.model.scenario import Scenario
 from nmfd.tensors import one_thread
 from nmfd.types import Controller, Controls, Observation, Plant, Result, State, Status
@@ -31,7 +31,7 @@ def run(
     either. A decision is late after the control interval or the controller's own `deadline` (s).
 
     progress: is called with the intervals done and `scenario.steps` after every interval
-    Raises: InputError if a number of a command is not finite
+    Raises: InputError for a command of a wrong type, shape or value, before the plant sees it
     """
     network = scenario.network
     controller.reset(seed)
@@ -53,7 +53,7 @@ def run(
         command = controller.act(given)
         decision_time.append(time.process_time() - processor)
         late = time.perf_counter() - before > deadline
-        command = _checked(command, f"{controller.name}: interval {k}")
+        command = admissible(command, network, f"{controller.name}: interval {k}")
         if problem:
             command = _with_status(command, Status.SENSOR_FAULT, problem, command.note)
         if late:
@@ -115,19 +115,6 @@ def measurement(plant: Plant, state: State, std: float, random: np.random.Genera
         backlog=state.backlog,
         realised=state.realised,
     )
-
-
-def _checked(controls: Controls, where: str) -> Controls:
-    """Return controls with copied arrays, into which no controller writes; raise InputError if one
-    is not finite."""
-    arrays = {}
-    for name in ("perimeter", "splits", "prices", "metering"):
-        if (values := getattr(controls, name)) is not None:
-            arrays[name] = values = np.array(values)
-            if wrong := np.argwhere(~np.isfinite(values)).tolist():
-                got = f"expected a finite number, got {values[*wrong[0]]} instead"
-                raise InputError(f"{where}: {name}{wrong[0]}: {got}")
-    return replace(controls, **arrays)
 
 
 def _with_status(controls: Controls, status: Status, *notes: str) -> Controls:

@@ -93,23 +93,24 @@ class Observation:
 
 @dataclass(frozen=True, kw_only=True)
 class Controls:
-    """Command of a controller for one control interval.
+    """Command of a controller for one control interval; `Controls(perimeter=u)` is enough.
 
-    perimeter: (R, R) [-], [i, h] = u_ih, share of the desired transfer flow from i to h that may
-        pass; ignored where h is not adjacent to i
-    splits: (R, R, R) [-], [i, h, j] = theta_ihj, share of the vehicles in i bound for j that head
-        for h; None without route guidance: drivers keep their routes (in the regional model the
-        nominal splits)
-    prices: (R,) [-], added share of the travel time through region i that guided drivers bound for
-        other regions see: 1 for twice as long. In a city, guidance by these travel times replaces
-        `splits`; the regional model takes `splits`. None: no prices
-    metering: (R,) [veh/s], largest rate of trips that may begin in region i; further trips wait
+    perimeter: u_ih, share of the desired transfer flow from i to h that may pass (-, (R, R) [i, h]);
+        ignored where h is not adjacent to i
+    splits: theta_ihj, share of the vehicles in i bound for j that head for h (-, (R, R, R)
+        [i, h, j]); None without route guidance: drivers keep their routes (in the regional model
+        the nominal splits)
+    status: OK, or the reasons why these are other controls
+    note: the status in words, "" if OK
+    prices: added share of the travel time through region i that guided drivers bound for other
+        regions see (-, (R,)), such as 1 for twice as long. In a city, guidance by these travel
+        times replaces `splits`; the regional model takes `splits`. None: no prices
+    metering: largest rate of trips that may begin in region i (veh/s, (R,)); further trips wait
         outside, in the backlog. Only cities with `+metering` obey it. None: no limit
-    status: OK, or the reasons why these are other controls; note: the same in words, "" if OK
     """
 
     perimeter: PerPair
-    splits: PerTurn | None
+    splits: PerTurn | None = None
     status: Status = Status.OK
     note: str = ""
     prices: PerRegion | None = None

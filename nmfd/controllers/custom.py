@@ -1,12 +1,10 @@
 """Controllers of the user's own: a class in a file, `path/to/file.py:Class` (template.py shows how
 to write one)."""
 
-import copy
 import re
 import sys
 import traceback
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -14,14 +12,12 @@ from typing import Any
 import numpy as np
 
 from nmfd.errors import InputError
+from nmfd.model.commands import admissible
 from nmfd.model.planning import PlanningModel
-from nmfd.model.regional_model import RegionalModel
 from nmfd.runs.files import file_hash
 from nmfd.types import Controls, Observation
 
 FILE_AND_CLASS = re.compile(r"(?P<file>.+\.py):(?P<cls>[^\W\d]\w*)")
-TOLERANCE = 1e-5  # of bounds and sums: rounding errors of float32
-LARGEST = {"prices": 100.0, "metering": 1e6}  # -, trips/s: as good as no limit
 
 
 def load(name: str) -> Any:
@@ -58,73 +54,25 @@ def fingerprint(name: str) -> dict[str, object]:
 
 
 class OwnController:
-    """Controller of the user's own with checked controls; its mistakes are InputErrors with file
-    and line."""
+    """Controller of a user's file, whose mistakes are InputErrors with file and line."""
 
     def __init__(self, name: str, planning: PlanningModel):
         """Make the controller and try it on an empty city. Raise InputError."""
-        self.name, self._network = name, copy.deepcopy(planning.network)
+        self.name = name
         self._controller = _located(name, "__init__", load(name), planning)
-        self.deadline, empty = (
-            getattr(self._controller, "deadline", None),
-            np.zeros((self._network.regions,) * 2),
-        )
+        self.deadline = getattr(self._controller, "deadline", None)
+        regions = planning.network.regions
+        empty = np.zeros((regions, regions))
+        first = Observation(step=0, time=0.0, accumulation=empty, backlog=empty.copy())
         self.reset()
-        self.act(Observation(step=0, time=0.0, accumulation=empty, backlog=empty.copy()))
+        admissible(self.act(first), planning.network, f"{name}: act: interval 0")
         self.reset()
 
     def reset(self, seed: int = 0) -> None:
         _located(self.name, "reset", lambda: self._controller.reset(seed))
 
     def act(self, observation: Observation) -> Controls:
-        controls = _located(self.name, "act", lambda: self._controller.act(observation))
-        return checked(controls, self._network, f"{self.name}: act: interval {observation.step}")
-
-
-def checked(controls: object, network: RegionalModel, where: str) -> Controls:
-    """Return `controls` as float64 without rounding errors. Raise InputError for a wrong type,
-    shape or value."""
-    if not isinstance(controls, Controls):
-        raise InputError(f"{where}: expected nmfd.Controls, got {type(controls).__name__} instead")
-    edges, allowed, zeros = network.adjacency, network.split_mask, np.zeros(network.regions)
-    low, high = np.where(edges, network.u_min, -np.inf), np.where(edges, network.u_max, np.inf)
-    perimeter = np.where(edges, _numbers(controls.perimeter, low, high, f"{where}: perimeter"), 0.0)
-    controls = replace(controls, perimeter=perimeter)
-    for key, most in LARGEST.items():
-        if (values := getattr(controls, key)) is not None:
-            controls = replace(
-                controls, **{key: _numbers(values, zeros, zeros + most, f"{where}: {key}")}
-            )
-    if controls.splits is None:
-        return controls
-    splits = _numbers(
-        controls.splits, np.zeros(allowed.shape), allowed.astype(float), f"{where}: splits"
-    )
-    sums = splits.sum(axis=1)
-    if (wrong := np.argwhere(allowed.any(axis=1) & (abs(sums - 1.0) > 100 * TOLERANCE))).size:
-        raise InputError(
-            f"{where}: splits: expected a sum of 1 over h, not so for [i, j] = {wrong[0].tolist()}"
-        )
-    return replace(controls, splits=splits / np.where(sums > 0, sums, 1.0)[:, None, :])
-
-
-def _numbers(values: object, low: np.ndarray, high: np.ndarray, where: str) -> np.ndarray:
-    """Return `values` as an array clipped to `low` and `high`, which may be missed by rounding
-    errors only."""
-    try:
-        array = np.asarray(values, dtype=float)
-    except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError: a tensor with a gradient
-        raise InputError(f"{where}: expected numbers of shape {low.shape} ({error})") from None
-    if array.shape != low.shape:
-        raise InputError(f"{where}: expected numbers of shape {low.shape}, got shape {array.shape}")
-    if (
-        wrong := np.argwhere(~((array >= low - TOLERANCE) & (array <= high + TOLERANCE)))
-    ).size:  # NaN too
-        n = tuple(wrong[0].tolist())
-        raise InputError(
-            f"{where}{list(n)}: expected {low[n]:g} to {high[n]:g}, got {array[n]:g} instead"
-        )
-    return np.clip(array, low, high)
+        return _located(self.name, "act", lambda: self._controller.act(observation))
 
 
 def _path(name: str) -> Path:

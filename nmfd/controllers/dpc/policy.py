@@ -21,7 +21,6 @@ from jaxtyping import Float, Int
 from torch import nn
 
 from nmfd.arrays import Adjacency
-from nmfd.controllers.custom import checked
 from nmfd.model.answer import Answer
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Horizon
@@ -322,11 +321,8 @@ class ModuleController:
     """
 
     def __init__(self, module: nn.Module, scenario: Horizon):
-        self.module, self.name, self._network = (
-            module.eval(),
-            type(module).__name__,
-            scenario.network,
-        )
+        self.module = module.eval()
+        self.name = type(module).__name__
 
     def reset(self, seed: int = 0) -> None:
         pass
@@ -344,8 +340,4 @@ class ModuleController:
         controls: dict[str, Any] = {
             name: v.cpu().numpy() for name, v in parts.items() if v is not None
         }
-        return checked(
-            Controls(**{"splits": None, **controls}),
-            self._network,
-            f"{self.name}: interval {observation.step}",
-        )
+        return Controls(**controls)
