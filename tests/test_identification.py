@@ -28,7 +28,7 @@ def scenario():
     return replace(
         loaded,
         network=tiny.limited(loaded.network),
-        demand=0.4 * loaded.demand,
+        demand=0.4 * loaded.demand[:120],
         steps=120,
         protected=(3,),
         controller_options={},

@@ -6,7 +6,6 @@ import gzip
 import re
 import shutil
 import xml.etree.ElementTree as ElementTree
-from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -26,6 +25,7 @@ from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.model.planning import planning_model
 from nmfd.model.regional_model import load_network
+from nmfd.model.scenario import with_demand
 
 
 @pytest.fixture(scope="module")
@@ -278,7 +278,7 @@ def test_options_and_includes_of_the_user_count(config, tmp_path):
 def test_signal_plans_know_the_city_s_own_vehicles(imported):
     """Turning flows are those of its routes, and of fastest ways; every signal plan runs on its
     signals."""
-    scenario = replace(load_scenario(imported[0] / "scenarios" / "tiny"), steps=2)
+    scenario = with_demand(load_scenario(imported[0] / "scenarios" / "tiny"), steps=2)
     own, additional = (
         [scenario.folder / name for name in names]
         for names in (settings(scenario).routes, settings(scenario).additional)

@@ -22,6 +22,7 @@ from nmfd.metrics import summary
 from nmfd.model import dynamics
 from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
+from nmfd.model.scenario import with_demand
 from nmfd.types import Observation, Status
 
 SCENARIO = load_scenario(Path(__file__).parents[1] / "scenarios" / "economic_mpc")
@@ -36,7 +37,7 @@ def states():
     trajectory = run(
         NmfdPlant(SCENARIO),
         NoControl(planning_model(SCENARIO)),
-        replace(SCENARIO, steps=50),
+        with_demand(SCENARIO, steps=50),
         seed=0,
     )
     return [
@@ -303,7 +304,7 @@ def test_a_decision_that_came_late_is_late_in_the_books(tmp_path):
             time.sleep(0.25 * (observation.step == 1))
             return super().act(observation)
 
-    scenario = replace(load_scenario(tiny.write(tmp_path)), steps=3)
+    scenario = with_demand(load_scenario(tiny.write(tmp_path)), steps=3)
     for controller, kinds, note in (
         (
             Slow(planning_model(scenario)),

@@ -13,6 +13,7 @@ from cosim.plant.guidance import Guide
 from cosim.plant.sampling import StreetSampler
 from cosim.sumo.session import Session
 from nmfd.api import load_scenario
+from nmfd.model.scenario import with_demand
 from nmfd.types import Controls
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
@@ -166,7 +167,7 @@ def sent_round(scenario, plant):
 
 def test_guided_vehicles_are_asked_again(scenario, plant_of):
     """The ledger is checked at every step; who was told something else counts for the last only."""
-    plant, scenario = plant_of(), replace(scenario, steps=2)
+    plant, scenario = plant_of(), with_demand(scenario, steps=2)
     _, once = drive(plant, scenario, guidance=True)
     plant.close()
     asked = plant_of(guidance_period=5.0)

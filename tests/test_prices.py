@@ -15,6 +15,7 @@ from nmfd.controllers.dpc.rollout import Rollout
 from nmfd.controllers.strategy import parse
 from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
+from nmfd.model.scenario import with_demand
 from nmfd.studies.benchmark import lower_bound
 from nmfd.types import Observation
 
@@ -72,11 +73,11 @@ def test_the_lower_bound_without_metering_is_not_that_of_a_policy_that_meters():
 def test_mpc_of_grid7_has_the_outputs_of_the_policy():
     """The script decides within its bounds, prices the filling centre most, and lets fewest trips
     begin there."""
-    scenario = replace(load_scenario("grid7_peak", {"demand_factor": 2.0}), steps=12)
+    scenario = load_scenario("grid7_peak", {"demand_factor": 2.0})
     strategy = parse(
         f"{scenario.folder}/price_mpc.py:PriceMpc+max-pressure+guidance-period-60+metering"
     )
-    x = run(scenario, "no-control").accumulation[12]
+    x = run(scenario, "no-control", steps=12).accumulation[12]
     controls = strategy.make(scenario).act(
         Observation(step=12, time=1080.0, accumulation=x, backlog=0.0 * x)
     )

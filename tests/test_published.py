@@ -21,6 +21,7 @@ from nmfd.model import dynamics
 from nmfd.model.planning import planning_model
 from nmfd.model.plant import AcyclicPlant, NmfdPlant
 from nmfd.model.regional_model import load_network
+from nmfd.model.scenario import with_demand
 from nmfd.studies import bound
 from nmfd.types import Observation
 
@@ -43,7 +44,9 @@ def begun(tmp_path):
 def test_the_noise_of_the_benchmark_is_a_standard_deviation_of_the_measurement_or_of_the_state(
     plant,
 ):
-    scenario = replace(load_scenario("economic_mpc"), steps=30, initial=np.full((7, 7), 100.0))
+    scenario = replace(
+        with_demand(load_scenario("economic_mpc"), steps=30), initial=np.full((7, 7), 100.0)
+    )
     assert (scenario.measurement_std, scenario.process_std) == (0.25, 0.0)
     moved = replace(scenario, measurement_std=0.0, process_std=0.25)
     quiet, first, again, noisy = (
@@ -198,7 +201,7 @@ def test_a_control_horizon_of_one_holds_the_best_constant_controls(two_regions):
 @pytest.mark.parametrize("plant", [NmfdPlant, AcyclicPlant])
 def test_a_city_that_does_not_begin_empty(begun, plant):
     """Everybody who was inside at first is there, and reaches the end of the trip."""
-    quiet = replace(begun, demand=0.0 * begun.demand, steps=20)
+    quiet = with_demand(begun, steps=20, factor=0.0)
     trajectory = run(plant(quiet), make_controller("no-control", quiet), quiet, seed=0)
     np.testing.assert_array_equal(trajectory.accumulation[0], [[0.0, 100.0], [0.0, 50.0]])
     assert trajectory.accumulation[-1].sum() + trajectory.completed[-1] == pytest.approx(150.0)

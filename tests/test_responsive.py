@@ -16,6 +16,7 @@ from signal_rules import MIN_GREEN, watched
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
 from nmfd.api import load_scenario
+from nmfd.model.scenario import with_demand
 from nmfd.types import Controls
 
 CONFIG = """<configuration>
@@ -67,7 +68,7 @@ def opened(town):
 def drive(folder, gates, faults=(), **overrides):
     """A run under u = gates[k] in interval k: what every signal shows second by second, and
     more."""
-    scenario = replace(load_scenario(folder), steps=len(gates), faults=tuple(faults))
+    scenario = replace(with_demand(load_scenario(folder), steps=len(gates)), faults=tuple(faults))
     plant = SumoPlant(
         scenario, settings=settings(scenario).changed(**({"chain_limit": 0.0} | overrides))
     )

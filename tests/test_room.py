@@ -17,6 +17,7 @@ from cosim.sumo.net import Gateway
 from nmfd.api import load_scenario
 from nmfd.controllers.rules import PiGating
 from nmfd.model.planning import planning_model
+from nmfd.model.scenario import with_demand
 from nmfd.types import Controls, Observation
 
 # Streets a and b lead to the gateways a -> x and b -> y; c, which has a signal at its end, d and e
@@ -108,7 +109,7 @@ def town(tmp_path_factory):
 
 @pytest.mark.parametrize("limit, held", [(0.6, True), (0.0, False)])
 def test_no_command_fills_the_street_before_a_gateway(town, limit, held):
-    scenario = replace(load_scenario(town), steps=4)
+    scenario = with_demand(load_scenario(town), steps=4)
     with closing(
         SumoPlant(scenario, settings=settings(scenario).changed(chain_limit=limit))
     ) as plant:

@@ -1,7 +1,6 @@
 """The proof sheet of signals: violations by hand, SUMO's own record, and random commands under
 every signal control."""
 
-from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -19,6 +18,7 @@ from cosim.sumo.net import city_of
 from cosim.sumo.xml_files import read_xml
 from nmfd.api import load_scenario
 from nmfd.controllers.strategy import parse
+from nmfd.model.scenario import with_demand
 from nmfd.types import Controls
 
 CONTROLS = ("", "max-pressure", "actuated", "webster", "metering")
@@ -65,7 +65,10 @@ def test_figures_of_a_sheet():
 def proven(folder, words, intervals, tmp_path):
     """Run with random commands in every interval; return the sheet of what SUMO's saveTLSStates
     wrote."""
-    scenario, strategy = replace(load_scenario(folder), steps=intervals), parse("no-control", words)
+    scenario, strategy = (
+        with_demand(load_scenario(folder), steps=intervals),
+        parse("no-control", words),
+    )
     chosen = (
         settings(scenario).changed(gateways_fixed=False, mesoscopic=False).changed(**strategy.city)
     )

@@ -5,7 +5,6 @@ import gzip
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,7 +16,7 @@ from cosim.importing.importer import import_city
 from cosim.importing.streets import Streets, graph
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
-from nmfd.model.scenario import Scenario
+from nmfd.model.scenario import Scenario, with_demand
 from nmfd.types import Controls
 
 CONFIG = """<configuration>
@@ -117,7 +116,7 @@ def played(
 ) -> Iterator:
     """A plant after so many intervals with all u at `gates`, its state and its record; the ledger
     is checked in every interval."""
-    scenario = replace(scenario, steps=intervals)
+    scenario = with_demand(scenario, steps=intervals)
     plant = SumoPlant(scenario, settings=settings(scenario).changed(**overrides))
     controls = Controls(perimeter=np.where(scenario.network.adjacency, gates, 0.0), splits=splits)
     try:

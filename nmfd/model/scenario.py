@@ -95,6 +95,20 @@ class Scenario(Horizon):
     faults: tuple[str, ...] = ()
     sumo: Mapping[str, Any] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        """Raise InputError for a demand or initial state of a wrong shape or value."""
+        regions = self.network.regions
+        shapes = {"demand": (self.steps, regions, regions), "initial": (regions, regions)}
+        for name, shape in shapes.items():
+            values = getattr(self, name)
+            if values is None:
+                continue
+            if np.shape(values) != shape:
+                expected = f"shape {shape} for {self.steps} intervals and {regions} regions"
+                raise config.error(self.where, name, config.got(expected, np.shape(values)))
+            if not (np.isfinite(values) & (np.asarray(values) >= 0.0)).all():
+                raise config.error(self.where, name, "expected finite numbers from 0 up")
+
     @property
     def start(self) -> PerPair:
         """A copy of `initial` (R, R) [veh]; zeros if the network is empty."""
@@ -292,27 +306,28 @@ def read_scenario(folder: Path | str, settings: Mapping[str, Any] | None = None)
     values = {
         key: value for key, value in vars(table).items() if key in Scenario.__dataclass_fields__
     }
-    values |= {
-        "network": network,
-        "demand": table.demand_factor * _demand(table, network, folder),
-        "folder": folder,
-    }
-    values |= {
-        "controller_options": table.controllers,
-        "initial": np.array(table.initial) if table.initial else None,
-    }
-    scenario = Scenario(**values)
+    values["network"] = network
+    values["demand"] = table.demand_factor * _demand(table, network, folder)
+    values["folder"] = folder
+    values["controller_options"] = table.controllers
+    values["initial"] = np.array(table.initial) if table.initial else None
     if max(table.protected, default=0) >= network.regions:
         allowed = f"a list of distinct whole numbers from 0 to {network.regions - 1}"
         raise config.error(path, "protected", config.got(allowed, list(table.protected)))
-    lengths = {len(row) for row in table.initial} | {len(table.initial)}
-    if table.initial and (lengths != {network.regions} or scenario.start.min() < 0):
-        allowed = f"{network.regions} lists of {network.regions} numbers from 0 up"
-        raise config.error(
-            path, "initial", config.got(allowed, [list(row) for row in table.initial])
-        )
+    _check_initial(table.initial, network.regions, path)
+    scenario = Scenario(**values)
     _ = scenario.ordered_faults
     return scenario
+
+
+def _check_initial(rows: tuple[Numbers, ...], regions: int, path: Path) -> None:
+    """Raise InputError unless there are no rows, or R of R numbers from 0 up."""
+    if not rows:
+        return
+    lengths = {len(rows), *map(len, rows)}
+    if lengths != {regions} or min(map(min, rows)) < 0:
+        allowed = f"{regions} lists of {regions} numbers from 0 up"
+        raise config.error(path, "initial", config.got(allowed, [list(row) for row in rows]))
 
 
 def read_tables(folder: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:

@@ -4,7 +4,6 @@ What is compared must agree; that part runs with the other tests.
 """
 
 import runpy
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +20,7 @@ from nmfd.controllers.mpc.ipopt import Ipopt
 from nmfd.controllers.rules import NoControl
 from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
-from nmfd.model.scenario import Scenario
+from nmfd.model.scenario import Scenario, with_demand
 from nmfd.types import Observation, Status
 
 SCALING = runpy.run_path(
@@ -44,7 +43,10 @@ def one_thread():
 @pytest.fixture(scope="module")
 def seen():
     """Measurements of a run without control."""
-    controller, short = NoControl(planning_model(SCENARIO)), replace(SCENARIO, steps=WHEN[-1] + 1)
+    controller, short = (
+        NoControl(planning_model(SCENARIO)),
+        with_demand(SCENARIO, steps=WHEN[-1] + 1),
+    )
     trajectory = run(NmfdPlant(SCENARIO), controller, short, seed=0)
     return [measurement(trajectory.accumulation[k], k) for k in WHEN]
 
@@ -116,7 +118,7 @@ def test_the_plain_model_is_the_model():
     trajectory = run(
         NmfdPlant(SCENARIO),
         NoControl(planning_model(SCENARIO)),
-        replace(SCENARIO, steps=30),
+        with_demand(SCENARIO, steps=30),
         seed=0,
     )
     x = trajectory.accumulation[0]
