@@ -16,11 +16,38 @@ import click
 
 import nmfd
 from nmfd.errors import InputError, RunFailed
+from nmfd.runs.files import parts_of
 
 FOLDER = click.Path(path_type=Path, file_okay=False)
 FILE = click.Path(path_type=Path, dir_okay=False)
 COUNT = click.IntRange(1, 10**6)
 SEED = click.IntRange(0, 2**31 - 1)  # SUMO's seeds have 32 bits
+
+
+class Seeds(click.ParamType):
+    """Number of seeds, or the seeds A,B,... or FROM-TO."""
+
+    name = "N|A,B|FROM-TO"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> int | tuple[int, ...]:
+        if isinstance(value, int | tuple):
+            return value
+        try:
+            first, dash, last = value.partition("-")
+            if dash:
+                seeds = tuple(range(int(first), int(last) + 1))
+            elif "," in value:
+                seeds = tuple(int(word) for word in value.split(","))
+            else:
+                return COUNT.convert(value, param, ctx)
+            if not seeds or len(set(seeds)) < len(seeds):
+                raise ValueError
+        except ValueError:
+            form = "a number of seeds, seeds such as 3300,3301, or a range such as 3300-3309"
+            self.fail(f"expected {form}, got {value!r} instead", param, ctx)
+        return tuple(SEED.convert(seed, param, ctx) for seed in seeds)
 
 
 class Number(click.FloatRange):
@@ -123,7 +150,7 @@ def listed(kind: click.ParamType) -> Callable[[str], tuple]:
     """Return a parser of values of a kind that are separated by commas."""
 
     def parse(text: str) -> tuple:
-        values = tuple(kind.convert(word.strip(), None, None) for word in text.split(","))
+        values = tuple(kind.convert(word, None, None) for word in parts_of(text))
         if len(set(values)) < len(values):
             raise click.BadParameter(
                 f"expected distinct values separated by commas, got {text!r} instead"
@@ -201,6 +228,36 @@ WORKERS = click.option("--workers", type=COUNT, default=1, help="Number of paral
 TRY = "; try it: nmfd benchmark {0} --controllers no-control,{1} --policy {1}={2}"
 
 
+SCHEDULER = click.option(
+    "--scheduler", metavar="ADDRESS", help="Dask scheduler for the runs, such as tls://host:8786."
+)
+TIME_LIMIT = click.option(
+    "--time-limit",
+    type=Number(0.0, min_open=True),
+    metavar="S",
+    help="Time after which a run in a process of its own is ended. [default: ten times the "
+    "expected one, at least 600]",
+)
+RUNNING = combined(WORKERS, SCHEDULER, TIME_LIMIT)
+LEVEL = Number(0.0, 10.0, min_open=True)
+STEPS = click.option(
+    "--steps", type=COUNT, help="Number of control intervals. [default: as in the scenario]"
+)
+DEMAND = click.option(
+    "--demand",
+    "--levels",
+    "demand",
+    type=listed(LEVEL),
+    default="1",
+    help="Factors that multiply the demand.",
+)
+
+
+def seeds_option(default: int, text: str, *others: str) -> Callable:
+    """Return the option --seeds, and its older names."""
+    return click.option("--seeds", *others, "seeds", type=Seeds(), default=default, help=text)
+
+
 def seed_option(text: str = "Random seed.") -> Callable:
     """Return the option --seed."""
     return click.option("--seed", type=SEED, default=0, help=text)
@@ -254,20 +311,25 @@ def show(scenario: Path | None, settings: dict, out: Path | None) -> None:
       nmfd show economic_mpc --out figures
     """
     if scenario is None:
-        click.echo(nmfd.api.catalogue())
-    else:
-        click.echo(nmfd.api.show(nmfd.load_scenario(scenario, settings), out=out))
+        click.echo(nmfd.api.listing(nmfd.api.catalogue()))
+        return
+    loaded = nmfd.load_scenario(scenario, settings)
+    files = nmfd.api.show(loaded, out=out)
+    lines = [nmfd.api.described(loaded), *(f"Written to {file}" for file in files)]
+    click.echo("\n".join(lines))
 
 
 @main.command()
 @SCENARIO
 @CONTROLLERS
-@click.option("--seeds", type=COUNT, default=1, help="Runs with seeds 0 to N - 1.")
+@seeds_option(1, "Number of runs, with seeds from 0, or the seeds.")
+@DEMAND
+@STEPS
 @click.option(
     "--plant", type=click.Choice(["nmfd", "acyclic"]), default="nmfd", help="Plant model."
 )
 @POLICIES
-@WORKERS
+@RUNNING
 @out_option("runs/SCENARIO-TIME")
 def benchmark(scenario: Path, settings: dict, out: Path | None, **options: Any) -> None:
     """Run controllers on a regional model and compare them.
@@ -303,8 +365,9 @@ def benchmark(scenario: Path, settings: dict, out: Path | None, **options: Any) 
     type=listed(Number(0.0)),
     help="Noise (veh/s) or spread (-). [default: 0,...,5 or 0,...,0.4]",
 )
-@click.option("--scenarios", type=COUNT, default=20, help="Random scenarios per sigma.")
-@WORKERS
+@seeds_option(20, "Number of random scenarios per sigma, or their seeds.", "--scenarios")
+@STEPS
+@RUNNING
 @out_option("runs/SCENARIO-TIME")
 def robustness(scenario: Path, settings: dict, out: Path | None, **options: Any) -> None:
     """Run controllers under unexpected demand or MFDs.
@@ -376,10 +439,10 @@ def bound(scenario: Path, settings: dict, controller: str, **options: Any) -> No
     Example:
       nmfd bound economic_mpc --controller bound-pcrg
     """
-    text = nmfd.api.bound(nmfd.load_scenario(scenario, settings), controller, **options)
-    click.echo(
-        text + TRY.format(scenario, controller, options["out"] or f"{scenario}/{controller}.npz")
-    )
+    plan = nmfd.api.bound(nmfd.load_scenario(scenario, settings), controller, **options)
+    file = options["out"] or f"{scenario}/{controller}.npz"
+    text = f"{nmfd.api.bound_report(plan)}\nWritten to {file}"
+    click.echo(text + TRY.format(scenario, controller, file))
 
 
 @main.command(name="new-controller")

@@ -1,17 +1,22 @@
 """The closed loop of any plant and any controller."""
 
 import copy
+import json
 import time
 from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
-from nmfd import faults
+from nmfd import __version__, faults
 from nmfd.model.commands import admissible
 from nmfd.model.scenario import Scenario
+from nmfd.runs.pool import Watchdog
 from nmfd.tensors import one_thread
 from nmfd.types import Controller, Controls, Observation, Plant, Result, State, Status
+
+PATIENCE = 10.0  # deadlines after which a decision ends the process of a run
+LEAST_PATIENCE_S = 10.0
 
 
 @one_thread()
@@ -34,6 +39,7 @@ def run(
     Raises: InputError for a command of a wrong type, shape or value, before the plant sees it
     """
     network = scenario.network
+    name = str(getattr(controller, "name", type(controller).__name__))
     controller.reset(seed)
     sensors, random = faults.Sensors(scenario.ordered_faults), noise_of(seed)
 
@@ -47,13 +53,15 @@ def run(
     own = getattr(controller, "deadline", None)
     if isinstance(own, int | float) and own > 0:
         deadline = min(own, deadline)
+    watchdog = Watchdog(max(PATIENCE * deadline, LEAST_PATIENCE_S))
     for k in range(scenario.steps):
         given = copy.deepcopy(observed)
         before, processor = time.perf_counter(), time.process_time()
-        command = controller.act(given)
+        with watchdog:
+            command = controller.act(given)
         decision_time.append(time.process_time() - processor)
         late = time.perf_counter() - before > deadline
-        command = admissible(command, network, f"{controller.name}: interval {k}")
+        command = admissible(command, network, f"{name}: interval {k}")
         if problem:
             command = _with_status(command, Status.SENSOR_FAULT, problem, command.note)
         if late:
@@ -71,13 +79,17 @@ def run(
             progress(k + 1, scenario.steps)
     return Result.make(
         {
-            "controller": controller.name,
+            "controller": name,
             "plant": type(plant).__name__,
             "seed": seed,
             "step": scenario.step,
+            "scenario": scenario.name,
+            "version": __version__,
+            "settings": json.dumps(scenario.settings),
             "estimated": int(plant.observe() is not None),
             "wall_time": time.perf_counter() - begin,
         },
+        network.region_names,
         accumulation=np.stack([s.accumulation for s in states]),
         backlog=np.stack([s.backlog for s in states]),
         completed=np.array([s.completed for s in states]),

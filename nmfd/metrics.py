@@ -26,7 +26,15 @@ KINDS = (
 )  # of COUNTED
 
 # Attributes of a Result that are no column of a table of runs.
-NO_COLUMNS = {"step", "estimated", "wall_time", "key", "scenario_folder"}
+NO_COLUMNS = {
+    "step",
+    "estimated",
+    "wall_time",
+    "key",
+    "scenario_folder",
+    "version",
+    "settings",
+}
 
 
 def total_time_spent(result: Result) -> float:
@@ -37,15 +45,10 @@ def total_time_spent(result: Result) -> float:
     to the end, the removal, or the end of the run, to the millisecond.
 
         >>> run = nmfd.run("economic_mpc", "no-control", steps=2)
-        >>> bool(total_time_spent(run) == run.step * run.accumulation[:2].sum())  # no vehicle waits or was removed
+        >>> bool(total_time_spent(run) == run.step * run["accumulation"][:2].sum())  # no vehicle waits or was removed
         True
     """
-    if "time_spent" in result:
-        return float(result.time_spent.sum())
-    vehicles = (
-        result.accumulation[:-1].sum() + result.backlog[:-1].sum() + result.removed[:-1].sum()
-    )
-    return float(result.step * vehicles)
+    return result.total_time_spent
 
 
 def largest_accumulation(states: Iterable[StatesOverTime]) -> PerRegion:

@@ -1,7 +1,7 @@
 """Types that plants, controllers and the closed loop exchange, and the result of a run."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Flag
 from pathlib import Path
@@ -157,14 +157,12 @@ class Quantity(NamedTuple):
     def variable(self, values: Any) -> tuple:
         """Return `values` as xarray.Dataset takes them: dimensions, array and attributes."""
         array = np.asarray(values)
-        array = (
-            array.astype(object) if array.dtype.kind == "U" else array
-        )  # as netCDF returns texts
-        return (
-            self.dimensions,
-            array,
-            {"long_name": self.text} | ({"units": self.unit} if self.unit else {}),
-        )
+        if array.dtype.kind == "U":
+            array = array.astype(object)  # as netCDF returns texts
+        attributes = {"long_name": self.text}
+        if self.unit:
+            attributes["units"] = self.unit
+        return self.dimensions, array, attributes
 
 
 _PAIRS = ("time", "region", "destination")
@@ -193,6 +191,8 @@ VARIABLES: dict[str, Quantity] = {
         ("interval",), "s", "processor time of Controller.act, of all threads of the process"
     ),
 }
+SHOWN_FACTS = 30  # in the representation of a result
+SHOWN_CHARACTERS = 60  # of a fact
 HOST_TIMES = (
     "decision_time",
     "wall_time",
@@ -208,28 +208,103 @@ class Result:
 
     data: variables over time (T+1 states), interval (T decisions), region, next_region and
         destination; in SUMO over gateway and edge, too. Attributes: controller, plant, seed, step
-        (s), estimated (0 or 1), wall_time (s), and all scalar facts of the run
+        (s), estimated (0 or 1), wall_time (s), scenario, version, settings (JSON), and all scalar
+        facts of the run
 
-    `result.accumulation` is the array of that variable, `result.controller` the attribute of that
-    name; a variable comes before an attribute of the same name.
+    `result.accumulation` is the labelled array of that variable, `result["accumulation"]` its
+    values, `result.seed` the attribute of that name; `dir(result)` lists them.
     """
 
     data: "xarray.Dataset"
 
+    @property
+    def accumulation(self) -> "xarray.DataArray":
+        """Vehicles inside (veh, (T+1, R, R))."""
+        return self.data["accumulation"]
+
+    @property
+    def backlog(self) -> "xarray.DataArray":
+        """Vehicles waiting to enter (veh, (T+1, R, R))."""
+        return self.data["backlog"]
+
+    @property
+    def completed(self) -> "xarray.DataArray":
+        """Completed trips since the start (veh, (T+1,))."""
+        return self.data["completed"]
+
+    @property
+    def observed(self) -> "xarray.DataArray":
+        """Vehicles inside as the controller observed them (veh, (T+1, R, R))."""
+        return self.data["observed"]
+
+    @property
+    def perimeter(self) -> "xarray.DataArray":
+        """Commanded shares of the transfer flows (-, (T, R, R))."""
+        return self.data["perimeter"]
+
+    @property
+    def splits(self) -> "xarray.DataArray":
+        """Commanded split ratios, nominal without guidance (-, (T, R, R, R))."""
+        return self.data["splits"]
+
+    @property
+    def status(self) -> "xarray.DataArray":
+        """Status of every decision, 0 if OK (nmfd.Status, (T,))."""
+        return self.data["status"]
+
+    @property
+    def controller(self) -> str:
+        """Name of the controller."""
+        return self.data.attrs["controller"]
+
+    @property
+    def seed(self) -> int:
+        """Seed of the run."""
+        return self.data.attrs["seed"]
+
+    @property
+    def step(self) -> float:
+        """Control interval (s)."""
+        return self.data.attrs["step"]
+
+    @property
+    def sizes(self) -> Mapping[str, int]:
+        """Length of every dimension."""
+        return {str(name): size for name, size in self.data.sizes.items()}
+
+    @property
+    def total_time_spent(self) -> float:
+        """Total time spent (veh s); see nmfd.metrics.total_time_spent."""
+        if "time_spent" in self:
+            return float(self["time_spent"].sum())
+        vehicles = self["accumulation"][:-1].sum() + self["backlog"][:-1].sum()
+        return float(self.step * (vehicles + self["removed"][:-1].sum()))
+
+    @property
+    def completed_trips(self) -> float:
+        """Trips that reached their end (veh)."""
+        return float(self.data.attrs.get("completed_veh", self["completed"][-1]))
+
     @classmethod
-    def make(cls, attrs: Mapping[str, Any], **arrays: Any) -> "Result":
+    def make(
+        cls, attrs: Mapping[str, Any], region_names: Sequence[str] = (), **arrays: Any
+    ) -> "Result":
         """Return the result of a closed loop with these `attrs` and the arrays of VARIABLES."""
         import xarray  # half a second, which few commands need
 
         times = attrs["step"] * np.arange(len(arrays["accumulation"]))
-        coordinates = {
-            "time": ("time", times, {"long_name": "time since the start", "units": "s"}),
-            "interval": (
-                "interval",
-                times[:-1],
-                {"long_name": "beginning of the interval", "units": "s"},
+        coordinates: dict[str, tuple] = {
+            "time": Quantity(("time",), "s", "time since the start").variable(times),
+            "interval": Quantity(("interval",), "s", "beginning of the interval").variable(
+                times[:-1]
             ),
         }
+        for name in ("region", "next_region", "destination"):
+            numbers = np.arange(arrays["accumulation"].shape[1])
+            coordinates[name] = Quantity((name,), "1", "number of the region").variable(numbers)
+        if len(region_names):
+            names = Quantity(("region",), "", "name of the region").variable(region_names)
+            coordinates["region_name"] = names
         variables = {name: about.variable(arrays[name]) for name, about in VARIABLES.items()}
         return cls(xarray.Dataset(variables, coordinates, dict(attrs)))
 
@@ -286,10 +361,32 @@ class Result:
         if name.startswith("__") or name == "data":
             raise AttributeError(name)
         if name in self.data.variables:
-            return self[name]
+            return self.data[name]
         if name in self.data.attrs:
             return self.data.attrs[name]
         raise AttributeError(f"result without variable or attribute {name!r}")
+
+    def __dir__(self) -> list[str]:
+        names = {*super().__dir__(), *map(str, self.data.variables), *map(str, self.data.attrs)}
+        return sorted(names)
+
+    def __repr__(self) -> str:
+        lengths = ", ".join(f"{name} {size}" for name, size in self.sizes.items())
+        facts = "\n".join(f"    {name}: {value}" for name, value in self._shown().items())
+        return f"Result of {self.data.attrs.get('controller', '?')} over {lengths}\n{facts}"
+
+    def _shown(self) -> dict[str, str]:
+        """Return facts for a screen: total time spent, and short attributes."""
+        shown = {}
+        if "accumulation" in self:
+            shown["total_time_spent"] = f"{self.total_time_spent:.6g} veh s"
+            shown["completed_trips"] = f"{self.completed_trips:,.0f}"
+        for name, value in self.data.attrs.items():
+            if len(shown) < SHOWN_FACTS and len(str(value)) <= SHOWN_CHARACTERS:
+                shown.setdefault(
+                    str(name), f"{value:g}" if isinstance(value, float) else f"{value}"
+                )
+        return shown
 
     def __getitem__(self, name: str) -> np.ndarray:
         return self.data.variables[name].values
@@ -310,14 +407,23 @@ class Result:
     def add(
         self, attrs: Mapping[str, Any], about: Mapping[str, Quantity] = {}, **arrays: np.ndarray
     ) -> "Result":
-        """Return the result with more attributes, and the `arrays` that are described in
-        `about`."""
-        variables = {
-            name: quantity.variable(arrays[name])
-            for name, quantity in about.items()
-            if name in arrays
-        }
+        """Return the result with more attributes and arrays.
+
+        about: name of an array -> its axes, unit and meaning
+        """
+        variables = {}
+        for name, quantity in about.items():
+            if name in arrays:
+                variables[name] = quantity.variable(arrays[name])
         return Result(self.data.assign(variables).assign_attrs(attrs))
+
+    def label(self, **names: Sequence[str]) -> "Result":
+        """Return the result with the names of the entries of a dimension, `gateway` or `edge`."""
+        coordinates = {}
+        for dimension, values in names.items():
+            about = Quantity((dimension,), "", f"name of the {dimension}")
+            coordinates[dimension] = about.variable(values)
+        return Result(self.data.assign_coords(coordinates))
 
     def without_times(self) -> "xarray.Dataset":
         """Return the Dataset without wall times and key: the same for every run of the same

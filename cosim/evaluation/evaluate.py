@@ -20,15 +20,15 @@ from pydantic import Field
 
 from cosim.evaluation import explain, results, statistics
 from cosim.evaluation.runs import city_key, runs_of
+from cosim.plant.strategy import Strategy
 from nmfd.api import load_scenario
-from nmfd.controllers.strategy import Strategy
 from nmfd.model.scenario import Scenario
 from nmfd.runs import config, files
 from nmfd.runs.run_many import TABLE, Run, read_manifest, run_many
 from nmfd.runs.tables import markdown_table
 from nmfd.types import HOST_TIMES
 
-Planned: TypeAlias = Sequence[tuple[Scenario, Sequence[float]]]  # with demand levels
+Planned: TypeAlias = list[tuple[Scenario, Sequence[float]]]  # with demand levels
 
 
 class Suite(config.Settings):
@@ -53,9 +53,9 @@ def read_suite(
         name: path if (path / "scenario.toml").is_file() else Path(name)
         for name, path in beside.items()
     }
-    scenarios = [
-        (load_scenario(folders[name], settings), levels) for name, levels in suite.scenarios.items()
-    ]
+    scenarios: Planned = []
+    for name, levels in suite.scenarios.items():
+        scenarios.append((load_scenario(folders[name], settings), levels))
     return scenarios, suite.seeds
 
 

@@ -7,9 +7,10 @@ import numpy as np
 
 from cosim.evaluation import statistics
 from cosim.evaluation.results import Finished, Level
+from cosim.plant.strategy import Strategy, of_finished
 from nmfd.arrays import PerRegion
-from nmfd.controllers.rules import Gating, PiGating
-from nmfd.controllers.strategy import ALONE, Strategy, parse
+from nmfd.controllers.rules import PiGate, PiGating
+from nmfd.controllers.strategy import ALONE
 from nmfd.metrics import largest_accumulation
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
@@ -105,7 +106,7 @@ def _reasons(
     reference, runs, strategy, network = (
         level.results(against),
         level.results(name),
-        parse(name),
+        of_finished(name),
         scenario.network,
     )
     beyond = load(network, reference)[1]
@@ -116,7 +117,7 @@ def _reasons(
     limit = network.u_max - OPEN_SHARE * (network.u_max - network.u_min)
     held = float(np.mean([(run.perimeter[:, network.adjacency] < limit).mean() for run in runs]))
     guided = sum(run.guided.sum() for run in runs) / trips
-    metered = strategy.city.get("metering") or level.key["sumo"].get("metering")
+    metered = strategy.city.metering or level.key["sumo"].get("metering")
     waited = sum(run.backlog[1:].sum() * run.step for run in runs) / trips if metered else 0.0
     deeds = {
         f"it holds vehicles back in {held:.0%} of its commands": held >= SMALL_SHARE,
@@ -172,8 +173,8 @@ def _losers(level: Level, region_names: Sequence[str], name: str, against: str) 
 
 def _never_reached(strategy: Strategy, scenario: Scenario, runs: Sequence[Result]) -> list[str]:
     """Return the gates whose region never reached its set point, in any run."""
-    gate = strategy.make(scenario) if strategy.controller.options is Gating else None
-    if not isinstance(gate, PiGating):
+    gate = strategy.make(scenario) if isinstance(strategy.options(scenario), PiGating) else None
+    if not isinstance(gate, PiGate):
         return []
     most = largest_accumulation(run.accumulation for run in runs)
     return [

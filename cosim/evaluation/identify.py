@@ -20,13 +20,13 @@ import pandas as pd
 
 from cosim.evaluation.model_validation import observed, outflow_samples
 from cosim.evaluation.runs import runs_of
+from cosim.plant.strategy import parse
 from cosim.sumo.net import city_of, network_folder
 from nmfd.api import load_scenario
-from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
 from nmfd.metrics import largest_accumulation
 from nmfd.model import authority, identification, mfd
-from nmfd.model.planning import GUIDED, GUIDING
+from nmfd.model.planning import GUIDED
 from nmfd.model.regional_model import RegionalModel, network_toml
 from nmfd.model.scenario import Scenario
 from nmfd.runs import config, files, shipped
@@ -41,8 +41,10 @@ PATHS = ("net", "regions")  # keys of [sumo] in network.toml
 
 def without_model(scenario: Scenario) -> bool:
     """Return True if no table of a guiding controller names a model."""
-    tables = scenario.controller_options.items()
-    return not any(name.startswith(GUIDING) and "model" in options for name, options in tables)
+    for name, table in scenario.controller_options.items():
+        if "model" in table and parse(name).controller_guides:
+            return False
+    return True
 
 
 def identify(
@@ -77,8 +79,8 @@ def identify(
     a run failed
     """
     loaded = load_scenario(scenario, settings)
-    strategy = parse("no-control", "" if city == "own" else city or "")
-    options = [word for word in strategy.words if word != "guided"]
+    strategy = parse("no-control", None if city == "own" else city)
+    options = [word for word in strategy.labels if word != "guided"]
     how: dict[str, Any] = {"levels": levels, "seeds": range(1000, 1000 + seeds), "options": options}
     how |= {"network": network, "iterations": iterations, "workers": workers}
     both = city is None and network is None and without_model(loaded)

@@ -13,9 +13,9 @@ from jaxtyping import Bool
 
 from cosim.evaluation.results import Finished
 from cosim.evaluation.simulate import regional_outflow
+from cosim.plant.strategy import of_finished
 from cosim.sumo.arrays import Points, RegionCounts
 from nmfd.arrays import Adjacency
-from nmfd.controllers.strategy import parse
 from nmfd.metrics import largest_accumulation
 from nmfd.model.dynamics import advance, parameters
 from nmfd.model.identification import Observed
@@ -71,7 +71,7 @@ def compare(found: Finished) -> pd.DataFrame:
     for level in found.levels:
         for controller in level.rows["controller"].unique():
             network, results = (
-                parse(controller).planning(found.scenario).network,
+                of_finished(controller).planning(found.scenario).network,
                 level.results(controller),
             )
             scenario, runs = replace(found.scenario, network=network), list(map(observed, results))

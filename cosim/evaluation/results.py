@@ -6,11 +6,13 @@ from pathlib import Path
 
 import pandas as pd
 
+from cosim.plant.strategy import parse
 from cosim.sumo.net import City, city_files, city_of
 from nmfd.api import load_scenario
+from nmfd.controllers.strategy import ControllerLike
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
-from nmfd.runs.files import file_hash, run_name
+from nmfd.runs.files import file_hash, file_name, run_name
 from nmfd.runs.run_many import TABLE, read_manifest
 from nmfd.types import Result
 
@@ -35,7 +37,7 @@ class Level:
         return [self.read(row.controller, row.seed) for row in rows.itertuples()]
 
     def read(self, controller: str, seed: int) -> Result:
-        return read_run(self.folder, controller, seed)
+        return Result.read(self.folder / f"{run_name(controller, seed)}.nc")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +73,7 @@ def read(path: Path, scenario: str | None = None) -> Finished:
     scenario: name of one of several scenarios, the first if None
     """
     rows = finished_rows(pd.read_csv(path / TABLE)) if (path / TABLE).is_file() else pd.DataFrame()
-    if rows.empty or "scenario" not in rows:
+    if rows.empty or "sumo" not in set(rows["plant"]):
         raise InputError(
             f"{path}: holds no finished runs in SUMO; give a folder of `cosim run` or `cosim evaluate`"
         )
@@ -107,6 +109,36 @@ def finished_rows(rows: pd.DataFrame) -> pd.DataFrame:
     )
 
 
-def read_run(folder: Path | str, controller: str, seed: int) -> Result:
-    """Return a finished run of a run folder. Raise InputError if it is missing."""
-    return Result.read(Path(folder) / f"{run_name(controller, seed)}.nc")
+def read_run(
+    folder: Path | str,
+    controller: ControllerLike,
+    seed: int,
+    *,
+    demand: float | None = None,
+    scenario: str | None = None,
+) -> Result:
+    """Return a finished run of a folder of `cosim run` or `cosim evaluate`.
+
+    controller: its name, or options such as nmfd.PiGating(kp=2.0)
+    seed: seed of the run
+    demand, scenario: needed if the folder holds such runs of several demand levels or scenarios
+    Raises: InputError if there is no such run, or if there are several
+    """
+    folder = Path(folder)
+    name = controller if isinstance(controller, str) else parse(controller).name
+    file = f"{run_name(name, seed)}.nc"
+    places = [
+        path for path in (folder / file, *sorted(folder.rglob(f"*/{file}"))) if path.is_file()
+    ]
+    if demand is not None:
+        places = [path for path in places if path.parent.name == f"demand-{demand:g}"]
+    if scenario is not None:
+        above = file_name(scenario)
+        places = [path for path in places if above in path.relative_to(folder).parts]
+    if not places:
+        raise InputError(f"{folder}: holds no finished run of {name} with seed {seed}")
+    if len(places) > 1:
+        where = ", ".join(path.parent.relative_to(folder).as_posix() for path in places)
+        problem = f"holds several runs of {name} with seed {seed} ({where})"
+        raise InputError(f"{folder}: {problem}; give demand or scenario")
+    return Result.read(places[0])

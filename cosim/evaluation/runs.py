@@ -12,10 +12,10 @@ from cosim.plant import incidents
 from cosim.plant.launch import own_vehicles
 from cosim.plant.programmes import check_strategy
 from cosim.plant.settings import FILES, MAX_PRESSURE, own_files, settings
+from cosim.plant.strategy import Strategy, check_tables
 from cosim.sumo.net import check_adjacency, city_files, load_city
 from cosim.sumo.signals import HELD, read_signals
 from cosim.sumo.xml_files import read_xml
-from nmfd.controllers.strategy import Strategy
 from nmfd.model.scenario import Scenario, with_demand
 from nmfd.runs.files import file_hash, run_name
 from nmfd.runs.run_many import Run
@@ -72,11 +72,12 @@ def city_key(scenario: Scenario, strategies: Sequence[Strategy]) -> dict[str, ob
     """Check that the strategies can run in the city; return what all runs there depend on. Raises
     InputError."""
     chosen = settings(scenario)
+    check_tables(scenario)
     files = city_files(scenario.network)
     city = load_city(*files, scenario.network.regions)
     check_adjacency(city, scenario.network)
     own_vehicles(scenario, chosen, city)
-    used = {strategy.city.get("signals", chosen.signals) for strategy in strategies}
+    used = {strategy.settings(scenario).signals for strategy in strategies}
     simple, _ = read_signals(city, own_files(scenario, chosen.additional), HELD)
     everywhere = MAX_PRESSURE in used
     incidents.check(

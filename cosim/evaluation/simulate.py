@@ -1,5 +1,6 @@
 """One closed-loop run in SUMO, and the facts in its result."""
 
+import json
 import math
 import time
 from collections import Counter
@@ -17,12 +18,12 @@ from cosim.plant.max_pressure import FACTS as PRESSURE_FACTS
 from cosim.plant.meter import COMPLETED, GIVEN_UP, REMOVED, UNDER_WAY, WAITING, Trip
 from cosim.plant.plant import Observer, SumoPlant
 from cosim.plant.record import RECORD, TOTALS, settled
-from cosim.plant.settings import own_files, settings
+from cosim.plant.settings import own_files
+from cosim.plant.strategy import Strategy
 from cosim.sumo.arrays import RegionCounts
 from cosim.sumo.net import City, Gateway, gateway_room_taken
 from nmfd import closed_loop, metrics
 from nmfd.arrays import PerRegion
-from nmfd.controllers.strategy import Strategy
 from nmfd.model.scenario import Scenario, with_demand
 from nmfd.runs import config
 from nmfd.runs.files import atomic
@@ -75,7 +76,7 @@ def simulate(
     controller = strategy.make(scenario, job.policy)
     with ExitStack() as stack:
         file = stack.enter_context(atomic(job.trip_file)) if job.trip_file else None
-        chosen = settings(scenario).changed(**strategy.city)
+        chosen = strategy.settings(scenario)
         plant = SumoPlant(
             scenario,
             settings=chosen,
@@ -86,9 +87,11 @@ def simulate(
         )
         stack.callback(plant.close)
         result = closed_loop.run(plant, controller, scenario, seed=job.seed, progress=progress)
-        result = result.assign(controller=strategy.name, plant="sumo").add(
-            {}, RECORD, **plant.record()
-        )
+        used = scenario.settings | {"sumo": chosen.model_dump(mode="json", exclude_defaults=True)}
+        facts = {"controller": strategy.name, "plant": "sumo", "settings": json.dumps(used)}
+        result = result.add(facts, RECORD, **plant.record())
+        gateways = [f"{gate.from_edge} to {gate.to_edge}" for gate in plant.city.gateways]
+        result = result.label(gateway=gateways, edge=list(plant.city.edges))
         if gui:
             return result
         plant_facts, leaks, emissions = (

@@ -28,17 +28,21 @@ from optuna.samplers import CmaEsSampler
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import FrozenTrial, TrialState
+from pydantic.fields import FieldInfo
 
 from cosim.evaluation.results import finished_rows
 from cosim.evaluation.runs import city_key, runs_of
 from cosim.evaluation.statistics import TTS
+from cosim.plant.strategy import Strategy
 from nmfd.controllers import training
-from nmfd.controllers.strategy import Strategy, check_tables
+from nmfd.controllers.dpc.options import Dpc
+from nmfd.controllers.strategy import check_tables
 from nmfd.errors import InputError, RunFailed
 from nmfd.model.scenario import Scenario
 from nmfd.runs import files
+from nmfd.runs.pool import in_processes
 from nmfd.runs.progress import Progress
-from nmfd.runs.run_many import TABLE, Run, locked, processes, raise_failures, run_many
+from nmfd.runs.run_many import TABLE, Run, locked, raise_failures, run_many
 
 OPTION = re.compile(r"[a-z_]\w*(\[[0-9]\])?")  # KEY, or KEY[N] for one number of a list
 INITIAL_DEVIATION = 0.25  # standard deviation of the first generation, as a share of every range
@@ -79,7 +83,7 @@ class Tuning:
 
     @cached_property
     def space(self) -> dict[str, Range]:
-        declared = self.strategy.controller.options.model_fields
+        declared = self.declared
         return {
             name: IntDistribution(math.ceil(low), math.floor(high))
             if name in declared and declared[name].annotation is int
@@ -106,14 +110,21 @@ class Tuning:
             self.scenario, controller_options={**tables, name: {**tables.get(name, {}), **table}}
         )
 
+    @property
+    def declared(self) -> Mapping[str, FieldInfo]:
+        """Declared options of the controller, none for the user's own code."""
+        options = self.strategy.options(self.scenario)
+        return {} if options is None else type(options).model_fields
+
     def value(self, key: str) -> Any:
         """Return an option of the scenario, or its default; None if there is neither."""
-        tables, kind = self.scenario.controller_options, self.strategy.controller
-        own = {**tables.get(kind.name, {}), **tables.get(self.strategy.table(self.scenario), {})}
-        declared = kind.options.model_fields.get(key)
-        return own.get(
-            key, None if declared is None or declared.is_required() else declared.default
-        )
+        tables = self.scenario.controller_options
+        own = tables.get(self.strategy.controller.name, {})
+        own = {**own, **tables.get(self.strategy.table(self.scenario), {})}
+        declared = self.declared.get(key)
+        if declared is None or declared.is_required():
+            return own.get(key)
+        return own.get(key, declared.default)
 
     def first(self) -> dict[str, float]:
         """Return the scenario's options within the ranges; the middle of a range without a
@@ -135,7 +146,13 @@ class Tuning:
         return self.out / "policies" / f"{number:03d}.pt"
 
 
-def tune(order: Tuning, *, workers: int = 1, progress: Progress = None) -> pd.DataFrame:
+def tune(
+    order: Tuning,
+    *,
+    workers: int = 1,
+    time_limit: float | None = None,
+    progress: Progress = None,
+) -> pd.DataFrame:
     """Run the candidates and return the table of tune.csv; the same call resumes, and one with more
     trials continues.
 
@@ -166,7 +183,13 @@ def tune(order: Tuning, *, workers: int = 1, progress: Progress = None) -> pd.Da
                 if trial.state == TrialState.RUNNING
             ]
             runs = _runs(order, running, city, workers)
-            rows = run_many(runs, order.out / "runs", workers=workers, progress=progress)
+            rows = run_many(
+                runs,
+                order.out / "runs",
+                workers=workers,
+                time_limit=time_limit,
+                progress=progress,
+            )
             for trial in running:
                 totals = np.maximum(
                     list(_totals(order, rows, trial.number).values()), 1.0
@@ -234,7 +257,7 @@ def _runs(
 ) -> list[Run]:
     """Train some candidates if their options train a policy; return their runs."""
     scenarios = {trial.number: order.tuned(trial.params) for trial in trials}
-    trains = order.strategy.controller.options is training.Training
+    trains = isinstance(order.strategy.options(order.scenario), Dpc)
     untrained = {
         number: scenario
         for number, scenario in scenarios.items()
@@ -242,15 +265,13 @@ def _runs(
     }
     if trains and untrained:
         order.policy(0).parent.mkdir(exist_ok=True)
-        jobs = [
-            Run(str(number), {}, partial(_train, order, number, one))
-            for number, one in untrained.items()
-        ]
-        if failures := [
-            f"policy of candidate {job.name}: {why}"
-            for job, why in processes(jobs, max(workers, 1))
-            if why
-        ]:
+        numbers = list(untrained)
+        jobs = [partial(_train, order, number, one) for number, one in untrained.items()]
+        failures = []
+        for place, why in in_processes(jobs, max(workers, 1), [None] * len(jobs)):
+            if why:
+                failures.append(f"policy of candidate {numbers[place]}: {why}")
+        if failures:
             raise RunFailed("; ".join(failures))
     runs = []
     for number, scenario in scenarios.items():
@@ -308,8 +329,7 @@ def _write(order: Tuning, study: optuna.Study) -> pd.DataFrame:
     files.write_table(order.out / "tune.csv", table)
     if table[SCORE].notna().any():
         row = table.loc[table[SCORE].idxmin()]
-        values = {name: study.trials[int(row["candidate"])].params[name] for name in order.options}
-        tuned = order.tuned(values).controller_options[order.strategy.table(order.scenario)]
+        tuned = best_of(order, table).controller_options[order.strategy.table(order.scenario)]
         keys = dict.fromkeys(_key_and_index(name)[0] for name in order.options)
         head = f"# Best of {len(table)} candidates: {row[SCORE]:.4g} veh s; the first: {table[SCORE].iloc[0]:.4g} veh s"
         lines = [
@@ -320,3 +340,13 @@ def _write(order: Tuning, study: optuna.Study) -> pd.DataFrame:
         ]
         files.write_text(order.out / "tune.toml", "\n".join(lines))
     return table
+
+
+def best_of(order: Tuning, table: pd.DataFrame) -> Scenario:
+    """Return the scenario with the best options of the table of `tune`."""
+    row = table.loc[table[SCORE].idxmin()]
+    values = {}
+    for name, span in order.space.items():
+        value = row[name]
+        values[name] = int(value) if isinstance(span, IntDistribution) else float(value)
+    return order.tuned(values)

@@ -18,13 +18,12 @@ from cosim.plant.settings import (
     Settings,
     check_lanes,
     own_files,
-    settings,
 )
+from cosim.plant.strategy import Strategy
 from cosim.sumo.net import City
 from cosim.sumo.programs import run_tool
 from cosim.sumo.signals import HELD, STATIC, Signal, phases_of, read_signals
 from cosim.sumo.xml_files import attribute, read_xml
-from nmfd.controllers.strategy import Strategy
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
 
@@ -32,7 +31,7 @@ from nmfd.model.scenario import Scenario
 def check_strategy(strategy: Strategy, scenario: Scenario, city: City) -> None:
     """Raise InputError, in a line that begins with the strategy, if it cannot run in this city."""
     try:
-        chosen = settings(scenario).changed(**strategy.city)
+        chosen = strategy.settings(scenario)
         check_lanes(scenario, chosen)
         if chosen.signals != FIXED:
             city_signals(city, scenario, chosen)

@@ -1,6 +1,7 @@
 """Controllers of the user's own: a class in a file, `path/to/file.py:Class` (template.py shows how
 to write one)."""
 
+import hashlib
 import re
 import sys
 import traceback
@@ -9,13 +10,14 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import cloudpickle
 import numpy as np
 
 from nmfd.errors import InputError
 from nmfd.model.commands import admissible
 from nmfd.model.planning import PlanningModel
 from nmfd.runs.files import file_hash
-from nmfd.types import Controls, Observation
+from nmfd.types import Controller, Controls, Observation
 
 FILE_AND_CLASS = re.compile(r"(?P<file>.+\.py):(?P<cls>[^\W\d]\w*)")
 
@@ -51,6 +53,17 @@ def fingerprint(name: str) -> dict[str, object]:
         *(_path(name).parent / str(file) for file in getattr(load(name), "files", ())),
     ]
     return {f"{path.name}_hash": file_hash(path) if path.is_file() else None for path in paths}
+
+
+def object_fingerprint(controller: Controller) -> str:
+    """Return a hash of an object with its code and state. Raise InputError if it has none."""
+    try:
+        content = cloudpickle.dumps(controller)
+    except Exception as error:
+        name = type(controller).__name__
+        reason = f"cannot be pickled ({error}); leave out files, locks and threads"
+        raise InputError(f"controller {name}: {reason}, or put the class into a file") from None
+    return hashlib.sha256(content).hexdigest()[:16]
 
 
 class OwnController:

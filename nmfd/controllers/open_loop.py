@@ -4,16 +4,45 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
 from nmfd.arrays import PairsOverTime, TurnsOverTime
+from nmfd.controllers.base import FileKind, Options
 from nmfd.errors import InputError
+from nmfd.model.planning import PlanningModel
 from nmfd.model.scenario import Scenario
+from nmfd.runs.config import Text, setting
 from nmfd.runs.files import atomic
 from nmfd.types import Controls, Observation
 
 NAMES = {"bound-pc": False, "bound-pcrg": True}  # controller -> with route guidance
+PLAN = FileKind("plan", ".npz", "nmfd bound {folder} --controller {name}")
+
+
+class Bound(Options):
+    """Replay of the best plan for known demand, which `nmfd bound` finds."""
+
+    plans: ClassVar[bool] = False
+
+    guidance: bool = setting("route guidance besides perimeter control", False)
+    plan: Text | Path | None = setting("plan file; by default SCENARIO/NAME.npz", None)
+
+    @property
+    def guides(self) -> bool:
+        return self.guidance
+
+    @property
+    def reads(self) -> FileKind:
+        return PLAN
+
+    @property
+    def file(self) -> str | Path | None:
+        return self.plan
+
+    def load(self, file: Path, planning: PlanningModel, scenario: Scenario) -> "Plan":
+        return read(file, scenario, guidance=self.guidance)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,8 +19,9 @@ import torch
 from torch import Generator, nn
 from torch.optim import Adam
 
+from nmfd.controllers.base import check_fit, from_table
 from nmfd.controllers.dpc.compact import CompactPolicy, Numbers
-from nmfd.controllers.dpc.options import Training
+from nmfd.controllers.dpc.options import Dpc
 from nmfd.controllers.dpc.policy import Architecture, ModuleController, Policy
 from nmfd.controllers.dpc.policy_file import checkpoint, new_policy, read_file
 from nmfd.controllers.dpc.rollout import Rollout, Trajectories, compiled_step
@@ -28,7 +29,7 @@ from nmfd.controllers.rules import PiGating
 from nmfd.controllers.strategy import Strategy
 from nmfd.errors import InputError, RunFailed
 from nmfd.model.authority import NO_GATEWAY
-from nmfd.model.planning import PlanningModel, options, planning_model
+from nmfd.model.planning import PlanningModel
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs.config import error
@@ -57,28 +58,25 @@ NO_CONTROL_WEIGHT, NO_CONTROL_LOGIT, NO_CONTROL_SPLIT = 0.1, 3.0, 1e-3
 OPEN_LOGIT, WORTH = 12.0, 0.03
 
 
-def settings(scenario: Scenario, strategy: Strategy, steps: int | None = None) -> Training:
-    """Return the training settings of a strategy; `steps` overrides. Raise InputError."""
-    kind, table = strategy.controller, strategy.table(scenario)
-    if kind.options is not Training:
-        raise InputError(
-            f"--controller: {strategy.name!r} cannot be trained; choose dpc-pc or dpc-pcrg"
-        )
+def settings(scenario: Scenario, strategy: Strategy, steps: int | None = None) -> Dpc:
+    """Return the options of a policy to train; `steps` overrides. Raise InputError."""
+    setup = strategy.options(scenario)
+    table = strategy.table(scenario)
+    name = strategy.controller.name
+    if not isinstance(setup, Dpc):
+        problem = "cannot be trained; choose dpc-pc or dpc-pcrg"
+        raise InputError(f"--controller: {strategy.name!r} {problem}")
     if table != strategy.name:
-        needs = f'needs a table [controllers."{strategy.name}"] in {scenario.where} with its differences'
-        raise InputError(f"--controller: {strategy.name!r} {needs}; add one, or train {kind.name}")
-    planning = planning_model(scenario, kind.name, table)
-    setup = options(Training, planning, kind.name, table)
-    if setup.local and kind.guides:
-        raise error(
-            planning.where,
-            f"controllers.{table}.local",
-            "a local policy guides no routes; train dpc-pc",
-        )
-    if setup.prices and not kind.guides:
-        raise error(
-            planning.where, f"controllers.{table}.prices", "prices guide drivers; train dpc-pcrg"
-        )
+        needs = f'needs a table [controllers."{strategy.name}"] in {scenario.where}'
+        remedy = f"add one, or train {name}"
+        raise InputError(f"--controller: {strategy.name!r} {needs} with its differences; {remedy}")
+    prefix = f"controllers.{table}."
+    check_fit(setup, strategy.own_planning(scenario), f"{scenario.where}: {prefix}")
+    if setup.local and setup.guides:
+        problem = "a local policy guides no routes; train dpc-pc"
+        raise error(scenario.where, f"{prefix}local", problem)
+    if setup.prices and not setup.guides:
+        raise error(scenario.where, f"{prefix}prices", "prices guide drivers; train dpc-pcrg")
     return setup if steps is None else setup.changed(steps=steps)
 
 
@@ -180,7 +178,7 @@ def train(
         )
     elif not anyway:
         check(scenario, strategy)
-    planning = planning_model(scenario, strategy.controller.name, strategy.table(scenario))
+    planning = strategy.own_planning(scenario)
     configuration = {
         "controller": strategy.name,
         "scenario": planning.name,
@@ -190,7 +188,7 @@ def train(
     configuration |= vars(setup) | ({"task": task.own} if task.own else {})
     torch.manual_seed(seed)
     generator = Generator().manual_seed(seed)
-    recipe, steps, guidance = setup.recipe, setup.steps, strategy.controller.guides
+    recipe, steps, guidance = setup.recipe, setup.steps, setup.guides
     policy = _first_policy(setup, planning, guidance=guidance) if module is None else module
     device = "cpu" if isinstance(policy, CompactPolicy) else device
     policy = policy.to(device).train()
@@ -258,7 +256,7 @@ def train(
     return policy.cpu().eval()
 
 
-def _first_policy(setup: Training, planning: PlanningModel, *, guidance: bool) -> Policy:
+def _first_policy(setup: Dpc, planning: PlanningModel, *, guidance: bool) -> Policy:
     """Return the untrained policy that the settings describe."""
     recipe = setup.recipe
     architecture = Architecture(
@@ -281,7 +279,7 @@ def _first_policy(setup: Training, planning: PlanningModel, *, guidance: bool) -
 def _loss(
     policy: nn.Module,
     rollout: Rollout,
-    setup: Training,
+    setup: Dpc,
     task: Task,
     generator: Generator,
     batch: int,
@@ -325,7 +323,7 @@ def _loss(
 
 
 def _descend(
-    policy: nn.Module, loss: torch.Tensor, optimizer: Adam, setup: Training, step: int, own: str
+    policy: nn.Module, loss: torch.Tensor, optimizer: Adam, setup: Dpc, step: int, own: str
 ) -> None:
     if not loss.requires_grad:
         raise InputError(
@@ -377,7 +375,10 @@ def begin_as_no_control(
 def begin_as_gate(policy: Policy, rollout: Rollout, generator: Generator) -> None:
     """Fit `policy` to gates that close the entries of protected regions as these fill, half at the
     set point."""
-    network, gate = rollout.planning.network, PiGating(rollout.planning)
+    network, gate = (
+        rollout.planning.network,
+        from_table(PiGating, rollout.planning, "pi-gating").make(rollout.planning),
+    )
     protected = gate.regions.tolist()
     set_point = torch.tensor(gate.set_point, dtype=rollout.dtype, device=rollout.device)
     counts = rollout.parameters.adjacency.expand(GATE_BATCH, -1, -1)
@@ -403,7 +404,7 @@ def begin_as_gate(policy: Policy, rollout: Rollout, generator: Generator) -> Non
         optimizer.step()
 
 
-def validate(policy: Policy, rollout: Rollout, seed: int, setup: Training) -> float:
+def validate(policy: Policy, rollout: Rollout, seed: int, setup: Dpc) -> float:
     """Return the TTS (veh s) of the scenario itself, the geometric mean of two noise draws.
 
     If training perturbs demand or model, also of VALIDATION_ROLLOUTS perturbed rollouts of

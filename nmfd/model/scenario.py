@@ -10,13 +10,19 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
+import tomli_w
 from jaxtyping import Bool
 from pydantic import Field, model_validator
 
 from nmfd.arrays import Intervals, PairsOverTime, PerPair
 from nmfd.errors import InputError
 from nmfd.faults import Fault, parse
-from nmfd.model.regional_model import RegionalModel, check_step, load_network
+from nmfd.model.regional_model import (
+    RegionalModel,
+    check_step,
+    load_network,
+    network_toml,
+)
 from nmfd.runs import config, files, shipped
 from nmfd.runs.config import (
     Name,
@@ -34,6 +40,12 @@ from nmfd.runs.config import (
 LONGEST_STEP_S = 86_400.0
 MOST_STEPS = 10**6
 MOST_FLOW_VEH_S = 1e6
+# Options of controllers that name a file or folder -> kind of the folder that it may be found in.
+CONTROLLER_FILES = {
+    "model": shipped.NETWORK,
+    "policy": shipped.SCENARIO,
+    "plan": shipped.SCENARIO,
+}
 KINDS = ("demand", "demand-total", "mfd-scale", "mfd-axis", "trip-lengths")  # of `perturbed`
 
 
@@ -133,6 +145,60 @@ class Scenario(Horizon):
         return hashlib.sha256(
             text.encode() + np.ascontiguousarray(self.demand).tobytes()
         ).hexdigest()[:16]
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Settings of a run besides network and demand, as in scenario.toml."""
+        content = {
+            "name": self.name,
+            "step": self.step,
+            "steps": self.steps,
+            "integrator": self.integrator,
+            "substeps": self.substeps,
+            "protected": list(self.protected),
+            "demand_factor": self.demand_factor,
+            "measurement_std": self.measurement_std,
+            "process_std": self.process_std,
+            "faults": list(self.faults),
+            "controllers": self.controller_options,
+            "sumo": self.sumo,
+        }
+        if self.initial is not None:
+            content["initial"] = self.initial.tolist()
+        return json.loads(json.dumps(content))
+
+    def save(self, folder: Path | str) -> Path:
+        """Write the scenario as a folder that nmfd.load_scenario reads, and return its path.
+
+        Trained policies are not copied. The network is named if it lies in a folder, else written.
+        Raises: InputError if the folder holds a scenario already
+        """
+        folder = Path(folder)
+        file = folder / "scenario.toml"
+        if file.exists():
+            raise InputError(f"{file}: exists; choose another folder")
+        folder.mkdir(parents=True, exist_ok=True)
+        content = self.settings
+        if self.folder is not None:
+            _relocate(content, self.folder, folder)
+        content["network"] = self._saved_network(folder)
+        content["demand_file"] = "demand.csv"
+        rows = ["interval,from,to,veh_s"]
+        for k, i, j in np.argwhere(self.demand > 0.0).tolist():
+            rows.append(f"{k},{i},{j},{float(self.demand[k, i, j]) / self.demand_factor!r}")
+        files.write_text(folder / "demand.csv", "\n".join(rows) + "\n")
+        files.write_text(file, tomli_w.dumps(content))
+        return folder
+
+    def _saved_network(self, folder: Path) -> str:
+        """Return the folder of the network, seen from `folder`; write it there if it has none."""
+        own = self.network.folder
+        if own is not None and load_network(own).hash == self.network.hash:
+            return files.relative(own, folder)
+        (folder / "network").mkdir(exist_ok=True)
+        text = network_toml(self.network, {}, f"Network of the scenario {self.name}")
+        files.write_text(folder / "network" / "network.toml", text)
+        return "network"
 
     @cached_property
     def ordered_faults(self) -> tuple[Fault, ...]:
@@ -368,9 +434,14 @@ def _relocate(own: dict, folder: Path, here: Path) -> None:
             if isinstance(sumo.get(key), list) and all(isinstance(name, str) for name in sumo[key]):
                 sumo[key] = [seen(name) for name in sumo[key]]
     controllers = own.get("controllers")
-    for options in controllers.values() if isinstance(controllers, dict) else ():
-        if isinstance(options, dict) and isinstance(options.get("model"), str):
-            options["model"] = seen(options["model"], shipped.NETWORK)
+    if not isinstance(controllers, dict):
+        return
+    for options in controllers.values():
+        if not isinstance(options, dict):
+            continue
+        for key, kind in CONTROLLER_FILES.items():
+            if isinstance(options.get(key), str):
+                options[key] = seen(options[key], kind)
 
 
 def _completed(content: dict, base: dict) -> dict:

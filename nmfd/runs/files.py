@@ -83,9 +83,19 @@ def file_name(name: str) -> str:
     return re.sub(r"[^\w.-]+", "-", name)
 
 
+def parts_of(text: str, sign: str = ",") -> list[str]:
+    """Return the parts of a text between signs that do not stand in parentheses.
+
+    >>> parts_of("no-control, pi-gating(kp=2.0, ki=0.1)")
+    ['no-control', 'pi-gating(kp=2.0, ki=0.1)']
+    """
+    parts = re.split(rf"{re.escape(sign)}(?![^(]*\))", text)
+    return [part.strip() for part in parts]
+
+
 def run_name(controller: str, seed: int) -> str:
     """Return the stem of the file of a run; of a controller path/to/file.py:Class, too."""
-    return f"{quote(controller, safe='+,-._ ')}-{seed}"
+    return f"{quote(controller, safe='+,-._ ()=')}-{seed}"
 
 
 def default_folder(scenario: str) -> Path:

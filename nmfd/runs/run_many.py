@@ -7,18 +7,13 @@ at all.
 <folder>/[<subfolder>/]<controller>-<seed>.nc    the Dataset of a run (nmfd.types.Result)
 """
 
-import atexit
 import json
-import multiprocessing
 import os
 import platform
 import shlex
 import shutil
-import signal
 import subprocess
 import sys
-import threading
-import traceback
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, as_completed
 from contextlib import closing, contextmanager, suppress
@@ -26,19 +21,17 @@ from dataclasses import dataclass
 from datetime import datetime
 from functools import cache
 from importlib import metadata
-from multiprocessing import connection, forkserver, resource_tracker
-from multiprocessing.process import BaseProcess
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote
 
 from filelock import FileLock, Timeout
 
 from nmfd import __version__
-from nmfd.errors import InputError, RunFailed, need, uninterrupted
+from nmfd.errors import InputError, RunFailed, need
 from nmfd.metrics import summary
 from nmfd.runs.files import write_table, write_text
+from nmfd.runs.pool import attempt, in_processes, in_subprocess
 from nmfd.runs.progress import Progress, watched
 from nmfd.types import Result
 
@@ -47,13 +40,8 @@ if TYPE_CHECKING:
 
 MANIFEST, TABLE, LOCK = "manifest.json", "runs.csv", ".lock"
 DASK_PATIENCE_S = 10.0  # for the scheduler to answer
-POLL_S, EXIT_S = (
-    0.2,
-    5.0,
-)  # longest wait: Windows lets Ctrl-C through after it; for a process to end after its outcome
-PRELOADED = "xarray", "dask.array"  # which a Result imports, if they are there
-STARTING = threading.Lock()  # held while a process starts
-SERVED: set[str] = set()  # modules of the jobs that the server has imported
+LONGER = 10.0  # time limit of a run, in expected times
+LEAST_LIMIT_S = 600.0
 PACKAGES = ("numpy", "torch", "casadi", "libsumo")  # whose versions are in the manifest
 
 
@@ -65,9 +53,10 @@ class Run:
     key: everything the result depends on, as JSON types: hashes, settings, versions. Its item
         "controller" holds what only runs of this controller depend on; all else is the same for all
         runs of a folder
-    job: a picklable function without arguments that returns the Result, or the reason why there is
-        none; `processes` takes any outcome for a Result
-    folder: below that of all runs; expected: wall time [s], 0 if unknown
+    job: function without arguments that returns the Result, or the reason why there is none; it
+        can be pickled, by value if it is the user's
+    folder: folder below that of all runs
+    expected: wall time (s), 0 if unknown
     """
 
     name: str
@@ -75,6 +64,11 @@ class Run:
     job: Callable[[], Any]
     folder: str = ""
     expected: float = 0.0
+
+    @property
+    def limit(self) -> float:
+        """Time after which the run is ended (s)."""
+        return max(LONGER * self.expected, LEAST_LIMIT_S)
 
     @property
     def file(self) -> str:
@@ -88,6 +82,7 @@ def run_many(
     *,
     workers: int = 1,
     scheduler: str | None = None,
+    time_limit: float | None = None,
     progress: Progress = None,
 ) -> "pd.DataFrame":
     """Do the `runs` whose files are not in the folder `out`, and return one row per run.
@@ -99,6 +94,8 @@ def run_many(
     workers: runs at a time, each in a process of its own; 0: one after the other in this process
     scheduler: address of a Dask scheduler, whose workers do the runs; it takes TLS certificates
         from Dask's own configuration
+    time_limit: wall time after which the process of a run is ended (s); if None, ten times the
+        expected time, at least ten minutes. Runs in this process have none
     progress: None for a bar, False for none, or a function of done, total and the name of a run
     Raises: InputError if another process has the folder, or it is not a folder of runs
     """
@@ -120,10 +117,10 @@ def run_many(
         try:
             with (
                 watched("runs", progress, said=said) as show,
-                closing(_outcomes(todo, workers, scheduler)) as ended,
+                closing(_outcomes(todo, workers, scheduler, time_limit)) as ended,
             ):
                 if show and todo:
-                    show(0, len(todo))
+                    show(0, len(todo), "")
                 for done, (run, outcome) in enumerate(ended, 1):
                     if isinstance(outcome, Result):
                         outcome = outcome.assign(key=json.dumps(keys[run.file]))
@@ -154,137 +151,23 @@ def raise_failures(rows: "pd.DataFrame") -> None:
         )
 
 
-def attempt(job: Callable[[], Result | str]) -> Result | str:
-    """Return the outcome of `job`, or why there is none, with file and line."""
-    try:
-        return job()
-    except InputError as error:
-        return str(error)
-    except (Exception, SystemExit) as error:
-        last = traceback.extract_tb(error.__traceback__)[-1]
-        return f"{type(error).__name__}: {error} ({Path(last.filename).name}:{last.lineno})"
-
-
 def _outcomes(
-    todo: Sequence[Run], workers: int, scheduler: str | None
-) -> Generator[tuple[Run, Result | str]]:
+    todo: Sequence[Run], workers: int, scheduler: str | None, time_limit: float | None
+) -> Generator[tuple[Run, Any]]:
     """Yield every run with its result or the reason of its failure, as they end."""
     if scheduler is not None and todo:
         with _dask(scheduler) as executor:
-            futures = {executor.submit(_alone, run.job, os.getcwd()): run for run in todo}
+            futures = {executor.submit(in_subprocess, run.job, os.getcwd()): run for run in todo}
             for future in as_completed(list(futures)):
                 run = futures.pop(future)  # with its result, which may be large
                 yield run, attempt(future.result)
     elif workers == 0:
-        yield from ((run, attempt(run.job)) for run in todo)
+        for run in todo:
+            yield run, attempt(run.job)
     else:
-        yield from processes(todo, workers)
-
-
-def _alone(job: Callable[[], Result | str], folder: str) -> Result | str:
-    """Do `job` in a new process in `folder`, from a worker of Dask."""
-    multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]  # may have a child
-    return list(processes([Run("", {}, job)], 1, folder))[0][1]
-
-
-def processes(todo: Sequence[Run], workers: int, folder: str = "") -> Generator[tuple[Run, Any]]:
-    """Yield every run with its outcome from a process of its own in `folder`, `workers` at a
-    time."""
-    waiting, live = list(reversed(todo)), dict[connection.Connection, tuple[Run, BaseProcess]]()
-    try:
-        while waiting or live:
-            while waiting and len(live) < workers:
-                channel, process = _start(waiting[-1].job, os.path.abspath(folder))
-                live[channel] = waiting.pop(), process
-                with suppress(BrokenPipeError):  # it has died, which is an outcome
-                    channel.send(live[channel][0].job)
-            ready = connection.wait(live, POLL_S)
-            for channel in [one for one in live if one in ready]:
-                outcome = _outcome(channel, live[channel][1])
-                yield live.pop(channel)[0], outcome
-    finally:  # after Ctrl-C there are some
-        for _, process in live.values():
-            process.kill()
-            process.join()
-
-
-def _start(
-    job: Callable[[], Result | str], folder: str
-) -> tuple[connection.Connection, BaseProcess]:
-    """Start a process, and return it behind the channel for a job and its outcome.
-
-    Where the system can, it is forked from a server that has imported the module of `job`, and that
-    later jobs of this module use, too.
-    """
-    method, environment = "forkserver" if hasattr(os, "fork") else "spawn", dict(os.environ)
-    context: Any = multiprocessing.get_context(method)
-    module = getattr(job, "func", job).__module__
-    # Without the user's script, which would do everything again; the server shows a traceback of a
-    # request cut short.
-    with STARTING, uninterrupted():
-        if method == "forkserver":
-            if module not in SERVED:
-                _stop_server()
-                SERVED.add(module)
-            context.set_forkserver_preload([__name__, *PRELOADED, *sorted(SERVED)])
-            resource_tracker.ensure_running()  # first, as it lets Ctrl-C through
-            blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-            os.environ |= {
-                "PYTHONSAFEPATH": "1",
-                "PYTHONPATH": os.pathsep.join(sys.path),
-            }  # to find the same modules
-            try:
-                forkserver.ensure_running()
-            finally:
-                os.environ.clear()
-                os.environ |= environment
-                signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
-        ours, theirs = context.Pipe()
-        process = context.Process(target=_work, args=(theirs, folder, environment), daemon=True)
-        main, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
-        try:
-            process.start()
-        finally:
-            sys.modules["__main__"] = main
-    theirs.close()
-    return ours, process
-
-
-@atexit.register
-def _stop_server() -> None:
-    server: Any = forkserver._forkserver
-    if server._forkserver_pid is not None:  # it may still import
-        os.kill(server._forkserver_pid, signal.SIGTERM)
-        server._stop()
-
-
-def _work(channel: connection.Connection, folder: str, environment: Mapping[str, str]) -> None:
-    """Send back the outcome of the job that comes through `channel`, as long as its other end is
-    there."""
-
-    def end_with_parent() -> None:
-        multiprocessing.parent_process().join()  # type: ignore[union-attr]
-        os._exit(1)
-
-    threading.Thread(target=end_with_parent, daemon=True).start()
-    os.environ.clear()
-    os.environ.update(environment)
-    os.chdir(folder)
-    with suppress(OSError):
-        channel.send(attempt(lambda: channel.recv()()))
-
-
-def _outcome(channel: connection.Connection, process: BaseProcess) -> Result | str:
-    """Return what comes through `channel`, or why nothing does; wait for the end of the process."""
-    try:
-        return channel.recv()
-    except (EOFError, OSError):
-        process.join(EXIT_S)
-        status = process.exitcode or 0
-        return f"its process died (status {status}{f', {signal.strsignal(-status)}' if status < 0 else ''})"
-    finally:
-        process.join(EXIT_S)
-        channel.close()
+        limits = [time_limit or run.limit for run in todo]
+        for number, outcome in in_processes([run.job for run in todo], workers, limits):
+            yield todo[number], outcome
 
 
 @contextmanager

@@ -33,15 +33,16 @@ The regional model answers prices by a logit (nmfd.model.answer); the policy is 
 network.
 """
 
-from typing import Annotated, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
 import torch
 from pydantic import Field
 from torch import nn
 
+from nmfd.controllers.base import Options
 from nmfd.controllers.dpc.policy import FILL_TIME_S, Architecture, DpcController, Memory, Policy
-from nmfd.model.planning import Options, PlanningModel, options
+from nmfd.model.planning import PlanningModel
 from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import config
 from nmfd.runs.config import Problem, setting
@@ -134,11 +135,18 @@ class CompactPolicy(Policy):
         return Numbers(*self.numbers.clamp(min=0.0))
 
 
-class Rule(Options):
-    """Options of a rule."""
+class GatingRule(Options):
+    """Gates by numbers that were tuned in SUMO."""
+
+    guidance: ClassVar[bool] = False
+    name: ClassVar[str] = "gating-rule"
 
     numbers: NumbersOption = setting(MEANING, Numbers(), unit="-")
     metering: bool = setting("trips wait while regions are full; for +metering", False)
+
+    @property
+    def guides(self) -> bool:
+        return self.guidance
 
     def misfit(self, planning: PlanningModel) -> Problem | None:
         """Return negative numbers, or no protected region, as a problem."""
@@ -148,16 +156,19 @@ class Rule(Options):
             return Problem("numbers", "expected a scenario with protected regions; name them")
         return None
 
+    def make(self, planning: PlanningModel) -> DpcController:
+        architecture = Architecture(
+            guidance=self.guidance, compact=planning.protected, metering=self.metering
+        )
+        policy = CompactPolicy(planning.network, architecture)
+        policy.numbers.data.copy_(torch.tensor(Numbers(*self.numbers)))
+        controller = DpcController(policy)
+        controller.name = self.name
+        return controller
 
-def rule(planning: PlanningModel, *, guidance: bool) -> DpcController:
-    """Return the pricing rule or, without guidance, the gating rule. Raise InputError."""
-    name = "pricing-rule" if guidance else "gating-rule"
-    setup = options(Rule, planning, name)
-    architecture = Architecture(
-        guidance=guidance, compact=planning.protected, metering=setup.metering
-    )
-    policy = CompactPolicy(planning.network, architecture)
-    policy.numbers.data.copy_(torch.tensor(Numbers(*setup.numbers)))
-    controller = DpcController(policy)
-    controller.name = name
-    return controller
+
+class PricingRule(GatingRule):
+    """Prices of the ways through regions, and gates, by numbers that were tuned in SUMO."""
+
+    guidance: ClassVar[bool] = True
+    name: ClassVar[str] = "pricing-rule"

@@ -70,6 +70,12 @@ def load_policy(path: Path, network: RegionalModel) -> tuple[Policy, dict]:
     return policy, content
 
 
+def guided_by(content: Any) -> bool:
+    """Return True if the policy in a checkpoint guides routes."""
+    architecture = content.get("architecture", {}) if isinstance(content, Mapping) else {}
+    return bool(architecture.get("guidance"))
+
+
 def outside_training(content: Mapping, level: float) -> str:
     """Return a sentence if `level` times the demand is outside the training range of a checkpoint,
     else ""."""

@@ -19,6 +19,7 @@ import numpy as np
 from pydantic import model_validator
 
 from nmfd.arrays import PerPair, PerTurn
+from nmfd.controllers.base import FileKind, Options, from_table
 from nmfd.controllers.mpc import edge_model
 from nmfd.controllers.mpc.edge_model import (
     Decision,
@@ -31,10 +32,11 @@ from nmfd.controllers.mpc.edge_model import (
 from nmfd.controllers.mpc.ipopt import Ipopt
 from nmfd.controllers.mpc.projected_gradient import AT_REST, TIME_LIMIT, Late, Minimum, minimise
 from nmfd.controllers.mpc.terminal import Terminal, read
-from nmfd.controllers.rules import PiGating
-from nmfd.model.planning import Options, PlanningModel, options
+from nmfd.controllers.rules import PiGate, PiGating
+from nmfd.model.planning import PlanningModel
 from nmfd.model.regional_model import RegionalModel
-from nmfd.runs.config import Problem, error, setting, whole
+from nmfd.model.scenario import Scenario
+from nmfd.runs.config import Problem, setting, whole
 from nmfd.types import Controls, Observation, Status
 
 MAX_ITERATIONS = 1000  # of the solver, per decision
@@ -47,6 +49,7 @@ JAM_ROUNDING = (
 TOLERANCE = 1e-6
 ACCEPTABLE_TOLERANCE = 1e-5
 TERMINAL_TOLERANCE = 1e-4  # with a terminal cost, which is no more exact
+VALUE = FileKind("value function", ".npz", "python scenarios/economic_mpc/terminal_cost.py {name}")
 FAILED = Status.SOLVER_FAILURE | Status.FALLBACK
 DEADLINE_SHARE = 0.9  # of the deadline for the solver
 METRIC_OFFSET_VEH = (
@@ -54,9 +57,15 @@ METRIC_OFFSET_VEH = (
 )
 
 
-class Mpc(Options):
-    """Options of model predictive control."""
+class EconomicMpc(Options):
+    """Economic model predictive control (nmfd.controllers.mpc.controller.MpcController).
 
+    >>> nmfd.run("economic_mpc", nmfd.EconomicMpc(horizon=4), steps=1).controller
+    'mpc-pc(horizon=4)'
+    """
+
+    guidance: bool = setting("route guidance besides perimeter control", False)
+    terminal: bool = setting("with a terminal cost, read from the scenario's folder", False)
     horizon: int = whole("horizon of the plan, in control intervals", 8, low=2, high=1000)
     control_horizon: int | None = whole(
         "intervals with controls of their own, of which the last hold on; by default all",
@@ -70,13 +79,30 @@ class Mpc(Options):
     )
 
     @model_validator(mode="after")
-    def _fits_together(self) -> "Mpc":
+    def _fits_together(self) -> "EconomicMpc":
         if self.control_horizon is not None and self.solver == "ipopt":
             raise Problem(
                 "control_horizon",
                 "ipopt has controls of its own in every interval; omit one of the keys",
             )
+        if self.terminal and self.solver == "ipopt":
+            raise Problem("solver", "ipopt has no terminal cost; omit it")
         return self
+
+    @property
+    def guides(self) -> bool:
+        return self.guidance
+
+    @property
+    def reads(self) -> FileKind | None:
+        return VALUE if self.terminal else None
+
+    def make(self, planning: PlanningModel) -> "MpcController":
+        return MpcController(planning, self)
+
+    def load(self, file: Path, planning: PlanningModel, scenario: Scenario) -> "MpcController":
+        name = "mpc-pcrg-terminal" if self.guidance else "mpc-pc-terminal"
+        return MpcController(planning, self, terminal=read(file, planning, name))
 
 
 class Admissible:
@@ -155,7 +181,7 @@ class Admissible:
         )
 
 
-class EconomicMpc:
+class MpcController:
     """Economic MPC on a regional model and a demand forecast.
 
     The solver starts from its last plan, shifted by one interval, or from no control if that is
@@ -166,14 +192,18 @@ class EconomicMpc:
     """
 
     def __init__(
-        self, planning: PlanningModel, *, guidance: bool, terminal: Terminal | None = None
+        self, planning: PlanningModel, options: EconomicMpc, *, terminal: Terminal | None = None
     ):
-        """Raise InputError for a wrong option. terminal: cost beyond the horizon"""
-        self.name = ("mpc-pcrg" if guidance else "mpc-pc") + (
-            "-terminal" if terminal is not None else ""
-        )
+        """Raise InputError for wrong options of the scenario's pi-gating, the fallback.
+
+        terminal: cost beyond the horizon
+        """
+        guidance = options.guidance
+        self.name = "mpc-pcrg" if guidance else "mpc-pc"
+        if terminal is not None:
+            self.name += "-terminal"
         self._terminal = terminal
-        self.options = options(Mpc, planning, self.name)
+        self.options = options
         network, horizon = planning.network, self.options.horizon
         used = np.flatnonzero(planning.destinations)
         self._used = used if len(used) else np.arange(network.regions)
@@ -190,17 +220,13 @@ class EconomicMpc:
         self._rounded: Callable = partial(edge_model.vehicle_steps, rounded, gradient=True)
         self.admissible = Admissible(network, self._model, guidance=guidance)
         self._open = self.admissible.open(self._moves)
-        self._gating = PiGating(planning) if planning.protected else None
+        self._gating: PiGate | None = None
+        if planning.protected:
+            self._gating = from_table(PiGating, planning, "pi-gating").make(planning)
         self.deadline = planning.step  # s: a later answer is of no use
         self._tolerance = TOLERANCE if terminal is None else TERMINAL_TOLERANCE
         self._ipopt = None
         if self.options.solver == "ipopt":
-            if terminal is not None:
-                raise error(
-                    planning.where,
-                    f"controllers.{self.name}.solver",
-                    "ipopt has no terminal cost; omit it",
-                )
             limits = {"max_iter": MAX_ITERATIONS, "max_wall_time": DEADLINE_SHARE * self.deadline}
             self._ipopt = Ipopt(planning, guidance=guidance, horizon=horizon, limits=limits)
         self.reset()
@@ -307,9 +333,3 @@ class EconomicMpc:
         return Minimum(
             point=plan, value=value, gap=self.admissible.gap(plan, gradient), reason=reason
         )
-
-
-def load(path: Path, planning: PlanningModel, *, guidance: bool) -> EconomicMpc:
-    """Return MPC with the terminal cost in the file `path`. Raise InputError if it does not fit."""
-    name = "mpc-pcrg-terminal" if guidance else "mpc-pc-terminal"
-    return EconomicMpc(planning, guidance=guidance, terminal=read(path, planning, name))
