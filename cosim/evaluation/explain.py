@@ -79,7 +79,8 @@ def city(level: Level, finished: Finished) -> str:
             state += f"; that of {len(names) - len(seen)} regions was not seen"
     state = "; ".join([state, *_removed(level, against)])
     when = "Without control" if against == REFERENCE else f"Under {against}"
-    seen_by_signals = f"{1.0 - _leaking(level):.0%} of the boundary flow"
+    leaking = statistics.by_seed(level.rows, level.demand, against, "leaking_share")
+    seen_by_signals = f"{1.0 - np.mean(list(leaking.values())):.0%} of the boundary flow"
     return f"Signals under control see {seen_by_signals}. {when} {state}."
 
 
@@ -255,10 +256,3 @@ def _removed(level: Level, name: str) -> list[str]:
     if removed > SMALL_SHARE * trips:
         return [f"{removed / trips:.1%} of its trips end by removal"]
     return []
-
-
-def _leaking(level: Level) -> float:
-    """Return the share of the boundary flow without a signal, under the reference."""
-    rows = level.rows
-    reference = rows["controller"] == statistics.compared_with(rows)
-    return float(rows.loc[reference, "leaking_share"].mean())

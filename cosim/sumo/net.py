@@ -340,7 +340,11 @@ def _read_net(path: Path) -> _Net:
     with network_root(path) as root:
         for element in root.iterfind("edge"):
             edge = attribute(element, "id")
-            lanes = [_lane(lane) for lane in element.iter("lane") if for_cars(lane)]
+            lanes = [
+                _Lane(size(lane, "length"), size(lane, "speed"), attribute(lane, "id"))
+                for lane in element.iter("lane")
+                if for_cars(lane)
+            ]
             if element.get("function", "normal") in NORMAL:
                 lanes_of[edge] = lanes
                 continue
@@ -364,11 +368,6 @@ def _read_net(path: Path) -> _Net:
     if not lanes_of:
         raise InputError(f"{path}: has no edges; build it with netconvert")
     return _Net(lanes_of, internal, connections)
-
-
-def _lane(element: ElementTree.Element) -> _Lane:
-    """Return a <lane>. Raises ValueError."""
-    return _Lane(size(element, "length"), size(element, "speed"), attribute(element, "id"))
 
 
 def _stem(name: str) -> str:
