@@ -93,7 +93,7 @@ def test_every_number_of_the_tables_is_there(content, evaluation):
 
 def test_doubtful_rows_are_flagged_on_the_card_and_below_the_tables(content):
     words = Page(content).words
-    assert words.count("WARNING: dpc-pcrg has") == 1 + 2  # card, and two demand levels
+    assert words.count("WARNING: vehicles were removed, ") == 1 + 2  # card, and two demand levels
     assert content.index('class="warning"') < content.index('class="card"')
     assert any(cell.endswith(" !") for cell in Page(content).cells)
 

@@ -91,8 +91,10 @@ def test_many_teleports_and_removed_vehicles_are_flagged():
     rows.loc[rows["controller"] == "actuated", "removed_veh"] = [0.0, 3.0]
     table = statistics.statistics(rows)
     teleports, removed = statistics.warnings(table)
-    assert teleports.startswith("WARNING: pi-gating has 13 teleports a run, no-control 4: ")
-    assert removed.startswith("WARNING: actuated has 1.5 vehicles removed a run")
+    assert teleports.startswith("WARNING: many times the teleports of no-control, ")
+    assert teleports.endswith(": pi-gating 13 a run")
+    assert removed.startswith("WARNING: vehicles were removed, ")
+    assert removed.endswith(": actuated 1.5 a run")
     outcomes = statistics.shown(table)[0]
     assert list(outcomes["teleports"]) == ["8", "24", "26 !", "0"]
     assert list(outcomes["removed [veh]"]) == ["0", "0", "0", "2 !"]
@@ -102,7 +104,7 @@ def test_many_teleports_and_removed_vehicles_are_flagged():
     quiet = rows.assign(teleports=0, removed_veh=0.0)
     assert statistics.warnings(statistics.statistics(quiet)) == []
     few = quiet.assign(teleports=rows["controller"].map({**counts, "no-control": 0}))
-    assert "max-pressure has 12 teleports a run, no-control 0" in statistics.text(few)
+    assert ": max-pressure 12, pi-gating 13 a run" in statistics.markdown(few)
 
 
 UNEQUAL = {

@@ -78,14 +78,16 @@ def city(level: Level, finished: Finished) -> str:
         if len(seen) < len(names):
             state += f"; that of {len(names) - len(seen)} regions was not seen"
     state = "; ".join([state, *_removed(level, against)])
-    when = "Without control" if against == REFERENCE else f"Under {against}"
+    when = f"Under {against}"
+    if against == REFERENCE:
+        when = "Without control"
     leaking = statistics.by_seed(level.rows, level.demand, against, "leaking_share")
     seen_by_signals = f"{1.0 - np.mean(list(leaking.values())):.0%} of the boundary flow"
     return f"Signals under control see {seen_by_signals}. {when} {state}."
 
 
 def paragraph(level: Level, finished: Finished, name: str) -> str:
-    """Return how much a controller gains or loses against the reference, and why."""
+    """Return how much a controller gains or loses, and why."""
     against = statistics.compared_with(level.rows)
     if name == against:
         return f"{name} is the reference."

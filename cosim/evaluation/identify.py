@@ -96,7 +96,9 @@ class Task:
     def held_out(
         self, static: RegionalModel, runs: Sequence[Result], model: RegionalModel
     ) -> pd.DataFrame | None:
-        """Return the errors in the runs of the last seed, predicted by a fit without them.
+        """Return errors of predictions of the last seed by a fit without it.
+
+        They are None if there is one seed only.
 
         model: fitted to all runs; it knows which critical accumulations were seen
         """
@@ -137,7 +139,7 @@ class Identified:
     verdict: authority.Verdict
 
     def fit_text(self) -> str:
-        """Return the quality of the fit as a table, with the errors of the seed held out."""
+        """Return the quality of the fit, and the errors of the seed held out."""
         lines = [fit_quality.fit_table(self.model, self.fits)]
         if self.held_out is not None:
             step = self.task.scenario.step
@@ -145,7 +147,11 @@ class Identified:
         return "\n".join(lines)
 
     def write(self, out: Path, target: Path) -> None:
-        """Write the model with its verdict to `target`, quality, samples and figures to `out`."""
+        """Write the model, and what its fit is based on.
+
+        out: folder of samples, figures and quality of the fit
+        target: folder of the model and its verdict
+        """
         files.write_text(out / "fit.txt", self.fit_text() + "\n")
         fit_quality.write_fits(out / "fit.csv", self.fits, self.held_out)
         rows = []
@@ -351,7 +357,7 @@ def _write_protected(scenario: Scenario, regions: tuple[int, ...]) -> None:
 
 
 def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool) -> RegionalModel:
-    """Return the network with fitted MFDs and, unless guided, own split ratios.
+    """Return the network with fitted MFDs, and own splits unless guided.
 
     Raises: InputError for empty runs
     """

@@ -1,4 +1,4 @@
-"""Microsimulation against predictions of the regional model, and samples of MFDs.
+"""Runs against predictions of the regional model, and samples of MFDs.
 
 `cosim compare` writes and prints the errors.
 """
@@ -38,7 +38,10 @@ CAPTION = (
 
 
 def observed(result: Result) -> Observed:
-    """Return the data of a run for identification; its demand is the departures."""
+    """Return the data of a run for identification.
+
+    Its demand is the departures.
+    """
     return Observed(
         accumulation=result.accumulation,
         demand=result["departures"] / result.step,
@@ -49,7 +52,10 @@ def observed(result: Result) -> Observed:
 
 
 def predict(scenario: Scenario, result: Result) -> Result:
-    """Run the regional model from the same start under the recorded departures and controls."""
+    """Run the regional model from the same start.
+
+    It gets the recorded departures and controls.
+    """
     known = parameters(scenario.network)
     states = [torch.from_numpy(result.accumulation[0])]
     given = (result["departures"] / scenario.step, result.perimeter, result.splits)
@@ -93,7 +99,7 @@ def compare(found: Finished) -> pd.DataFrame:
 def _errors(
     scenario: Scenario, results: Sequence[Result], predicted: Sequence[Result]
 ) -> pd.DataFrame:
-    """Return the errors of predictions of the runs of one strategy, a row per region."""
+    """Return the errors in the runs of one strategy, a row per region."""
     network = scenario.network
     states = np.concatenate([run.accumulation.sum(axis=2) for run in results])
     off = np.concatenate([run.accumulation.sum(axis=2) for run in predicted]) - states
@@ -115,7 +121,7 @@ def _errors(
 
 
 def prediction_table(rows: pd.DataFrame) -> str:
-    """Return prediction errors as text, one line per strategy and demand level."""
+    """Return prediction errors as text, a line per strategy and demand."""
     lines = []
     for (demand, controller), group in rows.groupby(["demand", "controller"], sort=False):
         first = group.iloc[0]
@@ -175,7 +181,7 @@ def outflow_samples(network: RegionalModel, results: Sequence[Result]) -> list[d
 def held_up(
     accumulation: RegionCounts, outflow: RegionCounts, adjacency: Adjacency
 ) -> Bool[np.ndarray, "T R"]:
-    """Mark the intervals in which a neighbour holds up the outflow of a region.
+    """Mark intervals in which a neighbour holds up a region's outflow.
 
     The neighbour has collapsed, and did so before the region. A collapsed region holds more
     vehicles than when its outflow was largest so far, and lets out less than COLLAPSED_SHARE of

@@ -86,11 +86,10 @@ def compared_with(rows: pd.DataFrame) -> str:
 
     Only controllers that every level and enough seeds have are chosen from, if there are any.
     """
-    levels = groups(rows).values()
+    everywhere = set.intersection(*map(set, groups(rows).values()))
     seeds = rows.groupby("controller", sort=False)["seed"].nunique()
     names = list(seeds.index[seeds >= min(FEWEST_SEEDS, seeds.max())])
-    everywhere = [name for name in names if all(name in level for level in levels)]
-    return benchmark.compared_with(everywhere or names)
+    return benchmark.compared_with([name for name in names if name in everywhere] or names)
 
 
 def on_common_seeds(rows: pd.DataFrame) -> pd.DataFrame:
@@ -130,7 +129,6 @@ def statistics(rows: pd.DataFrame) -> pd.DataFrame:
                 "change_significant": pair.significant if pair.seeds else None,
                 "change_seeds": pair.seeds,
                 "teleports": int(part["teleports"].sum()),
-                "many_teleports": _many_teleports(here, name, against),
                 "gateway_queue_max_veh": part["gateway_queue_max_veh"].max(),
                 "control_step_ms_max": part["control_step_ms_max"].max(),
             }
@@ -140,39 +138,43 @@ def statistics(rows: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(out)
 
 
-def _many_teleports(rows: pd.DataFrame, name: str, against: str) -> str:
-    """Return a warning if a controller has many times the teleports of the reference.
+def _many_teleports(table: pd.DataFrame) -> pd.Series:
+    """Mark rows with many times the teleports of the reference.
 
-    It is "" if not. rows: of one demand level
+    table: `statistics` of one demand level
     """
-    counts = rows.pivot_table("teleports", "seed", "controller")[[name, against]].dropna()
-    own, reference = counts.mean()
-    if name == against or not own > MANY_TELEPORTS * max(reference, 1.0):
-        return ""
-    return (
-        f"WARNING: {name} has {own:,.0f} teleports a run, {against} {reference:,.0f}: "
-        "SUMO takes vehicles out of its jams, which are worse than these numbers"
-    )
+    per_run = table["teleports"] / table["seeds"]
+    reference = per_run[table["controller"] == table["against"]].max()
+    return per_run > MANY_TELEPORTS * max(reference, 1.0)
 
 
 def warnings(table: pd.DataFrame) -> list[str]:
     """Return why rows of `statistics` of one demand level are doubtful."""
     found = []
-    for row in table.itertuples():
-        if row.many_teleports:
-            found.append(row.many_teleports)
-        if row.removed_veh > 0:
-            found.append(
-                f"WARNING: {row.controller} has {row.removed_veh:,.1f} vehicles removed a run: "
-                "their time counts until then"
-            )
-    if table["seeds_differ"].any():
-        seeds = ", ".join(f"{row.controller} {row.seeds}" for row in table.itertuples())
+    many = table[_many_teleports(table)]
+    if len(many):
         found.append(
-            f"WARNING: the controllers do not have the same seeds ({seeds}): "
-            "compare the changes, which are paired by seed, not the means"
+            f"WARNING: many times the teleports of {table['against'].iloc[0]}, so that jams are "
+            f"worse than these numbers: {_listed(many, many['teleports'] / many['seeds'])} a run"
+        )
+    removed = table[table["removed_veh"] > 0]
+    if len(removed):
+        found.append(
+            "WARNING: vehicles were removed, whose time counts until then: "
+            f"{_listed(removed, removed['removed_veh'])} a run"
+        )
+    if table["seeds_differ"].any():
+        found.append(
+            f"WARNING: controllers have different seeds ({_listed(table, table['seeds'])}): means "
+            "cannot be compared, but changes, which are paired; the best is that on common seeds"
         )
     return found
+
+
+def _listed(table: pd.DataFrame, values: pd.Series) -> str:
+    """Return controllers with a number each."""
+    pairs = zip(table["controller"], values, strict=True)
+    return ", ".join(f"{name} {value:,.1f}".removesuffix(".0") for name, value in pairs)
 
 
 def pairs(rows: pd.DataFrame) -> pd.DataFrame:
@@ -198,7 +200,7 @@ def shown(table: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
     change = "change"
     if against != REFERENCE and len(table) > 1:
         change = f"against {against}"
-    for row in table.to_dict("records"):
+    for row, many in zip(table.to_dict("records"), _many_teleports(table), strict=True):
         half = row[f"half_interval_{TTS}"]
         spread = "" if math.isnan(half) else f" ± {half:.1e}"
         times = [_seconds(row[f"{kind}_trip_time_s"]) for kind in ("mean", "median", "p95")]
@@ -212,7 +214,7 @@ def shown(table: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
             "removed [veh]": _marked(f"{row['removed_veh']:,.0f}", row["removed_veh"] > 0),
             "backlog [veh]": f"{row['final_backlog_veh']:,.0f}",
             "backlog [veh s]": f"{row['total_backlog_veh_s']:.2e}",
-            "teleports": _marked(f"{row['teleports']:.0f}", row["many_teleports"] != ""),
+            "teleports": _marked(f"{row['teleports']:.0f}", many),
             "trip [s]": " / ".join(times),
             "finished [s]": _seconds(row["mean_finished_trip_time_s"]),
             "departure delay [s]": _seconds(row["mean_departure_delay_s"]),
@@ -341,9 +343,10 @@ def longer_trips(level: Level, name: str, against: str) -> PerRegion:
 def by_region(
     level: Level, city: City, region_names: Sequence[str], names: Sequence[str]
 ) -> pd.DataFrame | None:
-    """Return a row of text per region and one of all; None without a common seed.
+    """Return a row of text per region and one of all.
 
-    Numbers are means over the common seeds, but the longest queue is that of all of them.
+    It is None without a common seed. Numbers are means over the common seeds, but the longest queue
+    is that of all of them.
 
     names: controllers, the reference first
     """
@@ -372,6 +375,6 @@ def by_region(
 
 
 def _numbers(run: Result, region: np.ndarray, regions: int) -> np.ndarray:
-    """Return trip times by origin (s) and CO2 (kg), (2, R + 1), the last of all regions."""
+    """Return trip times by origin (s) and CO2 (kg) of a run, (2, R + 1)."""
     co2 = np.bincount(region, run.co2, regions)
     return np.array([[*run.trip_time_by_origin, run.mean_trip_time_s], [*co2, co2.sum()]])

@@ -113,7 +113,7 @@ class Tuning:
         return replace(self.scenario, controller_options=tables)
 
     def value(self, key: str) -> Any:
-        """Return an option of the scenario, or its default; None if there is neither."""
+        """Return an option of the scenario, or its default, or else None."""
         tables = self.scenario.controller_options
         kind = self.strategy.controller
         own = {**tables.get(kind.name, {}), **tables.get(self.strategy.table(self.scenario), {})}
@@ -199,7 +199,10 @@ def _running(study: optuna.Study) -> list[FrozenTrial]:
 
 
 def _ask(order: Tuning, study: optuna.Study) -> None:
-    """Ask for the next generation: one candidate first, as many as are left at most."""
+    """Ask for the next generation, of as many candidates as are left at most.
+
+    The first one is a single candidate.
+    """
     states = [trial.state for trial in study.get_trials(deepcopy=False)]
     left = order.trials - len(states) + states.count(TrialState.WAITING)
     generation = 1
@@ -249,7 +252,10 @@ def _study(order: Tuning) -> optuna.Study:
 
 
 def _sampler(order: Tuning, number: int) -> CmaEsSampler:
-    """Return a new sampler for one candidate, so that a resumed generation is the same."""
+    """Return the sampler of one candidate.
+
+    Each has a new one, so that a resumed generation is the same.
+    """
     with warnings.catch_warnings():
         # x0 and sigma0 go in Optuna 6, without a successor yet.
         warnings.simplefilter("ignore", FutureWarning)
@@ -264,7 +270,10 @@ def _sampler(order: Tuning, number: int) -> CmaEsSampler:
 def _runs(
     order: Tuning, trials: Sequence[FrozenTrial], city: Mapping[str, object], workers: int
 ) -> list[Run]:
-    """Return the runs of some candidates; first train them if their options train a policy."""
+    """Return the runs of some candidates.
+
+    Train those without a policy first, if the controller is a trained one.
+    """
     scenarios = {trial.number: order.tuned(trial.params) for trial in trials}
     trains = order.strategy.controller.options is training.Training
     if trains:
@@ -315,7 +324,10 @@ def _train(order: Tuning, number: int, scenario: Scenario) -> str:
 
 
 def _totals(order: Tuning, rows: pd.DataFrame, number: int) -> dict[str, float]:
-    """Return column of tune.csv -> total time spent of a run (veh s), NaN if it failed."""
+    """Return column of tune.csv -> total time spent of a run (veh s).
+
+    It is NaN if the run failed.
+    """
     spent = {}
     for row in finished_rows(rows).to_dict("records"):
         spent[row["folder"], row["seed"]] = row[TTS]
@@ -328,7 +340,10 @@ def _totals(order: Tuning, rows: pd.DataFrame, number: int) -> dict[str, float]:
 
 
 def _write(order: Tuning, study: optuna.Study) -> pd.DataFrame:
-    """Write tune.csv and, if any candidate has a score, tune.toml; return the table."""
+    """Write tune.csv and, if there is a best candidate, tune.toml.
+
+    Return the table.
+    """
     runs = pd.read_csv(order.out / "runs" / TABLE)
     rows = []
     for trial in study.get_trials(deepcopy=False):

@@ -1,4 +1,4 @@
-"""A city before anything runs: its regions and gateways as tables and on a map."""
+"""A city before anything runs: regions and gateways in tables and a map."""
 
 from collections.abc import Sequence
 from functools import cached_property

@@ -80,7 +80,7 @@ def draw_level(out: Path, finished: Finished, level: Level) -> None:
 
 
 def draw_levels(out: Path, rows: pd.DataFrame) -> None:
-    """Draw trips served (the frontier) and time spent over several demand levels.
+    """Draw trips served (the frontier) and time spent over demand levels.
 
     out: folder of the files
     """

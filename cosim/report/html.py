@@ -1,4 +1,7 @@
-"""The report: one self-contained HTML page about finished runs of one or several folders."""
+"""The report: one self-contained HTML page about finished runs.
+
+The runs may lie in several folders.
+"""
 
 import base64
 import json
@@ -131,15 +134,18 @@ def _run(run: Finished) -> dict:
 
 
 def card(rows: pd.DataFrame) -> tuple[str, list[Figure], str]:
-    """Return the card of one demand level: a sentence, its figures, and the best strategy.
+    """Return the card of one demand level: a sentence, figures, and a name.
 
-    The strategy is compared with the reference on the seeds that both have. Figures that were not
-    recorded are left out.
+    The name is that of the best strategy. It is compared with the reference on the seeds that both
+    have. Figures that were not recorded are left out.
     """
     against, *others = figures.pair(rows)
     name = others[0] if others else against
     level = rows["demand"].iloc[0]
     heading = name
+    than = f"under {against}"
+    if against == REFERENCE:
+        than = "without control"
     shown = []
     for column, (label, unit, form, good, meaning) in QUANTITIES.items():
         now = statistics.by_seed(rows, level, name, column)
@@ -152,7 +158,6 @@ def card(rows: pd.DataFrame) -> tuple[str, list[Figure], str]:
         figure = Figure(label, form.format(value), meaning)
         if name != against and not math.isnan(pair.percent):
             reference = mean(before[seed] for seed in common) / unit
-            than = "without control" if against == REFERENCE else f"under {against}"
             change, verdict, better = _judged(pair, good)
             figure = figure._replace(
                 before=f"{form.format(reference)} {than}",
@@ -209,7 +214,10 @@ def _level(run: Finished, level: Level) -> dict:
 
 
 def _pictures(draw: Callable[[Path], None], captions: dict[str, str]) -> list[tuple[str, str]]:
-    """Return data URI and caption of the pictures that a function writes into a folder."""
+    """Return data URI and caption of pictures.
+
+    draw: writes them into a folder
+    """
     pictures = []
     with files.temporary_folder() as folder:
         draw(folder)

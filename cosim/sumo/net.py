@@ -1,4 +1,4 @@
-"""A SUMO network cut into regions: edge -> region, and the gateways between regions."""
+"""A SUMO network cut into regions, and the gateways between them."""
 
 import csv
 import math
@@ -254,7 +254,11 @@ def _derived(
         time = net.internal[_stem(link.via)].time if link.via else 0.0
         turn_time[link.source, link.target] = time
     over = _turns_over_junctions(links, net.connections)
-    inside = {edge: net.internal[edge].length for edge in sorted(set().union(*over.values()))}
+    inside = {}
+    for edge in sorted(set().union(*over.values())):
+        length = net.internal[edge].length
+        if length > 0.0:
+            inside[edge] = length
     lanes = {edge: net.lanes_of[edge] for edge in edges}
     return City(
         net_file=net_file,
@@ -270,7 +274,7 @@ def _derived(
         gateways=_gateways(links, region_of),
         signals={link.source: link.signal for link in links if link.signal},
         over=over,
-        inside={edge: length for edge, length in inside.items() if length > 0.0},
+        inside=inside,
     )
 
 
@@ -398,7 +402,10 @@ def for_cars(lane: ElementTree.Element) -> bool:
 
 
 def read_regions(path: Path, regions: int = 10**6) -> dict[str, int]:
-    """Return edge -> region, less than `regions`, of a csv file edge,region. Raises InputError."""
+    """Return edge -> region of a csv file with the columns edge,region.
+
+    Raises: InputError, also for a region that is not less than `regions`
+    """
     check_file(path, "give a table with the columns edge,region")
     try:
         with path.open(encoding="utf-8-sig", newline="") as stream:
@@ -430,7 +437,9 @@ def read_regions(path: Path, regions: int = 10**6) -> dict[str, int]:
 
 def _links_for_cars(net: _Net) -> list[_Connection]:
     """Return the connections from a lane for cars to a lane for cars."""
-    cars = {lane.id for lanes in net.lanes_of.values() for lane in lanes}
+    cars: set[str] = set()
+    for lanes in net.lanes_of.values():
+        cars.update(lane.id for lane in lanes)
     links = []
     for connection in net.connections:
         source_lane = f"{connection.source}_{connection.lane}"
@@ -521,7 +530,7 @@ def gateway_movements(city: City) -> dict[str, dict[int, int]]:
 def gateway_room_taken(
     edge_vehicles: Float[np.ndarray, "*intervals E"], city: City
 ) -> Float[np.ndarray, "*intervals G"]:
-    """Return the share of the room before each gateway that is taken, (..., G).
+    """Return the taken share of the room before each gateway, (..., G).
 
     edge_vehicles: vehicles on each edge (veh, (..., E))
     """

@@ -1,4 +1,4 @@
-"""SUMO's output files: tripinfo, read while SUMO writes it, and emissions by edge."""
+"""SUMO's output files: tripinfo while SUMO writes it, emissions by edge."""
 
 import math
 import xml.etree.ElementTree as ElementTree
@@ -68,7 +68,7 @@ class TripReader:
         return self._read(gone.__contains__, last=True)
 
     def _read(self, left: Callable[[str], bool], last: bool = False) -> list[End]:
-        """Return the trips that ended in what SUMO has written since the last call.
+        """Return the ends in what SUMO has written since the last call.
 
         left: says of a vehicle without an arrival that it has left, as after a teleport to its end
         last: the file must be whole
@@ -92,7 +92,7 @@ class TripReader:
         return ends
 
     def _trip(self, element: Element, left: Callable[[str], bool]) -> End | None:
-        """Count a <tripinfo>, and return its end; None if the vehicle is under way."""
+        """Count a <tripinfo>; return its end, None if it is under way."""
         vehicle = element.get("id", "")
         reason = element.get("vaporized", "")
         depart = float(attribute(element, "depart"))
@@ -137,7 +137,7 @@ def write_emission_data(path: Path, target: Path) -> None:
 
 
 def edge_emissions(path: Path) -> dict[str, tuple[float, float]]:
-    """Return edge, normal or on a junction -> CO2 and fuel of all vehicles (kg).
+    """Return CO2 and fuel of all vehicles (kg) by edge, also on junctions.
 
     path: file of `write_emission_data`, complete at the end of the simulation
     Raises: RunFailed for a file that is not whole

@@ -181,9 +181,10 @@ class Session:
         self.restart_programme = light.setProgram
 
     def close(self) -> None:
-        """End the simulation, which completes SUMO's own outputs; a second call does nothing.
+        """End the simulation, which completes SUMO's own outputs.
 
-        libsumo cannot close a window, which stays until this process ends.
+        A second call does nothing. libsumo cannot close a window, which stays until this process
+        ends.
         """
         if Session._open:
             Session._open = False
@@ -204,10 +205,11 @@ class Session:
         self.time = libsumo.simulation.getTime()
 
     def speeds(self, edge: str) -> tuple[float, float]:
-        """Return two mean speeds of an edge (m/s): of its vehicles, and of SUMO's routing.
+        """Return the mean speed of vehicles on an edge, and SUMO's own (m/s).
 
-        Both are the limit if the edge is empty. In the second one, an empty lane counts as one
-        vehicle at the limit, so that a queue for one turn does not deter drivers with another lane.
+        Both are the limit if the edge is empty. In SUMO's own, which is for routing, an empty lane
+        counts as one vehicle at the limit. So a queue for one turn does not deter drivers with
+        another lane.
         """
         routing = libsumo.edge.getLastStepMeanSpeed(edge)
         lanes = self._lanes(edge)
@@ -239,12 +241,12 @@ class Session:
         return self.is_private(vehicle) and not libsumo.vehicle.getStops(vehicle, 1)
 
     def is_private(self, vehicle: str) -> bool:
-        """Return False for public transport, and classes that no controller commands."""
+        """Return False for vehicles that no controller commands."""
         kind = libsumo.vehicle.getVehicleClass(vehicle)
         return kind not in BOUND and not libsumo.vehicle.getLine(vehicle)
 
     def is_public(self, vehicle: str) -> bool:
-        """Return True for public transport: by its class, or a vehicle with a line."""
+        """Return True for public transport, by its class or because of a line."""
         kind = libsumo.vehicle.getVehicleClass(vehicle)
         return kind in PUBLIC or bool(libsumo.vehicle.getLine(vehicle))
 
@@ -300,7 +302,7 @@ class Session:
         return stage.travelTime, tuple(stage.edges)
 
     def set_route(self, vehicle: str, edges: list[str]) -> bool:
-        """Give a vehicle on edges[0] a new route; return False if it keeps the old one."""
+        """Give a vehicle on edges[0] a new route; return False if it is refused."""
         return _accepted(libsumo.vehicle.setRoute, vehicle, edges)
 
     def begin_trip(self, order: Mapping[str, str]) -> None:
@@ -331,7 +333,7 @@ class Session:
         )
 
     def state_underneath(self, signal: str, programme: str) -> str:
-        """Return the state that a programme would show now without the states that were set."""
+        """Return the state that a programme would show if none had been set."""
         logic = self._logic(signal, programme)
         return logic.phases[logic.currentPhaseIndex].state
 

@@ -1,4 +1,4 @@
-"""SUMO's XML files: reading them, gzipped or not, and naming several to SUMO."""
+"""SUMO's XML files: how they are read, and named to SUMO."""
 
 import gzip
 import io
@@ -25,7 +25,7 @@ def attribute(element: ElementTree.Element, name: str) -> str:
 
 
 def child(element: ElementTree.Element, tag: str) -> ElementTree.Element:
-    """Return the first element `tag` directly below. Raises ValueError without one."""
+    """Return the first element `tag` directly below. Raises ValueError."""
     below = element.find(tag)
     if below is None:
         raise ValueError(f"{element.tag}: {tag}: missing")
