@@ -119,7 +119,7 @@ def test_an_interrupt_in_a_generation_keeps_its_candidates(city, tmp_path, runs,
         return run_many(*arguments, **options)
 
     monkeypatch.setattr(tuning, "run_many", interrupted)
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(KeyboardInterrupt, match="parts; the same command goes on"):
         tune(order(city, tmp_path / "parts", trials=6))
     pd.testing.assert_frame_equal(whole, tune(order(city, tmp_path / "parts", trials=6)))
 
@@ -133,6 +133,18 @@ def test_a_candidate_whose_run_failed_has_no_score(city, tmp_path, runs):
     failing.update(range(len(runs[0]) + 1, len(runs[0]) + 3))
     with pytest.raises(RunFailed, match="SUMO fell over"):
         tune(order(city, tmp_path / "other", trials=1, levels=(1.0, 1.6)))
+
+
+def test_a_failed_first_candidate_has_no_number(city, tmp_path, runs):
+    _, failing = runs
+    failing.add(1)
+    for words in ("SUMO fell over", "no candidate has a score"):
+        with pytest.raises(RunFailed, match=words):
+            tune(order(city, tmp_path, trials=1))
+    tune(order(city, tmp_path, trials=2))
+    head = (tmp_path / "tune.toml").read_text().splitlines()[0]
+    assert head.startswith("# Best of 2 candidates: ")
+    assert head.endswith(" veh s; the first: failed")
 
 
 @pytest.mark.parametrize(

@@ -97,7 +97,7 @@ def plan(
 def report(out: Path, rows: pd.DataFrame) -> str:
     """Return evaluate.md for the finished runs."""
     names = list(dict.fromkeys(rows["scenario"]))
-    parts = [] if len(names) == 1 else [ranking(rows)]
+    parts = [] if len(names) == 1 else [statistics.ranking(rows)]
     for name in names:
         finished = results.read(out, name)
         parts += [f"# {name}"] if len(names) > 1 else []
