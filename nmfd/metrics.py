@@ -78,7 +78,7 @@ def notes(result: Result) -> str:
     """Return the three most frequent notes of decisions that were not OK, such as "2 x solver
     failed: ..."."""
     counted = Counter(
-        note for note, status in zip(result.note, result.status, strict=True) if status
+        note for note, status in zip(result["note"], result["status"], strict=True) if status
     )
     return "; ".join(f"{count} x {note}" for note, count in counted.most_common(3))
 
@@ -92,24 +92,24 @@ def summary(result: Result) -> dict[str, float | int | str]:
     facts = {name: value for name, value in result.data.attrs.items() if name not in NO_COLUMNS}
     if "accumulation" not in result:
         return facts
-    total = result.accumulation.sum(axis=(1, 2))
-    decision_ms = 1e3 * result.decision_time
+    total = result["accumulation"].sum(axis=(1, 2))
+    decision_ms = 1e3 * result["decision_time"]
     return {
         **{name: facts.pop(name) for name in ("controller", "seed", "plant")},
         "total_time_spent_veh_s": total_time_spent(result),
         "final_accumulation_veh": float(total[-1]),  # inside at the end
         "max_accumulation_veh": float(total.max()),  # inside at the end of an interval, the most
         "completed_veh": float(
-            facts.pop("completed_veh", result.completed[-1])
+            facts.pop("completed_veh", result["completed"][-1])
         ),  # trips that reached their end
         "evaluation_time_s": float(
-            result.decision_time.sum()
+            result["decision_time"].sum()
         ),  # processor time of all decisions, of all threads
         "control_step_ms_first": float(decision_ms[0]),
         "control_step_ms_median": float(np.median(decision_ms)),
         "control_step_ms_max": float(decision_ms.max()),
         **{
-            name: int(((result.status & kind.value) != 0).sum())
+            name: int(((result["status"] & kind.value) != 0).sum())
             for name, kind in zip(COUNTED, KINDS, strict=True)
         },
         "wall_time_s": float(result.wall_time),

@@ -42,7 +42,7 @@ class Load(NamedTuple):
 
 def load(network: RegionalModel, runs: Sequence[Result]) -> Load:
     """Return the load of the regions."""
-    states = [run.accumulation.sum(axis=2) / network.seen_critical for run in runs]
+    states = [run["accumulation"].sum(axis=2) / network.seen_critical for run in runs]
     return Load(
         peak=np.mean([state.max(axis=0) for state in states], axis=0),
         beyond=np.mean([(state > 1).mean(axis=0) for state in states], axis=0),
@@ -132,16 +132,16 @@ def _reasons(
     runs = level.results(name)
     reference = level.results(against)
     strategy = of_finished(name)
-    trips = max(sum(run.departures.sum() for run in runs), 1)
+    trips = max(sum(run["departures"].sum() for run in runs), 1)
     acts = strategy.controller.name != ALONE
 
     limit = network.u_max - OPEN_SHARE * (network.u_max - network.u_min)
-    held = float(np.mean([(run.perimeter[:, network.adjacency] < limit).mean() for run in runs]))
+    held = float(np.mean([(run["perimeter"][:, network.adjacency] < limit).mean() for run in runs]))
     holds = held >= SMALL_SHARE
-    guided = sum(run.guided.sum() for run in runs) / trips
+    guided = sum(run["guided"].sum() for run in runs) / trips
     waited = 0.0
     if strategy.city.metering or level.key["sumo"].get("metering"):
-        waited = sum(run.backlog[1:].sum() * run.step for run in runs) / trips
+        waited = sum(run["backlog"][1:].sum() * run.step for run in runs) / trips
     deeds = []
     if holds:
         deeds.append(f"it holds vehicles back in {held:.0%} of its commands")
@@ -193,8 +193,8 @@ def _limits(
     if acts and not len(critical):
         limits.append("no region is seen to be critical, so there is nothing to protect")
     if holds and len(critical):
-        started = sum(run.departures.sum(axis=(0, 2)) for run in reference)
-        entered = sum(run.crossings.sum(axis=(0, 1, 3)) for run in reference)
+        started = sum(run["departures"].sum(axis=(0, 2)) for run in reference)
+        entered = sum(run["crossings"].sum(axis=(0, 1, 3)) for run in reference)
         if (started > entered)[critical].all():
             limits.append("most vehicles in the critical regions start there, behind the gateways")
     full = own["gateway_full_share"]
@@ -240,7 +240,7 @@ def _never_reached(strategy: Strategy, scenario: Scenario, runs: Sequence[Result
     gate = strategy.make(scenario)
     if not isinstance(gate, PiGate):
         return []
-    most = largest_accumulation(run.accumulation for run in runs)
+    most = largest_accumulation(run["accumulation"] for run in runs)
     gates = []
     for region, goal in zip(gate.regions, gate.set_point, strict=True):
         if most[region] < goal:

@@ -314,7 +314,7 @@ def identified(task: Task) -> Identified:
     samples = outflow_samples(static, runs)
     model = task.fit(static, runs, samples)
 
-    states = [run.accumulation for run in runs]
+    states = [run["accumulation"] for run in runs]
     city = city_of(static)
     lane_km = np.bincount(city.edge_region, city.lane_metres, city.regions) / 1000.0
     fastest = scenario.substeps / scenario.step
@@ -424,9 +424,9 @@ def run_verdict(
     return authority.verdict(
         network,
         boundaries,
-        most=largest_accumulation(result.accumulation for result in results),
+        most=largest_accumulation(result["accumulation"] for result in results),
         started=started.astype(float),
-        waiting=max(float(result.backlog.sum(axis=(1, 2)).max()) for result in results),
+        waiting=max(float(result["backlog"].sum(axis=(1, 2)).max()) for result in results),
         slowness=slowness,
         where=f"in {len(results)} loading run{plural} under {results[0].controller}",
         scenario=os.path.relpath(scenario.folder) if scenario.folder else scenario.name,

@@ -43,10 +43,10 @@ def observed(result: Result) -> Observed:
     Its demand is the departures.
     """
     return Observed(
-        accumulation=result.accumulation,
+        accumulation=result["accumulation"],
         demand=result["departures"] / result.step,
-        perimeter=result.perimeter,
-        splits=result.splits,
+        perimeter=result["perimeter"],
+        splits=result["splits"],
         crossings=result["crossings"].sum(axis=3),
     )
 
@@ -57,13 +57,13 @@ def predict(scenario: Scenario, result: Result) -> Result:
     It gets the recorded departures and controls.
     """
     known = parameters(scenario.network)
-    states = [torch.from_numpy(result.accumulation[0])]
-    given = (result["departures"] / scenario.step, result.perimeter, result.splits)
+    states = [torch.from_numpy(result["accumulation"][0])]
+    given = (result["departures"] / scenario.step, result["perimeter"], result["splits"])
     for interval in zip(*map(torch.from_numpy, given), strict=True):
         states.append(advance(known, states[-1], *interval, **scenario.scheme))
     return result.assign(
         accumulation=torch.stack(states).numpy(),
-        backlog=np.zeros_like(result.backlog),
+        backlog=np.zeros_like(result["backlog"]),
         plant="nmfd",
     )
 
@@ -89,7 +89,8 @@ def compare(found: Finished) -> pd.DataFrame:
             errors.insert(1, "controller", controller)
             tables.append(errors)
             drawn = [
-                run.assign(backlog=np.zeros_like(run.backlog)) for run in (results[0], predicted[0])
+                run.assign(backlog=np.zeros_like(run["backlog"]))
+                for run in (results[0], predicted[0])
             ]
             prefix = f"compare-{files.run_name(controller, results[0].seed)}-"
             draw_accumulations(level.folder, scenario, drawn, prefix=prefix)
@@ -101,8 +102,8 @@ def _errors(
 ) -> pd.DataFrame:
     """Return the errors in the runs of one strategy, a row per region."""
     network = scenario.network
-    states = np.concatenate([run.accumulation.sum(axis=2) for run in results])
-    off = np.concatenate([run.accumulation.sum(axis=2) for run in predicted]) - states
+    states = np.concatenate([run["accumulation"].sum(axis=2) for run in results])
+    off = np.concatenate([run["accumulation"].sum(axis=2) for run in predicted]) - states
     base = network.critical.copy()
     for region, largest in network.critical_above.items():
         base[region] = largest or np.nan  # no vehicle was ever there
@@ -158,13 +159,13 @@ def outflow_samples(network: RegionalModel, results: Sequence[Result]) -> list[d
         {"loading": [], "unloading": [], SPILLBACK: []} for _ in range(network.regions)
     ]
     for result in results:
-        x = 0.5 * (result.accumulation[1:] + result.accumulation[:-1])
+        x = 0.5 * (result["accumulation"][1:] + result["accumulation"][:-1])
         total = x.sum(axis=2)
         own = np.diagonal(x, axis1=1, axis2=2)
         outflow = regional_outflow(result, result.step)
-        weight = own + np.minimum(result.perimeter.max(axis=2), network.u_max) * (total - own)
+        weight = own + np.minimum(result["perimeter"].max(axis=2), network.u_max) * (total - own)
         points = np.stack([total, outflow * total / np.maximum(weight, 1e-9)], axis=2)
-        rising = np.diff(result.accumulation.sum(axis=2), axis=0) >= 0
+        rising = np.diff(result["accumulation"].sum(axis=2), axis=0) >= 0
         seen = total >= FEWEST_VEHICLES
         blocked = held_up(total, outflow, network.adjacency)
         masks = {

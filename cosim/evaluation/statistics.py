@@ -335,8 +335,8 @@ def longer_trips(level: Level, name: str, against: str) -> PerRegion:
     runs, reference = common_runs(level, (name, against))
     if not runs:
         return np.zeros(0)
-    own = np.mean([run.trip_time_by_origin for run in runs], axis=0)
-    before = np.mean([run.trip_time_by_origin for run in reference], axis=0)
+    own = np.mean([run["trip_time_by_origin"] for run in runs], axis=0)
+    before = np.mean([run["trip_time_by_origin"] for run in reference], axis=0)
     return 100.0 * (own / before - 1.0)
 
 
@@ -366,7 +366,7 @@ def by_region(
     inside = [np.flatnonzero(region == r) for r in range(regions)]
     inside.append(np.arange(len(region)))
     for name, of in zip(names, runs, strict=True):
-        queue = np.max([run.queue_max for run in of], axis=0)
+        queue = np.max([run["queue_max"] for run in of], axis=0)
         longest = [edges[np.argmax(queue[edges])] for edges in inside]
         columns["longest queue [veh], on street", name] = [
             f"{queue[edge]}, {city.edges[edge]}" for edge in longest
@@ -376,5 +376,5 @@ def by_region(
 
 def _numbers(run: Result, region: np.ndarray, regions: int) -> np.ndarray:
     """Return trip times by origin (s) and CO2 (kg) of a run, (2, R + 1)."""
-    co2 = np.bincount(region, run.co2, regions)
-    return np.array([[*run.trip_time_by_origin, run.mean_trip_time_s], [*co2, co2.sum()]])
+    co2 = np.bincount(region, run["co2"], regions)
+    return np.array([[*run["trip_time_by_origin"], run.mean_trip_time_s], [*co2, co2.sum()]])

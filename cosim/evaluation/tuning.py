@@ -36,10 +36,12 @@ from cosim.evaluation.runs import city_key, runs_of
 from cosim.evaluation.statistics import TTS
 from cosim.plant.strategy import Strategy
 from nmfd.controllers import training
+from nmfd.controllers.dpc.options import Dpc
 from nmfd.controllers.strategy import check_tables
 from nmfd.errors import InputError, RunFailed
 from nmfd.model.scenario import Scenario
 from nmfd.runs import files
+from nmfd.runs.pool import in_processes
 from nmfd.runs.progress import Progress
 from nmfd.runs.run_many import TABLE, Run, locked, raise_failures, run_many
 

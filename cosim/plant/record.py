@@ -36,9 +36,12 @@ def settled(result: Result) -> Result:
     def since_start(counts: np.ndarray) -> np.ndarray:
         return np.concatenate([np.zeros_like(counts[:1]), counts]).cumsum(axis=0).astype(float)
 
-    moved, redirected = (result.crossings + result.jumps).sum(axis=0), result.redirected.sum(axis=0)
-    inside = (result.departures - result.removals).sum(axis=0) - np.diag(
-        result.arrivals.sum(axis=0)
+    moved, redirected = (
+        (result["crossings"] + result["jumps"]).sum(axis=0),
+        result["redirected"].sum(axis=0),
+    )
+    inside = (result["departures"] - result["removals"]).sum(axis=0) - np.diag(
+        result["arrivals"].sum(axis=0)
     )
     inside = (
         inside
@@ -48,9 +51,9 @@ def settled(result: Result) -> Result:
         - redirected.sum(axis=2)
     )
     return result.assign(
-        accumulation=np.concatenate([result.accumulation[:-1], inside[None].astype(float)]),
-        completed=since_start(result.arrivals.sum(axis=1)),
-        removed=since_start(result.removals + result.given_up),
+        accumulation=np.concatenate([result["accumulation"][:-1], inside[None].astype(float)]),
+        completed=since_start(result["arrivals"].sum(axis=1)),
+        removed=since_start(result["removals"] + result["given_up"]),
     )
 
 

@@ -212,11 +212,13 @@ def frames(picture: CityPicture, result: Any) -> list[Frame]:
     }
     states = [
         State(step=k, time=k * picture.step, **{name: values[k] for name, values in parts.items()})
-        for k in range(len(result.accumulation))
+        for k in range(len(result["accumulation"]))
     ]
-    made = [first(picture, result.gateway_green.shape[1], states[0])]
+    made = [first(picture, result["gateway_green"].shape[1], states[0])]
     for k, state in enumerate(states[1:]):
-        controls = Controls(perimeter=result.perimeter[k], splits=None, note=str(result.note[k]))
+        controls = Controls(
+            perimeter=result["perimeter"][k], splits=None, note=str(result["note"][k])
+        )
         row = {name: getattr(result, name)[k] for name in ROW}
         made.append(after(picture, made[-1], controls, state, row))
     return made
@@ -229,8 +231,8 @@ def totals(picture: CityPicture, results: Sequence[Any]) -> dict[str, list[PerEd
         return {}
     kilometres = picture.lane_km / picture.lanes
     return {
-        "CO2 [kg/km]": [result.co2 / kilometres for result in results],
-        "longest queue [veh]": [result.queue_max.astype(float) for result in results],
+        "CO2 [kg/km]": [result["co2"] / kilometres for result in results],
+        "longest queue [veh]": [result["queue_max"].astype(float) for result in results],
     }
 
 

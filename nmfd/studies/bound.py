@@ -79,7 +79,7 @@ def compute(
         if progress:
             progress(0, steps, f"closed loop {start}")
         result = closed_loop.run(NmfdPlant(scenario), parse(start).make(scenario), scenario, seed=0)
-        begin[start] = result.perimeter, result.splits
+        begin[start] = result["perimeter"], result["splits"]
     plan = solve(scenario, begin, guidance=guidance, iterations=iterations, progress=progress)
     return replace(plan, lower=lower)
 

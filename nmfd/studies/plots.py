@@ -109,7 +109,7 @@ def total_accumulation(ax: Axes, trajectories: Sequence[Result], seed: int | Non
     _curves(
         ax,
         trajectories,
-        lambda t: t.accumulation.sum(axis=(1, 2)) + t.backlog.sum(axis=(1, 2)),
+        lambda t: t["accumulation"].sum(axis=(1, 2)) + t["backlog"].sum(axis=(1, 2)),
         seed,
     )
     ax.set(ylabel="vehicles in the network [veh]", ylim=(0.0, None))
@@ -130,8 +130,10 @@ def region_accumulation(
     critical = network.seen_critical[region]
     style = dict(color="0.35", linewidth=1.0, linestyle=":", zorder=1)
     ax.hlines(critical, 0.0, 1.0, transform=ax.get_yaxis_transform(), label=CRITICAL, **style)
-    _curves(ax, trajectories, lambda t: t.accumulation[:, region].sum(axis=1), seed)
-    highest = max((t.accumulation[:, region].sum(axis=1).max() for t in trajectories), default=0.0)
+    _curves(ax, trajectories, lambda t: t["accumulation"][:, region].sum(axis=1), seed)
+    highest = max(
+        (t["accumulation"][:, region].sum(axis=1).max() for t in trajectories), default=0.0
+    )
     ax.set(ylabel="accumulation [veh]", ylim=(0.0, 1.06 * np.nanmax([highest, 1.25 * critical])))
     ax.set_title(network.titles[region], fontsize="medium")
     return ax

@@ -85,7 +85,7 @@ def learn(
         city, total = replace(scenario, network=planning.network), rounds * (samples + steps)
 
         def driven(driver: Controller) -> StatesOverTime:
-            return closed_loop.run(NmfdPlant(city), driver, city, seed=seed).accumulation[:-1]
+            return closed_loop.run(NmfdPlant(city), driver, city, seed=seed)["accumulation"][:-1]
 
         both = [driven(DpcController(after)), driven(EconomicMpc(planning, guidance=guidance))]
         for number in range(rounds):
