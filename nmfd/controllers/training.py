@@ -73,7 +73,10 @@ def settings(scenario: Scenario, strategy: Strategy, steps: int | None = None) -
 
 
 def check(scenario: Scenario, strategy: Strategy) -> None:
-    """Raise InputError without gateways, or for placeholder MFDs of the model to train on."""
+    """Check that a training is worth its time.
+
+    Raises: InputError without gateways, or for placeholder MFDs of the model to train on
+    """
     city = scenario.network
     believed = strategy.planning(scenario).network
     still = "nmfd.train(..., anyway=True) trains all the same"
@@ -110,7 +113,7 @@ def available(device: str) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """Cost, sample and constraints of the user's own, as nmfd.train takes them.
+    """Cost, sample and constraints of the user's own; see nmfd.train.
 
     By default the cost is the total time spent.
     """
@@ -155,9 +158,9 @@ def train(
     anyway: bool = False,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> Any:
-    """Train the policy of `strategy` and write the best in validation to `out`.
+    """Train the policy of a strategy.
 
-    The same seed gives the same weights.
+    The best in validation is written to `out`. The same seed gives the same weights.
 
     module: trained in place instead of the policy and returned with its best weights; no file is
         written
@@ -209,13 +212,18 @@ def train(
             f"nmfd: no policy gained {WORTH:.0%} on the model: its gates stay open", file=sys.stderr
         )
     if not math.isfinite(run.best):
-        problem = f"every validation of {setup.steps} steps diverged"
-        raise RunFailed(f"{strategy.name}: {problem}; lower the learning rate")
+        raise RunFailed(
+            f"{strategy.name}: every validation of {setup.steps} steps diverged; "
+            "lower the learning rate"
+        )
     return keeper.finish()
 
 
 def _check_module(module: nn.Module, scenario: Scenario) -> None:
-    """Raise InputError for a module without weights or with wrong controls of an empty city."""
+    """Check a module on an empty city.
+
+    Raises: InputError without weights, or for wrong controls
+    """
     is_module = isinstance(module, nn.Module)
     if not is_module or not any(weights.requires_grad for weights in module.parameters()):
         raise InputError(
@@ -227,7 +235,7 @@ def _check_module(module: nn.Module, scenario: Scenario) -> None:
 
 
 class TrainingRun:
-    """Gradient descent of one policy, with validations and a state to resume from.
+    """Gradient descent of one policy, with validations and a state.
 
     done: steps taken
     best: lowest validation, total time spent (veh s) or cost of the task; infinite before the first
@@ -277,17 +285,14 @@ class TrainingRun:
         if self._setup.from_gating:
             begin_as_gate(self._policy, self._rollout, self._generator)
         if self._setup.from_no_control and not self._task.own:
-            self._keep_open_gates()
-
-    def _keep_open_gates(self) -> None:
-        """Keep a policy that is always open until one gains WORTH."""
-        first = copy.deepcopy(self._policy.state_dict())
-        network = self._rollout.planning.network
-        begin_as_no_control(self._policy, network, weight=0.0, logit=OPEN_LOGIT)
-        self.validate()
-        self.best *= 1.0 - WORTH
-        self.bar = self.best
-        self._policy.load_state_dict(first)
+            # Keep a policy that is always open until one gains WORTH.
+            first = copy.deepcopy(self._policy.state_dict())
+            network = self._rollout.planning.network
+            begin_as_no_control(self._policy, network, weight=0.0, logit=OPEN_LOGIT)
+            self.validate()
+            self.best *= 1.0 - WORTH
+            self.bar = self.best
+            self._policy.load_state_dict(first)
 
     def step(self) -> None:
         """Take one step of Adam."""
@@ -297,8 +302,10 @@ class TrainingRun:
             group["lr"] = self._recipe.learning_rate or falling
         loss = self._loss(self._generator, self._recipe.batch, self._advance)
         if not loss.requires_grad:
-            problem = "has no gradient by the weights of the policy"
-            raise InputError(f"cost: {problem}; compute it from the run with torch")
+            raise InputError(
+                "cost: has no gradient by the weights of the policy; "
+                "compute it from the run with torch"
+            )
         self._optimizer.zero_grad()
         loss.backward()
         self._clear_gradients()
@@ -409,10 +416,10 @@ class TrainingRun:
 
 
 def validate(policy: Policy, rollout: Rollout, seed: int, setup: Training) -> float:
-    """Return the TTS (veh s) of the scenario itself, a geometric mean over rollouts.
+    """Return the total time spent (veh s) of the scenario itself.
 
-    They are two draws of the noise. If training perturbs demand or model, there are
-    VALIDATION_ROLLOUTS more under increasing perturbations.
+    It is a geometric mean over two draws of the noise. If training perturbs demand or model, there
+    are VALIDATION_ROLLOUTS more under increasing perturbations.
     """
     generator = Generator().manual_seed(seed)
     low = setup.demand_low

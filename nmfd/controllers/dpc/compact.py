@@ -1,4 +1,4 @@
-"""Gates, prices and metering by a few readable numbers: compact DPC policies, and rules.
+"""Compact DPC policies and rules: control by a few readable numbers.
 
 A compact policy is trained through the regional model (dpc-pc, dpc-pcrg with `compact`). A rule,
 gating-rule or, with prices, pricing-rule, has numbers that were tuned in SUMO (`cosim tune`) or
@@ -60,7 +60,10 @@ from nmfd.tensors import PerPair, PerRegion
 
 
 class Numbers(NamedTuple):
-    """Parameters of a compact policy (-); the last three may be omitted in scenario.toml."""
+    """Parameters of a compact policy (-).
+
+    The last three may be omitted in scenario.toml.
+    """
 
     set_point: float = 1.0
     gain: float = 2.0
@@ -83,7 +86,11 @@ MEANING = (
 
 
 class CompactPolicy(Policy):
-    """Policy with `numbers` (11,) for the protected regions `architecture.compact`."""
+    """Policy with a few numbers for its protected regions.
+
+    numbers: a tensor of Numbers (11,)
+    held: True for a protected region (R,)
+    """
 
     def _build(self, network: RegionalModel) -> None:
         self.numbers = nn.Parameter(torch.tensor(Numbers(), dtype=DTYPE))
@@ -126,7 +133,7 @@ class CompactPolicy(Policy):
         return torch.stack([v.clamp(-0.5, 0.5), error], dim=-2)
 
     def prices(self, x: PerPair) -> PerRegion | None:
-        """Return the price of each region (-, (..., R)), None without guidance."""
+        """Return the price of each region (-, (..., R)), or None."""
         if not self.architecture.guidance:
             return None
         numbers = self._read()
@@ -136,7 +143,7 @@ class CompactPolicy(Policy):
         return torch.where(self.held, protected, elsewhere)
 
     def metering(self, x: PerPair) -> PerRegion | None:
-        """Return the largest departure rates (veh/s, (..., R)), None without metering."""
+        """Return the largest departure rates (veh/s, (..., R)), or None."""
         if not self.architecture.metering:
             return None
         numbers = self._read()

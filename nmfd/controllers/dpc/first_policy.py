@@ -1,4 +1,4 @@
-"""First policies of a training: as the settings say, like no control, or like a gate."""
+"""First policies of a training: random, like no control, like a gate."""
 
 import numpy as np
 import torch

@@ -1,4 +1,4 @@
-"""Keepers of a training: a policy file, or memory for a module of the user's own.
+"""Keepers of a training: a policy file, or the memory for a module.
 
 A keeper holds the best weights so far and returns them at the end.
 """
@@ -22,7 +22,7 @@ State = dict[str, Any]
 
 
 class FileKeeper:
-    """Policy file of a training, and its state in the file `out`.resume until it ends."""
+    """Policy file `out` of a training, with its state in `out`.resume."""
 
     def __init__(self, policy: Policy, network: RegionalModel, configuration: State, out: Path):
         self.policy = policy
@@ -93,7 +93,10 @@ Keeper = FileKeeper | ModuleKeeper
 
 
 def write(content: dict, path: Path) -> None:
-    """Write a checkpoint or the state of a training; the same content gives the same bytes."""
+    """Write a checkpoint or the state of a training.
+
+    The same content gives the same bytes.
+    """
     buffer = io.BytesIO()  # given a path, torch would write its name into the file
     torch.save(content, buffer)
     with atomic(path) as temporary:

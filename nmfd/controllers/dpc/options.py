@@ -59,7 +59,7 @@ PUBLISHED = Recipe(
 
 
 class Training(Options):
-    """Options of a DPC policy and of its training, `nmfd train SCENARIO --controller NAME`."""
+    """Options of a DPC policy and of its training (`nmfd train`)."""
 
     local: bool = setting(
         "one small network for every boundary, which fits other cities; perimeter control", False

@@ -1,7 +1,8 @@
-"""Differentiable predictive control (DPC): a neural policy from states to admissible controls.
+"""Differentiable predictive control (DPC): neural policies.
 
-As in Tumu et al.: an MLP backbone with one decoder for the perimeter (scaled sigmoid) and one for
-the split ratios (masked softmax). Every output satisfies the constraints by construction.
+A policy maps states to admissible controls. As in Tumu et al.: an MLP backbone with one decoder for
+the perimeter (scaled sigmoid) and one for the split ratios (masked softmax). Every output satisfies
+the constraints by construction.
 
 With `prices` the second decoder gives prices, from which the regional model derives the split
 ratios (nmfd.model.answer). With `metering` a third one limits departures:
@@ -37,6 +38,8 @@ PRICE_LOGIT = -3.0
 METERING_SLOPE = 6.0
 METERING_FROM = 1.25
 Memory = Float[torch.Tensor, "*#B N R"]  # N numbers per region
+PerBoundary = Float[torch.Tensor, "*#B R D"]  # of the D regions that outputs are for
+PerBoundaryTurn = Float[torch.Tensor, "*#B R D R"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +83,10 @@ class PerimeterLayer(nn.Module):
     """
 
     def __init__(self, network: RegionalModel, allowed: torch.Tensor | None = None):
-        """allowed: boundaries that the inputs (..., R, D) stand for (R, D); None: the adjacency"""
+        """Make the box.
+
+        allowed: boundaries that the inputs (..., R, D) stand for (R, D); None: the adjacency
+        """
         super().__init__()
         self.low = network.u_min
         self.high = network.u_max
@@ -88,7 +94,7 @@ class PerimeterLayer(nn.Module):
             allowed = network.adjacency
         self.register_buffer("allowed", torch.as_tensor(allowed, dtype=DTYPE), persistent=False)
 
-    def forward(self, numbers: Float[torch.Tensor, "*#B R D"]) -> Float[torch.Tensor, "*#B R D"]:
+    def forward(self, numbers: PerBoundary) -> PerBoundary:
         return (self.low + (self.high - self.low) * torch.sigmoid(numbers)) * self.allowed
 
 
@@ -99,7 +105,10 @@ class SplitsLayer(nn.Module):
     """
 
     def __init__(self, network: RegionalModel, mask: torch.Tensor | None = None):
-        """mask: turns that the inputs (..., R, D, R) stand for (R, D, R); None: all allowed ones"""
+        """Make the simplex.
+
+        mask: turns that the inputs (..., R, D, R) stand for (R, D, R); None: all allowed ones
+        """
         super().__init__()
         if mask is None:
             mask = network.split_mask
@@ -111,18 +120,21 @@ class SplitsLayer(nn.Module):
         self.register_buffer("mask", mask.to(DTYPE), persistent=False)
         self.register_buffer("bias", bias, persistent=False)
 
-    def forward(
-        self, numbers: Float[torch.Tensor, "*#B R D R"]
-    ) -> Float[torch.Tensor, "*#B R D R"]:
+    def forward(self, numbers: PerBoundaryTurn) -> PerBoundaryTurn:
         return torch.softmax(numbers + self.bias, dim=-2) * self.mask
 
 
 class SoftExponential(nn.Module):
-    """Activation with one trained number a, initially 0 (Godfrey and Gashler, 2015).
+    """Activation with one trained number a, initially 0.
 
-    -log(1 - a (x + a)) / a for a < 0, x for a = 0, (exp(a x) - 1) / a + a for a > 0. Near a = 0 it
-    is a series, so that a has a gradient. NeuroMANCER's has none at its default a = 0, and a
-    network of it stays linear.
+    After Godfrey and Gashler (2015):
+
+        -log(1 - a (x + a)) / a     for a < 0
+        x                           for a = 0
+        (exp(a x) - 1) / a + a      for a > 0
+
+    Near a = 0 it is a series, so that a has a gradient. NeuroMANCER's has none at its default
+    a = 0, and a network of it stays linear.
     """
 
     def __init__(self) -> None:
@@ -139,10 +151,11 @@ class SoftExponential(nn.Module):
 
 
 class Policy(nn.Module):
-    """Policy: states (veh, (..., R, R)) -> perimeter (-, (..., R, R)) and splits or None.
+    """Policy that maps states to perimeter, and splits or None.
 
-    The splits are (..., R, R, R). D is the number of regions that outputs are for: R, or with
-    `only_adjacent` the largest number of adjacent ones.
+    The states are (veh, (..., R, R)), perimeter (-, (..., R, R)) and splits (-, (..., R, R, R)). D
+    is the number of regions that outputs are for: R, or with `only_adjacent` the largest number of
+    adjacent ones.
 
     onward: region of every output, (R, D)
     scale: normalisation of the state, the critical accumulation of each region (veh, (R, 1))
@@ -161,9 +174,8 @@ class Policy(nn.Module):
             onward = np.tile(np.arange(regions), (regions, 1))
         here = np.arange(regions)[:, None]
         repeated = np.diff(onward, prepend=-1) == 0
-        self.box = PerimeterLayer(
-            network, torch.tensor(network.adjacency[here, onward] & ~repeated)
-        )
+        allowed = torch.tensor(network.adjacency[here, onward] & ~repeated)
+        self.box = PerimeterLayer(network, allowed)
         self.register_buffer("onward", torch.tensor(onward), persistent=False)
         self._build(network)
         if architecture.prices or (architecture.compact and architecture.guidance):
@@ -216,8 +228,8 @@ class Policy(nn.Module):
 
     def outputs(
         self, x: PerPair, memory: Memory | None = None
-    ) -> tuple[Float[torch.Tensor, "*#B R D"], Float[torch.Tensor, "*#B R D R"] | None]:
-        """Return perimeter (..., R, D) and splits (..., R, D, R) for the regions `onward`."""
+    ) -> tuple[PerBoundary, PerBoundaryTurn | None]:
+        """Return perimeter and splits for the regions `onward`."""
         hidden = self._hidden(x)
         shape = self.onward.shape
         perimeter = self.box(self.perimeter_decoder(hidden).reshape(*x.shape[:-2], *shape))
@@ -234,20 +246,20 @@ class Policy(nn.Module):
         return None
 
     def prices(self, x: PerPair) -> PerRegion | None:
-        """Return the price of each region (-, (..., R)), None for a policy without prices."""
+        """Return the price of each region (-, (..., R)), or None."""
         if not self.architecture.prices:
             return None
         return MOST_PRICE * torch.sigmoid(self.prices_decoder(self._hidden(x)) + PRICE_LOGIT)
 
     def metering(self, x: PerPair) -> PerRegion | None:
-        """Return the largest departure rates (veh/s, (..., R)), None for a policy without them."""
+        """Return the largest departure rates (veh/s, (..., R)), or None."""
         if not self.architecture.metering:
             return None
         room = METERING_SLOPE * (METERING_FROM - self._full(x))
         share = torch.sigmoid(self.metering_decoder(self._hidden(x)) + room)
         return self.scale.squeeze(-1) / FILL_TIME_S * share
 
-    def _hidden(self, x: PerPair) -> Float[torch.Tensor, "*#B H"]:
+    def _hidden(self, x: PerPair) -> Float[torch.Tensor, "... H"]:
         """Return the output of the backbone."""
         if self.architecture.local:
             return self.backbone(self._around(x))
@@ -258,10 +270,10 @@ class Policy(nn.Module):
         return x.to(self.scale.dtype).sum(-1) / self.scale.squeeze(-1)
 
     def _around(self, x: PerPair) -> Float[torch.Tensor, "*#B R D F"]:
-        """Return the features of every boundary: those of region i, then those of region h.
+        """Return the features of every boundary.
 
-        They are its accumulation, the mean one of its neighbours, and its trips that end there,
-        all relative to the critical accumulation.
+        They are those of region i, then those of region h: its accumulation, the mean one of its
+        neighbours, and its trips that end there, relative to the critical accumulation.
         """
         critical = self.scale.squeeze(-1)
         full = x.sum(-1).to(critical.dtype) / critical
@@ -293,7 +305,10 @@ def _decoder(architecture: Architecture, outputs: int) -> nn.Module:
 
 
 def _adjacent(adjacency: Adjacency) -> Int[np.ndarray, "R D"]:
-    """Return the regions adjacent to each, (R, D); shorter rows repeat their last one."""
+    """Return the regions adjacent to each (R, D).
+
+    Shorter rows repeat their last region.
+    """
     rows = [np.flatnonzero(row) for row in adjacency]
     most = max(len(row) for row in rows)
     return np.stack([np.pad(row, (0, most - len(row)), "edge") for row in rows])

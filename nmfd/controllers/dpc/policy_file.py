@@ -1,4 +1,4 @@
-"""Policy files: weights with what they were trained for, and the controllers in them."""
+"""Policy files: weights, and what they were trained for."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, fields
@@ -21,7 +21,7 @@ def new_policy(network: RegionalModel, architecture: Architecture) -> Policy:
 
 
 def checkpoint(policy: Policy, network: RegionalModel, configuration: Mapping) -> dict:
-    """Return the content of a policy file: weights, and what they were trained for."""
+    """Return the content of a policy file."""
     weights = policy.state_dict()
     return {
         "architecture": asdict(policy.architecture),
@@ -78,7 +78,11 @@ def load_policy(path: Path, network: RegionalModel) -> tuple[Policy, dict]:
 
 
 def outside_training(content: Mapping, level: float) -> str:
-    """Return a warning if a policy was not trained for `level` times the demand, else ""."""
+    """Return a warning if a policy was not trained for a demand, else "".
+
+    content: of the policy file
+    level: factor of the scenario's demand (-)
+    """
     configuration = content["configuration"]
     low = configuration.get("demand_low", 1.0)
     high = configuration.get("demand_high", 1.0)

@@ -1,4 +1,4 @@
-"""Batched rollouts of the regional model under a policy, as tensors: the objective of training."""
+"""Batched rollouts of the regional model under a policy, for training."""
 
 import os
 import shutil
@@ -24,7 +24,7 @@ Levels = Float[torch.Tensor, " B"]
 
 @dataclass(frozen=True, kw_only=True)
 class Trajectories:
-    """B rollouts of T control intervals; costs and constraints are functions of them.
+    """B rollouts of T control intervals, for costs and constraints.
 
     step: control interval (s)
     states: in region i at the beginning of each interval (veh, (T, B, R, R))
@@ -100,7 +100,10 @@ class Rollout:
         return torch.randn(*shape, generator=generator, dtype=self.dtype).to(self.device)
 
     def _factor(self, generator: Generator, spread: float, *shape: int) -> torch.Tensor:
-        """Return random factors whose logarithm has the standard deviation `spread`."""
+        """Return random factors.
+
+        spread: standard deviation of their logarithm (-)
+        """
         return torch.exp(spread * self._normal(generator, *shape).clamp(-2.0, 2.0))
 
     def random_start(
@@ -111,7 +114,7 @@ class Rollout:
         generator: Generator,
         levels: tuple[float, float] = (1.0, 1.0),
     ) -> tuple[States, Demands]:
-        """Return initial states (veh, (B, R, R)) and demands (veh/s, (T, B, R, R)).
+        """Return initial states (veh) and demands (veh/s), of `batch` rollouts.
 
         spread: every flow is scaled by a factor from 1 - spread to 1 + spread
         share: of the rollouts that start at a random time from a random state, with regions filled
@@ -137,7 +140,9 @@ class Rollout:
     def draw_model(
         self, batch: int, spread: float, generator: Generator, scale: float = 1.0
     ) -> None:
-        """Draw a regional model for each of `batch` rollouts, around the nominal one.
+        """Draw a regional model for each of `batch` rollouts.
+
+        All are around the nominal one.
 
         spread: standard deviation of the logarithm of every region's accumulation axis (jam,
             critical accumulation, storage), and half of that for its outflow and capacities (-)
@@ -196,7 +201,7 @@ class Rollout:
         generator: Generator,
         step: Callable | None = None,
     ) -> tuple[Demands, Demands, Demands]:
-        """Return the states, the observed ones, and the backlog (veh, (T, B, R, R)).
+        """Return states, observed states and backlog (veh, (T, B, R, R)).
 
         policy: a Policy or any module: states -> perimeter or (perimeter, splits); it may have a
             method `metering`
@@ -257,7 +262,10 @@ class Rollout:
         generator: Generator,
         step: Callable | None = None,
     ) -> Levels:
-        """Return the total time spent with both costs (veh s, (B,)); arguments as `states`."""
+        """Return the total time spent with both costs (veh s, (B,)).
+
+        Arguments as `states`.
+        """
         exact, seen, waiting = self.states(policy, x, demand, generator, step)
         vehicles = exact.sum((0, -2, -1)) + waiting.sum((-2, -1)).sum(0)
         if self.detour_cost or self.holding_cost:
@@ -283,7 +291,7 @@ class Rollout:
         return dynamics.rate(p, vehicles) * vehicles * closed.sum(-1) / boundaries
 
     def _diverted(self, x: PerPair, splits: PerTurn) -> PerPair:
-        """Return the flow that leaves a region off the nominal splits (veh/s, (..., R, R))."""
+        """Return the flow off the nominal splits (veh/s, (..., R, R))."""
         p = self.parameters
         leaving = dynamics.rate(p, x.sum(-1)).unsqueeze(-1) * x
         if p.exit_rates is not None:

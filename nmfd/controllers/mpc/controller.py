@@ -1,4 +1,4 @@
-"""Economic model predictive control: the least total time spent over a horizon.
+"""Economic MPC: the least total time spent over a horizon.
 
 As in Tumu et al.: perimeter control alone ("mpc-pc") or with route guidance ("mpc-pcrg"), on the
 regional model, with the demand known ahead. Nothing beyond the horizon counts unless there is a
@@ -107,7 +107,10 @@ class Admissible:
         return np.concatenate([perimeter, splits], axis=1)
 
     def _simplices(self, splits: np.ndarray) -> np.ndarray:
-        """Return the nearest shares (K, V) >= 0 with sum 1 in every cell (Michelot, 1986)."""
+        """Return the nearest shares (K, V) >= 0 with sum 1 in every cell.
+
+        Michelot (1986)
+        """
         groups = self._groups(len(splits))
         count = groups.max(initial=-1) + 1
         value = splits.ravel()
@@ -137,12 +140,18 @@ class Admissible:
         return saved + float((splits * (of_splits - least[groups])).sum())
 
     def _groups(self, moves: int) -> np.ndarray:
-        """Return the number of the simplex of every share, one per interval and cell, (K * V,)."""
+        """Return the simplex of every share (K * V,).
+
+        There is one for every interval and cell.
+        """
         cells = len(self._model.region)
         return (cells * np.arange(moves)[:, None] + self._model.source).ravel()
 
     def controls(self, decision: Decision) -> tuple[PerPair, PerTurn | None]:
-        """Return perimeter (R, R) and splits (R, R, R), or None, of one interval (E + V,)."""
+        """Return perimeter (R, R), and splits (R, R, R) or None.
+
+        decision: one interval of a plan (E + V,)
+        """
         perimeter = self._network.open_perimeter
         perimeter[tuple(self._model.edges.T)] = decision[: self._edges]
         if not self._guidance:
@@ -152,7 +161,10 @@ class Admissible:
         return perimeter, splits
 
     def decision(self, perimeter: PerPair, splits: PerTurn) -> Decision:
-        """Return one interval (E + V,) of a plan from perimeter (R, R) and splits (R, R, R)."""
+        """Return one interval (E + V,) of a plan.
+
+        perimeter: (R, R); splits: (R, R, R)
+        """
         of_edges = perimeter[tuple(self._model.edges.T)]
         return np.concatenate([of_edges, splits[tuple(self._model.turns.T)]])
 
@@ -181,9 +193,7 @@ class EconomicMpc:
         horizon = self.options.horizon
         self._terminal = terminal
         self._tolerance = TOLERANCE if terminal is None else TERMINAL_TOLERANCE
-        self._demand = planning.forecast
-        self._step = planning.step
-        self._steps = planning.steps
+        self._planning = planning
         self._used = np.flatnonzero(planning.destinations)
         if not len(self._used):
             self._used = np.arange(network.regions)
@@ -275,19 +285,22 @@ class EconomicMpc:
 
         Cells are numbered as in edge_model.
         """
-        first = min(observation.step, self._steps)
+        planning = self._planning
         horizon = self.options.horizon
-        known = self._demand[first : first + horizon]
+        first = min(observation.step, planning.steps)
+        known = planning.forecast[first : first + horizon]
         demand = np.zeros((horizon, *known.shape[1:]))
         demand[: len(known)] = known
-        demand[0] += observation.backlog / self._step
+        demand[0] += observation.backlog / planning.step
         start = np.maximum(observation.accumulation, 0.0)[:, self._used].ravel()
         return start, demand[:, :, self._used].reshape(horizon, -1)
 
     def _solve(
         self, start: PerCell, demand: Demands, plan: Plan, deadline: float, beyond: Callable | None
     ) -> Minimum:
-        """Return the best plan from `plan` on, with its value (veh) by the rounded model.
+        """Return the best plan from `plan` on.
+
+        Its value (veh) is that of the rounded model.
 
         Raises: Late
         """
@@ -306,7 +319,10 @@ class EconomicMpc:
         )
 
     def _by_ipopt(self, solver: Ipopt, start: PerCell, demand: Demands) -> Minimum:
-        """Return the plan of IPOPT, projected: it meets bounds and sums to its tolerance only."""
+        """Return the plan of IPOPT, made admissible.
+
+        IPOPT meets bounds and sums to its tolerance only.
+        """
         regions = solver.shape[0]
         state = np.zeros(solver.shape)
         state[:, self._used] = start.reshape(regions, -1)

@@ -1,4 +1,4 @@
-"""Regional model in edge-list form with exact gradients, for optimisation over many regions.
+"""Regional model as a list of edges, with exact gradients for solvers.
 
 A turn (i, h, j) is the movement of the vehicles in i bound for j over the boundary to h. Only turns
 and destinations in use are listed, so that a planar city costs R^2 and not R^3. The equations are
@@ -76,7 +76,7 @@ class Turns:
 
 
 class Boundary(NamedTuple):
-    """Share of the desired flow that passes each edge (E,), and its derivatives.
+    """Share of the desired flow that passes each edge, and derivatives.
 
     by_wish, by_perimeter, by_ahead: by desired flow, u, and accumulation ahead
     """
@@ -193,7 +193,10 @@ def derivative(
 
 
 def _boundary(model: Turns, wish: PerEdge, perimeter: PerEdge, accumulation: PerRegion) -> Boundary:
-    """Return the share of the desired flow `wish` (veh/s, (E,)) that passes each edge."""
+    """Return the share of `wish` that passes each edge.
+
+    wish: desired flow (veh/s, (E,))
+    """
     assert model.capacity is not None
     assert model.storage is not None
     ahead = model.edges[:, 1]
@@ -244,7 +247,7 @@ def pull_derivative(
 def advance(
     model: Turns, x: PerCell, demand: PerCell, perimeter: PerEdge, splits: PerTurn
 ) -> tuple[PerCell, list[Record]]:
-    """Return x (C,) after one integration step, and the records for `pull_advance`."""
+    """Return x (C,) after one integration step, and its records."""
     step = model.step / model.substeps
     total = np.zeros_like(x)
     slope = np.zeros_like(x)
@@ -259,9 +262,9 @@ def advance(
 def pull_advance(
     model: Turns, adjoint: PerCell, splits: PerTurn, records: list[Record]
 ) -> tuple[PerCell, Decision]:
-    """Return the gradients by x (C,) and decision (E + V,) before an integration step.
+    """Return the gradients by x (C,) before a step and by its decision.
 
-    adjoint: gradient by x after it (C,)
+    adjoint: gradient by x after the integration step (C,)
     """
     step = model.step / model.substeps
     of_x = adjoint
@@ -288,7 +291,9 @@ def vehicle_steps(
     deadline: float = math.inf,
     beyond: Callable[[PerCell], tuple[float, PerCell]] | None = None,
 ) -> tuple[float, Plan | None]:
-    """Return the sum of vehicles over the ends of H intervals, and its gradient or None.
+    """Return the vehicles, summed over the ends of all intervals.
+
+    The second value is the gradient (K, E + V), or None without `gradient`.
 
     start: (veh, (C,)); demand: (veh/s, (H, C))
     plan: u of the edges and theta of the turns in every interval (-, (K, E + V)); the last stays in
@@ -326,7 +331,7 @@ def vehicle_steps(
 def affected_vehicles(
     model: Turns, start: PerCell, demand: Demands, plan: Plan, *, deadline: float = math.inf
 ) -> Plan:
-    """Return the vehicles that every number of the plan affects (veh, (K, E + V)).
+    """Return the vehicles (veh, (K, E + V)) that the plan affects.
 
     For an edge, the vehicles that want to cross it in that interval; for a turn, those that leave
     its cell. Arguments as in `vehicle_steps`.
@@ -342,7 +347,11 @@ def affected_vehicles(
 
 
 class _Step(NamedTuple):
-    """Integration step: row of the plan in force, x (C,) after it, and its records."""
+    """Integration step.
+
+    row: of the plan in force
+    x: after the step (veh, (C,))
+    """
 
     row: int
     x: PerCell

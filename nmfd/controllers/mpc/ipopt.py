@@ -1,10 +1,10 @@
-"""Economic MPC by IPOPT on the published formulation, to compare our solver with.
+"""Economic MPC by IPOPT, the reference of the projected-gradient solver.
 
-Multiple shooting on the CasADi twin of nmfd.model.dynamics: every x_ij, u_ih and theta_ihj of every
-interval is a variable, and the dynamics are constraints. It is two orders of magnitude slower.
+The published formulation is multiple shooting: every x_ij, u_ih and theta_ihj of every interval is
+a variable, and the dynamics are constraints. It is two orders of magnitude slower.
 
-The twin has the same names and equations on SX, MX or DM matrices, without a batch. Structural
-zeros are kept.
+The dynamics are a CasADi twin of nmfd.model.dynamics, with the same names and equations, on SX, MX
+or DM matrices without a batch. Structural zeros are kept.
 
 x: (veh, (R, R)); demand: (veh/s, (R, R)); perimeter: (-, (R, R))
 splits: R matrices (-, (R, R)), splits[i][h, j]
@@ -32,7 +32,7 @@ Parameters: TypeAlias = SimpleNamespace
 
 
 class Ipopt:
-    """Solver that minimises the vehicles summed over the ends of `horizon` intervals."""
+    """Solver for the vehicles, summed over the ends of all intervals."""
 
     def __init__(
         self, planning: PlanningModel, *, guidance: bool, horizon: int, limits: Mapping[str, float]
@@ -83,7 +83,7 @@ class Ipopt:
     def solve(
         self, state: PerPair, demand: PairsOverTime
     ) -> tuple[PairsOverTime, TurnsOverTime, str | None]:
-        """Return u (-, (H, R, R)), theta (-, (H, R, R, R)), and the reason of a failure.
+        """Return u (H, R, R), theta (H, R, R, R), and the reason of a failure.
 
         The reason is None if IPOPT converged.
 
@@ -115,7 +115,10 @@ class Ipopt:
         return perimeter, splits, reason
 
     def _splits(self, theta: ca.SX) -> tuple[list[ca.SX], list[ca.SX]]:
-        """Return R matrices (R, R), and the constraints that are 0 if their shares have sum 1."""
+        """Return R matrices (R, R), and constraints.
+
+        The constraints are 0 if the shares have sum 1.
+        """
         regions = self._network.regions
         if not self._guidance:
             return [ca.SX(ca.sparsify(ca.DM(rows))) for rows in self._network.nominal_splits], []
@@ -178,7 +181,7 @@ def flows(
 
 
 def passing(p: Parameters, wish: Matrix, perimeter: Matrix, accumulation: Matrix) -> Matrix:
-    """Return the share of the desired flow that passes each boundary (-, (R, R)).
+    """Return the share of `wish` that passes each boundary (-, (R, R)).
 
     wish: desired flow (veh/s, (R, R))
     """

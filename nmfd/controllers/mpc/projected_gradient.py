@@ -1,4 +1,6 @@
-"""Spectral projected gradients with a certificate, for smooth functions on simple convex sets.
+"""Spectral projected gradients with a certificate.
+
+They minimise smooth functions on simple convex sets.
 
 Birgin, Martinez and Raydan, "Nonmonotone spectral projected gradient methods on convex sets", SIAM
 J. Optim. 10 (2000).
@@ -112,7 +114,7 @@ def minimise(
 def _line_search(
     function: Function, here: _Evaluated, direction: np.ndarray, limit: float, deadline: float
 ) -> _Evaluated | str:
-    """Return the first point with sufficient decrease, or the reason why there is none.
+    """Return the first point with sufficient decrease, or why there is none.
 
     limit: value that the decrease counts from
     """

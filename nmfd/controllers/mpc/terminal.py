@@ -1,12 +1,12 @@
-"""Terminal cost of economic MPC: a value function, learned from rollouts of a DPC policy.
+"""Terminal cost of economic MPC: a learned value function.
 
     V(x, k) = (T - k) sum_ij s(o_ij) x_ij + (1 - k / T) OFFSET o_0
     s(a)    = 1 / (1 + e^(LATE - a))
 
-It approximates the sum of all vehicles over the intervals k + 1 .. T - 1 under the policy, from the
-state x in interval k. Every vehicle stays for a share s of the remaining time. (o_ij, o_0) is a
+It approximates the sum of all vehicles over the intervals k + 1 .. T - 1 under a DPC policy, from
+the state x in interval k. Every vehicle stays for a share s of the remaining time. (o_ij, o_0) is a
 small network of x in critical accumulations and of the time.
-scenarios/economic_mpc/terminal_cost.py learns it, on values and derivatives.
+scenarios/economic_mpc/terminal_cost.py learns it from rollouts, on values and derivatives.
 """
 
 import math
@@ -29,7 +29,7 @@ WEIGHTS = ("first", "second", "last")
 
 @dataclass(frozen=True, kw_only=True)
 class Terminal:
-    """Value function V of one scenario, evaluated by NumPy in some forty microseconds.
+    """Value function V of one scenario, which takes forty microseconds.
 
     steps: T
     used: destinations of the cells, (R,)
@@ -48,9 +48,9 @@ class Terminal:
     controller: str
 
     def __call__(self, x: PerCell, step: int) -> tuple[float, PerCell]:
-        """Return V (veh intervals) at the beginning of interval `step`, and dV/dx (C,).
+        """Return V (veh intervals) and dV/dx (C,).
 
-        x: vehicles in the cells (veh, (C,))
+        x: vehicles in the cells at the beginning of interval `step` (veh, (C,))
         """
         step = min(step, self.steps)
         left = float(self.steps - step)
@@ -69,13 +69,19 @@ class Terminal:
 
 
 def clock(share: float) -> Float[np.ndarray, " F"]:
-    """Return the features (1 + 2 WAVES,) of the time, a share (-) of the horizon."""
+    """Return the features of the time (1 + 2 WAVES,).
+
+    share: of the horizon (-)
+    """
     angles = math.pi * share * np.arange(1, WAVES + 1)
     return np.concatenate([[share], np.sin(angles), np.cos(angles)])
 
 
 def _gelu(a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return torch.nn.GELU, x times the normal distribution function, and its derivative."""
+    """Return torch.nn.GELU and its derivative.
+
+    It is a times the normal distribution function.
+    """
     below = 0.5 * (1.0 + erf(a / math.sqrt(2.0)))
     return a * below, below + a * np.exp(-0.5 * a * a) / math.sqrt(2.0 * math.pi)
 
