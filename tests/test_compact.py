@@ -213,9 +213,12 @@ def test_it_is_trained_and_kept_in_a_file(tmp_path):
 
 @pytest.mark.parametrize(
     "numbers, protected, problem",
-    [([-1.0] * 8, (3,), "numbers: expected 8 to 11 numbers >= 0"), ([1.0] * 7, (3,), "numbers: should have at least 8"),
-     ([1.0] * 8, (), "numbers: expected a scenario with protected regions")],
-)  # fmt: skip
+    [
+        ([-1.0] * 8, (3,), "numbers: expected 8 to 11 numbers >= 0"),
+        ([1.0] * 7, (3,), "numbers: should have at least 8"),
+        ([1.0] * 8, (), "numbers: expected a scenario with protected regions"),
+    ],
+)
 def test_wrong_numbers_of_a_rule(numbers, protected, problem):
     options = {"pricing-rule": {"numbers": numbers}}
     scenario = replace(
