@@ -80,9 +80,9 @@ def test_a_controller_and_a_plant_as_objects(tmp_path):
     )  # all that the docstring asks for
     trajectory = nmfd.run(scenario, HALF, steps=5, plant=own)
     assert (trajectory.controller, trajectory.plant) == ("half", "SimpleNamespace")
-    assert (trajectory.accumulation == nmfd.run(scenario, HALF, steps=5).accumulation).all()
-    assert trajectory.perimeter.shape == (5, 2, 2)
-    assert (trajectory.perimeter == 0.5).all()
+    assert (trajectory["accumulation"] == nmfd.run(scenario, HALF, steps=5)["accumulation"]).all()
+    assert trajectory["perimeter"].shape == (5, 2, 2)
+    assert (trajectory["perimeter"] == 0.5).all()
 
 
 @pytest.mark.parametrize(

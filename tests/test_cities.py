@@ -16,8 +16,8 @@ from tiny_city import driven, pieces
 
 from cosim.evaluation.simulate import Simulation, simulate
 from cosim.importing.streets import read_streets
+from cosim.plant.strategy import parse
 from nmfd.api import load_scenario
-from nmfd.controllers.strategy import parse
 from nmfd.metrics import total_time_spent
 
 ROOT = Path(__file__).parents[1]

@@ -12,7 +12,7 @@ from commands import MAINS, call, error_line, good, nmfd, runs, same
 
 from nmfd import closed_loop
 from nmfd.controllers import training
-from nmfd.controllers.rules import PiGating
+from nmfd.controllers.rules import PiGate
 from nmfd.runs.run_many import run_many
 from nmfd.types import Result
 
@@ -111,7 +111,7 @@ def test_settings(folder, tmp_path):
 def test_a_failing_controller_names_itself_and_the_others_are_kept(
     both, tmp_path, monkeypatch, in_process
 ):
-    monkeypatch.setattr(PiGating, "act", lambda self, measurement: 1 / 0)
+    monkeypatch.setattr(PiGate, "act", lambda self, measurement: 1 / 0)
     result = nmfd(*both)
     assert result.exit_code == 1
     assert result.stderr.count("\n") == 1

@@ -14,8 +14,8 @@ import trajectories
 from cosim.evaluation import identify, model_validation
 from cosim.evaluation.identify import as_it_was, static_model
 from cosim.evaluation.model_validation import held_up, observed, outflow_samples, predict
+from cosim.plant.strategy import parse
 from nmfd.api import load_scenario
-from nmfd.controllers.strategy import parse
 from nmfd.model import dynamics, mfd
 from nmfd.model.identification import observed_split_ratios
 from nmfd.model.regional_model import load_network, network_toml
@@ -71,7 +71,7 @@ def result(scenario):
 
 
 def test_a_perfect_model_has_no_error(scenario, result):
-    assert np.abs(predict(scenario, result).accumulation - result.accumulation).max() < 1e-6
+    assert np.abs(predict(scenario, result).accumulation - result["accumulation"]).max() < 1e-6
     rows = predictions(scenario.network, [observed(result)], scenario.scheme)
     assert rows[["next_interval_rmse_share", "ahead_rmse_share"]].to_numpy().max() < 1e-4
 
@@ -79,7 +79,7 @@ def test_a_perfect_model_has_no_error(scenario, result):
 def test_a_model_that_discharges_too_slowly_holds_too_many(scenario, result):
     slow = tuple(replace(m, a=0.9 * m.a, b=0.9 * m.b, c=0.9 * m.c) for m in scenario.network.mfds)
     wrong = replace(scenario, network=replace(scenario.network, mfds=slow))
-    off = predict(wrong, result).accumulation.sum(axis=2) - result.accumulation.sum(axis=2)
+    off = predict(wrong, result).accumulation.sum(axis=2) - result["accumulation"].sum(axis=2)
     assert off.sum(axis=1).mean() > 100
     rows = predictions(wrong.network, [observed(result)], wrong.scheme)
     whole = np.sqrt((off**2).mean(axis=0)) / wrong.network.critical
@@ -92,14 +92,14 @@ def test_errors_where_the_critical_accumulation_was_not_seen(scenario, result):
     network = scenario.network
     critical = network.critical
     unseen = replace(scenario, network=replace(network, critical_above={0: 50.0, 1: 0.0}))
-    late = result.assign(accumulation=result.accumulation + 1.0)
+    late = result.assign(accumulation=result["accumulation"] + 1.0)
     errors = model_validation._errors(unseen, [result], [late])
     errors.insert(0, "demand", 1.0)
     errors.insert(1, "controller", "no-control")
     base = [50.0, np.nan, *critical[2:]]
     np.testing.assert_allclose(errors["share_of_veh"], base)
     np.testing.assert_allclose(errors["whole_run_rmse_share"], 7.0 / np.array(base))
-    most = result.accumulation.sum(axis=2).max(axis=0)
+    most = result["accumulation"].sum(axis=2).max(axis=0)
     np.testing.assert_allclose(errors["most_share"], most / np.array(base))
     assert errors["critical_veh"].isna().tolist() == [True, True, *[False] * 5]
     table = model_validation.prediction_table(errors)

@@ -11,7 +11,7 @@ import pytest
 from commands import MAINS
 from documents import FILES, ROOT, kind, read
 
-from nmfd.controllers.strategy import parse
+from cosim.plant.strategy import parse
 from nmfd.runs import shipped
 
 # What a reader replaces, and files and folders that are not kept here: a path that begins so need

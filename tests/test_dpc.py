@@ -10,12 +10,13 @@ import tiny
 import torch
 
 import nmfd
+from nmfd import api
 from nmfd.api import load_scenario
 from nmfd.controllers import training
 from nmfd.controllers.dpc import first_policy
+from nmfd.controllers.dpc.options import Dpc
 from nmfd.controllers.dpc.policy import FILL_TIME_S, MOST_PRICE, Architecture, DpcController, Policy
 from nmfd.controllers.dpc.policy_file import checkpoint, load, load_policy
-from nmfd.controllers.rules import PiGating
 from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
 from nmfd.model import dynamics
@@ -160,10 +161,8 @@ def test_training_lowers_the_total_time_spent(tmp_path, scenario):
     rollout = training.Rollout(planning_model(scenario))
     torch.manual_seed(0)
     fresh = Policy(scenario.network, Architecture())
-    after = training.validate(
-        load_policy(trained, scenario.network)[0], rollout, 0, training.Training()
-    )
-    assert after < training.validate(fresh, rollout, 0, training.Training())
+    after = training.validate(load_policy(trained, scenario.network)[0], rollout, 0, Dpc())
+    assert after < training.validate(fresh, rollout, 0, Dpc())
 
 
 def test_resume_needs_something_to_resume_and_the_same_settings(tmp_path, scenario, monkeypatch):
@@ -414,7 +413,7 @@ def test_a_policy_begins_as_a_gate(scenario):
     for full in (0.7, 1.0, 1.4):
         filled = x.clone()
         filled[:, 1] *= (
-            full * PiGating(planning_model(scenario)).set_point[0] / x[:, 1].sum(-1)
+            full * api.controller("pi-gating", scenario).set_point[0] / x[:, 1].sum(-1)
         ).unsqueeze(-1)
         with torch.no_grad():
             shares.append((made(filled)[0] - network.u_min) / (network.u_max - network.u_min))

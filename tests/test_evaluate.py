@@ -14,8 +14,8 @@ from commands import cosim, error_line, good
 from filelock import FileLock, Timeout
 
 from cosim.evaluation import evaluate, results
+from cosim.plant.strategy import parse
 from nmfd.api import load_scenario
-from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
 from nmfd.model.scenario import with_demand
 

@@ -126,9 +126,11 @@ def test_measures_of_a_city_are_those_of_tripinfo(tmp_path, steps):
     assert row["co2_kg"] == pytest.approx(
         1e-6 * sum(emissions.values()), rel=1e-2
     )  # parts of steps
-    assert result.co2.sum() == pytest.approx(row["co2_kg"], rel=1e-5)
-    assert result.co2.min() >= 0.0
-    assert row["longest_queue_veh"] == result.queue_max.max() >= result.gateway_queue_max.max()
+    assert result["co2"].sum() == pytest.approx(row["co2_kg"], rel=1e-5)
+    assert result["co2"].min() >= 0.0
+    assert (
+        row["longest_queue_veh"] == result["queue_max"].max() >= result["gateway_queue_max"].max()
+    )
     private, delay = time[~other], trips["departDelay"]
     expected = {
         "total_time_spent_veh_s": private.sum(),
@@ -157,9 +159,9 @@ def test_measures_of_a_city_are_those_of_tripinfo(tmp_path, steps):
     assert {name: row[name] for name in expected} == pytest.approx(
         expected, rel=1e-5
     )  # of hundredths of seconds
-    assert result.time_spent.shape == (steps,)
+    assert result["time_spent"].shape == (steps,)
     assert min(expected.values()) > 0
-    assert result.other_time_spent.sum() == pytest.approx(time[other].sum())
+    assert result["other_time_spent"].sum() == pytest.approx(time[other].sum())
 
 
 def test_outputs_do_not_change_who_reroutes(tmp_path):
@@ -210,6 +212,6 @@ def test_full_edges_before_gateways(run):
     plant, record, _, _ = run
     city, room = plant.city, plant.city.room
     for share, expected in ((0.0, 0.0), (0.7, 0.0), (0.9, 1.0)):
-        full = SimpleNamespace(**vars(record) | {"edge_vehicles": np.tile(share * room, (3, 1))})
+        full = vars(record) | {"edge_vehicles": np.tile(share * room, (3, 1))}
         row = simulate.queue_facts(full, city)
         assert row["gateway_full_share"] == expected

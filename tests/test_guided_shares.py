@@ -14,8 +14,8 @@ from cosim.evaluation.simulate import Simulation, simulate
 from cosim.plant import guidance
 from cosim.plant.guidance import Guide
 from cosim.plant.meter import Event
+from cosim.plant.strategy import parse
 from nmfd.api import load_scenario
-from nmfd.controllers.strategy import parse
 from nmfd.types import Controls
 
 # s and z are in region 0, a and b in 1 and 2; all lead to t in 3, where t2 follows, and z by a

@@ -9,13 +9,11 @@ import pytest
 import tiny
 import torch
 
-from nmfd import closed_loop
+from nmfd import api, closed_loop
 from nmfd.api import load_scenario
-from nmfd.controllers.rules import Probing
 from nmfd.model import dynamics, identification
 from nmfd.model.identification import Observed
 from nmfd.model.mfd import Cubic
-from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
 
 ROOT = Path(__file__).parents[1]
@@ -38,13 +36,13 @@ def scenario():
 
 def observe(scenario, seed, factor):
     demanded = replace(scenario, demand=factor * scenario.demand)
-    controller = Probing(planning_model(demanded), guidance=False)
+    controller = api.controller("probing-pc", demanded)
     trajectory = closed_loop.run(NmfdPlant(demanded), controller, demanded, seed=seed)
     return Observed(
-        accumulation=trajectory.accumulation,
+        accumulation=trajectory["accumulation"],
         demand=demanded.demand[: demanded.steps],
-        perimeter=trajectory.perimeter,
-        splits=trajectory.splits,
+        perimeter=trajectory["perimeter"],
+        splits=trajectory["splits"],
         crossings=np.full((demanded.steps, 7, 7), 60.0),
     )
 
@@ -90,19 +88,19 @@ def test_windows_are_the_intervals_in_order(runs):
 
 def test_probing_moves_every_gate_and_repeats_itself(scenario):
     def trajectory(seed, guidance=True):
-        controller = Probing(planning_model(scenario), guidance=guidance)
+        controller = api.controller("probing-pcrg" if guidance else "probing-pc", scenario)
         return closed_loop.run(NmfdPlant(scenario), controller, scenario, seed=seed)
 
     first, again, other = trajectory(0), trajectory(0), trajectory(1)
-    np.testing.assert_array_equal(first.perimeter, again.perimeter)
-    assert (first.perimeter != other.perimeter).any()
-    gates = first.perimeter[:, scenario.network.adjacency]
+    np.testing.assert_array_equal(first["perimeter"], again["perimeter"])
+    assert (first["perimeter"] != other["perimeter"]).any()
+    gates = first["perimeter"][:, scenario.network.adjacency]
     assert (np.ptp(gates, axis=0) > 0.2).all()
     assert gates.min() >= scenario.network.u_min
     assert gates.max() <= scenario.network.u_max
-    sums = first.splits.sum(axis=2)
+    sums = first["splits"].sum(axis=2)
     assert np.isclose(sums, 1.0).sum() == np.isclose(sums, 0.0).sum() * 6  # all but j = i
-    assert not first.splits[:, ~scenario.network.split_mask].any()
+    assert not first["splits"][:, ~scenario.network.split_mask].any()
     assert (trajectory(0, guidance=False).splits == scenario.network.nominal_splits).all()
 
 

@@ -19,11 +19,11 @@ from cosim.importing.demand import read_traffic
 from cosim.importing.streets import graph, read_streets
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
+from cosim.plant.strategy import parse
 from cosim.sumo.net import load_city
 from cosim.sumo.recorded_trips import own_flows, read_recorded_trips, read_routes
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
-from nmfd.model.planning import planning_model
 from nmfd.model.regional_model import load_network
 from nmfd.model.scenario import with_demand
 
@@ -390,7 +390,7 @@ def test_identification_gives_both_models_and_the_import_takes_the_second_away(
     assert f"Written to {network / 'guided' / 'network.toml'}" in text
     assert (tmp_path / "loading" / "guided" / "level-2" / "probing-pcrg-1000.nc").is_file()
     loaded = load_scenario(scenario)
-    guided = planning_model(loaded, "dpc-pcrg").network
+    guided = parse("dpc-pcrg").own_planning(loaded).network
     assert guided.hash != loaded.network.hash
     assert guided.observed_split_ratios == loaded.network.observed_split_ratios
     assert "PLACEHOLDERS" not in (network / "network.toml").read_text()
@@ -403,7 +403,7 @@ def test_identification_gives_both_models_and_the_import_takes_the_second_away(
     shutil.rmtree(network)
     shutil.rmtree(scenario)
     tiny_city.imported(tmp_path, 2, config)
-    assert planning_model(load_scenario(scenario), "dpc-pcrg").network.regions == 2
+    assert parse("dpc-pcrg").own_planning(load_scenario(scenario)).network.regions == 2
 
 
 @pytest.mark.slow

@@ -127,12 +127,12 @@ def days(generator, batch):
 def test_a_network_and_mfd_serve_plants_rules_and_mpc(controller):
     for plant in ("nmfd", "acyclic", TripBased(ring())):
         result = nmfd.run(ring(), controller, plant=plant, progress=False)
-        assert result.completed[-1] + result.accumulation[-1].sum() == pytest.approx(
+        assert result["completed"][-1] + result["accumulation"][-1].sum() == pytest.approx(
             30.0 * ring().demand.sum()
         )
-        assert result.completed[-1] > 50
-        assert (result.status == 0).all()
-    assert not result.completed[:10].any()  # no trip ends before its length is driven
+        assert result["completed"][-1] > 50
+        assert (result["status"] == 0).all()
+    assert not result["completed"][:10].any()  # no trip ends before its length is driven
 
 
 def test_a_policy_cost_constraint_and_days():
@@ -145,7 +145,7 @@ def test_a_policy_cost_constraint_and_days():
         own = {"cost": burnt, "sample": days, "constraints": [(crowded, weight)]}
         trained = nmfd.train(scenario, policy=policy, **own, steps=40, progress=False)
         after = nmfd.run(scenario, nmfd.ModuleController(trained, scenario), progress=False)
-        most[weight] = after.accumulation[:, 1].sum(-1).max()
+        most[weight] = after["accumulation"][:, 1].sum(-1).max()
         assert trained is policy
         assert nmfd.total_time_spent(after) < nmfd.total_time_spent(before)
     assert most[1e4] < 0.6 * most[0.0]
@@ -160,8 +160,8 @@ def test_rollouts_are_the_closed_loop():
         policy, rollout.start[None], rollout.demand[:, None], torch.Generator()
     )
     result = nmfd.run(ring(), nmfd.ModuleController(policy, ring()), progress=False)
-    np.testing.assert_allclose(run.states[:, 0].detach(), result.accumulation[:-1], atol=1e-9)
-    np.testing.assert_allclose(run.perimeter[:, 0].detach(), result.perimeter, atol=1e-9)
+    np.testing.assert_allclose(run.states[:, 0].detach(), result["accumulation"][:-1], atol=1e-9)
+    np.testing.assert_allclose(run.perimeter[:, 0].detach(), result["perimeter"], atol=1e-9)
     assert run.backlog.max() > 1.0
     assert run.total_time_spent.item() == pytest.approx(nmfd.total_time_spent(result))
 

@@ -41,7 +41,7 @@ def test_the_template_is_copied_runs_and_counts_in_the_fingerprint(place):
     )
     assert command("new-controller", "mine.py").exit_code == 2
     scenario, strategy = nmfd.load_scenario(place / "scenario"), parse("mine.py:MyController")
-    assert nmfd.run(scenario, "mine.py:MyController").perimeter[:, 0, 1].max() == 0.9
+    assert nmfd.run(scenario, "mine.py:MyController")["perimeter"][:, 0, 1].max() == 0.9
     before = strategy.fingerprint(scenario)
     with (place / "mine.py").open("a") as file:
         file.write("# changed\n")

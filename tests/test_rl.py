@@ -126,7 +126,7 @@ def test_return_is_the_total_time_spent_of_the_same_closed_loop(hexagon):
     assert steps == hexagon.steps
     assert -total * env.unit * hexagon.step == pytest.approx(total_time_spent(trajectory))
     assert info["total_time_spent_veh_s"] == pytest.approx(total_time_spent(trajectory))
-    assert info["completed_veh"] == pytest.approx(trajectory.completed[-1])
+    assert info["completed_veh"] == pytest.approx(trajectory["completed"][-1])
 
 
 def test_agents_together_do_what_one_agent_does(hexagon):

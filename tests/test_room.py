@@ -14,9 +14,8 @@ from cosim.plant.room import Room, shared, upstream
 from cosim.plant.settings import settings
 from cosim.plant.supervisor import Supervisor
 from cosim.sumo.net import Gateway
+from nmfd import api
 from nmfd.api import load_scenario
-from nmfd.controllers.rules import PiGating
-from nmfd.model.planning import planning_model
 from nmfd.model.scenario import with_demand
 from nmfd.types import Controls, Observation
 
@@ -133,7 +132,7 @@ def test_no_command_fills_the_street_before_a_gateway(town, limit, held):
 def test_the_integral_goes_on_from_what_was_realised():
     """At the set point the next command is the mean of what the entries realised."""
     scenario = load_scenario("economic_mpc")
-    network, controller = scenario.network, PiGating(planning_model(scenario))
+    network, controller = scenario.network, api.controller("pi-gating", scenario)
     accumulation = np.zeros((7, 7))
     accumulation[3, 0] = controller.set_point[0]
     entries = network.adjacency[:, 3]

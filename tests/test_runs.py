@@ -43,8 +43,8 @@ def test_a_result_is_read_as_it_was_written(tmp_path):
     xr.testing.assert_identical(back.data, original.data)
     assert (back.controller, back.plant, back.seed, back.step) == ("no-control", "nmfd", 0, 30.0)
     assert back.co2_kg == 3.25
-    assert back.gateway_flow.shape == (4, 3)
-    assert list(back.note) == ["", "", "", "no"]
+    assert back["gateway_flow"].shape == (4, 3)
+    assert list(back["note"]) == ["", "", "", "no"]
     assert list(tmp_path.iterdir()) == [tmp_path / "a.nc"]
     assert pickle.loads(pickle.dumps(back)).seed == 0
     with pytest.raises(AttributeError, match="nothing"):

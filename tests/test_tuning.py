@@ -12,8 +12,8 @@ import trajectories
 from commands import cosim, good
 
 from cosim.evaluation import tuning
+from cosim.plant.strategy import parse
 from nmfd.api import load_scenario
-from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError, RunFailed
 from nmfd.runs import config
 
@@ -197,7 +197,9 @@ def test_options_that_train_a_policy_train_one_for_every_candidate(city, tmp_pat
             scenario, strategy, seed, demand, tts=1e6 * seen[-1], trips=9, completed=9
         )
 
-    monkeypatch.setattr(tuning, "processes", lambda jobs, _: [(job, job.job()) for job in jobs])
+    monkeypatch.setattr(
+        tuning, "in_processes", lambda jobs, *_: [(n, job()) for n, job in enumerate(jobs)]
+    )
     made_up.instead_of_sumo(monkeypatch, made)
     chosen = tuning.Tuning(
         scenario=city,

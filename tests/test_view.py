@@ -17,11 +17,11 @@ from bokeh.models import Button
 from bokeh.resources import CDN
 
 from cosim.evaluation.simulate import Simulation, simulate
+from cosim.plant.strategy import parse
 from cosim.sumo.net import city_of
 from cosim.view import live, page, picture
 from cosim.view.picture import CityPicture, Frame
 from nmfd.api import load_scenario
-from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError, RunFailed
 from nmfd.metrics import total_time_spent
 

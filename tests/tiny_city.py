@@ -116,7 +116,7 @@ def played(
 ) -> Iterator:
     """A plant after so many intervals with all u at `gates`, its state and its record; the ledger
     is checked in every interval."""
-    scenario = with_demand(scenario, steps=intervals)
+    scenario = with_demand(scenario, steps=max(intervals, 1))
     plant = SumoPlant(scenario, settings=settings(scenario).changed(**overrides))
     controls = Controls(perimeter=np.where(scenario.network.adjacency, gates, 0.0), splits=splits)
     try:

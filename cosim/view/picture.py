@@ -207,9 +207,7 @@ def after(
 def frames(picture: CityPicture, result: Any) -> list[Frame]:
     """Return the frames of a finished run: one at its start and one at the end of every control
     interval."""
-    parts = {
-        name: getattr(result, name) for name in ("accumulation", "backlog", "completed", "removed")
-    }
+    parts = {name: result[name] for name in ("accumulation", "backlog", "completed", "removed")}
     states = [
         State(step=k, time=k * picture.step, **{name: values[k] for name, values in parts.items()})
         for k in range(len(result["accumulation"]))
@@ -219,7 +217,7 @@ def frames(picture: CityPicture, result: Any) -> list[Frame]:
         controls = Controls(
             perimeter=result["perimeter"][k], splits=None, note=str(result["note"][k])
         )
-        row = {name: getattr(result, name)[k] for name in ROW}
+        row = {name: result[name][k] for name in ROW}
         made.append(after(picture, made[-1], controls, state, row))
     return made
 

@@ -27,6 +27,7 @@ from nmfd.controllers.dpc.rollout import Demands, Rollout, States, Trajectories,
 from nmfd.controllers.strategy import Strategy
 from nmfd.errors import InputError, RunFailed
 from nmfd.model.authority import NO_GATEWAY
+from nmfd.model.commands import admissible
 from nmfd.model.planning import PlanningModel
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
@@ -226,7 +227,8 @@ def _check_module(module: nn.Module, scenario: Scenario) -> None:
         )
     empty = np.zeros(scenario.network.adjacency.shape)
     observation = Observation(step=0, time=0.0, accumulation=empty, backlog=empty)
-    ModuleController(module, scenario).act(observation)
+    controller = ModuleController(module, scenario)
+    admissible(controller.act(observation), scenario.network, f"{controller.name}: interval 0")
 
 
 class TrainingRun:
