@@ -10,9 +10,9 @@ import numpy as np
 from cosim.evaluation.simulate import Simulation
 from cosim.plant import incidents
 from cosim.plant.launch import own_vehicles
-from cosim.plant.programmes import check_strategy
+from cosim.plant.programmes import check_strategy, scenario_city
 from cosim.plant.settings import FILES, MAX_PRESSURE, own_files, settings
-from cosim.sumo.net import check_adjacency, city_files, load_city
+from cosim.sumo.net import check_adjacency, city_files
 from cosim.sumo.signals import HELD, read_signals
 from cosim.sumo.xml_files import read_xml
 from nmfd.controllers.strategy import Strategy
@@ -73,7 +73,7 @@ def city_key(scenario: Scenario, strategies: Sequence[Strategy]) -> dict[str, ob
     InputError."""
     chosen = settings(scenario)
     files = city_files(scenario.network)
-    city = load_city(*files, scenario.network.regions)
+    city = scenario_city(scenario, chosen)
     check_adjacency(city, scenario.network)
     own_vehicles(scenario, chosen, city)
     used = {strategy.city.get("signals", chosen.signals) for strategy in strategies}

@@ -13,7 +13,7 @@ from cosim.plant.supervisor import Supervisor
 from cosim.sumo.arrays import PerEdge, PerGateway
 from cosim.sumo.net import City, Gateway, gateway_movements
 from cosim.sumo.session import Phase, Session
-from cosim.sumo.signals import GREEN, Signal
+from cosim.sumo.signals import GREEN, Signal, held_city, running_logic
 from nmfd.arrays import PerPair
 from nmfd.model.regional_model import RegionalModel
 
@@ -51,28 +51,29 @@ class Actuation:
             network,
             incidents,
         )
-        movements = gateway_movements(city)
+        programmes = {signal: session.programme(signal) for signal in gateway_movements(city)}
+        logics = {signal: running_logic(plan) for signal, plan in programmes.items()}
+        held = held_city(city, logics, settings.leave_signals)
+        movements, self._gateways = gateway_movements(held), held.gateways
         phases: dict[str, Sequence[Phase]] = {}  # original ones of the signals that are commanded
         self._pressure, show = None, incidents.show
         self._controls: list[MaxPressure | GatewaySignal | ResponsiveSignal] = []
         if flows is not None:
             self._pressure = MaxPressure(
-                session, city, steered, flows, show=show, lookahead=settings.lookahead
+                session, held, steered, flows, show=show, lookahead=settings.lookahead
             )
             self._controls.append(self._pressure)
             phases = {signal.id: signal.phases for signal in steered if signal.id in movements}
-        left = {*phases, *settings.leave_signals}
-        own = [session.programme(signal) for signal in sorted(movements) if signal not in left]
-        for plan in own:
-            links = movements[plan.signal]
+        for signal in sorted(movements.keys() - phases.keys()):
+            plan, links = programmes[signal], movements[signal]
+            phases[signal] = plan.phases
             if plan.static:
                 self._controls.append(GatewaySignal(plan, links, start=session.time, show=show))
-            elif plan.actuated:
+            else:
                 self._controls.append(
                     ResponsiveSignal(session, plan, links, show=show, release=incidents.release)
                 )
-        phases |= {plan.signal: plan.phases for plan in own if plan.static or plan.actuated}
-        self.original_green = _programmed_green(city, phases, step)
+        self.original_green = _programmed_green(held, phases, step)
         self.room = Room(
             session,
             city,
@@ -146,7 +147,7 @@ class Actuation:
                 sum(green[g.signal][link] for link in g.links) / len(g.links)
                 if g.signal in green
                 else np.nan
-                for g in self._city.gateways
+                for g in self._gateways
             ]
         )
 

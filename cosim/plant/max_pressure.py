@@ -42,7 +42,7 @@ from cosim.sumo.net import City, gateway_movements
 from cosim.sumo.session import Phase, Session
 from cosim.sumo.signals import GREEN, Link, Signal, is_stage, lane_id
 
-LEVELS = "rgG"  # from red to the right of way
+LEVELS = "rsgG"  # from red by way of turns on red to the right of way
 FACTS = {  # columns of the table of runs
     "signal_lanes": "lanes before signals under max-pressure",
     "split_lanes": "those that a stage serves in part",

@@ -13,14 +13,14 @@ from cosim.plant.incidents import Incidents
 from cosim.plant.launch import Launch
 from cosim.plant.meter import Meter
 from cosim.plant.metering import Metering
-from cosim.plant.programmes import city_signals
+from cosim.plant.programmes import city_signals, scenario_city
 from cosim.plant.record import Recorder
 from cosim.plant.sampling import SAMPLE_PERIOD_S, StreetMeans, StreetSampler
 from cosim.plant.settings import ESTIMATE, MAX_PRESSURE, Settings, check_lanes
 from cosim.plant.settings import settings as settings_of
 from cosim.plant.stuck import Junctions
 from cosim.sumo.arrays import PerEdge
-from cosim.sumo.net import City, check_adjacency, city_of
+from cosim.sumo.net import City, check_adjacency
 from cosim.sumo.outputs import TripReader, edge_emissions
 from cosim.sumo.session import Session
 from nmfd.model.planning import PlanningModel, planning_model
@@ -77,7 +77,7 @@ class SumoPlant:
         self._observer = observer or Observer()
         self._settings = settings = settings or settings_of(scenario)
         check_lanes(scenario, settings)
-        self.city: City = city_of(scenario.network)
+        self.city: City = scenario_city(scenario, settings)
         check_adjacency(self.city, scenario.network)
         self._layout = lay_out(self.city, settings.detector_share)
         self._instruments = instruments(self.city, self._layout, settings.probe_share)

@@ -2,6 +2,7 @@
 tools."""
 
 import re
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from xml.etree.ElementTree import Element, ElementTree, SubElement
@@ -20,9 +21,20 @@ from cosim.plant.settings import (
     own_files,
     settings,
 )
-from cosim.sumo.net import City
+from cosim.sumo.net import City, city_of
 from cosim.sumo.programs import run_tool
-from cosim.sumo.signals import HELD, STATIC, Signal, phases_of, read_signals
+from cosim.sumo.signals import (
+    HELD,
+    STATIC,
+    TIMETABLE,
+    Signal,
+    held_city,
+    phases_of,
+    read_logics,
+    read_signals,
+    timetabled,
+    without_effect,
+)
 from cosim.sumo.xml_files import attribute, read_xml
 from nmfd.controllers.strategy import Strategy
 from nmfd.errors import InputError
@@ -40,6 +52,17 @@ def check_strategy(strategy: Strategy, scenario: Scenario, city: City) -> None:
         raise InputError(f"controller {strategy.name} cannot run here: {error}") from None
 
 
+def scenario_city(scenario: Scenario, settings: Settings) -> City:
+    """Return the scenario's city, with a signal only at gateways that a command can hold.
+
+    Raises InputError.
+    """
+    city = city_of(scenario.network)
+    additional = own_files(scenario, settings.additional)
+    logics = read_logics(city.net_file, additional)
+    return held_city(city, logics, _left_alone(city, settings, additional, logics))
+
+
 def city_signals(
     city: City, scenario: Scenario, settings: Settings
 ) -> tuple[list[Signal], list[str]]:
@@ -50,20 +73,41 @@ def city_signals(
     """
     pressure = settings.signals == MAX_PRESSURE
     kinds = HELD if pressure else (STATIC,)
-    simple, others = read_signals(city, own_files(scenario, settings.additional), kinds)
-    left = {signal.id for signal in simple} & set(settings.leave_signals)
-    simple, others = (
-        [signal for signal in simple if signal.id not in left],
-        sorted({*others, *left}),
-    )
+    additional = own_files(scenario, settings.additional)
+    simple, others = read_signals(city, additional, kinds)
+    left = _left_alone(city, settings, additional, [signal.id for signal in simple])
+    others |= left
+    simple = [signal for signal in simple if signal.id not in left]
     if settings.signals != FIXED and not simple:
         raise InputError(
             f"{city.net_file}: sumo.signals: {settings.signals} needs {'' if pressure else 'fixed-time '}signals "
-            f"with several green phases, but none of the {len(others)} signals here is one; choose fixed"
+            f"with several green phases, but none of the {len(others)} signals here is one"
+            f"{_counted(others.values())}; choose fixed"
         )
-    fixed = settings.gateways_fixed and settings.signals == ACTUATED
-    kept = {gateway.signal for gateway in city.gateways if fixed}
-    return [signal for signal in simple if signal.id not in kept], others
+    kept = set()
+    if settings.gateways_fixed and settings.signals == ACTUATED:
+        kept = {gateway.signal for gateway in city.gateways}
+    return [signal for signal in simple if signal.id not in kept], sorted(others)
+
+
+def _left_alone(
+    city: City, settings: Settings, additional: Sequence[Path], signals: Iterable[str]
+) -> dict[str, str]:
+    """Return those of `signals` that perimeter control does not use, with the reason."""
+    everywhere = without_effect(settings.options, settings.mesoscopic)
+    if everywhere:
+        return dict.fromkeys(signals, everywhere)
+    reasons = dict.fromkeys(settings.leave_signals, "left alone by the scenario")
+    reasons |= dict.fromkeys(timetabled(city.net_file, additional), TIMETABLE)
+    return {signal: reasons[signal] for signal in signals if signal in reasons}
+
+
+def _counted(reasons: Iterable[str]) -> str:
+    """Return how often each reason occurs, in parentheses; "" without any."""
+    counts = Counter(reasons).most_common()
+    if not counts:
+        return ""
+    return f" ({', '.join(f'{reason}: {count}' for reason, count in counts)})"
 
 
 def write_actuated(path: Path, signals: Iterable[Signal]) -> None:
@@ -78,7 +122,7 @@ def write_actuated(path: Path, signals: Iterable[Signal]) -> None:
             "id": signal.id,
             "type": "actuated",
             "programID": "plan",
-            "offset": f"{signal.offset:g}",
+            "offset": signal.offset,
         }
         logic = SubElement(root, "tlLogic", about)
         for n, (phase, low) in enumerate(

@@ -11,6 +11,7 @@ from cosim.importing import maps, quality
 from cosim.importing.streets import read_streets
 from cosim.plant.settings import own_files, settings
 from cosim.sumo import net
+from cosim.sumo.signals import timetabled, without_effect
 from nmfd.api import load_scenario
 from nmfd.model.regional_model import RegionalModel, load_network
 from nmfd.model.scenario import Scenario
@@ -55,7 +56,8 @@ class City:
         setup = None if self.scenario is None else settings(self.scenario)
         additional = own_files(self.scenario, setup.additional) if self.scenario and setup else ()
         left = setup.leave_signals if setup else ()
-        self._streets = read_streets(net.city_files(self.network).net_file, additional)
+        net_file = net.city_files(self.network).net_file
+        self._streets = read_streets(net_file, additional)
         built = net.city_of(self.network)
         self._regions = np.array([built.region_of.get(edge, -1) for edge in self._streets.edges])
         of_region = [
@@ -64,8 +66,10 @@ class City:
         self._places = np.stack(
             [self._streets.centre[members].mean(axis=0) for members in of_region]
         )
-        reasons = quality.left_alone(self._streets) | dict.fromkeys(
-            left, "left alone by the scenario"
+        reasons = dict.fromkeys(left, "left alone by the scenario") | quality.left_alone(
+            self._streets,
+            timetabled(net_file, additional),
+            without_effect(setup.options, setup.mesoscopic) if setup else "",
         )
         names = self.network.region_names
         self._tables = quality.tables(self._streets, self._regions, names, built, None, reasons)

@@ -44,7 +44,8 @@ class Gateway:
     """A boundary movement from an edge in region `source` over a junction to an edge in region
     `target`.
 
-    signal: the one that controls it, None where it leaks; links: its indices in the signal's state
+    signal: the one that controls all of it, None where it leaks; links: its indices in the
+        signal's state
     lanes: numbers of those that it comes from
     """
 
@@ -416,12 +417,18 @@ def _gateways(links: list[_Connection], region_of: dict[str, int]) -> tuple[Gate
             target=key[1],
             from_edge=key[2],
             to_edge=key[3],
-            signal=members[0].signal,
+            signal=_common_signal(members),
             links=tuple(sorted(link.link for link in members if link.signal)),
             lanes=tuple(sorted({link.lane for link in members})),
         )
         for key, members in sorted(movements.items())
     )
+
+
+def _common_signal(links: list[_Connection]) -> str | None:
+    """Return the signal that controls all links of a movement, None if there is none."""
+    signals = {link.signal for link in links}
+    return signals.pop() if len(signals) == 1 else None
 
 
 def gateway_movements(city: City) -> dict[str, dict[int, int]]:
