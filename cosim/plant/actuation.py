@@ -68,7 +68,11 @@ class Actuation:
             plan, links = programmes[signal], movements[signal]
             phases[signal] = plan.phases
             if plan.static:
-                self._controls.append(GatewaySignal(plan, links, start=session.time, show=show))
+                self._controls.append(
+                    GatewaySignal(
+                        plan, links, start=session.time, step=session.step_length, show=show
+                    )
+                )
             else:
                 self._controls.append(
                     ResponsiveSignal(session, plan, links, show=show, release=incidents.release)

@@ -12,9 +12,10 @@ Then come the original yellow and red. Green is only taken away: no new conflict
 original programme. The green that is taken stays red.
 """
 
-from bisect import bisect_right
+from bisect import bisect_left
 from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import accumulate
+from typing import NamedTuple
 
 from cosim.sumo.arrays import PerGateway
 from cosim.sumo.session import Phase, Programme, Session
@@ -28,18 +29,26 @@ Show = Callable[[str, str], None]  # (signal, state): sets the state
 
 
 class GatewaySignal:
-    """A fixed-time signal with gateway links. next_change: time of the next change of its state
-    [s]"""
+    """A fixed-time signal with gateway links.
 
-    def __init__(self, programme: Programme, movements: Movements, *, start: float, show: Show):
-        """start: simulation time at which the programme was read [s]"""
+    Changes take effect as in SUMO: in the simulation step that contains their time.
+
+    next_change: time of the next change of its state [s]
+    """
+
+    def __init__(
+        self, programme: Programme, movements: Movements, *, start: float, step: float, show: Show
+    ):
+        """start: simulation time at which the programme was read; step: of the simulation [s]"""
         self._signal, self._phases, self._show = programme.signal, programme.phases, show
+        self._step, self._cycle = step, programme.cycle
+        self._cycle_start = start - programme.position
+        self._ends = list(accumulate(phase.duration for phase in programme.phases))
         self._movements = {
             link: _Movement(gateway, programme, link) for link, gateway in movements.items()
         }
-        self._cycle, self._cycle_start = programme.cycle, start - programme.position
-        self._ends = list(accumulate(phase.duration for phase in programme.phases))
-        self._shown, self._since, self.next_change = "", start, start
+        self._shown = ""
+        self._since = self.next_change = start
 
     def command(self, share: PerGateway) -> None:
         """Set the shares (G,) [-] of the windows or cycles that begin from now on."""
@@ -47,21 +56,21 @@ class GatewaySignal:
             movement.share = float(share[movement.gateway])
 
     def play(self, now: float) -> None:
-        """Set the state from `now` [s] on."""
-        if now < self.next_change - 1e-6:
+        """Set the state of the simulation step that begins at `now` [s]."""
+        step_end = now + self._step - 1e-6
+        if self.next_change >= step_end:
             return
         for link, movement in self._movements.items():
             if self._shown and self._shown[link] in GREEN:
                 movement.green_time += now - self._since
-        while now >= self._cycle_start + self._cycle:
+        while self._cycle_start + self._cycle < step_end:
             self._cycle_start += self._cycle
-        phase = min(bisect_right(self._ends, now - self._cycle_start + 1e-6), len(self._ends) - 1)
-        shown, self.next_change = (
-            list(self._phases[phase].state),
-            self._cycle_start + self._ends[phase],
-        )
+        phase = bisect_left(self._ends, step_end - self._cycle_start)
+        phase = min(phase, len(self._ends) - 1)
+        shown = list(self._phases[phase].state)
+        self.next_change = self._cycle_start + self._ends[phase]
         for link, movement in self._movements.items():
-            shown[link], change = self._filter(movement, shown[link], phase, now)
+            shown[link], change = self._filter(movement, shown[link], phase, step_end)
             self.next_change = min(self.next_change, change)
         self._shown, self._since = "".join(shown), now
         self._show(self._signal, self._shown)
@@ -73,56 +82,75 @@ class GatewaySignal:
         }
 
     def _filter(
-        self, movement: "_Movement", base: str, phase: int, now: float
+        self, movement: "_Movement", base: str, phase: int, step_end: float
     ) -> tuple[str, float]:
         """Return the light of a link instead of `base`, and the time of its next change [s]."""
-        full = movement.windows.get(phase, 0.0)
-        always = full >= self._cycle  # a link without red: its window is the cycle
-        if base in GREEN:
-            if not movement.open or (always and now - movement.opened_at >= self._cycle - 1e-6):
-                movement.open, movement.cut_at = True, NEVER
-                if self._shown:  # the window during which control starts is left whole
-                    least = min(MIN_GREEN_S, full)
-                    most = (
-                        full - movement.yellow if always else full
-                    )  # its yellow ends with the cycle
-                    kept = (
-                        full
-                        if movement.share >= 1.0
-                        else min(least + round(movement.share * (full - least)), most)
-                    )
-                    movement.opened_at, movement.cut_at = now, now + kept
-            if now < movement.cut_at:
-                return base, movement.cut_at
-        else:
-            movement.open = False
-            if base != "y":
-                movement.cut_at = NEVER
-                return base, NEVER
-            if now < movement.cut_at:
-                return base, NEVER
+        window = movement.windows.get(phase)
+        if window is not None:
+            begin = self._cycle_start + window.after_cycle_start
+            if begin > movement.begin + 1e-6:
+                movement.begin = begin
+                # The window during which control starts is left whole.
+                movement.cut_at = movement.end_of(window) if self._shown else NEVER
+        elif base != "y":
+            movement.cut_at = NEVER
+        if movement.cut_at >= step_end:
+            return base, movement.cut_at
         red_at = movement.cut_at + movement.yellow
-        return ("y", red_at) if now < red_at else ("r", NEVER)
+        return ("y", red_at) if red_at >= step_end else ("r", NEVER)
+
+
+class _Window(NamedTuple):
+    """A green window of a link: its begin against that of the cycle, and its length [s]."""
+
+    after_cycle_start: float
+    length: float
 
 
 class _Movement:
     """State of a gateway link between two changes.
 
-    windows: phase -> length [s] of the green window that begins there, which may pass the cycle's
-        end
+    windows: phase with green -> its window; a link without red has one window, the cycle
+    begin: of the present window, or the last one [s]; cut_at: end of its green [s]
     """
 
     def __init__(self, gateway: int, programme: Programme, link: int):
         self.gateway, self.green_time, self.share = gateway, 0.0, 1.0
-        phases, self.yellow = programme.phases, yellow_time(programme.phases, link)
-        green = [phase.state[link] in GREEN for phase in phases]
-        starts = [n for n in range(len(phases)) if green[n] and not green[n - 1]]
-        self.windows = (
-            {0: programme.cycle}
-            if all(green)
-            else {n: run_length(phases, n, link, GREEN) for n in starts}
-        )
-        self.open, self.opened_at, self.cut_at = False, -NEVER, NEVER
+        self.yellow = yellow_time(programme.phases, link)
+        self.windows, self._always = _windows(programme, link)
+        self.begin, self.cut_at = -NEVER, NEVER
+
+    def end_of(self, window: _Window) -> float:
+        """Return the end of the green in the present window [s]."""
+        if self.share >= 1.0:
+            return NEVER
+        least = min(MIN_GREEN_S, window.length)
+        most = window.length
+        if self._always:
+            most -= self.yellow  # its yellow ends with the cycle
+        kept = least + round(self.share * (window.length - least))
+        return self.begin + min(kept, most)
+
+
+def _windows(programme: Programme, link: int) -> tuple[dict[int, _Window], bool]:
+    """Return phase with green -> its window, and True for a link that is never red."""
+    phases = programme.phases
+    green = [phase.state[link] in GREEN for phase in phases]
+    if all(green):
+        return dict.fromkeys(range(len(phases)), _Window(0.0, programme.cycle)), True
+    windows: dict[int, _Window] = {}
+    begin = 0.0
+    for first, phase in enumerate(phases):
+        if green[first] and not green[first - 1]:
+            length = run_length(phases, first, link, GREEN)
+            n, after = first, begin
+            while green[n]:
+                windows[n] = _Window(after, length)
+                n += 1
+                if n == len(phases):  # it passes the end of the cycle
+                    n, after = 0, after - programme.cycle
+        begin += phase.duration
+    return windows, False
 
 
 def yellow_time(phases: Sequence[Phase], link: int) -> float:

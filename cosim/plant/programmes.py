@@ -169,7 +169,7 @@ def write_optimised(
             )
         if plan == plans[0]:
             _keep_times(plan, city.net_file)
-    # Whole seconds: perimeter control follows programmes second by second.
+    # Offsets in whole seconds, as in plans of practice.
     whole = re.sub(
         r'offset="([^"]+)"',
         lambda m: f'offset="{round(float(m[1]))}"',
