@@ -148,7 +148,7 @@ def test_u_max_is_the_original_programme_to_the_fraction_of_a_second():
     signal.command(np.ones(1))
     for now in np.arange(0.0, 271.0, 0.1):
         signal.play(now)
-    assert signal.green_time()["s"][0] == pytest.approx(3 * 42.4)
+    assert signal.green_time()["s"][0].shown == pytest.approx(3 * 42.4)
 
 
 @pytest.mark.parametrize(
@@ -219,5 +219,7 @@ def test_a_ration_of_green_is_spent_in_every_cycle(lights, share, full, expected
         shown += last
         assert ration.opened(second) == (last == "G" and shown[-2:-1] != "G")
     assert shown == expected
-    assert ration.green_time(float(len(lights))) == shown.count("G")
+    green = ration.green_time(float(len(lights)))
+    assert green.shown == shown.count("G")
+    assert green.ungated == lights.count("G")
     assert ration.limited == (share < 1.0)

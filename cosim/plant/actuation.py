@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from cosim.plant.gates import GatewaySignal, ResponsiveSignal
+from cosim.plant.gates import GatewaySignal, Green, ResponsiveSignal
 from cosim.plant.incidents import Incidents
 from cosim.plant.max_pressure import FACTS, MaxPressure
 from cosim.plant.room import Room
@@ -64,6 +64,7 @@ class Actuation:
             )
             self._controls.append(self._pressure)
             phases = {signal.id: signal.phases for signal in steered if signal.id in movements}
+        self._rationed = np.array([gateway.signal in phases for gateway in held.gateways], bool)
         for signal in sorted(movements.keys() - phases.keys()):
             plan, links = programmes[signal], movements[signal]
             phases[signal] = plan.phases
@@ -138,31 +139,35 @@ class Actuation:
             if not states or state != states[-1][1]:
                 states.append((now, state))
 
-    def green_time(self) -> PerGateway:
-        """Return (G,) [s] of green so far per gateway, mean of its links; NaN where no command
-        arrives."""
-        green = {
-            signal: times
-            for control in self._controls
-            for signal, times in control.green_time().items()
-        }
-        return np.array(
-            [
-                sum(green[g.signal][link] for link in g.links) / len(g.links)
-                if g.signal in green
-                else np.nan
-                for g in self._gateways
-            ]
-        )
+    def green_time(self) -> tuple[PerGateway, PerGateway]:
+        """Return two (G,) [s], mean of a gateway's links; NaN where no command arrives.
 
-    def as_shown(self, green: PerGateway) -> PerGateway:
-        """Return `green` (G,) [s] of the last interval, the original one where a signal did not
-        obey."""
+        The green so far, and that without commands.
+        """
+        times: dict[str, dict[int, Green]] = {}
+        for control in self._controls:
+            times |= control.green_time()
+        green = np.full((2, len(self._gateways)), np.nan)
+        for n, gateway in enumerate(self._gateways):
+            if gateway.signal in times:
+                of_links = [times[gateway.signal][link] for link in gateway.links]
+                green[:, n] = np.sum(of_links, axis=0) / len(of_links)
+        return green[0], green[1]
+
+    def ungated(self, green: PerGateway) -> PerGateway:
+        """Return the green (G,) [s] of the last interval without commands.
+
+        green: as timed, from `green_time`. Max-pressure seldom asks for the green of a link that is
+        held: there the original programme tells what it would get.
+        """
+        held = self._rationed & (self.room.gateway_shares() < 1.0)
+        return np.where(held, np.maximum(green, self.original_green), green)
+
+    def as_shown(self, green: PerGateway, ungated: PerGateway) -> PerGateway:
+        """Return `green` (G,) [s] of the last interval, `ungated` where a signal did not obey."""
         refused = self._incidents.refused
         return np.where(
-            [gateway.signal in refused for gateway in self._city.gateways],
-            self.original_green,
-            green,
+            [gateway.signal in refused for gateway in self._city.gateways], ungated, green
         )
 
     def pressure_facts(self) -> dict[str, float]:

@@ -28,6 +28,13 @@ Movements = Mapping[int, int]  # index of a gateway link -> number of its gatewa
 Show = Callable[[str, str], None]  # (signal, state): sets the state
 
 
+class Green(NamedTuple):
+    """Green of a link since the start [s]: as shown, and as it would be without commands."""
+
+    shown: float = 0.0
+    ungated: float = 0.0
+
+
 class GatewaySignal:
     """A fixed-time signal with gateway links.
 
@@ -60,9 +67,8 @@ class GatewaySignal:
         step_end = now + self._step - 1e-6
         if self.next_change >= step_end:
             return
-        for link, movement in self._movements.items():
-            if self._shown and self._shown[link] in GREEN:
-                movement.green_time += now - self._since
+        for movement in self._movements.values():
+            movement.count(now - self._since)
         while self._cycle_start + self._cycle < step_end:
             self._cycle_start += self._cycle
         phase = bisect_left(self._ends, step_end - self._cycle_start)
@@ -70,16 +76,16 @@ class GatewaySignal:
         shown = list(self._phases[phase].state)
         self.next_change = self._cycle_start + self._ends[phase]
         for link, movement in self._movements.items():
-            shown[link], change = self._filter(movement, shown[link], phase, step_end)
+            base = shown[link]
+            shown[link], change = self._filter(movement, base, phase, step_end)
+            movement.shown, movement.base = shown[link], base
             self.next_change = min(self.next_change, change)
         self._shown, self._since = "".join(shown), now
         self._show(self._signal, self._shown)
 
-    def green_time(self) -> dict[str, dict[int, float]]:
-        """Return signal -> gateway link -> green up to the last change [s]."""
-        return {
-            self._signal: {link: movement.green_time for link, movement in self._movements.items()}
-        }
+    def green_time(self) -> dict[str, dict[int, Green]]:
+        """Return signal -> gateway link -> green up to the last change."""
+        return {self._signal: {link: movement.green for link, movement in self._movements.items()}}
 
     def _filter(
         self, movement: "_Movement", base: str, phase: int, step_end: float
@@ -112,13 +118,25 @@ class _Movement:
 
     windows: phase with green -> its window; a link without red has one window, the cycle
     begin: of the present window, or the last one [s]; cut_at: end of its green [s]
+    shown, base: light that is shown, and that of the programme, since the last change
     """
 
     def __init__(self, gateway: int, programme: Programme, link: int):
-        self.gateway, self.green_time, self.share = gateway, 0.0, 1.0
+        self.gateway, self.share = gateway, 1.0
+        self.green = Green()
+        self.shown = self.base = ""
         self.yellow = yellow_time(programme.phases, link)
         self.windows, self._always = _windows(programme, link)
         self.begin, self.cut_at = -NEVER, NEVER
+
+    def count(self, seconds: float) -> None:
+        """Count the time since the last change as green if it was."""
+        shown, ungated = self.green
+        if self.shown in GREEN:
+            shown += seconds
+        if self.base in GREEN:
+            ungated += seconds
+        self.green = Green(shown, ungated)
 
     def end_of(self, window: _Window) -> float:
         """Return the end of the green in the present window [s]."""
@@ -203,13 +221,14 @@ class Ration:
     ):
         """start: time at which the first cycle begins [s]; full: green of share 1 in a cycle, the
         cycle if None [s]"""
-        self.gateway, self._green_time = gateway, 0.0
+        self.gateway, self._green = gateway, Green()
         self._full = cycle if full is None else full
         self._cycle, self._least, self._yellow = cycle, min(MIN_GREEN_S, self._full), yellow
         self.share, self._budget, self._spent = 1.0, NEVER, 0.0
         self._cycle_end = start
         self._open, self._opened_at = False, -NEVER
         self._light, self._since, self._yellow_until = "r", start, start
+        self._base = "r"  # the light that was last asked for
 
     @property
     def limited(self) -> bool:
@@ -225,12 +244,9 @@ class Ration:
 
         Call it also when `light` changes. lasting: a green lasts for the minimum green at least
         """
-        green = now - self._since if self._light in GREEN else 0.0
-        self._spent, self._green_time, self._since = (
-            self._spent + green,
-            self._green_time + green,
-            now,
-        )
+        before, self._green = self._green, self.green_time(now)
+        self._spent += self._green.shown - before.shown
+        self._since, self._base = now, light
         while now >= self._cycle_end - 1e-6:
             self._cycle_end += self._cycle
             self._spent = 0.0
@@ -239,9 +255,14 @@ class Ration:
         self._light, again = self._filter(light, now, lasting)
         return self._light, min(again, self._cycle_end)
 
-    def green_time(self, now: float) -> float:
+    def green_time(self, now: float) -> Green:
         """Return the green before `now` [s]."""
-        return self._green_time + (now - self._since if self._light in GREEN else 0.0)
+        shown, ungated = self._green
+        if self._light in GREEN:
+            shown += now - self._since
+        if self._base in GREEN:
+            ungated += now - self._since
+        return Green(shown, ungated)
 
     def opened(self, now: float) -> bool:
         return self._open and self._opened_at >= now - 1e-6
@@ -357,8 +378,8 @@ class ResponsiveSignal:
         elif self._held or self._limited:
             self._hold("".join(shown), now)
 
-    def green_time(self) -> dict[str, dict[int, float]]:
-        """Return signal -> gateway link -> green so far [s]."""
+    def green_time(self) -> dict[str, dict[int, Green]]:
+        """Return signal -> gateway link -> green so far."""
         now = self._session.time
         return {
             self._signal: {link: ration.green_time(now) for link, ration in self._rations.items()}

@@ -30,6 +30,7 @@ from scipy.sparse import csr_array
 from cosim.plant.gates import (
     MIN_GREEN_S,
     NEVER,
+    Green,
     Movements,
     Ration,
     Show,
@@ -95,8 +96,8 @@ class MaxPressure:
             for ration in junction.rations.values():
                 ration.share = float(share[ration.gateway])
 
-    def green_time(self) -> dict[str, dict[int, float]]:
-        """Return signal -> gateway link -> green so far [s]."""
+    def green_time(self) -> dict[str, dict[int, Green]]:
+        """Return signal -> gateway link -> green so far."""
         now = self._session.time
         return {
             junction.signal: {

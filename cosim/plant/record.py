@@ -67,11 +67,12 @@ class Recorder:
         """Add and return the row of the interval that has just ended. streets: its means"""
         totals = self._totals()
         added = {key: total - self._before[key] for key, total in totals.items()}
+        ungated = self._actuation.ungated(added["gateway_original_green"])
         row = {
             # Half the memory for counts, which fill the record of a long run.
             **{key: a.astype(np.int32) if a.dtype.kind == "i" else a for key, a in added.items()},
-            "gateway_green": self._actuation.as_shown(added["gateway_green"]),
-            "gateway_original_green": self._actuation.original_green,
+            "gateway_green": self._actuation.as_shown(added["gateway_green"], ungated),
+            "gateway_original_green": ungated,
             "gateway_command": self._actuation.room.command_of_gateways(),
             "gateway_share": self._actuation.room.gateway_shares(),
             "production": streets.production,
@@ -101,10 +102,12 @@ class Recorder:
         return {name: getattr(self._meter, name).copy() for name in BOOKS} | spent
 
     def _totals(self) -> dict[str, np.ndarray]:
+        green, ungated = self._actuation.green_time()
         return {
             **self._booked(),
             "teleports": np.array(self._meter.teleports),
             "guided": self._guide.realised.copy(),
             "gateway_flow": self._meter.gateway_flow(),
-            "gateway_green": self._actuation.green_time(),
+            "gateway_green": green,
+            "gateway_original_green": ungated,
         }
