@@ -25,29 +25,44 @@ SHEET = {  # variable of a result, column of signals.csv
         ("signal",), "s", "shortest green of a link; NaN without one that began and ended"
     ),
     "shortest_yellow": Quantity(("signal",), "s", "shortest yellow after a green; NaN without one"),
+    "shortest_clearance": Quantity(
+        ("signal",), "s", "shortest time from the green of a crossing to that of cars across it"
+    ),
     "longest_red": Quantity(
         ("signal",), "s", "longest time without green of a link that has green in a programme"
+    ),
+    "longest_wait": Quantity(
+        ("signal",), "s", "longest time that the first driver of a lane stood at red"
     ),
     "short_greens": Quantity(("signal",), "1", "greens below the minimum"),
     "short_yellows": Quantity(("signal",), "1", "greens without the original yellow after them"),
     "short_intergreens": Quantity(
         ("signal",), "1", "greens too soon after the green of another link"
     ),
+    "short_clearances": Quantity(
+        ("signal",), "1", "greens of cars too soon after the green of a crossing"
+    ),
     "conflicts": Quantity(
         ("signal",), "1", "pairs of links with green, or the right of way, as never originally"
     ),
 }
-VIOLATIONS = tuple(SHEET)[-4:]
+VIOLATIONS = tuple(SHEET)[-5:]
 States = Sequence[tuple[float, str]]  # time [s] and state at every change
 
 
 def proof_sheet(
-    states: Mapping[str, States], files: Iterable[Path], *, end: float, step: float
+    states: Mapping[str, States],
+    files: Iterable[Path],
+    *,
+    end: float,
+    step: float,
+    waits: Mapping[str, float],
 ) -> dict:
     """Return the arrays (S,) of SHEET.
 
     states: by signal; files: network and additional files, with the programmes
     end: of the run [s]; step: of the simulation [s], to which times are rounded down
+    waits: longest wait of a driver by signal [s]
     """
     programmes: dict[str, list[Element]] = {}
     crossings: dict[str, set[int]] = {}
@@ -61,7 +76,9 @@ def proof_sheet(
     rows = {
         signal: min(
             (
-                Rules(logic, crossings.get(signal, ()), step).judge(states[signal], end)
+                Rules(logic, crossings.get(signal, ()), step).judge(
+                    states[signal], end, waits.get(signal, np.nan)
+                )
                 for logic in programmes[signal]
             ),
             key=lambda row: sum(row[-len(VIOLATIONS) :]),
@@ -121,7 +138,7 @@ class Rules:
             )
 
         self.apart, self.yielding = (~(on.T @ on) for on in (green, lights == "G"))
-        crossing = np.isin(np.arange(lights.shape[1]), list(crossings))
+        self.crossing = crossing = np.isin(np.arange(lights.shape[1]), list(crossings))
         own, passed = least(~green, green), least(green, yellow)
         self.green = np.where(crossing & np.isfinite(own), own, np.minimum(own, MIN_GREEN_S))
         self.yellow = np.where(np.isfinite(passed), passed, np.where(crossing, 0.0, YELLOW_S))
@@ -152,9 +169,9 @@ class Rules:
         for times in (self.green, self.yellow, self.between):  # whole steps
             times[:] = np.floor(times / step + 1e-6) * step - 1e-6
 
-    def judge(self, states: States, end: float) -> tuple[float, float, float, int, int, int, int]:
+    def judge(self, states: States, end: float, wait: float = np.nan) -> tuple[float, ...]:
         """Return the row of SHEET; lights that began before the first state, or last to the end,
-        are not judged."""
+        are not judged. wait: the longest [s]"""
         time = np.array([time for time, _ in states])[:, None]
         lights = np.array([list(state) for _, state in states])
         green, yellow = np.isin(lights, ["G", "g"]), lights == "y"
@@ -168,13 +185,17 @@ class Rules:
         bare = ends & ~yellow & (self.yellow > 0.0)
         red = np.where(starts, time - np.maximum(_before(ended), time[0]), 0.0).max(axis=0)
         red = np.where(green[-1], red, np.maximum(red, end - np.maximum(ended[-1], time[0])))
-        early = 0
+        early = early_after_walk = 0
+        clearances = [np.inf]
         for link, apart in enumerate(self.apart.T):
             rows = starts[:, link]
             gap = time[rows] - ended[rows]
-            early += np.count_nonzero(
-                (apart & ~green[rows] & (gap < self.between[:, link])).any(axis=1)
-            )
+            others = apart & ~green[rows]
+            too_soon = others & (gap < self.between[:, link])
+            walks = self.crossing & ~self.crossing[link]
+            early += np.count_nonzero((too_soon & ~walks).any(axis=1))
+            early_after_walk += np.count_nonzero((too_soon & walks).any(axis=1))
+            clearances.append(gap[others & walks].min(initial=np.inf))
         conflicts = 0
         for on, first in zip(green, lights == "G", strict=True):
             pairs = self.apart & np.outer(on, on) | self.yielding & np.outer(first, first)
@@ -182,10 +203,13 @@ class Rules:
         return (
             _least(lasted[ends]),
             _least(lasted[over]),
+            _least(np.array(clearances)),
             float(red[~self.apart.diagonal()].max(initial=0.0)),
+            wait,
             np.count_nonzero(ends & (lasted < self.green)),
             np.count_nonzero(bare) + np.count_nonzero(over & (lasted < self.yellow)),
             early,
+            early_after_walk,
             conflicts,
         )
 

@@ -91,6 +91,7 @@ def simulate(
         )
         if gui:
             return result
+        waits = plant.longest_waits()
         plant_facts, leaks, emissions = (
             plant.facts(),
             set(plant.actuation.leaks()),
@@ -105,7 +106,7 @@ def simulate(
             [plant.city.net_file, *programmes],
             plant.edge_totals(),
         )
-        sheet = proof_sheet(shown, files, end=end, step=chosen.step_length)
+        sheet = proof_sheet(shown, files, end=end, step=chosen.step_length, waits=waits)
         measures, totals["trip_time_by_origin"] = trip_measures(
             plant.meter.trips(), plant.city.regions
         )

@@ -10,6 +10,7 @@ from cosim.plant.max_pressure import FACTS, MaxPressure
 from cosim.plant.room import Room
 from cosim.plant.settings import Settings
 from cosim.plant.supervisor import Supervisor
+from cosim.plant.waits import Waits
 from cosim.sumo.arrays import PerEdge, PerGateway
 from cosim.sumo.net import City, Gateway, gateway_movements
 from cosim.sumo.session import Phase, Session
@@ -131,13 +132,15 @@ class Actuation:
             control.play(now)
         self._incidents.play(now)
 
-    def observe(self) -> None:
-        """Note the states that SUMO has shown in the last simulation step."""
+    def observe(self, waits: Waits | None = None) -> None:
+        """Note the states that SUMO has shown in the last simulation step. waits: hears of them"""
         state_of, now = self._session.signal_state, self._session.time
         for signal, states in self.states.items():
             state = state_of(signal)
             if not states or state != states[-1][1]:
                 states.append((now, state))
+                if waits is not None:
+                    waits.changed(signal, state, now)
 
     def green_time(self) -> tuple[PerGateway, PerGateway]:
         """Return two (G,) [s], mean of a gateway's links; NaN where no command arrives.

@@ -19,10 +19,12 @@ from cosim.plant.sampling import SAMPLE_PERIOD_S, StreetMeans, StreetSampler
 from cosim.plant.settings import ESTIMATE, MAX_PRESSURE, Settings, check_lanes
 from cosim.plant.settings import settings as settings_of
 from cosim.plant.stuck import Junctions
+from cosim.plant.waits import Waits
 from cosim.sumo.arrays import PerEdge
 from cosim.sumo.net import City, check_adjacency
 from cosim.sumo.outputs import TripReader, edge_emissions
 from cosim.sumo.session import Session
+from cosim.sumo.signals import read_links
 from nmfd.model.planning import PlanningModel, planning_model
 from nmfd.model.scenario import Scenario
 from nmfd.types import Controls, Observation, State
@@ -135,7 +137,10 @@ class SumoPlant:
             self._incidents,
             flows,
         )
-        self._junctions = None if settings.mesoscopic else Junctions(session, city)
+        self._junctions, self._waits = None, None
+        if not settings.mesoscopic:  # that model has no lanes
+            self._junctions = Junctions(session, city)
+            self._waits = Waits(session, read_links(city.net_file))
         self._state = meter.state(0, 0.0)
         self._recorder = Recorder(meter, self._guide, self.actuation)
         self._observer.began(city, self._state)
@@ -167,12 +172,14 @@ class SumoPlant:
             if self._metering:
                 self._metering.play()
             session.step()
-            self.actuation.observe()
+            self.actuation.observe(self._waits)
             events = self.meter.observe()
             if self._estimation and n % reading == 0:
                 self._estimation.sample()
             if n % sampling == 0:
                 self._sampler.sample()
+                if self._waits:
+                    self._waits.sample()
                 if n < steps:
                     self.actuation.update(self._sampler.last[0])
                 self._observer.sampled(session.time, *self._sampler.last)
@@ -220,6 +227,10 @@ class SumoPlant:
             "led_on_veh": self._guide.led_on,
             **self.actuation.pressure_facts(),
         }
+
+    def longest_waits(self) -> dict[str, float]:
+        """Return signal -> longest time [s] that a driver waited there at red so far."""
+        return self._waits.longest() if self._waits else {}
 
     def trip_facts(self) -> dict[str, float]:
         """End the simulation, close the books, and return emissions [kg] of all vehicles.

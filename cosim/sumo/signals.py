@@ -161,6 +161,11 @@ def read_logics(net: Path, additional: Iterable[Path] = ()) -> dict[str, Logic]:
     return {name: _logic(element) for name, element in _read(net, additional).programmes.items()}
 
 
+def read_links(net: Path) -> Mapping[str, Sequence[Link]]:
+    """Return signal -> its links, without those of crossings. Raises InputError."""
+    return _read(net, ()).links
+
+
 def running_logic(programme: Programme) -> Logic:
     """Return a programme that runs in a session."""
     kind = "other"

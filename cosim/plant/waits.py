@@ -1,0 +1,77 @@
+"""How long drivers wait at red signals, which the proof sheet of a run tells.
+
+A driver waits from the time when the vehicle stands first on its lane and its light is red, until
+the light ends. Samples find these drivers, and changes of signals end their waits.
+"""
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+
+from cosim.sumo.session import Session
+from cosim.sumo.signals import CLOSED, Link, lane_id
+
+
+class Waits:
+    """Waits of one run: `sample` every few seconds, `changed` at every change of a signal."""
+
+    def __init__(self, session: Session, links: Mapping[str, Iterable[Link]]):
+        """links: signal -> its links"""
+        self._session = session
+        # Edge -> lane -> next edge -> signal and link.
+        self._lanes: dict[str, dict[str, dict[str, tuple[str, int]]]] = {}
+        for signal, own in links.items():
+            for link in own:
+                lanes = self._lanes.setdefault(link.from_edge, {})
+                lanes.setdefault(lane_id(link), {})[link.to_edge] = signal, link.index
+        self._red_since: dict[str, dict[int, float]] = defaultdict(dict)  # signal -> link -> [s]
+        self._waiting: dict[str, dict[int, float]] = defaultdict(dict)  # the same of drivers
+        self._longest: dict[str, float] = {}
+
+    def changed(self, signal: str, state: str, now: float) -> None:
+        """Take the state of a signal from `now` [s] on."""
+        red, waiting = self._red_since[signal], self._waiting[signal]
+        for link, light in enumerate(state):
+            if light in CLOSED:
+                red.setdefault(link, now)
+                continue
+            red.pop(link, None)
+            begin = waiting.pop(link, None)
+            if begin is not None:
+                self._end(signal, now - begin)
+
+    def sample(self) -> None:
+        """Look for the drivers who wait now."""
+        session, now = self._session, self._session.time
+        self._waiting.clear()
+        for edge, lanes in self._lanes.items():
+            if not session.halting(edge):
+                continue
+            for lane, targets in lanes.items():
+                vehicle = session.first_on(lane)
+                if vehicle is None:
+                    continue
+                standing = session.standing_time(vehicle)
+                if standing == 0.0:
+                    continue
+                ahead = targets.get(self._next_edge(vehicle))
+                if ahead is None:  # the vehicle is on the wrong lane
+                    continue
+                signal, link = ahead
+                red_since = self._red_since[signal].get(link)
+                if red_since is not None:
+                    self._waiting[signal][link] = max(now - standing, red_since)
+
+    def longest(self) -> dict[str, float]:
+        """Return signal -> longest wait so far [s]; no entry where nobody waited."""
+        for signal, waiting in self._waiting.items():
+            for begin in waiting.values():
+                self._end(signal, self._session.time - begin)
+        return self._longest
+
+    def _end(self, signal: str, seconds: float) -> None:
+        self._longest[signal] = max(seconds, self._longest.get(signal, 0.0))
+
+    def _next_edge(self, vehicle: str) -> str:
+        """Return the next edge of a vehicle's route, "" at its end."""
+        route, place = self._session.route(vehicle), self._session.route_index(vehicle)
+        return route[place + 1] if place + 1 < len(route) else ""
