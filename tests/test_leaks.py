@@ -11,6 +11,7 @@ import tiny_city
 from commands import cosim
 from test_responsive import CARS, CONFIG
 
+from cosim.api import run_controllers
 from cosim.evaluation.simulate import leaking_share
 from cosim.report.city import City
 from cosim.sumo.signals import free_light
@@ -180,6 +181,17 @@ def test_turns_on_red_leak_and_the_other_gates_hold(tmp_path):
     with tiny_city.played(scenario, 2, OPEN, chain_limit=0.0) as (_, _, record):
         free = record.gateway_flow.sum(axis=0)
     assert seen.flow[seen.controlled].sum() < 0.5 * free[seen.controlled].sum()
+
+
+@pytest.mark.parametrize("contents", [arrows, off, timetable, everywhere("o")])
+def test_a_whole_run(tmp_path, contents):
+    """Without words about broken rules; a timetable may cut the green of a programme short."""
+    scenario, out = imported(tmp_path, contents), tmp_path / "out"
+    text = run_controllers(scenario, ["no-control"], steps=3, out=out)
+    assert "break their rules" not in text
+    row = pd.read_csv(out / "runs.csv").iloc[0]
+    assert row.signal_violations == 0
+    assert row.leaking_share > 0.5
 
 
 def test_max_pressure_runs_signals_with_turns_on_red(tmp_path):

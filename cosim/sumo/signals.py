@@ -225,7 +225,7 @@ def phases_of(logic: ElementTree.Element) -> tuple[Phase, ...]:
     phases = []
     for row in logic.iter("phase"):
         try:
-            duration, state = _seconds(attribute(row, "duration")), attribute(row, "state")
+            duration, state = seconds_of(attribute(row, "duration")), attribute(row, "state")
         except ValueError as error:
             raise InputError(f"tlLogic {logic.get('id')}: phase: {error}; correct it") from None
         phases.append(Phase(duration=duration, state=state))
@@ -295,7 +295,7 @@ def _is_on(value: str) -> bool:
     return value.lower() in ("true", "1", "yes", "on", "x", "t")
 
 
-def _seconds(text: str) -> float:
+def seconds_of(text: str) -> float:
     """Convert a time of SUMO: seconds, or days:hours:minutes:seconds. Raises ValueError."""
     total = 0.0
     for part, unit in zip(reversed(text.split(":")), (1.0, 60.0, 3600.0, 86400.0), strict=False):
