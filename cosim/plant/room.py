@@ -19,6 +19,8 @@ distribution of metered traffic flow in perimeter control: queue and delay balan
 2021.
 """
 
+from collections import defaultdict, deque
+
 import numpy as np
 
 from cosim.sumo.arrays import PerEdge, PerGateway
@@ -44,25 +46,24 @@ class Room:
         """
         gateways, number = city.gateways, city.number
         self._session, self._limit = session, limit
-        self._source, self._target = (
-            np.array([(g.source, g.target) for g in gateways], dtype=int).reshape(-1, 2).T
-        )
-        self._capacity = np.nan_to_num(green) * [len(g.lanes) for g in gateways]
-        obedient = np.flatnonzero(self._capacity > 0)
-        pairs = self._source[obedient], self._target[obedient]
-        self._boundaries = {
-            (int(i), int(h)): obedient[(pairs[0] == i) & (pairs[1] == h)]
-            for i, h in set(zip(*pairs, strict=True))
-        }
+        self._source = np.array([gateway.source for gateway in gateways], dtype=int)
+        self._target = np.array([gateway.target for gateway in gateways], dtype=int)
+        self._capacity = np.nan_to_num(green) * [len(gateway.lanes) for gateway in gateways]
+        boundaries = defaultdict[tuple[int, int], list[int]](list)
+        for n in np.flatnonzero(self._capacity > 0):  # the gateways that obey
+            boundaries[gateways[n].source, gateways[n].target].append(n)
+        self._boundaries = {pair: np.array(members) for pair, members in boundaries.items()}
         self._room = city.room
-        self._behind = np.array([number[g.to_edge] for g in gateways], dtype=int)
-        self._chains = [[number[edge] for edge in upstream(city, g.from_edge)] for g in gateways]
-        self._lanes = [
-            [f"{g.from_edge}_{lane}" for lane in g.lanes] if lanes else [] for g in gateways
-        ]
-        self._lane_room = np.array(
-            [len(g.lanes) * max(city.length[g.from_edge] / JAM_SPACING, 1.0) for g in gateways]
-        )
+        self._behind = np.array([number[gateway.to_edge] for gateway in gateways], dtype=int)
+        self._chains: list[list[int]] = []  # of edges
+        self._lanes: list[list[str]] = []
+        lane_room = []
+        for gateway in gateways:
+            edge = gateway.from_edge
+            self._chains.append([number[street] for street in upstream(city, edge)])
+            self._lanes.append([f"{edge}_{lane}" for lane in gateway.lanes] if lanes else [])
+            lane_room.append(len(gateway.lanes) * max(city.length[edge] / JAM_SPACING, 1.0))
+        self._lane_room = np.array(lane_room)
         self._commanded = np.ones((city.regions, city.regions))
         self._shares: list[PerGateway] = []  # since the last command
         self.share = np.ones(len(gateways))
@@ -80,11 +81,11 @@ class Room:
             chain = [vehicles[edges].sum() / self._room[edges].sum() for edges in self._chains]
             before = np.clip(np.maximum(own / self._lane_room, chain), 0.0, 1.0)
             behind = vehicles[self._behind] / self._room[self._behind]
+            urgency = before - behind
             floor = np.clip(2.0 * before / self._limit - 1.0, 0.0, 1.0)
             for pair, members in self._boundaries.items():
-                urgency, capacity = (before - behind)[members], self._capacity[members]
                 self.share[members] = shared(
-                    self._commanded[pair], urgency, floor[members], capacity
+                    self._commanded[pair], urgency[members], floor[members], self._capacity[members]
                 )
         self._shares.append(self.share)
 
@@ -97,8 +98,10 @@ class Room:
         return np.mean(self._shares, axis=0)
 
     def realised(self) -> PerPair | None:
-        """Return the mean shares (R, R) [-] since the command, which counts where no gate obeys;
-        None without limit."""
+        """Return (R, R) [-], the mean share that each boundary's gateways got since the command.
+
+        The commanded share counts where no gateway is controlled. None if `chain_limit` is 0.
+        """
         if self._limit == 0:
             return None
         realised, share = self._commanded.copy(), self.gateway_shares()
@@ -110,25 +113,28 @@ class Room:
 def shared(
     share: float, urgency: PerGateway, floor: PerGateway, capacity: PerGateway
 ) -> PerGateway:
-    """Return clip(urgency + m, floor, 1) with the mean `share`, weighted by capacity, or `floor` if
-    that is more."""
+    """Return clip(urgency + m, floor, 1), with m such that the mean is `share`.
+
+    The mean is weighted by capacity; it is that of `floor` if that is more.
+    """
     if share >= 1.0:
         return np.ones(len(urgency))
-    bends = np.sort(
-        np.concatenate([floor - urgency, 1.0 - urgency])
-    )  # m where the mean, piecewise linear, bends
+    # The mean is piecewise linear in m, with bends where a gateway reaches floor or 1.
+    bends = np.sort(np.concatenate([floor - urgency, 1.0 - urgency]))
     means = np.clip(urgency + bends[:, None], floor, 1.0) @ (capacity / capacity.sum())
     return np.clip(urgency + np.interp(share, means, bends), floor, 1.0)
 
 
 def upstream(city: City, edge: str) -> list[str]:
-    """Return `edge` and all streets that lead there past no signal and end less than CHAIN_M before
-    its end."""
-    chain, waiting = {edge: city.length[edge]}, [edge]
+    """Return `edge` and all streets that lead there past no signal, up to CHAIN_M away."""
+    to_the_end = {edge: city.length[edge]}  # street -> distance from its begin to the gateway [m]
+    waiting = deque([edge])
     while waiting:
-        street = waiting.pop(0)
+        street = waiting.popleft()
+        if to_the_end[street] >= CHAIN_M:
+            continue
         for source in city.before[street]:
-            if chain[street] < CHAIN_M and source not in city.signals and source not in chain:
-                chain[source] = chain[street] + city.length[source]
+            if source not in city.signals and source not in to_the_end:
+                to_the_end[source] = to_the_end[street] + city.length[source]
                 waiting.append(source)
-    return list(chain)
+    return list(to_the_end)
