@@ -29,25 +29,24 @@ from nmfd.model.planning import PlanningModel, planning_model
 from nmfd.model.scenario import Scenario
 from nmfd.types import Controls, Observation, State
 
-GUIDANCE = (
-    0x67756964  # keeps the random numbers of the guided drivers apart from others of the same seed
-)
+# Keeps the random numbers of the guided drivers apart from others of the same seed.
+GUIDANCE = 0x67756964
 
 
 class Observer:
-    """Base class of observers, which read a run and may delay it; an exception of theirs ends the
-    run."""
+    """Callbacks during a run. They block the simulation; an exception aborts it."""
 
     def began(self, city: City, state: State) -> None:
         """Take the initial state."""
 
     def sampled(self, time: float, vehicles: PerEdge, speed: PerEdge) -> None:
-        """Take a sample every few seconds: SUMO's time [s], vehicles (E,) [veh], mean speed (E,)
-        [m/s]."""
+        """Take a sample every few seconds.
+
+        time: SUMO's [s]; vehicles: (E,) [veh]; speed: (E,) [m/s], mean
+        """
 
     def recorded(self, controls: Controls, state: State, row: Mapping[str, np.ndarray]) -> None:
-        """Take controls, new state and row of the record (cosim.plant.record) after a control
-        interval."""
+        """Take controls, new state and row of the record (cosim.plant.record) of an interval."""
 
 
 class SumoPlant:
@@ -69,21 +68,23 @@ class SumoPlant:
     ):
         """Build the network if need be.
 
-        settings: instead of the table [sumo]; trip_file: for SUMO's tripinfo, complete after
-            `trip_facts`
-        gui: show the run in sumo-gui; planning: model of the estimator, that of the scenario if
-            None
+        settings: instead of the table [sumo]
+        trip_file: for SUMO's tripinfo, complete after `trip_facts`
+        gui: show the run in sumo-gui
+        planning: model of the estimator; that of the scenario if None
         Raises InputError for a city that does not fit the scenario's network or the settings.
         """
         self._scenario, self._planning = scenario, planning or planning_model(scenario)
         self._observer = observer or Observer()
-        self._settings = settings = settings or settings_of(scenario)
+        settings = settings or settings_of(scenario)
+        self._settings = settings
         check_lanes(scenario, settings)
         self.city: City = scenario_city(scenario, settings)
         check_adjacency(self.city, scenario.network)
         self._layout = lay_out(self.city, settings.detector_share)
         self._instruments = instruments(self.city, self._layout, settings.probe_share)
-        self.steered, self.other_signals = signals = city_signals(self.city, scenario, settings)
+        signals = city_signals(self.city, scenario, settings)
+        self.steered, self.other_signals = signals
         self._launch = Launch(
             scenario, settings, self.city, signals, self._layout, trip_file=trip_file, gui=gui
         )
@@ -93,21 +94,24 @@ class SumoPlant:
         """Start a simulation whose trips, drivers and reroutes follow from `seed`."""
         self._end_session()
         scenario, settings, city = self._scenario, self._settings, self.city
-        self._k, self._session = 0, self._launch.start(seed)
-        session = self._session
+        session = self._launch.start(seed)
+        self._k, self._session = 0, session
         self._trips = TripReader(self._launch.trip_file, session.flush or (lambda: None))
         self._incidents = Incidents(scenario.ordered_faults, session, city)
-        held, critical = self._launch.held, self._planning.network.critical
         self._metering = None
-        if held is not None:
+        if self._launch.held is not None:
             self._metering = Metering(
-                session, held, critical, level=settings.metering, step=scenario.step
+                session,
+                self._launch.held,
+                self._planning.network.critical,
+                level=settings.metering,
+                step=scenario.step,
             )
         estimated = settings.measurement == ESTIMATE
         known = probes(self._launch.vehicles, settings.probe_share if estimated else 0.0, seed)
-        self.meter = meter = Meter(
-            session, city, known, self._trips if session.flush else None, self._metering
-        )
+        trips = self._trips if session.flush else None
+        meter = Meter(session, city, known, trips, self._metering)
+        self.meter = meter
         self._estimation = None
         if estimated:
             self._estimation = Estimation(
@@ -147,22 +151,17 @@ class SumoPlant:
         return self._state
 
     def step(self, controls: Controls) -> State:
-        """Simulate one control interval: actuate, simulate, measure and guide in every simulation
-        step; then record."""
+        """Simulate one control interval, and record it.
+
+        In every simulation step: actuate, simulate, measure and guide.
+        """
         session, scenario = self.session, self._scenario
         steps = round(scenario.step / session.step_length)
-        reading, sampling = (
-            min(max(1, round(seconds / session.step_length)), steps)
-            for seconds in (READING_PERIOD_S, SAMPLE_PERIOD_S)
-        )
+        reading = self._period(READING_PERIOD_S, steps)
+        sampling = self._period(SAMPLE_PERIOD_S, steps)
         self._incidents.begin(self._k)
         self.actuation.command(controls.perimeter, self._sampler.last[0])
-        splits = controls.splits
-        if controls.prices is not None or (
-            splits is None and self._settings.guided
-        ):  # by travel times alone
-            splits = scenario.network.nominal_splits
-        self._guide.command(splits, self._streets, controls.prices)
+        self._guide.command(self._splits(controls), self._streets, controls.prices)
         if self._metering:
             self._metering.command(controls.metering, self._state.accumulation.sum(axis=1))
         if self._junctions:
@@ -186,12 +185,14 @@ class SumoPlant:
             self._guide.apply(events)
         self._k += 1
         state = self.meter.state(self._k, self._k * scenario.step)
-        self._streets = streets = self._sampler.finish(self._incidents.closed)
+        streets = self._sampler.finish(self._incidents.closed)
+        self._streets = streets
         realised = self.actuation.realised()
         if self._estimation:
-            self._estimation.update(
-                controls if realised is None else replace(controls, perimeter=realised)
-            )
+            acted = controls
+            if realised is not None:
+                acted = replace(controls, perimeter=realised)
+            self._estimation.update(acted)
         self._state = replace(state, problem=self._incidents.problem(), realised=realised)
         row = self._recorder.add(streets)
         self._observer.recorded(controls, self._state, row)
@@ -199,13 +200,13 @@ class SumoPlant:
 
     def observe(self) -> Observation | None:
         """Return the estimate; None if the exact state is measured."""
-        if (known := self._estimation) is None:
+        if self._estimation is None:
             return None
         return Observation(
             step=self._k,
             time=self._state.time,
-            accumulation=known.accumulation,
-            backlog=known.backlog(),
+            accumulation=self._estimation.accumulation,
+            backlog=self._estimation.backlog(),
             realised=self._state.realised,
         )
 
@@ -261,11 +262,24 @@ class SumoPlant:
 
     @property
     def session(self) -> Session:
-        """Return the running simulation. Raises RuntimeError before the first reset and after the
-        end."""
+        """Return the running simulation.
+
+        Raises RuntimeError before the first reset and after the end.
+        """
         if self._session is None:
             raise RuntimeError("no simulation is running; call reset(seed) first")
         return self._session
+
+    def _period(self, seconds: float, steps: int) -> int:
+        """Return a period in simulation steps: at least one, at most all `steps` of an interval."""
+        return min(max(1, round(seconds / self.session.step_length)), steps)
+
+    def _splits(self, controls: Controls) -> np.ndarray | None:
+        """Return the split ratios of the guidance; nominal ones for guidance by travel times."""
+        by_travel_times = controls.splits is None and self._settings.guided
+        if controls.prices is not None or by_travel_times:
+            return self._scenario.network.nominal_splits
+        return controls.splits
 
     def _end_session(self) -> None:
         if self._session is not None:
