@@ -1,15 +1,13 @@
 """Perimeter control to green: how commands limit the green of gateway links, signal by signal.
 
-With s the share of its gateway (cosim.plant.room), and m the minimum green, a gateway link keeps m
-+ s (L - m) seconds
+With s the share of its gateway (cosim.plant.room), and m the minimum green, a gateway link keeps
+m + s (L - m) seconds of green. At a fixed-time signal (GatewaySignal), this is the length of a
+green window, and L the one that the programme gives it. At a signal that SUMO times by detectors
+(ResponsiveSignal) or that max-pressure runs, it is the sum over a cycle (Ration), and L the nominal
+green in a cycle, or the whole cycle.
 
-- of every window of L seconds at a fixed-time signal (GatewaySignal), from its beginning,
-- of every cycle at a signal that SUMO times by detectors (ResponsiveSignal) or max-pressure runs
-(Ration): L is the
-  nominal green in a cycle, or the whole cycle.
-
-Then come the original yellow and red. Green is only taken away: no new conflicts, and s = 1 is the
-original programme. The green that is taken stays red.
+Then come the original yellow, and red. Green is only taken away: there are no new conflicts, and
+s = 1 is the original programme. The green that is taken stays red.
 """
 
 from bisect import bisect_left
@@ -173,65 +171,81 @@ def _windows(programme: Programme, link: int) -> tuple[dict[int, _Window], bool]
 
 def yellow_time(phases: Sequence[Phase], link: int) -> float:
     """Return the longest yellow after a green of a link [s]."""
-    starts = [
-        n
-        for n, phase in enumerate(phases)
-        if phase.state[link] == "y" and phases[n - 1].state[link] in GREEN
-    ]
-    return max((run_length(phases, n, link, "y") for n in starts), default=DEFAULT_YELLOW_S)
+    times = []
+    for n, phase in enumerate(phases):
+        if phase.state[link] == "y" and phases[n - 1].state[link] in GREEN:
+            times.append(run_length(phases, n, link, "y"))
+    return max(times, default=DEFAULT_YELLOW_S)
 
 
 def ends_bare(phases: Sequence[Phase]) -> set[int]:
     """Return the links whose green ends without yellow, such as those of crossings."""
-    changes = [(phases[n - 1].state, phase.state) for n, phase in enumerate(phases)]
-    return {k for a, b in changes for k in range(len(b)) if a[k] in GREEN and b[k] == "r"}
+    links = set()
+    for n, phase in enumerate(phases):
+        before = phases[n - 1].state
+        for link, light in enumerate(phase.state):
+            if before[link] in GREEN and light == "r":
+                links.add(link)
+    return links
 
 
 def least_times(phases: Sequence[Phase]) -> list[float]:
-    """Return the least time of every phase [s]: of a stage the minimum green, if no crossing is
-    green or cleared."""
+    """Return the shortest duration of each phase [s].
+
+    It is the minimum green for a stage without pedestrians, otherwise the programmed duration.
+    """
     bare = ends_bare(phases)
     walks = [any(phase.state[link] in GREEN for link in bare) for phase in phases]
-    return [
-        min(
-            phase.duration,
-            MIN_GREEN_S if is_stage(phase.state) and not (walks[n] or walks[n - 1]) else NEVER,
-        )
-        for n, phase in enumerate(phases)
-    ]
+    least = []
+    for n, phase in enumerate(phases):
+        # Pedestrians walk, or are still on their way.
+        walking = walks[n] or walks[n - 1]
+        if is_stage(phase.state) and not walking:
+            least.append(min(phase.duration, MIN_GREEN_S))
+        else:
+            least.append(phase.duration)
+    return least
 
 
 def run_length(phases: Sequence[Phase], first: int, link: int, lights: Collection[str]) -> float:
     """Return how long a link shows one of `lights` from phase `first` on [s]."""
     length, n = 0.0, first
     while phases[n % len(phases)].state[link] in lights:
-        length, n = length + phases[n % len(phases)].duration, n + 1
+        length += phases[n % len(phases)].duration
+        n += 1
     return length
 
 
 class Ration:
     """The green of one gateway link, limited per cycle.
 
-    gateway: its number, whose share it follows; share: [-] of the cycles that begin from now on, 1
-        is no limit
+    gateway: its number, whose share it follows
+    share: of the cycles that begin from now on [-]; 1: no limit
     """
 
     def __init__(
         self, gateway: int, *, cycle: float, yellow: float, start: float, full: float | None = None
     ):
-        """start: time at which the first cycle begins [s]; full: green of share 1 in a cycle, the
-        cycle if None [s]"""
-        self.gateway, self._green = gateway, Green()
+        """start: time at which the first cycle begins [s]
+
+        full: green of share 1 in a cycle [s]; the cycle if None
+        """
+        self.gateway, self.share = gateway, 1.0
+        self._cycle, self._yellow = cycle, yellow
         self._full = cycle if full is None else full
-        self._cycle, self._least, self._yellow = cycle, min(MIN_GREEN_S, self._full), yellow
-        self.share, self._budget, self._spent = 1.0, NEVER, 0.0
+        self._least = min(MIN_GREEN_S, self._full)
         self._cycle_end = start
+        # Green that the link may have in this cycle, and green that it has had [s].
+        self._budget, self._spent = NEVER, 0.0
         self._open, self._opened_at = False, -NEVER
-        self._light, self._since, self._yellow_until = "r", start, start
-        self._base = "r"  # the light that was last asked for
+        self._base = self._light = "r"  # lights asked for and shown, since the last call
+        self._since = start
+        self._yellow_until = start
+        self._green = Green()
 
     @property
     def limited(self) -> bool:
+        """Return True if the green of this cycle is limited."""
         return self._budget < NEVER
 
     @property
@@ -244,14 +258,15 @@ class Ration:
 
         Call it also when `light` changes. lasting: a green lasts for the minimum green at least
         """
-        before, self._green = self._green, self.green_time(now)
-        self._spent += self._green.shown - before.shown
+        self._green = self.green_time(now)
+        if self._light in GREEN:
+            self._spent += now - self._since
         self._since, self._base = now, light
         while now >= self._cycle_end - 1e-6:
             self._cycle_end += self._cycle
-            self._spent = 0.0
-            limit = self._least + self.share * (self._full - self._least)
-            self._budget = NEVER if self.share >= 1.0 else limit
+            self._spent, self._budget = 0.0, NEVER
+            if self.share < 1.0:
+                self._budget = self._least + self.share * (self._full - self._least)
         self._light, again = self._filter(light, now, lasting)
         return self._light, min(again, self._cycle_end)
 
@@ -265,6 +280,7 @@ class Ration:
         return Green(shown, ungated)
 
     def opened(self, now: float) -> bool:
+        """Return True if the present green began at `now` [s]."""
         return self._open and self._opened_at >= now - 1e-6
 
     def _filter(self, light: str, now: float, lasting: bool) -> tuple[str, float]:
@@ -274,22 +290,20 @@ class Ration:
         if light in GREEN:
             if self._open and left <= 1e-6:
                 self._open, self._yellow_until = False, now + self._yellow
-            elif (
-                not self._open
-                and lasting
-                and now >= self._yellow_until - 1e-6
-                and left >= self._least - 1e-6
-            ):
-                self._open, self._opened_at = True, now
+            elif not self._open and lasting:
+                yellow_is_over = now >= self._yellow_until - 1e-6
+                if yellow_is_over and left >= self._least - 1e-6:
+                    self._open, self._opened_at = True, now
             if self._open:
                 return light, now + left
         elif self._open:
-            self._open = (
-                False  # a green after the yellow of the programme has to be a whole one again
-            )
+            # A green after the yellow of the programme has to be a whole one again.
+            self._open = False
             if light == "y":
                 self._yellow_until = NEVER
-        return ("y", self._yellow_until) if now < self._yellow_until - 1e-6 else ("r", NEVER)
+        if now < self._yellow_until - 1e-6:
+            return "y", self._yellow_until
+        return "r", NEVER
 
 
 class ResponsiveSignal:
@@ -309,37 +323,28 @@ class ResponsiveSignal:
         release: Callable[[str, str], None],
     ):
         """release(signal, programme): see Incidents"""
-        self._signal, self._phases, self._programme = (
-            programme.signal,
-            programme.phases,
-            programme.id,
-        )
+        self._signal, self._programme = programme.signal, programme.id
         self._session, self._show, self._release = session, show, release
         phases, start = programme.phases, session.time
-        full = {
-            link: sum(p.duration for p in phases if p.state[link] in GREEN) for link in movements
-        }
-        self._rations = {
-            link: Ration(
+        self._rations: dict[int, Ration] = {}
+        self._always: set[int] = set()  # links that are never red
+        for link, gateway in movements.items():
+            green = [phase for phase in phases if phase.state[link] in GREEN]
+            if len(green) == len(phases):
+                self._always.add(link)
+            self._rations[link] = Ration(
                 gateway,
                 cycle=programme.cycle,
                 yellow=yellow_time(phases, link),
                 start=start,
-                full=full[link],
+                full=sum(phase.duration for phase in green),
             )
-            for link, gateway in movements.items()
-        }
-        self._least = least_times(phases)
-        self._always = {
-            link for link in movements if all(phase.state[link] in GREEN for phase in phases)
-        }
-        self._base, self._since, self._next, self._held, self._limited = (
-            "",
-            start,
-            start,
-            False,
-            False,
-        )
+        self._least: dict[str, float] = {}  # state -> least duration [s]
+        for phase, least in zip(phases, least_times(phases), strict=True):
+            self._least[phase.state] = max(least, self._least.get(phase.state, MIN_GREEN_S))
+        self._base = ""  # state of the programme underneath
+        self._since = self._next = start
+        self._held = self._limited = False
 
     def command(self, share: PerGateway) -> None:
         """Set the shares (G,) [-] from the next cycle on."""
@@ -350,12 +355,7 @@ class ResponsiveSignal:
 
     def play(self, now: float) -> None:
         """Set the state from `now` [s] on, or leave the signal to SUMO."""
-        session, signal = self._session, self._signal
-        base = (
-            session.state_underneath(signal, self._programme)
-            if self._held
-            else session.signal_state(signal)
-        )
+        base = self._state_underneath()
         if base == self._base and now < self._next - 1e-6:
             return
         before, self._base = self._base, base
@@ -363,12 +363,11 @@ class ResponsiveSignal:
             self._since = now
         shown, self._next = list(base), NEVER
         for link, ration in self._rations.items():
-            begun = (
-                not before or before[link] not in GREEN
-            )  # a window that begins lasts for SUMO's own minimum
-            own = (
-                "G" if not before and base[link] == "y" else base[link]
-            )  # a first yellow as that after a green
+            own = base[link]
+            if not before and own == "y":
+                own = "G"  # the first yellow counts as one after a green
+            # A window that begins lasts for SUMO's own minimum.
+            begun = not before or before[link] not in GREEN
             light, again = ration.show(own, now, lasting=begun or link in self._always)
             self._next = min(self._next, again)
             if light == "y" or base[link] in "Ggy":
@@ -378,6 +377,11 @@ class ResponsiveSignal:
         elif self._held or self._limited:
             self._hold("".join(shown), now)
 
+    def _state_underneath(self) -> str:
+        if self._held:
+            return self._session.state_underneath(self._signal, self._programme)
+        return self._session.signal_state(self._signal)
+
     def green_time(self) -> dict[str, dict[int, Green]]:
         """Return signal -> gateway link -> green so far."""
         now = self._session.time
@@ -386,21 +390,18 @@ class ResponsiveSignal:
         }
 
     def _hold(self, state: str, now: float) -> None:
-        """Show `state` from the first limit on; give the signal back to SUMO in the midst of a
-        stage after the last."""
-        # A stage that has just begun could end too early, one step behind SUMO.
-        least = [
-            time
-            for phase, time in zip(self._phases, self._least, strict=True)
-            if phase.state == state
-        ]
+        """Override SUMO from the first limited green on.
+
+        Hand the signal back during a stage once no link is limited. A stage that has just begun
+        could end too early, as what is shown is one step behind SUMO.
+        """
+        again = NEVER
         limited = self._limited or any(ration.limited for ration in self._rations.values())
-        ends = not limited and state == self._base and is_stage(state)
-        again = self._since + max(MIN_GREEN_S, *least, 0.0) if ends else NEVER
+        if not limited and state == self._base and is_stage(state):
+            again = self._since + self._least.get(state, MIN_GREEN_S)
         self._held = now < again - 1e-6
         if self._held:
             self._show(self._signal, state)
+            self._next = min(self._next, again)
         else:
-            again = NEVER
             self._release(self._signal, self._programme)
-        self._next = min(self._next, again)
