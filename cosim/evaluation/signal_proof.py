@@ -25,7 +25,8 @@ from cosim.sumo.xml_files import attribute, read_xml
 from nmfd.types import Quantity, Result
 
 KINDS = ("static", "actuated", "delay_based")
-MIN_GREEN_S, YELLOW_S = 5.0, 3.0
+MIN_GREEN_S = 5.0
+YELLOW_S = 3.0
 SHEET = {  # variable of a result, column of signals.csv
     "signal": Quantity(("signal",), "", "id of the signal"),
     "shortest_green": Quantity(
@@ -164,7 +165,8 @@ class Rules:
     def __init__(self, logic: Element, crossings: Collection[int], step: float):
         """crossings: links for pedestrians; step: see `proof_sheet`"""
         programme = _programme(logic)
-        green, yellow = programme.green, programme.lights == "y"
+        green = programme.green
+        yellow = programme.lights == "y"
         right_of_way = programme.lights == "G"
         self.apart = ~(green.T @ green)
         self.yielding = ~(right_of_way.T @ right_of_way)
@@ -186,9 +188,12 @@ class Rules:
         """
         time = np.array([time for time, _ in states])[:, None]
         lights = np.array([list(state) for _, state in states])
-        green, yellow = np.isin(lights, ["G", "g"]), lights == "y"
-        was_green, was_yellow = _before(green), _before(yellow)
-        starts, ends = green & ~was_green, was_green & ~green
+        green = np.isin(lights, ["G", "g"])
+        yellow = lights == "y"
+        was_green = _before(green)
+        was_yellow = _before(yellow)
+        starts = green & ~was_green
+        ends = was_green & ~green
         ended = _latest(ends, time)
         changed = starts | ends | (yellow != was_yellow)
         since = _before(_latest(changed, time))  # when the light before this one began
@@ -236,7 +241,10 @@ def _programme(logic: Element) -> _Programme:
     """Return the phases of a <tlLogic>."""
     shortest = "duration" if logic.get("type") == "static" else "minDur"
     phases = list(logic.iter("phase"))
-    lights, times, changes, after = [], [], [], []
+    lights = []
+    times = []
+    changes = []
+    after = []
     for n, phase in enumerate(phases):
         lights.append(list(attribute(phase, "state")))
         times.append(seconds_of(phase.get(shortest) or attribute(phase, "duration")))
@@ -275,7 +283,8 @@ def _intergreen(
     waits for none that stays green. But a crossing is cleared while cars beside it are green. For
     other links the shortest direct switch from the first link counts.
     """
-    green, cycle = programme.green, sum(programme.shortest)
+    green = programme.green
+    cycle = sum(programme.shortest)
     between = np.full(apart.shape, np.inf)
     direct = between.copy()
     for n, start in programme.changes:
@@ -294,7 +303,8 @@ def _intergreen(
                 new = new & at_once
                 direct[link, new] = np.minimum(direct[link, new], walk.time)
 
-                left, later = walk.left & ~on, walk.time + programme.shortest[walk.phase]
+                left = walk.left & ~on
+                later = walk.time + programme.shortest[walk.phase]
                 if later >= MIN_GREEN_S and not crossing[link]:
                     at_once = at_once & ~(on @ apart)
                 if left.any() and later < cycle:

@@ -18,15 +18,16 @@ from cosim.sumo.signals import GREEN, Signal, held_city, running_logic
 from nmfd.arrays import PerPair
 from nmfd.model.regional_model import RegionalModel
 
-OPEN_SHARE = 0.95  # of what a boundary can let through; above it a gate holds no queue, but takes green that is needed
+# Share of what a boundary can let through. Above it a gate holds no queue, but takes green that is
+# needed.
+OPEN_SHARE = 0.95
 
 
 class Actuation:
-    """All signals under control: `command` once per control interval, `play` before every
-    simulation step.
+    """All signals under control.
 
-    Between them, `update` from time to time shares the command over the gateways again
-    (cosim.plant.room).
+    Call `command` once per control interval and `play` before every simulation step. Between them,
+    `update` from time to time shares the command over the gateways again (cosim.plant.room).
 
     original_green: (G,) [s] per control interval in the original programme, mean of the gateway's
         links; NaN where no command arrives
@@ -44,21 +45,23 @@ class Actuation:
         incidents: Incidents,
         flows: Mapping[tuple[str, str], float] | None,
     ):
-        """step: control interval [s]; steered: signals for max-pressure; flows: (edge, next edge)
-        -> flow, any unit, if max-pressure runs the signals"""
-        self._session, self._city, self._network, self._incidents = (
-            session,
-            city,
-            network,
-            incidents,
-        )
+        """step: control interval [s]; steered: signals for max-pressure
+
+        flows: (edge, next edge) -> flow, any unit, if max-pressure runs the signals
+        """
+        self._session = session
+        self._city = city
+        self._network = network
+        self._incidents = incidents
         programmes = {signal: session.programme(signal) for signal in gateway_movements(city)}
         logics = {signal: running_logic(plan) for signal, plan in programmes.items()}
         held = held_city(city, logics, settings.leave_signals)
-        movements, self._gateways = gateway_movements(held), held.gateways
+        movements = gateway_movements(held)
+        self._gateways = held.gateways
+        show = incidents.show
         phases: dict[str, Sequence[Phase]] = {}  # original ones of the signals that are commanded
-        self._pressure, show = None, incidents.show
         self._controls: list[MaxPressure | GatewaySignal | ResponsiveSignal] = []
+        self._pressure: MaxPressure | None = None
         if flows is not None:
             self._pressure = MaxPressure(
                 session, held, steered, flows, show=show, lookahead=settings.lookahead
@@ -66,19 +69,20 @@ class Actuation:
             self._controls.append(self._pressure)
             phases = {signal.id: signal.phases for signal in steered if signal.id in movements}
         self._rationed = np.array([gateway.signal in phases for gateway in held.gateways], bool)
-        for signal in sorted(movements.keys() - phases.keys()):
-            plan, links = programmes[signal], movements[signal]
-            phases[signal] = plan.phases
+        for name in sorted(movements.keys() - phases.keys()):
+            plan = programmes[name]
+            links = movements[name]
+            phases[name] = plan.phases
+            signal: GatewaySignal | ResponsiveSignal
             if plan.static:
-                self._controls.append(
-                    GatewaySignal(
-                        plan, links, start=session.time, step=session.step_length, show=show
-                    )
+                signal = GatewaySignal(
+                    plan, links, start=session.time, step=session.step_length, show=show
                 )
             else:
-                self._controls.append(
-                    ResponsiveSignal(session, plan, links, show=show, release=incidents.release)
+                signal = ResponsiveSignal(
+                    session, plan, links, show=show, release=incidents.release
                 )
+            self._controls.append(signal)
         self.original_green = _programmed_green(held, phases, step)
         self.room = Room(
             session,
@@ -88,13 +92,13 @@ class Actuation:
             lanes=not settings.mesoscopic,
         )
         self._supervisor = Supervisor(network, step) if settings.chain_limit > 0 else None
-        self.states: dict[str, list[tuple[float, str]]] = {
-            signal: [] for signal in session.signals()
-        }
+        self.states: dict[str, list[tuple[float, str]]] = {name: [] for name in session.signals()}
 
     def command(self, perimeter: PerPair, vehicles: PerEdge) -> None:
-        """Set u (R, R) [-] of the control interval that begins. vehicles: (E,) [veh] on the
-        streets"""
+        """Set u (R, R) [-] of the control interval that begins.
+
+        vehicles: (E,) [veh] on the streets
+        """
         network = self._network
         share = np.clip((perimeter - network.u_min) / (network.u_max - network.u_min), 0.0, 1.0)
         share[share >= OPEN_SHARE] = 1.0
@@ -112,14 +116,16 @@ class Actuation:
             self._obey()
 
     def realised(self) -> PerPair | None:
-        """Return u (R, R) [-] that the gateways were given since the last command; None for the
-        command itself."""
-        network, share = self._network, self.room.realised()
+        """Return u (R, R) [-] that the gateways were given since the last command.
+
+        None: it is the command itself.
+        """
+        network = self._network
+        share = self.room.realised()
         if share is None:
             return None
-        return np.where(
-            network.adjacency, network.u_min + share * (network.u_max - network.u_min), 0.0
-        )
+        realised = network.u_min + share * (network.u_max - network.u_min)
+        return np.where(network.adjacency, realised, 0.0)
 
     def _obey(self) -> None:
         for control in self._controls:
@@ -134,7 +140,8 @@ class Actuation:
 
     def observe(self, waits: Waits | None = None) -> None:
         """Note the states that SUMO has shown in the last simulation step. waits: hears of them"""
-        state_of, now = self._session.signal_state, self._session.time
+        state_of = self._session.signal_state
+        now = self._session.time
         for signal, states in self.states.items():
             state = state_of(signal)
             if not states or state != states[-1][1]:
@@ -169,17 +176,14 @@ class Actuation:
     def as_shown(self, green: PerGateway, ungated: PerGateway) -> PerGateway:
         """Return `green` (G,) [s] of the last interval, `ungated` where a signal did not obey."""
         refused = self._incidents.refused
-        return np.where(
-            [gateway.signal in refused for gateway in self._city.gateways], ungated, green
-        )
+        disobeyed = [gateway.signal in refused for gateway in self._city.gateways]
+        return np.where(disobeyed, ungated, green)
 
     def pressure_facts(self) -> dict[str, float]:
         """Return max_pressure.FACTS of this run; NaN without max-pressure."""
-        return (
-            self._pressure.facts(self._session.time)
-            if self._pressure
-            else dict.fromkeys(FACTS, float("nan"))
-        )
+        if self._pressure is None:
+            return dict.fromkeys(FACTS, float("nan"))
+        return self._pressure.facts(self._session.time)
 
     def leaks(self) -> list[Gateway]:
         """Return the gateways that no command reaches."""
@@ -190,13 +194,14 @@ def _programmed_green(city: City, phases: Mapping[str, Sequence[Phase]], step: f
     """Return (G,) [s] of green per control interval `step` [s]; NaN without phases."""
     green = np.full(len(city.gateways), np.nan)
     for n, gateway in enumerate(city.gateways):
-        if plan := phases.get(gateway.signal or ""):
-            lasting = [
-                phase.duration * (phase.state[link] in GREEN)
-                for phase in plan
-                for link in gateway.links
-            ]
-            green[n] = (
-                sum(lasting) / len(gateway.links) * step / sum(phase.duration for phase in plan)
-            )
+        plan = phases.get(gateway.signal or "")
+        if plan is None:
+            continue
+        lasting = 0.0
+        for phase in plan:
+            for link in gateway.links:
+                if phase.state[link] in GREEN:
+                    lasting += phase.duration
+        cycle = sum(phase.duration for phase in plan)
+        green[n] = lasting / len(gateway.links) * step / cycle
     return green

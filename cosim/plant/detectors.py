@@ -27,10 +27,12 @@ from nmfd.types import Controls
 LAYOUT = 0x6C6F6F70  # seed of the places of the loops: a property of the city, not of a run
 PROBES = 0x70726F62  # keeps the random numbers of the probes apart from others of the same seed
 VEHICLE_LENGTH_M = 5.0  # SUMO's passenger car
-STATIONS, SPACING_M = 3, 50.0  # largest number of loops along a lane, and lane length per loop
+STATIONS = 3  # largest number of loops along a lane
+SPACING_M = 50.0  # lane length per loop
 # Standard deviation over mean [-] of the density over the links of a region, and of the readings
 # along one link, measured in a run of grid7 that locked.
-SPREAD_OVER_LINKS, SPREAD_ALONG_LINK = 1.3, 1.0
+SPREAD_OVER_LINKS = 1.3
+SPREAD_ALONG_LINK = 1.0
 READING_PERIOD_S = 3.0
 
 
@@ -87,7 +89,8 @@ def _stations(length: float, place: float) -> tuple[float, ...]:
 
 def instruments(city: City, layout: Layout, probe_share: float) -> Instruments:
     """Return shares and errors that follow from the layout."""
-    lane_length, region = city.lane_metres, city.edge_region
+    lane_length = city.lane_metres
+    region = city.edge_region
     equipped = np.isin(np.arange(len(region)), layout.edges)
     whole = np.bincount(region, lane_length, city.regions)
     seen = np.bincount(region, lane_length * equipped, city.regions)
@@ -149,8 +152,11 @@ class Estimation:
 
         planning: model of the filter
         """
-        self._session, self._meter, self._known = session, meter, known
-        self._layout, self._city = layout, city
+        self._session = session
+        self._meter = meter
+        self._known = known
+        self._layout = layout
+        self._city = city
         self._filter = Estimator(planning, known)
         self.accumulation = self._filter.accumulation
         loops = _loops(city, layout)
@@ -164,7 +170,8 @@ class Estimation:
 
     def _begin(self) -> None:
         """Begin the sums of a control interval."""
-        self._occupancy, self._samples = np.zeros(len(self._loops)), 0
+        self._occupancy = np.zeros(len(self._loops))
+        self._samples = 0
         self._departed = self._meter.probe_departures.copy()
         self._flow = self._meter.gateway_flow()
 
@@ -184,7 +191,9 @@ class Estimation:
 
     def readings(self) -> Readings:
         """Return the readings since the last call."""
-        known, regions, meter = self._known, self._city.regions, self._meter
+        known = self._known
+        regions = self._city.regions
+        meter = self._meter
         density = self._occupancy / max(self._samples, 1) / 100.0 / VEHICLE_LENGTH_M
         lane_length = np.bincount(self._region, self._length, regions)
         share = known.detector_share * lane_length / np.maximum(lane_length, 1e-9)

@@ -45,8 +45,11 @@ class GatewaySignal:
         self, programme: Programme, movements: Movements, *, start: float, step: float, show: Show
     ):
         """start: simulation time at which the programme was read; step: of the simulation [s]"""
-        self._signal, self._phases, self._show = programme.signal, programme.phases, show
-        self._step, self._cycle = step, programme.cycle
+        self._signal = programme.signal
+        self._phases = programme.phases
+        self._show = show
+        self._step = step
+        self._cycle = programme.cycle
         self._cycle_start = start - programme.position
         self._ends = list(accumulate(phase.duration for phase in programme.phases))
         self._movements = {
@@ -76,9 +79,11 @@ class GatewaySignal:
         for link, movement in self._movements.items():
             base = shown[link]
             shown[link], change = self._filter(movement, base, phase, step_end)
-            movement.shown, movement.base = shown[link], base
+            movement.shown = shown[link]
+            movement.base = base
             self.next_change = min(self.next_change, change)
-        self._shown, self._since = "".join(shown), now
+        self._shown = "".join(shown)
+        self._since = now
         self._show(self._signal, self._shown)
 
     def green_time(self) -> dict[str, dict[int, Green]]:
@@ -120,12 +125,14 @@ class _Movement:
     """
 
     def __init__(self, gateway: int, programme: Programme, link: int):
-        self.gateway, self.share = gateway, 1.0
+        self.gateway = gateway
+        self.share = 1.0
         self.green = Green()
         self.shown = self.base = ""
         self.yellow = yellow_time(programme.phases, link)
         self.windows, self._always = _windows(programme, link)
-        self.begin, self.cut_at = -NEVER, NEVER
+        self.begin = -NEVER
+        self.cut_at = NEVER
 
     def count(self, seconds: float) -> None:
         """Count the time since the last change as green if it was."""
@@ -159,12 +166,14 @@ def _windows(programme: Programme, link: int) -> tuple[dict[int, _Window], bool]
     for first, phase in enumerate(phases):
         if green[first] and not green[first - 1]:
             length = run_length(phases, first, link, GREEN)
-            n, after = first, begin
+            n = first
+            after = begin
             while green[n]:
                 windows[n] = _Window(after, length)
                 n += 1
                 if n == len(phases):  # it passes the end of the cycle
-                    n, after = 0, after - programme.cycle
+                    n = 0
+                    after = after - programme.cycle
         begin += phase.duration
     return windows, False
 
@@ -209,7 +218,8 @@ def least_times(phases: Sequence[Phase]) -> list[float]:
 
 def run_length(phases: Sequence[Phase], first: int, link: int, lights: Collection[str]) -> float:
     """Return how long a link shows one of `lights` from phase `first` on [s]."""
-    length, n = 0.0, first
+    length = 0.0
+    n = first
     while phases[n % len(phases)].state[link] in lights:
         length += phases[n % len(phases)].duration
         n += 1
@@ -230,14 +240,18 @@ class Ration:
 
         full: green of share 1 in a cycle [s]; the cycle if None
         """
-        self.gateway, self.share = gateway, 1.0
-        self._cycle, self._yellow = cycle, yellow
+        self.gateway = gateway
+        self.share = 1.0
+        self._cycle = cycle
+        self._yellow = yellow
         self._full = cycle if full is None else full
         self._least = min(MIN_GREEN_S, self._full)
         self._cycle_end = start
         # Green that the link may have in this cycle, and green that it has had [s].
-        self._budget, self._spent = NEVER, 0.0
-        self._open, self._opened_at = False, -NEVER
+        self._budget = NEVER
+        self._spent = 0.0
+        self._open = False
+        self._opened_at = -NEVER
         self._base = self._light = "r"  # lights asked for and shown, since the last call
         self._since = start
         self._yellow_until = start
@@ -261,10 +275,12 @@ class Ration:
         self._green = self.green_time(now)
         if self._light in GREEN:
             self._spent += now - self._since
-        self._since, self._base = now, light
+        self._since = now
+        self._base = light
         while now >= self._cycle_end - 1e-6:
             self._cycle_end += self._cycle
-            self._spent, self._budget = 0.0, NEVER
+            self._spent = 0.0
+            self._budget = NEVER
             if self.share < 1.0:
                 self._budget = self._least + self.share * (self._full - self._least)
         self._light, again = self._filter(light, now, lasting)
@@ -289,11 +305,13 @@ class Ration:
             self._yellow_until = now
         if light in GREEN:
             if self._open and left <= 1e-6:
-                self._open, self._yellow_until = False, now + self._yellow
+                self._open = False
+                self._yellow_until = now + self._yellow
             elif not self._open and lasting:
                 yellow_is_over = now >= self._yellow_until - 1e-6
                 if yellow_is_over and left >= self._least - 1e-6:
-                    self._open, self._opened_at = True, now
+                    self._open = True
+                    self._opened_at = now
             if self._open:
                 return light, now + left
         elif self._open:
@@ -323,9 +341,13 @@ class ResponsiveSignal:
         release: Callable[[str, str], None],
     ):
         """release(signal, programme): see Incidents"""
-        self._signal, self._programme = programme.signal, programme.id
-        self._session, self._show, self._release = session, show, release
-        phases, start = programme.phases, session.time
+        self._signal = programme.signal
+        self._programme = programme.id
+        self._session = session
+        self._show = show
+        self._release = release
+        phases = programme.phases
+        start = session.time
         self._rations: dict[int, Ration] = {}
         self._always: set[int] = set()  # links that are never red
         for link, gateway in movements.items():
@@ -358,10 +380,12 @@ class ResponsiveSignal:
         base = self._state_underneath()
         if base == self._base and now < self._next - 1e-6:
             return
-        before, self._base = self._base, base
+        before = self._base
+        self._base = base
         if base != before:
             self._since = now
-        shown, self._next = list(base), NEVER
+        shown = list(base)
+        self._next = NEVER
         for link, ration in self._rations.items():
             own = base[link]
             if not before and own == "y":

@@ -44,7 +44,9 @@ class Incidents:
     """
 
     def __init__(self, faults: Sequence[Fault], session: Session, city: City):
-        self._faults, self._session, self._city = faults, session, city
+        self._faults = faults
+        self._session = session
+        self._city = city
         self._limits: dict[str, list[float]] = {}  # closed edge -> speed limits of its lanes before
         self._own: dict[str, str] = {}  # signal -> its programme
         for fault in faults:
@@ -81,7 +83,8 @@ class Incidents:
         for edge in self._limits.keys() - closed:
             self._session.limit_speed(edge, self._limits.pop(edge))
         changed = sorted(silent ^ self._silent)
-        self._silent, self._failed = silent, set()
+        self._silent = silent
+        self._failed = set()
         for signal in changed:
             self._change(signal)
 

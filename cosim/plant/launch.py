@@ -62,9 +62,13 @@ class Launch:
 
         gui: show the run in sumo-gui
         """
-        self._scenario, self._settings = scenario, settings
-        self._city, self._signals = city, signals
-        self._layout, self._kept, self._gui = layout, trip_file is not None, gui
+        self._scenario = scenario
+        self._settings = settings
+        self._city = city
+        self._signals = signals
+        self._layout = layout
+        self._kept = trip_file is not None
+        self._gui = gui
         self._temporary = tempfile.TemporaryDirectory(prefix="cosim-", ignore_cleanup_errors=True)
         self._folder = Path(self._temporary.name)
         self.vehicles: list[str] = []
@@ -74,7 +78,8 @@ class Launch:
 
     def start(self, seed: int) -> Session:
         """Return a simulation whose trips, drivers and reroutes follow from `seed`."""
-        settings, routes = self._settings, self._folder / "trips.rou.xml"
+        settings = self._settings
+        routes = self._folder / "trips.rou.xml"
         self.vehicles = self._write_vehicles(routes, seed)
         beside = own_files(self._scenario, settings.background)
         if settings.routes and beside and not seed:
@@ -129,7 +134,9 @@ class Launch:
 
         The last programme of a signal runs.
         """
-        scenario, settings, folder = self._scenario, self._settings, self._folder
+        scenario = self._scenario
+        settings = self._settings
+        folder = self._folder
         steered, others = self._signals
         additional = own_files(scenario, settings.additional)
         if settings.signals == WEBSTER:
@@ -146,11 +153,15 @@ class Launch:
 
     def _write_vehicles(self, path: Path, seed: int) -> list[str]:
         """Write the route file of one run, and return the ids of its vehicles."""
-        scenario, settings = self._scenario, self._settings
+        scenario = self._scenario
+        settings = self._settings
         originals = self._vehicles_of(seed)
-        factor, begin, jitter = 1.0, 0.0, 0.0
+        factor = 1.0
+        begin = 0.0
+        jitter = 0.0
         if settings.routes:
-            factor, begin = scenario.demand_factor, settings.begin
+            factor = scenario.demand_factor
+            begin = settings.begin
             jitter = recorded.JITTER_S if seed else 0.0
         drawn = recorded.draw(originals, seed=seed, factor=factor, jitter=jitter, begin=begin)
         if settings.metering > 0.0:

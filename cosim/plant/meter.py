@@ -24,8 +24,11 @@ from nmfd.ledger import LedgerError
 from nmfd.types import State
 
 POLL_PERIOD_S = 3.0  # longest time between two looks at the entry edges
-COMPLETED, REMOVED, UNDER_WAY = "completed", "removed", "under way"
-WAITING, GIVEN_UP = "waiting", "given up"
+COMPLETED = "completed"
+REMOVED = "removed"
+UNDER_WAY = "under way"
+WAITING = "waiting"
+GIVEN_UP = "given up"
 
 
 @dataclass
@@ -108,8 +111,11 @@ class Meter:
 
         trips: ends of trips; None if SUMO cannot write them at once: all are arrivals then
         """
-        self._session, self._city, self._probes = session, city, probes
-        self._trips, self._metering = trips, metering
+        self._session = session
+        self._city = city
+        self._probes = probes
+        self._trips = trips
+        self._metering = metering
         self._vehicles: dict[str, _Vehicle] = {}
         # Vehicles that are not in tripinfo yet; several if an id is used again.
         self._gone: dict[str, list[_Vehicle]] = {}
@@ -253,7 +259,8 @@ class Meter:
             return
         self._settle(self._trips.finish(self._gone))
         trips = self._trips
-        arrivals, removals = int(self.arrivals.sum()), int(self.removals.sum())
+        arrivals = int(self.arrivals.sum())
+        removals = int(self.removals.sum())
         if self._gone or (trips.completed, trips.removed) != (arrivals, removals):
             raise LedgerError(
                 f"vehicle ledger broken at the end: {arrivals} completed trips and {removals} "
@@ -361,7 +368,8 @@ class Meter:
 
     def _book(self, gone: _Vehicle, end: End) -> None:
         """Book the end of a vehicle that has left."""
-        i, j = gone.region, gone.destination
+        i = gone.region
+        j = gone.destination
         if end.reason:
             self._end(_trip(gone, REMOVED, end.time, end.time_loss))
             h = self._city.region_of.get(end.edge, i)
@@ -383,7 +391,8 @@ class Meter:
         """Return a vehicle, which may be new."""
         known = self._vehicles.get(vehicle)
         if known is None:
-            session, region_of = self._session, self._city.region_of
+            session = self._session
+            region_of = self._city.region_of
             route = session.route(vehicle)
             private = session.is_private(vehicle)
             known = _Vehicle(
@@ -412,7 +421,9 @@ class Meter:
             self._time(vehicle, known)
             self._follow(vehicle, known)
             known.origin = self._city.region_of.get(self._session.road(vehicle), known.origin)
-        known.departed, known.region, known.announced = True, known.origin, known.origin
+        known.departed = True
+        known.region = known.origin
+        known.announced = known.origin
         self._running[known.origin, known.destination] += 1
         self.departures[known.origin, known.destination] += 1
         self.probe_departures[known.origin, known.destination] += vehicle in self._probes

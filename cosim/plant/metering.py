@@ -18,7 +18,8 @@ from cosim.sumo.session import Session
 from nmfd.arrays import PerPair, PerRegion
 
 # Shares of the excess vehicles that are kept out in the next control interval [-]; not tuned.
-KP, KI = 1.0, 0.3
+KP = 1.0
+KI = 0.3
 FILLING_S = 60.0  # in which the largest rate fills a region to its critical accumulation
 
 
@@ -36,8 +37,10 @@ class Metering:
 
         step: control interval [s]
         """
-        self._session, self._trips = session, trips
-        self._set_point, self._step = level * critical, step
+        self._session = session
+        self._trips = trips
+        self._set_point = level * critical
+        self._step = step
         self._most = critical / FILLING_S
         # Numbers of the trips that wait in every region, by departure.
         self._queues: list[deque[int]] = [deque() for _ in critical]

@@ -74,7 +74,8 @@ class SumoPlant:
         planning: model of the estimator; that of the scenario if None
         Raises InputError for a city that does not fit the scenario's network or the settings.
         """
-        self._scenario, self._planning = scenario, planning or planning_model(scenario)
+        self._scenario = scenario
+        self._planning = planning or planning_model(scenario)
         self._observer = observer or Observer()
         settings = settings or settings_of(scenario)
         self._settings = settings
@@ -93,9 +94,12 @@ class SumoPlant:
     def reset(self, seed: int) -> State:
         """Start a simulation whose trips, drivers and reroutes follow from `seed`."""
         self._end_session()
-        scenario, settings, city = self._scenario, self._settings, self.city
+        scenario = self._scenario
+        settings = self._settings
+        city = self.city
         session = self._launch.start(seed)
-        self._k, self._session = 0, session
+        self._k = 0
+        self._session = session
         self._trips = TripReader(self._launch.trip_file, session.flush or (lambda: None))
         self._incidents = Incidents(scenario.ordered_faults, session, city)
         self._metering = None
@@ -141,7 +145,8 @@ class SumoPlant:
             self._incidents,
             flows,
         )
-        self._junctions, self._waits = None, None
+        self._junctions = None
+        self._waits = None
         if not settings.mesoscopic:  # that model has no lanes
             self._junctions = Junctions(session, city)
             self._waits = Waits(session, read_links(city.net_file))
@@ -155,7 +160,8 @@ class SumoPlant:
 
         In every simulation step: actuate, simulate, measure and guide.
         """
-        session, scenario = self.session, self._scenario
+        session = self.session
+        scenario = self._scenario
         steps = round(scenario.step / session.step_length)
         reading = self._period(READING_PERIOD_S, steps)
         sampling = self._period(SAMPLE_PERIOD_S, steps)

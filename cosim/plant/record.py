@@ -25,7 +25,8 @@ def _quantities(table: Mapping[str, tuple[str, str, str]]) -> dict[str, Quantity
 
 
 _TABLES = config.read(Path(__file__).with_name("record.toml"))
-RECORD, TOTALS = _quantities(_TABLES["record"]), _quantities(_TABLES["totals"])
+RECORD = _quantities(_TABLES["record"])
+TOTALS = _quantities(_TABLES["totals"])
 
 
 def settled(result: Result) -> Result:
@@ -57,13 +58,16 @@ class Recorder:
 
     def __init__(self, meter: Meter, guide: Guide, actuation: Actuation):
         """Their counts so far belong to no interval."""
-        self._meter, self._guide, self._actuation = meter, guide, actuation
+        self._meter = meter
+        self._guide = guide
+        self._actuation = actuation
         self._rows: list[dict[str, np.ndarray]] = []
         self._before = self._totals()
 
     def add(self, streets: StreetMeans) -> dict[str, np.ndarray]:
         """Add and return the row of the interval that has just ended. streets: its means"""
-        totals, actuation = self._totals(), self._actuation
+        totals = self._totals()
+        actuation = self._actuation
         row: dict[str, np.ndarray] = {}
         for name, total in totals.items():
             added = total - self._before[name]

@@ -44,8 +44,10 @@ class Room:
 
         limit: share of the room; 0: all gateways of a boundary get the same share
         """
-        gateways, number = city.gateways, city.number
-        self._session, self._limit = session, limit
+        gateways = city.gateways
+        number = city.number
+        self._session = session
+        self._limit = limit
         self._source = np.array([gateway.source for gateway in gateways], dtype=int)
         self._target = np.array([gateway.target for gateway in gateways], dtype=int)
         self._capacity = np.nan_to_num(green) * [len(gateway.lanes) for gateway in gateways]
@@ -70,7 +72,8 @@ class Room:
 
     def command(self, share: PerPair, vehicles: PerEdge) -> None:
         """Set the shares (R, R) [-] of the boundaries. vehicles: (E,) [veh] on the streets"""
-        self._commanded, self._shares = share, []
+        self._commanded = share
+        self._shares = []
         self.update(vehicles)
 
     def update(self, vehicles: PerEdge) -> None:
@@ -104,7 +107,8 @@ class Room:
         """
         if self._limit == 0:
             return None
-        realised, share = self._commanded.copy(), self.gateway_shares()
+        realised = self._commanded.copy()
+        share = self.gateway_shares()
         for pair, members in self._boundaries.items():
             realised[pair] = np.average(share[members], weights=self._capacity[members])
         return realised

@@ -51,7 +51,9 @@ class StreetSampler:
     """
 
     def __init__(self, session: Session, city: City, probes: frozenset[str] | None = None):
-        self._session, self._city, self._probes = session, city, probes
+        self._session = session
+        self._city = city
+        self._probes = probes
         self._inside = {edge: n for n, edge in enumerate(city.inside)}
         # Gateways may share the edge before them.
         self._upstream = sorted({gateway.from_edge for gateway in city.gateways})
@@ -65,15 +67,19 @@ class StreetSampler:
         """Begin the sums over the samples of a control interval."""
         edges = len(self._city.edges)
         self._start = self._session.time
-        self._vehicles, self._metres = np.zeros(edges), np.zeros(edges)  # the latter times speed
-        self._timed, self._routed = np.zeros(edges), np.zeros(edges)  # the latter times speed
-        self._crossing, self._crossed = np.zeros(len(self._inside)), np.zeros(len(self._inside))
+        self._vehicles = np.zeros(edges)
+        self._metres = np.zeros(edges)  # vehicles times their speed
+        self._timed = np.zeros(edges)
+        self._routed = np.zeros(edges)  # timed vehicles times their routing speed
+        self._crossing = np.zeros(len(self._inside))
+        self._crossed = np.zeros(len(self._inside))
         self._queues: list[list[int]] = []
 
     def sample(self) -> None:
         """Add a sample."""
         streets, crossed = self._travelled()
-        session, edges = self._session, self._city.edges
+        session = self._session
+        edges = self._city.edges
         counts, speeds, routing = np.zeros((3, len(edges)))
         counts[streets] = [session.vehicle_count(edges[n]) for n in streets]
         for n in np.flatnonzero(counts):
@@ -97,7 +103,8 @@ class StreetSampler:
         for edge in crossed:
             count = session.vehicle_count(edge)
             if count:
-                n, (speed, _) = self._inside[edge], session.speeds(edge)
+                n = self._inside[edge]
+                (speed, _) = session.speeds(edge)
                 self._crossing[n] += count
                 self._crossed[n] += count * speed / self._city.inside[edge]
 
@@ -115,7 +122,8 @@ class StreetSampler:
 
     def finish(self, closed: EdgeMask) -> StreetMeans:
         """Return the means since the last call. closed: (E,) bool, streets without traffic"""
-        samples, city = len(self._queues), self._city
+        samples = len(self._queues)
+        city = self._city
         queues = np.array(self._queues).reshape(samples, len(self._upstream))[:, self._upstream_of]
         with np.errstate(invalid="ignore"):
             speed = self._routed / self._timed

@@ -34,7 +34,9 @@ class Lanes:
     """
 
     def __init__(self, session: Session, near_m: float = QUEUE_END_M):
-        self._session, self._near, self._lane = session, near_m, cache(session.lane)
+        self._session = session
+        self._near = near_m
+        self._lane = cache(session.lane)
 
     def too_late(self, vehicle: str, way: Sequence[str]) -> bool:
         """Return True if a vehicle on way[0] cannot take this way any more."""
@@ -75,7 +77,8 @@ class Junctions:
     """The junctions of one simulation with lanes. freed: vehicles put on a street so far."""
 
     def __init__(self, session: Session, city: City):
-        self._session, self.freed = session, 0
+        self._session = session
+        self.freed = 0
         self._inside: dict[str, list[str]] = defaultdict(list)  # junction -> its internal edges
         for edge in sorted(city.region_of):
             if edge.startswith(":"):

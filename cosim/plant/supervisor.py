@@ -23,7 +23,8 @@ class Supervisor:
 
     def __init__(self, network: RegionalModel, step: float):
         """step: control interval [s]"""
-        self._network, self._patience = network, max(round(PATIENCE_S / step), 1)
+        self._network = network
+        self._patience = max(round(PATIENCE_S / step), 1)
         self._before: list[PerRegion] = []  # accumulations of the past intervals [veh]
         # Control intervals that every region was held so far, and that it is open from now on.
         self._held = np.zeros(network.regions, dtype=int)

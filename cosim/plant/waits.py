@@ -29,7 +29,8 @@ class Waits:
 
     def changed(self, signal: str, state: str, now: float) -> None:
         """Take the state of a signal from `now` [s] on."""
-        red, waiting = self._red_since[signal], self._waiting[signal]
+        red = self._red_since[signal]
+        waiting = self._waiting[signal]
         for link, light in enumerate(state):
             if light in CLOSED:
                 red.setdefault(link, now)
@@ -41,7 +42,8 @@ class Waits:
 
     def sample(self) -> None:
         """Look for the drivers who wait now."""
-        session, now = self._session, self._session.time
+        session = self._session
+        now = self._session.time
         self._waiting.clear()
         for edge, lanes in self._lanes.items():
             if not session.halting(edge):
@@ -73,5 +75,6 @@ class Waits:
 
     def _next_edge(self, vehicle: str) -> str:
         """Return the next edge of a vehicle's route, "" at its end."""
-        route, place = self._session.route(vehicle), self._session.route_index(vehicle)
+        route = self._session.route(vehicle)
+        place = self._session.route_index(vehicle)
         return route[place + 1] if place + 1 < len(route) else ""

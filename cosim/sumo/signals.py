@@ -21,10 +21,13 @@ from nmfd.errors import InputError
 GREEN = frozenset("Gg")
 CLOSED = frozenset("ryu")  # lights at which vehicles stop
 SIMPLE = frozenset("Ggyrs")  # lights that other programmes and max-pressure can show
-SWITCHED_OFF, TIMETABLE = "switched off", "programme follows a timetable"
+SWITCHED_OFF = "switched off"
+TIMETABLE = "programme follows a timetable"
 FREE = {"s": "turn on red", "o": "blinking", "O": SWITCHED_OFF}  # lights at which they may go
-STATIC, ACTUATED = "static", "actuated"  # SUMO's types of programmes
-# Types that always show one of their phases: green can be taken away.
+# SUMO's types of programmes.
+STATIC = "static"
+ACTUATED = "actuated"
+# Those that always show one of their phases: green can be taken away.
 HELD = (STATIC, ACTUATED, "delay_based")
 OFF = "off"  # SUMO's name of the programme of a signal without lights
 CONTROLLED = "controlled"  # gateway that perimeter control can hold
@@ -225,7 +228,8 @@ def phases_of(logic: ElementTree.Element) -> tuple[Phase, ...]:
     phases = []
     for row in logic.iter("phase"):
         try:
-            duration, state = seconds_of(attribute(row, "duration")), attribute(row, "state")
+            duration = seconds_of(attribute(row, "duration"))
+            state = attribute(row, "state")
         except ValueError as error:
             raise InputError(f"tlLogic {logic.get('id')}: phase: {error}; correct it") from None
         phases.append(Phase(duration=duration, state=state))
@@ -236,7 +240,8 @@ def _read(net: Path, additional: Iterable[Path]) -> _File:
     """Return the signals of a network with those of additional files, which count more."""
     stamp = net.stat().st_mtime_ns if net.is_file() else 0
     network = _network(net, stamp)
-    programmes, switched = dict(network.programmes), set(network.timetabled)
+    programmes = dict(network.programmes)
+    switched = set(network.timetabled)
     for path in additional:
         more = _file(read_xml(path))
         programmes |= more.programmes
@@ -253,7 +258,8 @@ def _network(net: Path, stamp: int) -> _File:
 def _file(root: ElementTree.Element) -> _File:
     links = defaultdict[str, list[Link]](list)
     for connection in root.iter("connection"):
-        source, signal = attribute(connection, "from"), connection.get("tl")
+        source = attribute(connection, "from")
+        signal = connection.get("tl")
         if signal is None or source.startswith(":"):  # those are pedestrian crossings
             continue
         link = Link(
