@@ -1,4 +1,4 @@
-"""Proof sheet of the signals of a run: what each showed, against its original programmes.
+"""Proof sheet of the signals of a run, against their programmes.
 
 - A green lasts MIN_GREEN_S, or as long as originally if that is less. The green of a crossing
   lasts as long as originally.
@@ -256,9 +256,9 @@ def _programme(logic: Element) -> _Programme:
 
 
 def _least_times(programme: _Programme, first: np.ndarray, then: np.ndarray) -> np.ndarray:
-    """Return (K,) [s], the shortest time that a link spends in `then` after leaving `first`.
+    """Return for each link the shortest time in `then` after leaving `first`.
 
-    It is inf if that never happens. first, then: (n, K) bool, phases
+    It is (K,) [s], inf if that never happens. first, then: (n, K) bool, phases
     """
     times = np.where(then, np.inf, 0.0)  # (n, K) from the begin of a phase on
     for _ in programme.shortest:
@@ -276,7 +276,7 @@ def _least_times(programme: _Programme, first: np.ndarray, then: np.ndarray) -> 
 def _intergreen(
     programme: _Programme, apart: np.ndarray, crossing: np.ndarray, yellow: np.ndarray
 ) -> np.ndarray:
-    """Return (K, K) [s], the least time from a green of the first link to one of the second.
+    """Return (K, K) [s], least times from a green of a link to another's.
 
     The programme is walked from the end of every green on. It switches to a link directly if this
     link is among the first ones that become green, or follows them within the minimum green, and
@@ -321,9 +321,9 @@ def _before(rows: np.ndarray) -> np.ndarray:
 
 
 def _latest(events: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """Return (M, K) [s], the time of the latest of the events (M, K); -inf before the first.
+    """Return (M, K) [s], the time of the latest event so far; -inf before any.
 
-    time: (M, 1) [s]
+    events: (M, K) bool; time: (M, 1) [s]
     """
     return np.maximum.accumulate(np.where(events, time, -np.inf))
 

@@ -1,4 +1,4 @@
-"""The signals of one run: commands to states, by perimeter control and max-pressure."""
+"""The signals of one run, from commands to states."""
 
 from collections.abc import Mapping, Sequence
 
@@ -109,7 +109,10 @@ class Actuation:
         self._obey()
 
     def update(self, vehicles: PerEdge) -> None:
-        """Share the command over the gateways again. vehicles: (E,) [veh] on the streets"""
+        """Share the command over the gateways again.
+
+        vehicles: (E,) [veh] on the streets
+        """
         before = self.room.share
         self.room.update(vehicles)
         if (self.room.share != before).any():
@@ -139,7 +142,10 @@ class Actuation:
         self._incidents.play(now)
 
     def observe(self, waits: Waits | None = None) -> None:
-        """Note the states that SUMO has shown in the last simulation step. waits: hears of them"""
+        """Note the states that SUMO showed in the last simulation step.
+
+        waits: is told of every change
+        """
         state_of = self._session.signal_state
         now = self._session.time
         for signal, states in self.states.items():
@@ -150,9 +156,9 @@ class Actuation:
                     waits.changed(signal, state, now)
 
     def green_time(self) -> tuple[PerGateway, PerGateway]:
-        """Return two (G,) [s], mean of a gateway's links; NaN where no command arrives.
+        """Return two (G,) [s], means of links; NaN where no command arrives.
 
-        The green so far, and that without commands.
+        They are the green so far, and the green that there would be without commands.
         """
         times: dict[str, dict[int, Green]] = {}
         for control in self._controls:
@@ -174,7 +180,10 @@ class Actuation:
         return np.where(held, np.maximum(green, self.original_green), green)
 
     def as_shown(self, green: PerGateway, ungated: PerGateway) -> PerGateway:
-        """Return `green` (G,) [s] of the last interval, `ungated` where a signal did not obey."""
+        """Return the green (G,) [s] that was shown in the last interval.
+
+        It is `green`, or `ungated` where a signal did not obey.
+        """
         refused = self._incidents.refused
         disobeyed = [gateway.signal in refused for gateway in self._city.gateways]
         return np.where(disobeyed, ungated, green)
@@ -191,7 +200,10 @@ class Actuation:
 
 
 def _programmed_green(city: City, phases: Mapping[str, Sequence[Phase]], step: float) -> PerGateway:
-    """Return (G,) [s] of green per control interval `step` [s]; NaN without phases."""
+    """Return (G,) [s] of green per control interval; NaN without phases.
+
+    step: control interval [s]
+    """
     green = np.full(len(city.gateways), np.nan)
     for n, gateway in enumerate(city.gateways):
         plan = phases.get(gateway.signal or "")

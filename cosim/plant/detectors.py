@@ -1,4 +1,4 @@
-"""Loop detectors on some links, some vehicles as probes, and the estimate from both.
+"""Loop detectors on some links, some vehicles as probes, and the estimate.
 
 Loops are SUMO's own, on every lane of an equipped link, at up to three places along it (Vigos,
 Papageorgiou and Wang, "Real-time estimation of vehicle-count within signalized links",
@@ -51,7 +51,10 @@ class Layout:
 
 
 class _Loop(NamedTuple):
-    """One loop: its name in SUMO, lane, position on it [m], and number of its link."""
+    """One loop.
+
+    name: in SUMO; position: on its lane [m]; edge: number of its link
+    """
 
     name: str
     lane: str
@@ -181,12 +184,14 @@ class Estimation:
         self._samples += 1
 
     def update(self, controls: Controls) -> None:
-        """Filter the readings of the interval that has just ended under `controls`."""
+        """Filter the readings of the interval that ended under `controls`."""
         self.accumulation = self._filter.step(controls, self.readings())
 
     def backlog(self) -> PerPair:
-        """Return (R, R) [veh]: metered trips that wait, and the probes that wait to enter, scaled
-        up."""
+        """Return (R, R) [veh], the trips that wait.
+
+        These are metered trips, and probes that wait to enter, scaled up.
+        """
         return self._meter.held() + self._meter.probe_backlog() / max(self._known.probe_share, 1e-9)
 
     def readings(self) -> Readings:

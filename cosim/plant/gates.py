@@ -1,4 +1,4 @@
-"""Perimeter control to green: how commands limit the green of gateway links, signal by signal.
+"""Perimeter control to green: how commands limit the green of gateways.
 
 With s the share of its gateway (cosim.plant.room), and m the minimum green, a gateway link keeps
 m + s (L - m) seconds of green. At a fixed-time signal (GatewaySignal), this is the length of a
@@ -27,7 +27,10 @@ Show = Callable[[str, str], None]  # (signal, state): sets the state
 
 
 class Green(NamedTuple):
-    """Green of a link since the start [s]: as shown, and as it would be without commands."""
+    """Green of a link since the start [s].
+
+    shown: as shown; ungated: as it would be without commands
+    """
 
     shown: float = 0.0
     ungated: float = 0.0
@@ -44,7 +47,7 @@ class GatewaySignal:
     def __init__(
         self, programme: Programme, movements: Movements, *, start: float, step: float, show: Show
     ):
-        """start: simulation time at which the programme was read; step: of the simulation [s]"""
+        """start: time at which the programme was read; step: simulation step [s]"""
         self._signal = programme.signal
         self._phases = programme.phases
         self._show = show
@@ -93,7 +96,7 @@ class GatewaySignal:
     def _filter(
         self, movement: "_Movement", base: str, phase: int, step_end: float
     ) -> tuple[str, float]:
-        """Return the light of a link instead of `base`, and the time of its next change [s]."""
+        """Return the light of a link instead of `base`, and its next change [s]."""
         window = movement.windows.get(phase)
         if window is not None:
             begin = self._cycle_start + window.after_cycle_start
@@ -110,7 +113,10 @@ class GatewaySignal:
 
 
 class _Window(NamedTuple):
-    """A green window of a link: its begin against that of the cycle, and its length [s]."""
+    """A green window of a link.
+
+    after_cycle_start: its begin against that of the cycle [s]; length: [s]
+    """
 
     after_cycle_start: float
     length: float
@@ -156,7 +162,7 @@ class _Movement:
 
 
 def _windows(programme: Programme, link: int) -> tuple[dict[int, _Window], bool]:
-    """Return phase with green -> its window, and True for a link that is never red."""
+    """Return phase with green -> its window, and True for a link without red."""
     phases = programme.phases
     green = [phase.state[link] in GREEN for phase in phases]
     if all(green):
@@ -188,7 +194,7 @@ def yellow_time(phases: Sequence[Phase], link: int) -> float:
 
 
 def ends_bare(phases: Sequence[Phase]) -> set[int]:
-    """Return the links whose green ends without yellow, such as those of crossings."""
+    """Return the links whose green ends without yellow, such as crossings."""
     links = set()
     for n, phase in enumerate(phases):
         before = phases[n - 1].state
@@ -268,7 +274,7 @@ class Ration:
         return not self._open and self._budget - self._spent < self._least - 1e-6
 
     def show(self, light: str, now: float, *, lasting: bool = True) -> tuple[str, float]:
-        """Return the light instead of `light` from `now` [s] on, and the time of the next call.
+        """Return the light instead of `light`, and the time of the next call [s].
 
         Call it also when `light` changes. lasting: a green lasts for the minimum green at least
         """

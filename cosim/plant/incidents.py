@@ -1,4 +1,4 @@
-"""Faults of a simulated city: closed streets, and signals that take no commands."""
+"""Faults of a city: closed streets, and signals that take no commands."""
 
 from collections.abc import Collection, Sequence
 
@@ -89,7 +89,10 @@ class Incidents:
             self._change(signal)
 
     def play(self, now: float) -> None:
-        """End the transitions that are over at `now` [s]; call after all that shows states."""
+        """End the transitions that are over at `now` [s].
+
+        Call it after everything that shows states.
+        """
         for signal, end in list(self._yellow_end.items()):
             if now >= end - 1e-6:
                 del self._yellow_end[signal]
@@ -117,7 +120,10 @@ class Incidents:
         return signal not in self._silent and signal not in self._yellow_end
 
     def _change(self, signal: str) -> None:
-        """Switch between own programme and commanded state, through yellow if a green ends."""
+        """Switch between own programme and commanded state.
+
+        If a green ends, yellow comes first.
+        """
         session = self._session
         shown = session.signal_state(signal)
         target = None if signal in self._silent else self._commanded.get(signal)

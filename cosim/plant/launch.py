@@ -58,8 +58,9 @@ class Launch:
         trip_file: Path | None,
         gui: bool,
     ):
-        """layout: loop detectors to install; trip_file: where to keep SUMO's tripinfo
+        """layout: loop detectors to install
 
+        trip_file: where to keep SUMO's tripinfo
         gui: show the run in sumo-gui
         """
         self._scenario = scenario
@@ -77,7 +78,7 @@ class Launch:
         self.emission_file = self._folder / "emissions.xml"
 
     def start(self, seed: int) -> Session:
-        """Return a simulation whose trips, drivers and reroutes follow from `seed`."""
+        """Return a simulation in which everything random follows from `seed`."""
         settings = self._settings
         routes = self._folder / "trips.rou.xml"
         self.vehicles = self._write_vehicles(routes, seed)
@@ -179,7 +180,7 @@ class Launch:
         return [name for _, _, name in drawn]
 
     def _vehicles_of(self, seed: int) -> RecordedTrips:
-        """Return the recorded trips, or trips that are made from the demand by `seed`."""
+        """Return the recorded trips, or trips made from the demand by `seed`."""
         if self._settings.routes:
             return self._recorded
         return as_recorded(make_trips(self._city, self._scenario.demand, self._scenario.step, seed))
@@ -193,7 +194,7 @@ class Launch:
         return recorded.read_routes(own_files(self._scenario, self._settings.additional))
 
     def _planning_trips(self) -> Iterator[tuple[float, Sequence[str]]]:
-        """Yield departure [s] and edges of the trips that Webster's plan is made for."""
+        """Yield departure [s] and edges of the trips for Webster's plan."""
         originals = self._vehicles_of(PLANNING_SEEDS[0])
         for depart, element in zip(originals.depart.tolist(), originals.elements, strict=True):
             edges, driven = recorded.edges_of(element, self._shared_routes)

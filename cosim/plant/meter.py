@@ -1,4 +1,4 @@
-"""The exact vehicle ledger of a run: accumulations x_ij, and every crossing of a boundary.
+"""The exact vehicle ledger of a run: accumulations x_ij and crossings.
 
 SUMO's tripinfo has the outcome of vehicles that have left (cosim.sumo.outputs): an arrival at the
 last edge of the final route, else a removal.
@@ -49,7 +49,7 @@ class _Vehicle:
 
 
 class Event(NamedTuple):
-    """A departure (source None), or the entry of a vehicle into another region.
+    """A departure (source None), or an entry into another region.
 
     edge: last one of its route; free: the driver may take another route (no public transport, no
         stops)
@@ -107,8 +107,9 @@ class Meter:
         trips: TripReader | None = None,
         metering: Metering | None = None,
     ):
-        """probes: vehicles that are also counted apart; metering: trips that wait outside
+        """probes: vehicles that are also counted apart
 
+        metering: trips that wait outside
         trips: ends of trips; None if SUMO cannot write them at once: all are arrivals then
         """
         self._session = session
@@ -145,7 +146,9 @@ class Meter:
         self._alike = Counter((g.source, g.to_edge) for g in city.gateways)
 
     def state(self, step: int, time: float) -> State:
-        """Return the state at `time` [s] since the start, when control step `step` begins.
+        """Return the state when control step `step` begins.
+
+        time: since the start [s]
 
         Raises LedgerError.
         """
@@ -206,7 +209,9 @@ class Meter:
         return events
 
     def accumulation(self, step: int = 0) -> PerPair:
-        """Return x_ij (R, R) [veh], with every vehicle counted where it is now, on junctions too.
+        """Return x_ij (R, R) [veh], with every vehicle counted where it is now.
+
+        Vehicles on junctions count, too.
 
         step: control step, for messages
         Raises LedgerError if the count differs from departures minus arrivals and removals, in
@@ -287,16 +292,17 @@ class Meter:
         return waiting
 
     def time_spent(self) -> Float[np.ndarray, "2"]:
-        """Return the total time spent since the beginning [veh s], of other and of private
-        vehicles."""
+        """Return (2,) [veh s] spent so far, by other and by private vehicles."""
         spent = self._spent.copy()
         for trip in self._open():
             spent[int(trip.private)] += trip.time
         return spent
 
     def trips(self) -> list[Trip]:
-        """Return all trips that were due; time losses of those under way are known when the books
-        are closed."""
+        """Return all trips that were due.
+
+        Time losses of those under way are known when the books are closed.
+        """
         return [*self._ended, *self._open()]
 
     def _open(self) -> Iterator[Trip]:
@@ -323,7 +329,7 @@ class Meter:
         return self._metering.backlog()
 
     def probes(self) -> PerPair:
-        """Return (R, R) [veh] of the accumulation when it was last counted: probes."""
+        """Return (R, R) [veh], the probes of the accumulation last counted."""
         counted = np.zeros(self._running.shape)
         for vehicle in self._probes & self._vehicles.keys():
             known = self._vehicles[vehicle]
@@ -384,7 +390,7 @@ class Meter:
             self._passages(i, h)[i, h, j] += 1
 
     def _passages(self, i: int, h: int) -> np.ndarray:
-        """Return the book (R, R, R) of what comes from region i to h: crossings or jumps."""
+        """Return the book (R, R, R) of passages from i to h: crossings or jumps."""
         return self.crossings if (i, h) in self._joined else self.jumps
 
     def _load(self, vehicle: str) -> _Vehicle:
@@ -415,7 +421,10 @@ class Meter:
         known.due = departed - known.waited
 
     def _depart(self, vehicle: str) -> _Vehicle:
-        """Record a departure from the vehicle's current region to its current destination."""
+        """Record a departure from the vehicle's region to its destination.
+
+        Both are the current ones.
+        """
         known = self._load(vehicle)
         with suppress(REFUSALS):  # gone already
             self._time(vehicle, known)
@@ -465,7 +474,7 @@ class Meter:
             self._gone.setdefault(vehicle, []).append(known)
 
     def _enter(self, vehicle: str, edge: str, region: int) -> list[Event]:
-        """Book a vehicle on the first edge behind a boundary; return its Event, if it has one."""
+        """Book a vehicle on the first edge behind a boundary; return its Event."""
         known = self._under_way(vehicle)
         if vehicle in self._teleporting or known.region == known.announced == region:
             return []

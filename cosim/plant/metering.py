@@ -1,4 +1,4 @@
-"""Metering: trips begin in a region no faster than at a commanded rate, or wait outside.
+"""Metering: trips begin no faster than at a commanded rate, or wait.
 
 SUMO gets the trips of a metered city one by one, on the same routes, with the same ids and by the
 same seed as without metering. Trips that wait are in the backlog and in the total time spent.
@@ -24,8 +24,9 @@ FILLING_S = 60.0  # in which the largest rate fills a region to its critical acc
 
 
 class Metering:
-    """The metered trips of one run: `command` once per control interval, `play` before every
-    simulation step.
+    """The metered trips of one run.
+
+    Call `command` once per control interval and `play` before every simulation step.
 
     waited: vehicle -> time that it waited outside [s], of trips that have begun
     """
@@ -51,7 +52,10 @@ class Metering:
         self._before: PerRegion | None = None
 
     def command(self, rate: PerRegion | None, accumulation: PerRegion) -> None:
-        """Set the largest rate (R,) [veh/s]; None: PI control of `accumulation` (R,) [veh]."""
+        """Set the largest rate (R,) [veh/s].
+
+        rate: None for PI control of `accumulation` (R,) [veh]
+        """
         before = self._before
         if before is None:
             before = accumulation

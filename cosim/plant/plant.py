@@ -1,4 +1,4 @@
-"""The SUMO city as a plant: the protocol and the controllers of the regional plants."""
+"""The SUMO city as a plant."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -34,7 +34,10 @@ GUIDANCE = 0x67756964
 
 
 class Observer:
-    """Callbacks during a run. They block the simulation; an exception aborts it."""
+    """Callbacks during a run.
+
+    They block the simulation; an exception aborts it.
+    """
 
     def began(self, city: City, state: State) -> None:
         """Take the initial state."""
@@ -46,7 +49,7 @@ class Observer:
         """
 
     def recorded(self, controls: Controls, state: State, row: Mapping[str, np.ndarray]) -> None:
-        """Take controls, new state and row of the record (cosim.plant.record) of an interval."""
+        """Take controls, new state and row of the record of an interval."""
 
 
 class SumoPlant:
@@ -226,7 +229,7 @@ class SumoPlant:
         return self._recorder.record()
 
     def facts(self) -> dict[str, float]:
-        """Return scalar facts of the run so far, by the names of the columns of its table."""
+        """Return scalar facts of the run so far, by columns of its table."""
         return {
             "sumo_time_s": self.session.sumo_time,
             "signals_left_alone": len(self.other_signals),
@@ -236,11 +239,11 @@ class SumoPlant:
         }
 
     def longest_waits(self) -> dict[str, float]:
-        """Return signal -> longest time [s] that a driver waited there at red so far."""
+        """Return signal -> longest wait of a driver at red so far [s]."""
         return self._waits.longest() if self._waits else {}
 
     def trip_facts(self) -> dict[str, float]:
-        """End the simulation, close the books, and return emissions [kg] of all vehicles.
+        """End the simulation, close the books, and return emissions [kg].
 
         Raises LedgerError if SUMO's tripinfo differs from the books.
         """
@@ -256,7 +259,10 @@ class SumoPlant:
         return {"co2_kg": co2, "fuel_kg": fuel}
 
     def edge_totals(self) -> dict[str, np.ndarray]:
-        """Return the arrays over edges of cosim.plant.record.TOTALS; call it after `trip_facts`."""
+        """Return the arrays of cosim.plant.record.TOTALS over edges.
+
+        Call it after `trip_facts`.
+        """
         emitted = {edge: co2 for edge, (co2, _) in self._emissions.items()}
         co2 = {edge: emitted.get(edge, 0.0) for edge in self.city.edges}
         for (_, edge), turn in self.city.over.items():
@@ -277,11 +283,14 @@ class SumoPlant:
         return self._session
 
     def _period(self, seconds: float, steps: int) -> int:
-        """Return a period in simulation steps: at least one, at most all `steps` of an interval."""
+        """Return a period in simulation steps, from 1 to `steps`."""
         return min(max(1, round(seconds / self.session.step_length)), steps)
 
     def _splits(self, controls: Controls) -> np.ndarray | None:
-        """Return the split ratios of the guidance; nominal ones for guidance by travel times."""
+        """Return the split ratios of the guidance.
+
+        They are the nominal ones for guidance by travel times.
+        """
         by_travel_times = controls.splits is None and self._settings.guided
         if controls.prices is not None or by_travel_times:
             return self._scenario.network.nominal_splits

@@ -1,4 +1,4 @@
-"""Signal programmes beside those of the network file: actuated ones, and plans by SUMO's tools."""
+"""Signal programmes beside those of the network: actuated, or optimised."""
 
 import re
 from collections import Counter
@@ -42,7 +42,10 @@ from nmfd.model.scenario import Scenario
 
 
 def check_strategy(strategy: Strategy, scenario: Scenario, city: City) -> None:
-    """Raise InputError, in a line that begins with the strategy, if it cannot run in this city."""
+    """Raise InputError if a strategy cannot run in this city.
+
+    The message begins with the strategy.
+    """
     try:
         chosen = settings(scenario).changed(**strategy.city)
         check_lanes(scenario, chosen)
@@ -53,7 +56,7 @@ def check_strategy(strategy: Strategy, scenario: Scenario, city: City) -> None:
 
 
 def scenario_city(scenario: Scenario, settings: Settings) -> City:
-    """Return the scenario's city, with a signal only at gateways that a command can hold.
+    """Return the scenario's city, with signals only where commands can hold.
 
     Raises InputError.
     """
@@ -66,7 +69,7 @@ def scenario_city(scenario: Scenario, settings: Settings) -> City:
 def city_signals(
     city: City, scenario: Scenario, settings: Settings
 ) -> tuple[list[Signal], list[str]]:
-    """Return the signals to run another programme, and the names of those that cannot.
+    """Return the signals to run another programme, and those that cannot.
 
     Signals with gateways that stay fixed-time are in neither. Raises InputError if
     `settings.signals` fits none.
@@ -94,7 +97,7 @@ def city_signals(
 def _left_alone(
     city: City, settings: Settings, additional: Sequence[Path], signals: Iterable[str]
 ) -> dict[str, str]:
-    """Return those of `signals` that perimeter control does not use, with the reason."""
+    """Return which of `signals` perimeter control does not use, and why."""
     everywhere = without_effect(settings.options, settings.mesoscopic)
     if everywhere:
         return dict.fromkeys(signals, everywhere)
@@ -110,7 +113,9 @@ def _counted(reasons: Iterable[str]) -> str:
 
 
 def write_actuated(path: Path, signals: Iterable[Signal]) -> None:
-    """Write an additional file that makes fixed-time signals gap-based actuated ones of SUMO.
+    """Write an additional file that makes fixed-time signals actuated ones.
+
+    They are SUMO's, based on gaps.
 
     A stage lasts up to 1.5 times its fixed time: in congestion, the shares of the green are those
     of the programme.
@@ -164,7 +169,10 @@ def write_optimised(
 
 
 def _plan(tool: str, city: City, plan: Path, *options: str) -> None:
-    """Write a plan by a tool of SUMO, in the folder of the plan. Raises InputError if it fails."""
+    """Write a plan by a tool of SUMO, in the folder of the plan.
+
+    Raises InputError if the tool fails.
+    """
     files = ("-n", str(city.net_file.resolve()), "-r", "planned.xml", "-o", plan.name)
     result = run_tool(tool, *files, *options, folder=plan.parent)
     if result.returncode:
@@ -175,7 +183,7 @@ def _plan(tool: str, city: City, plan: Path, *options: str) -> None:
 
 
 def _keep_times(plan: Path, net_file: Path) -> None:
-    """Lengthen phases of a plan to their least times in the network's programmes.
+    """Lengthen phases of a plan to their least times in the network.
 
     The cycle stays: the seconds come from the phases that exceed their least times most.
     """

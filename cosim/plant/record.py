@@ -1,4 +1,4 @@
-"""The record of a run in SUMO per control interval, beside its states and controls."""
+"""The record of a run in SUMO per control interval."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -49,7 +49,7 @@ def settled(result: Result) -> Result:
 
 
 def _since_start(counts: np.ndarray) -> np.ndarray:
-    """Return (K + 1, ...), the sums of counts (K, ...) up to the begin of every interval."""
+    """Return (K + 1, ...), sums of counts (K, ...) before every interval."""
     return np.concatenate([np.zeros_like(counts[:1]), counts]).cumsum(axis=0).astype(float)
 
 
@@ -65,7 +65,10 @@ class Recorder:
         self._before = self._totals()
 
     def add(self, streets: StreetMeans) -> dict[str, np.ndarray]:
-        """Add and return the row of the interval that has just ended. streets: its means"""
+        """Add and return the row of the interval that has just ended.
+
+        streets: its means
+        """
         totals = self._totals()
         actuation = self._actuation
         row: dict[str, np.ndarray] = {}

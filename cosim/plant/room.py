@@ -1,5 +1,6 @@
-"""Gates with room: a command per boundary, shared over its gateways by the room before and behind
-them.
+"""Gates with room: a command per boundary, shared over its gateways.
+
+The room before and behind the gateways decides.
 
 A command u_ih is the share s = (u_ih - u_min) / (u_max - u_min) of what the boundary i -> h can let
 through. Gateway g of this boundary gets the share of green
@@ -32,7 +33,9 @@ CHAIN_M = 400.0  # before a gateway
 
 
 class Room:
-    """The shares of one run: `command` once per control interval, `update` every few seconds.
+    """The shares of one run.
+
+    Call `command` once per control interval and `update` every few seconds.
 
     share: (G,) [-], of green, from now on
     """
@@ -40,8 +43,9 @@ class Room:
     def __init__(
         self, session: Session, city: City, green: PerGateway, *, limit: float, lanes: bool
     ):
-        """green: original one (G,), NaN where no command arrives; lanes: the simulation has lanes
+        """green: original one (G,) [s], NaN where no command arrives
 
+        lanes: the simulation has lanes
         limit: share of the room; 0: all gateways of a boundary get the same share
         """
         gateways = city.gateways
@@ -71,7 +75,10 @@ class Room:
         self.share = np.ones(len(gateways))
 
     def command(self, share: PerPair, vehicles: PerEdge) -> None:
-        """Set the shares (R, R) [-] of the boundaries. vehicles: (E,) [veh] on the streets"""
+        """Set the shares (R, R) [-] of the boundaries.
+
+        vehicles: (E,) [veh] on the streets
+        """
         self._commanded = share
         self._shares = []
         self.update(vehicles)
@@ -101,7 +108,7 @@ class Room:
         return np.mean(self._shares, axis=0)
 
     def realised(self) -> PerPair | None:
-        """Return (R, R) [-], the mean share that each boundary's gateways got since the command.
+        """Return (R, R) [-], the mean share of each boundary since the command.
 
         The commanded share counts where no gateway is controlled. None if `chain_limit` is 0.
         """
@@ -117,7 +124,7 @@ class Room:
 def shared(
     share: float, urgency: PerGateway, floor: PerGateway, capacity: PerGateway
 ) -> PerGateway:
-    """Return clip(urgency + m, floor, 1), with m such that the mean is `share`.
+    """Return clip(urgency + m, floor, 1) with the mean `share`.
 
     The mean is weighted by capacity; it is that of `floor` if that is more.
     """
@@ -130,7 +137,10 @@ def shared(
 
 
 def upstream(city: City, edge: str) -> list[str]:
-    """Return `edge` and all streets that lead there past no signal, up to CHAIN_M away."""
+    """Return `edge` and the streets that lead there past no signal.
+
+    They end less than CHAIN_M before the end of `edge`.
+    """
     to_the_end = {edge: city.length[edge]}  # street -> distance from its begin to the gateway [m]
     waiting = deque([edge])
     while waiting:

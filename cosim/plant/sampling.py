@@ -1,4 +1,4 @@
-"""Samples of the streets every few seconds, and their means over a control interval."""
+"""Samples of the streets every few seconds, and means over an interval."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -121,7 +121,10 @@ class StreetSampler:
                 self._routed[n] += max(session.vehicle_speed(vehicle), STANDING_M_S)
 
     def finish(self, closed: EdgeMask) -> StreetMeans:
-        """Return the means since the last call. closed: (E,) bool, streets without traffic"""
+        """Return the means since the last call.
+
+        closed: (E,) bool, streets without traffic
+        """
         samples = len(self._queues)
         city = self._city
         queues = np.array(self._queues).reshape(samples, len(self._upstream))[:, self._upstream_of]

@@ -1,4 +1,4 @@
-"""Help for vehicles that SUMO would let stand forever, on lanes and on junctions.
+"""Help for vehicles that SUMO would let stand forever.
 
 SUMO gives a vehicle any route that its street leads to, and leaves the lane change to the vehicle.
 Two leaders of neighbouring lanes that wait for each other's lane block a street forever, and soon
@@ -67,14 +67,17 @@ class Lanes:
         return [here, *fastest]
 
     def _left(self, vehicle: str) -> tuple[float, frozenset[str]]:
-        """Return the way to the end of the vehicle's lane [m], and the edges behind it."""
+        """Return the way to the end of a vehicle's lane [m], and edges behind."""
         lane, position = self._session.place(vehicle)
         length, onward = self._lane(lane)
         return length - position, onward
 
 
 class Junctions:
-    """The junctions of one simulation with lanes. freed: vehicles put on a street so far."""
+    """The junctions of one simulation with lanes.
+
+    freed: vehicles put on a street so far
+    """
 
     def __init__(self, session: Session, city: City):
         self._session = session
@@ -99,7 +102,10 @@ class Junctions:
             self._free([vehicle for _, vehicle in sorted(standing)])
 
     def _free(self, vehicles: list[str]) -> None:
-        """Put the vehicles of one junction on the streets behind it, if there is room for all."""
+        """Put the vehicles of one junction on the streets behind it.
+
+        Nothing happens unless there is room for all.
+        """
         lanes: dict[str, str] = {}  # lane behind the junction -> first vehicle that goes there
         for vehicle in vehicles:
             lane = self._behind(self._session.place(vehicle)[0])

@@ -18,8 +18,10 @@ OVERFULL = 1.2
 
 
 class Supervisor:
-    """The regions whose gates are open against the command; call `opened` once per control
-    interval."""
+    """The regions whose gates are open against the command.
+
+    Call `opened` once per control interval.
+    """
 
     def __init__(self, network: RegionalModel, step: float):
         """step: control interval [s]"""
@@ -31,7 +33,10 @@ class Supervisor:
         self._open_for = np.zeros(network.regions, dtype=int)
 
     def opened(self, share: PerPair, accumulation: PerRegion) -> Bool[np.ndarray, " R"]:
-        """Return the regions to open. share: commanded (R, R) [-]; accumulation: (R,) now [veh]"""
+        """Return the regions to open.
+
+        share: commanded (R, R) [-]; accumulation: (R,) now [veh]
+        """
         adjacency = self._network.adjacency
         self._before = [*self._before[-self._patience :], accumulation]
         self._open_for = np.maximum(self._open_for - 1, 0)

@@ -1,4 +1,4 @@
-"""How long drivers wait at red signals, which the proof sheet of a run tells.
+"""Waits of drivers at red signals, for the proof sheet of a run.
 
 A driver waits from the time when the vehicle stands first on its lane and its light is red, until
 the light ends. Samples find these drivers, and changes of signals end their waits.
@@ -12,7 +12,10 @@ from cosim.sumo.signals import CLOSED, Link, lane_id
 
 
 class Waits:
-    """Waits of one run: `sample` every few seconds, `changed` at every change of a signal."""
+    """Waits of one run.
+
+    Call `sample` every few seconds and `changed` at every change of a signal.
+    """
 
     def __init__(self, session: Session, links: Mapping[str, Iterable[Link]]):
         """links: signal -> its links"""

@@ -32,7 +32,9 @@ def run_sumo(program: str, options: Mapping[str, object], *flags: str, where: st
 def run_tool(
     tool: str, *arguments: str, folder: Path, seconds: float | None = None
 ) -> subprocess.CompletedProcess:
-    """Run a Python tool of SUMO in a folder, for so many seconds at most; return its outcome.
+    """Run a Python tool of SUMO in a folder; return its outcome.
+
+    seconds: time limit
 
     Raises subprocess.TimeoutExpired.
     """

@@ -71,7 +71,10 @@ class Signal:
 
 @dataclass(frozen=True, kw_only=True)
 class Logic:
-    """A signal programme: its id, SUMO's type or "branching", and the states of its phases."""
+    """A signal programme.
+
+    programme: its id; kind: SUMO's type, or "branching"; states: of its phases
+    """
 
     programme: str
     kind: str
@@ -121,7 +124,7 @@ def unfit(logic: Logic) -> str:
 
 
 def control(gateway: Gateway, logics: Mapping[str, Logic], left: Mapping[str, str]) -> str:
-    """Return CONTROLLED if a command can hold a gateway, otherwise the reason why none can.
+    """Return CONTROLLED if a command can hold a gateway, else why none can.
 
     logics: signal -> the programme that runs; left: signal -> reason why it gets no command
     """
@@ -136,7 +139,7 @@ def control(gateway: Gateway, logics: Mapping[str, Logic], left: Mapping[str, st
 
 
 def held_city(city: City, logics: Mapping[str, Logic], left: Iterable[str] = ()) -> City:
-    """Return the city with a signal only at gateways that a command can hold (see `control`)."""
+    """Return the city with signals only where a command can hold (`control`)."""
     reasons = dict.fromkeys(left, "left alone")
     gateways = []
     for gateway in city.gateways:
@@ -148,7 +151,7 @@ def held_city(city: City, logics: Mapping[str, Logic], left: Iterable[str] = ())
 
 
 def without_effect(options: Mapping[str, str], mesoscopic: bool) -> str:
-    """Return why all signals are without effect under SUMO's options, "" if they are not.
+    """Return why SUMO's options leave all signals without effect, or "".
 
     mesoscopic: SUMO's queue model, in which signals belong to the junction control
     """
@@ -165,7 +168,7 @@ def read_logics(net: Path, additional: Iterable[Path] = ()) -> dict[str, Logic]:
 
 
 def read_links(net: Path) -> Mapping[str, Sequence[Link]]:
-    """Return signal -> its links, without those of crossings. Raises InputError."""
+    """Return signal -> its links, without crossings. Raises InputError."""
     return _read(net, ()).links
 
 
@@ -181,14 +184,17 @@ def running_logic(programme: Programme) -> Logic:
 
 
 def timetabled(net: Path, additional: Iterable[Path] = ()) -> frozenset[str]:
-    """Return the signals whose programme a timetable (WAUT) changes. Raises InputError."""
+    """Return the signals whose programme a timetable (WAUT) changes.
+
+    Raises InputError.
+    """
     return _read(net, additional).timetabled
 
 
 def read_signals(
     city: City, additional: Iterable[Path] = (), kinds: Collection[str] = (STATIC,)
 ) -> tuple[list[Signal], dict[str, str]]:
-    """Return the simple signals of the city, and why each of the others keeps its programme.
+    """Return the simple signals, and why others keep their programme.
 
     Simple ones are of these `kinds`, with two stages or more, phases in order, and green, yellow,
     red and turns on red only. Of several programmes the last one counts, as in SUMO: first those
@@ -237,7 +243,7 @@ def phases_of(logic: ElementTree.Element) -> tuple[Phase, ...]:
 
 
 def _read(net: Path, additional: Iterable[Path]) -> _File:
-    """Return the signals of a network with those of additional files, which count more."""
+    """Return the signals of a network, with those of additional files."""
     stamp = net.stat().st_mtime_ns if net.is_file() else 0
     network = _network(net, stamp)
     programmes = dict(network.programmes)
@@ -251,7 +257,10 @@ def _read(net: Path, additional: Iterable[Path]) -> _File:
 
 @lru_cache(maxsize=2)  # a large city takes seconds, and a run asks several times
 def _network(net: Path, stamp: int) -> _File:
-    """Return the signals of a network file. stamp: time of its last change, for the cache"""
+    """Return the signals of a network file.
+
+    stamp: time of its last change, for the cache
+    """
     return _file(read_xml(net))
 
 
@@ -284,7 +293,7 @@ def _logic(element: ElementTree.Element) -> Logic:
 
 
 def _not_simple(element: ElementTree.Element, kinds: Collection[str]) -> str:
-    """Return why a <tlLogic> cannot give way to another programme, "" if it can."""
+    """Return why a <tlLogic> cannot give way to another, "" if it can."""
     logic = _logic(element)
     if logic.programme == OFF:
         return SWITCHED_OFF
@@ -302,7 +311,10 @@ def _is_on(value: str) -> bool:
 
 
 def seconds_of(text: str) -> float:
-    """Convert a time of SUMO: seconds, or days:hours:minutes:seconds. Raises ValueError."""
+    """Convert a time of SUMO: seconds, or days:hours:minutes:seconds.
+
+    Raises ValueError.
+    """
     total = 0.0
     for part, unit in zip(reversed(text.split(":")), (1.0, 60.0, 3600.0, 86400.0), strict=False):
         total += unit * float(part)
