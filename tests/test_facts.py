@@ -85,7 +85,7 @@ def run():
 
 
 def test_time_on_the_road_is_that_of_the_vehicles_seen_second_by_second(run):
-    plant, record, running, facts = run
+    plant, record, running, _ = run
     trips = plant.meter.trips()
     assert sum(trip.time - trip.departure_delay for trip in trips) == pytest.approx(sum(running))
     assert record.time_spent.sum() == pytest.approx(sum(trip.time for trip in trips))
@@ -194,7 +194,7 @@ def test_edges_hold_the_vehicles_of_their_region(run):
 
 
 def test_open_gateways_show_the_original_green(run):
-    plant, record, _, _ = run
+    _, record, _, _ = run
     actuated = ~np.isnan(record.gateway_green[0])
     assert actuated.sum() > 50
     shown, original = (
