@@ -34,10 +34,12 @@ def street(vehicle="car", standing=0.0, route=("a", "b")):
 
 def waited(session, *moments):
     """The longest wait after (time, state that begins, time that the vehicle has stood)."""
-    waits = Waits(session, LINKS)
+    states = {"s": []}
+    waits = Waits(session, LINKS, states)
     for time, state, standing in moments:
         session.time, session.stands = float(time), standing
         if state:
+            states["s"].append((float(time), state))
             waits.changed("s", state, float(time))
         waits.sample()
     return waits.longest().get("s")

@@ -152,7 +152,7 @@ class SumoPlant:
         self._waits = None
         if not settings.mesoscopic:  # that model has no lanes
             self._junctions = Junctions(session, city)
-            self._waits = Waits(session, read_links(city.net_file))
+            self._waits = Waits(session, read_links(city.net_file), self.actuation.states)
         self._state = meter.state(0, 0.0)
         self._recorder = Recorder(meter, self._guide, self.actuation)
         self._observer.began(city, self._state)

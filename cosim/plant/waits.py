@@ -5,7 +5,7 @@ the light ends. Samples find these drivers, and changes of signals end their wai
 """
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 from cosim.sumo.session import Session
 from cosim.sumo.signals import CLOSED, Link, lane_id
@@ -17,36 +17,38 @@ class Waits:
     Call `sample` every few seconds and `changed` at every change of a signal.
     """
 
-    def __init__(self, session: Session, links: Mapping[str, Iterable[Link]]):
-        """links: signal -> its links"""
+    def __init__(
+        self,
+        session: Session,
+        links: Mapping[str, Iterable[Link]],
+        states: Mapping[str, Sequence[tuple[float, str]]],
+    ):
+        """links: signal -> its links; states: signal -> time [s] and state at every change"""
         self._session = session
+        self._states = states
         # Edge -> lane -> next edge -> signal and link.
         self._lanes: dict[str, dict[str, dict[str, tuple[str, int]]]] = {}
         for signal, own in links.items():
             for link in own:
                 lanes = self._lanes.setdefault(link.from_edge, {})
                 lanes.setdefault(lane_id(link), {})[link.to_edge] = signal, link.index
-        self._red_since: dict[str, dict[int, float]] = defaultdict(dict)  # signal -> link -> [s]
-        self._waiting: dict[str, dict[int, float]] = defaultdict(dict)  # the same of drivers
+        # Signal -> link -> time since which a driver waits [s].
+        self._waiting: dict[str, dict[int, float]] = defaultdict(dict)
         self._longest: dict[str, float] = {}
 
     def changed(self, signal: str, state: str, now: float) -> None:
-        """Take the state of a signal from `now` [s] on."""
-        red = self._red_since[signal]
-        waiting = self._waiting[signal]
-        for link, light in enumerate(state):
-            if light in CLOSED:
-                red.setdefault(link, now)
-                continue
-            red.pop(link, None)
-            begin = waiting.pop(link, None)
-            if begin is not None:
+        """End the waits of drivers whose light ends to be red at `now` [s]."""
+        waiting = self._waiting.get(signal)
+        if not waiting:
+            return
+        for link, begin in list(waiting.items()):
+            if state[link] not in CLOSED:
+                del waiting[link]
                 self._end(signal, now - begin)
 
     def sample(self) -> None:
         """Look for the drivers who wait now."""
         session = self._session
-        now = self._session.time
         self._waiting.clear()
         for edge, lanes in self._lanes.items():
             if not session.halting(edge):
@@ -62,9 +64,9 @@ class Waits:
                 if ahead is None:  # the vehicle is on the wrong lane
                     continue
                 signal, link = ahead
-                red_since = self._red_since[signal].get(link)
+                red_since = self._red_since(signal, link)
                 if red_since is not None:
-                    self._waiting[signal][link] = max(now - standing, red_since)
+                    self._waiting[signal][link] = max(session.time - standing, red_since)
 
     def longest(self) -> dict[str, float]:
         """Return signal -> longest wait so far [s]; no entry where nobody waited."""
@@ -72,6 +74,15 @@ class Waits:
             for begin in waiting.values():
                 self._end(signal, self._session.time - begin)
         return self._longest
+
+    def _red_since(self, signal: str, link: int) -> float | None:
+        """Return the time at which a light became red [s], None if it is not."""
+        since = None
+        for time, state in reversed(self._states[signal]):
+            if state[link] not in CLOSED:
+                break
+            since = time
+        return since
 
     def _end(self, signal: str, seconds: float) -> None:
         self._longest[signal] = max(seconds, self._longest.get(signal, 0.0))
