@@ -71,7 +71,7 @@ def test_with_a_queue_trips_begin_at_the_commanded_rate(rate, step):
 
 
 def test_without_a_command_regions_are_held_at_their_level():
-    meters, session, _ = metering([], [])
+    meters, _, _ = metering([], [])
     most, rates = CRITICAL / FILLING_S, []
     for full in (0.5, 1.5, 1.5, 1.3):
         meters.command(None, full * CRITICAL)

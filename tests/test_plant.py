@@ -2,6 +2,7 @@
 simulations of grid7."""
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -71,7 +72,7 @@ def test_open_gateways_leave_sumo_alone(scenario, plant_of):
 @pytest.mark.parametrize("guidance", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_ledger_and_crossings_balance(scenario, plant_of, guidance):
     measurements, record = drive(plant_of(), scenario, guidance=guidance)
-    for k, (before, after) in enumerate(zip(measurements[:-1], measurements[1:], strict=True)):
+    for k, (before, after) in enumerate(pairwise(measurements)):
         crossings = record.crossings[k]
         expected = before.accumulation + record.departures[k] - crossings.sum(1) + crossings.sum(0)
         expected -= np.diag(record.arrivals[k])

@@ -144,8 +144,16 @@ def test_the_integral_goes_on_from_what_was_realised():
     assert controller.act(seen).perimeter[entries, 3] == pytest.approx(0.5)
 
 
-@pytest.mark.parametrize("change, full, share, opens", [(1, 1.5, 0.2, True), (0, 1.5, 0.2, True), (-1, 1.5, 0.2, False),
-                                                        (1, 0.5, 0.2, False), (1, 1.5, 0.9, False)])  # fmt: skip
+@pytest.mark.parametrize(
+    "change, full, share, opens",
+    [
+        (1, 1.5, 0.2, True),
+        (0, 1.5, 0.2, True),
+        (-1, 1.5, 0.2, False),
+        (1, 0.5, 0.2, False),
+        (1, 1.5, 0.9, False),
+    ],
+)
 def test_gates_that_do_not_empty_their_region_open_for_a_while(change, full, share, opens):
     network = load_scenario("economic_mpc").network
     supervisor, command = Supervisor(network, 90.0), np.where(network.adjacency, 1.0, 0.0)

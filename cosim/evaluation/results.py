@@ -6,8 +6,10 @@ from pathlib import Path
 
 import pandas as pd
 
+from cosim.plant.programmes import scenario_city
+from cosim.plant.settings import settings
 from cosim.plant.strategy import parse
-from cosim.sumo.net import City, city_files, city_of
+from cosim.sumo.net import City, city_files
 from nmfd.api import load_scenario
 from nmfd.controllers.strategy import ControllerLike
 from nmfd.errors import InputError
@@ -60,7 +62,7 @@ class Finished:
         for key, file in (("net_file_hash", files.net_file), ("regions_hash", files.regions_csv)):
             if self.levels[0].key[key] != file_hash(file):
                 raise InputError(f"{self.path}: {file} has changed since the runs; run them again")
-        return city_of(self.scenario.network)
+        return scenario_city(self.scenario, settings(self.scenario))
 
     def level(self, demand: float = 1.0) -> Level:
         """Return the level nearest to `demand`."""

@@ -10,10 +10,10 @@ import numpy as np
 from cosim.evaluation.simulate import Simulation
 from cosim.plant import incidents
 from cosim.plant.launch import own_vehicles
-from cosim.plant.programmes import check_strategy
+from cosim.plant.programmes import check_strategy, scenario_city
 from cosim.plant.settings import FILES, MAX_PRESSURE, own_files, settings
 from cosim.plant.strategy import Strategy, check_tables
-from cosim.sumo.net import check_adjacency, city_files, load_city
+from cosim.sumo.net import check_adjacency, city_files
 from cosim.sumo.signals import HELD, read_signals
 from cosim.sumo.xml_files import read_xml
 from nmfd.model.scenario import Scenario, with_demand
@@ -74,7 +74,7 @@ def city_key(scenario: Scenario, strategies: Sequence[Strategy]) -> dict[str, ob
     chosen = settings(scenario)
     check_tables(scenario)
     files = city_files(scenario.network)
-    city = load_city(*files, scenario.network.regions)
+    city = scenario_city(scenario, chosen)
     check_adjacency(city, scenario.network)
     own_vehicles(scenario, chosen, city)
     used = {strategy.settings(scenario).signals for strategy in strategies}

@@ -103,6 +103,7 @@ def _with_facts(
     result: Result, plant: SumoPlant, job: Simulation, scenario: Scenario, chosen: Settings
 ) -> Result:
     """End the simulation and return its result with all facts."""
+    waits = plant.longest_waits()
     plant_facts = plant.facts()
     leaks = set(plant.actuation.leaks())
     emissions = plant.trip_facts()
@@ -114,6 +115,7 @@ def _with_facts(
         [plant.city.net_file, *own_files(scenario, chosen.additional)],
         end=chosen.begin + scenario.steps * scenario.step,
         step=chosen.step_length,
+        waits=waits,
     )
     arrays = {**plant.record(), **sheet, **totals}
     result = settled(result.add({}, {**RECORD, **SHEET, **TOTALS}, **arrays))

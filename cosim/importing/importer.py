@@ -21,6 +21,7 @@ from cosim.importing.generated import morning_peak
 from cosim.importing.partition import finish, own_regions, partition
 from cosim.importing.streets import Streets, read_streets
 from cosim.sumo.net import load_city
+from cosim.sumo.signals import timetabled, without_effect
 from nmfd.errors import InputError
 from nmfd.model import authority
 from nmfd.model.regional_model import network_toml
@@ -140,7 +141,8 @@ def import_city(
             streets, folder, files, model.options(case, clock), factor, meso, seeds, progress
         )
         progress("partition")
-        left = quality.left_alone(streets, traffic.switched)
+        switched = sorted({*traffic.switched, *timetabled(case.net)})
+        left = quality.left_alone(streets, switched, without_effect(case.options, mesoscopic))
         if count is not None:
             labels = partition(streets, baseline, count, uncontrollable=left)
         else:
@@ -190,7 +192,7 @@ def import_city(
                 case,
                 name=scenario.name,
                 files=files,
-                leave=traffic.switched,
+                leave=switched,
                 network_path=os.path.relpath(out, scenario).replace(os.sep, "/"),
                 protected=int(np.argmax(load / np.bincount(labels, streets.lane_metres))),
                 factor=factor,

@@ -30,6 +30,7 @@ from scipy.sparse import csr_array
 from cosim.plant.gates import (
     MIN_GREEN_S,
     NEVER,
+    Green,
     Movements,
     Ration,
     Show,
@@ -42,7 +43,7 @@ from cosim.sumo.net import City, gateway_movements
 from cosim.sumo.session import Phase, Session
 from cosim.sumo.signals import GREEN, Link, Signal, is_stage, lane_id
 
-LEVELS = "rgG"  # from red to the right of way
+LEVELS = "rsgG"  # from red by way of turns on red to the right of way
 FACTS = {  # columns of the table of runs
     "signal_lanes": "lanes before signals under max-pressure",
     "split_lanes": "those that a stage serves in part",
@@ -95,8 +96,8 @@ class MaxPressure:
             for ration in junction.rations.values():
                 ration.share = float(share[ration.gateway])
 
-    def green_time(self) -> dict[str, dict[int, float]]:
-        """Return signal -> gateway link -> green so far [s]."""
+    def green_time(self) -> dict[str, dict[int, Green]]:
+        """Return signal -> gateway link -> green so far."""
         now = self._session.time
         return {
             junction.signal: {

@@ -12,6 +12,7 @@ from cosim.importing import maps, quality
 from cosim.importing.streets import read_streets
 from cosim.plant.settings import own_files, settings
 from cosim.sumo import net
+from cosim.sumo.signals import timetabled, without_effect
 from nmfd.api import load_scenario
 from nmfd.model.regional_model import RegionalModel, load_network
 from nmfd.model.scenario import Scenario
@@ -57,12 +58,14 @@ class City:
         self.scenario: Scenario | None = None
         additional: Sequence[Path] = ()
         left: Sequence[str] = ()
+        switched_off = ""
         if isinstance(city, Scenario):
             self.scenario = city
             self.network = city.network
             setup = settings(city)
             additional = own_files(city, setup.additional)
             left = setup.leave_signals
+            switched_off = without_effect(setup.options, setup.mesoscopic)
         else:
             self.network = city
         built = net.city_of(self.network)
@@ -72,8 +75,9 @@ class City:
         for region in range(self.network.regions):
             members = streets.drivable & (regions == region)
             places.append(streets.centre[members].mean(axis=0))
-        reasons = quality.left_alone(streets)
-        reasons |= dict.fromkeys(left, "left alone by the scenario")
+        reasons = dict.fromkeys(left, "left alone by the scenario")
+        timetables = timetabled(built.net_file, additional)
+        reasons |= quality.left_alone(streets, timetables, switched_off)
         names = self.network.region_names
         self._streets = streets
         self._regions = regions

@@ -45,7 +45,7 @@ class Gateway:
 
     source, target: regions
     from_edge, to_edge: last edge in `source`, first edge in `target`
-    signal: the signal that controls the turn; None if there is none
+    signal: the signal that controls all of the turn; None where it leaks
     links: indices of the turn in the signal's state
     lanes: numbers of the lanes of `from_edge` that lead over the boundary
     """
@@ -507,12 +507,18 @@ def _gateways(links: Sequence[_Connection], region_of: Mapping[str, int]) -> tup
             target=target,
             from_edge=from_edge,
             to_edge=to_edge,
-            signal=members[0].signal,
+            signal=_common_signal(members),
             links=tuple(sorted(link.link for link in members if link.signal)),
             lanes=tuple(sorted({link.lane for link in members})),
         )
         gateways.append(gateway)
     return tuple(gateways)
+
+
+def _common_signal(links: list[_Connection]) -> str | None:
+    """Return the signal that controls all links of a movement, None if there is none."""
+    signals = {link.signal for link in links}
+    return signals.pop() if len(signals) == 1 else None
 
 
 def gateway_movements(city: City) -> dict[str, dict[int, int]]:

@@ -276,6 +276,11 @@ class Session:
         """
         return libsumo.lane.getLinks(lane)[0][0]
 
+    def first_on(self, lane: str) -> str | None:
+        """Return the vehicle nearest to the end of a lane, None if the lane is empty."""
+        vehicles = libsumo.lane.getLastStepVehicleIDs(lane)
+        return vehicles[-1] if vehicles else None
+
     def room(self, lane: str) -> float:
         """Return the free length at the beginning of a lane (m)."""
         vehicle = libsumo.vehicle

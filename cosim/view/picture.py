@@ -184,8 +184,9 @@ def after(
     row: Mapping[str, np.ndarray],
 ) -> Frame:
     """Return the frame at the end of a control interval."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        green = row["gateway_green"] / row["gateway_original_green"]
+    ungated = row["gateway_original_green"]
+    # A gate without any green to take is open.
+    green = np.divide(row["gateway_green"], ungated, out=np.ones_like(ungated), where=ungated != 0)
     flows = {name: row[name][None] for name in ("arrivals", "crossings")}
     return Frame(
         time=state.time,
