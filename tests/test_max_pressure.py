@@ -12,15 +12,9 @@ import tiny_city
 from signal_rules import CROSS, MIN_GREEN, PHASES, SINGLE, WALK, check, signal
 
 from cosim.plant import max_pressure
-from cosim.plant.max_pressure import (
-    MAX_RED_S,
-    PERMISSIVE,
-    Junction,
-    MaxPressure,
-    Roads,
-    stages_of,
-    transition,
-)
+from cosim.plant.max_pressure import MAX_RED_S, MaxPressure
+from cosim.plant.pressure import PERMISSIVE, Roads
+from cosim.plant.stages import Junction, stages_of, transition
 from cosim.sumo.net import Gateway, load_city
 from cosim.sumo.session import Phase
 from cosim.sumo.signals import Link, read_signals

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from signal_rules import MIN_GREEN, watched
 
-from cosim.plant.max_pressure import Roads
 from cosim.plant.plant import SumoPlant
+from cosim.plant.pressure import Roads
 from cosim.plant.settings import Settings
 from cosim.sumo.net import city_of
 from cosim.sumo.signals import read_signals

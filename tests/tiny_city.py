@@ -110,6 +110,13 @@ def imported(folder: Path, regions: int = 3, source: Path | None = None, **optio
     return scenario
 
 
+class Record(SimpleNamespace):
+    """Arrays of a record, by name and, as those of a Result, by item."""
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        return getattr(self, name)
+
+
 @contextmanager
 def played(
     scenario: Scenario, intervals: int, gates: float, splits: np.ndarray | None = None, **overrides
@@ -121,7 +128,7 @@ def played(
     controls = Controls(perimeter=np.where(scenario.network.adjacency, gates, 0.0), splits=splits)
     try:
         states = [plant.reset(0), *(plant.step(controls) for _ in range(intervals))]
-        yield plant, states[-1], SimpleNamespace(**plant.record()) if intervals else None
+        yield plant, states[-1], Record(**plant.record()) if intervals else None
     finally:
         plant.close()
 
