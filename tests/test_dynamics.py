@@ -71,7 +71,8 @@ def test_who_is_where_he_wants_to_be_is_not_sent_on(network):
 
 
 def test_one_region_with_a_linear_mfd_decays_exponentially():
-    mfds, adjacency = (Cubic(a=0.0, b=0.0, c=0.0042, jam=10_000.0),), np.zeros((1, 1), dtype=bool)
+    mfds = (Cubic(a=0.0, b=0.0, c=0.0042, jam=10_000.0),)
+    adjacency = np.zeros((1, 1), dtype=bool)
     p = dynamics.parameters(
         replace(NETWORK, region_names=("only",), adjacency=adjacency, mfds=mfds)
     )
@@ -140,17 +141,13 @@ def test_gradients_against_finite_differences(integrator, filling, network):
 def test_torch_and_casadi_agree(integrator, substeps, network):
     """Over a rollout into the jam and beyond, with new controls in every interval."""
     random = np.random.default_rng(6)
-    p, x, twin, most = (
-        ipopt.parameters(network),
-        torch.zeros(7, 7, dtype=torch.float64),
-        ca.DM(7, 7),
-        0.0,
-    )
+    p = ipopt.parameters(network)
+    x = torch.zeros(7, 7, dtype=torch.float64)
+    twin = ca.DM(7, 7)
+    most = 0.0
     for _ in range(120):
-        demand, (perimeter, splits) = (
-            random.uniform(0.0, 2.0, (7, 7)),
-            random_controls(random, NETWORK),
-        )
+        demand = random.uniform(0.0, 2.0, (7, 7))
+        perimeter, splits = random_controls(random, NETWORK)
         scheme = {"step": STEP, "integrator": integrator, "substeps": substeps}
         inputs = (torch.from_numpy(array) for array in (demand, perimeter, splits))
         x = dynamics.advance(dynamics.parameters(network), x, *inputs, **scheme)

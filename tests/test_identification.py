@@ -13,7 +13,7 @@ from nmfd import closed_loop
 from nmfd.api import load_scenario
 from nmfd.controllers.rules import Probing
 from nmfd.model import dynamics, identification
-from nmfd.model.identification import Observed
+from nmfd.model.identification import Observed, Windows
 from nmfd.model.mfd import Cubic
 from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
@@ -118,7 +118,7 @@ def model(scenario, runs):
 
 
 def test_any_free_numbers_are_a_valid_model(model):
-    """q = c (1 - first y - second y^2) with y = x / jam, falling from c to a hundredth of it at the least."""
+    """q = c (1 - first y - second y^2) falls from c, to a hundredth at the least; y = x / jam."""
     p = model.regional()
     c, first, second, jam = model.shape()
     assert (first >= 0).all()
@@ -154,12 +154,14 @@ def test_what_a_fit_makes_small(scenario, runs, by_origin):
     """Errors that cancel out in their regions count by destination only; far ones linearly."""
     p, scheme = dynamics.parameters(scenario.network, dtype=torch.float32), {"step": 30.0}
     observed, *rest = identification.windows(runs[:1], 2)
-    missed, scale = torch.zeros(7, 7), torch.full((7,), 50.0)
-    missed[1, 3], missed[(1, 5) if by_origin else (5, 3)] = 100.0, -100.0
+    scale = torch.full((7,), 50.0)
+    missed = torch.zeros(7, 7)
+    missed[1, 3] = 100.0
+    missed[(1, 5) if by_origin else (5, 3)] = -100.0
     wrong = observed.clone()
     wrong[:, 1:] += missed
     far = (2.0 - 0.5 * identification.OUTLIER) * 2.0  # two errors of twice the scale
-    found = identification._misfit(p, [wrong, *rest], scale, scheme)
+    found = identification._misfit(p, Windows(wrong, *rest), scale, scheme)
     assert found == pytest.approx(
         identification.BY_DESTINATION * far / 49 + (0.0 if by_origin else far / 7), rel=1e-3
     )
@@ -170,3 +172,22 @@ def test_a_run_shorter_than_the_horizon_is_left_out(runs):
     assert len(identification.windows([short, runs[0]], 5)[0]) == len(
         identification.windows(runs[:1], 5)[0]
     )
+
+
+def test_the_learning_rate_falls_from_first_to_last():
+    rates = [identification._learning_rate(k, 100) for k in range(101)]
+    assert (np.diff(rates) < 0.0).all()
+    assert rates[::50] == pytest.approx([0.03, 0.03 * 0.525, 0.03 * 0.05])
+
+
+def test_split_ratios_are_the_shares_of_crossings(scenario):
+    """Of turns that are allowed; rare ones count as none, and few vehicles give no ratio."""
+    crossings = np.zeros((7, 7, 7))
+    crossings[0, [1, 3, 2, 5], 2] = 60.0, 39.6, 0.4, 900.0  # 5 is not beside 0
+    crossings[0, 1, 6] = 29.0
+    crossings[0, 3, 5] = 30.0
+    ratios = identification.observed_split_ratios(scenario.network, crossings)
+    assert ratios == {
+        (0, 2): {1: pytest.approx(0.6024, abs=1e-4), 3: pytest.approx(0.3976, abs=1e-4)},
+        (0, 5): {3: 1.0},
+    }

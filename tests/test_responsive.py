@@ -19,7 +19,8 @@ from nmfd.api import load_scenario
 from nmfd.types import Controls
 
 CONFIG = """<configuration>
-  <input><net-file value="city.net.xml"/><route-files value="cars.rou.xml"/></input><time><end value="450"/></time>
+  <input><net-file value="city.net.xml"/><route-files value="cars.rou.xml"/></input>
+  <time><end value="450"/></time>
 </configuration>"""
 CARS = """<routes>
   <flow id="east" begin="0" end="450" period="3" from="A1B1" to="C1D1"/>
@@ -182,7 +183,8 @@ def test_what_cannot_run_here_is_refused_before_the_first_run(
         else ("--controllers", f"no-control,{name}")
     )
     done = cosim(command, places[city], *names, "--steps", 1, "--out", "out")
-    assert done.exit_code != 0 and len(done.stderr.strip().splitlines()) == 1, done.stderr
+    assert done.exit_code != 0
+    assert len(done.stderr.strip().splitlines()) == 1, done.stderr
     assert f"controller {name} cannot run here: " in done.stderr
     assert said in done.stderr
     assert not (tmp_path / "out").exists()
