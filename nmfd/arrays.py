@@ -1,8 +1,9 @@
-"""Shapes of NumPy arrays for annotations; content and unit are documented where they are used.
+"""Shapes of NumPy arrays for annotations.
 
-R regions, T control intervals, S = T + 1 states. One letter is one number within a call, or within
-one object. The tests check shapes (tests/conftest.py, jaxtyping and beartype); elsewhere they cost
-nothing. The shapes of torch's tensors are in nmfd.tensors.
+Content and unit are documented where they are used. R regions, T control intervals, S = T + 1
+states. One letter is one number within a call, or within one object. The tests check shapes
+(tests/conftest.py, jaxtyping and beartype); elsewhere they cost nothing. The shapes of torch's
+tensors are in nmfd.tensors.
 """
 
 import numpy as np

@@ -1,8 +1,9 @@
-"""Faults of a run: sensors that freeze, lag or fail, closed streets, signals that do not obey.
+"""Faults of a run: of sensors, streets and signals.
 
-A fault is a text KIND[:VALUE][@FROM-TO] in the list `faults` of scenario.toml. FROM and TO are
-control intervals, TO excluded; without them the fault lasts for the whole run. Every decision under
-a fault carries it in its status.
+Sensors freeze, lag or fail; streets are closed; signals do not obey. A fault is a text
+KIND[:VALUE][@FROM-TO] in the list `faults` of scenario.toml. FROM and TO are control intervals, TO
+excluded; without them the fault lasts for the whole run. Every decision under a fault carries it in
+its status.
 """
 
 import re
@@ -27,7 +28,7 @@ FOREVER = 10**9
 
 @dataclass(frozen=True, kw_only=True)
 class Fault:
-    """Fault of a kind, active in control intervals begin <= k < end; value: as text."""
+    """Fault, active in control intervals begin <= k < end; value: as text."""
 
     kind: str
     value: str = ""

@@ -1,4 +1,7 @@
-"""Vehicle ledger: entered = ended + inside, checked in every plant at every step."""
+"""Vehicle ledger: entered = ended + inside.
+
+Every plant checks it at every step.
+"""
 
 import math
 

@@ -59,7 +59,7 @@ def largest_accumulation(states: Iterable[StatesOverTime]) -> PerRegion:
 
 
 def percent_change(value: float, reference: float) -> float:
-    """Return the change from `reference` to `value` [%]; NaN if `reference` is 0.
+    """Return the change from a reference [%]; NaN if the reference is 0.
 
     >>> percent_change(150.0, 100.0)
     50.0
@@ -91,7 +91,7 @@ def notes(result: Result) -> str:
 
 
 def summary(result: Result) -> dict[str, float | int | str]:
-    """Return the row of a run in a table: figures of merit, and all scalar facts.
+    """Return the row of a run: figures of merit, and all scalar facts.
 
     >>> round(summary(nmfd.run("economic_mpc", "no-control", steps=20))["max_accumulation_veh"])
     12558

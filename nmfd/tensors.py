@@ -1,6 +1,6 @@
-"""Shapes of torch's tensors for annotations, like those of nmfd.arrays; one thread for torch.
+"""Shapes of torch's tensors for annotations; one thread for torch.
 
-B: any batch, or none, that broadcasts.
+nmfd.arrays has those of NumPy. B: any batch, or none, that broadcasts.
 """
 
 from collections.abc import Iterator

@@ -126,12 +126,12 @@ def build(network: RegionalModel) -> Acyclic:
 
 
 def _badness(network: RegionalModel, i: int, h: int, j: int) -> tuple[bool, int, int]:
-    """Return the key that orders the next regions h from i to j, the best one first."""
+    """Return a key for next regions h from i to j, least for the best one."""
     return not network.split_mask[i, h, j], network.hops[h, j], h
 
 
 def shares(model: Acyclic, splits: PerTurn) -> tuple[PerMove, Bool[np.ndarray, " C"]]:
-    """Return theta_ogihj of each move (M,) [-], and the forced cells (C,) bool.
+    """Return theta_ogihj of each move (M,) [-], and forced cells (C,) bool.
 
     A cell is forced to its least-bad move if theta leads only to its origin or previous region.
 
@@ -177,7 +177,9 @@ def derivative(
 def transfers(
     model: Acyclic, x: PerCell, leaving: PerCell, perimeter: PerPair, theta: PerMove
 ) -> PerMove:
-    """Return the flow of each move (M,) [veh/s], with capacities as in dynamics.passing.
+    """Return the flow of each move (M,) [veh/s].
+
+    Capacities act as in dynamics.passing.
 
     leaving: desired outflow of each cell (veh/s, (C,))
     """

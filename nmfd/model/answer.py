@@ -1,8 +1,8 @@
-"""Answer of guided drivers to prices in the regional model: a logit over the next regions.
+"""Answer of guided drivers to prices: a logit over the next regions.
 
-A price c_i multiplies the travel time through region i by 1 + c_i for guided drivers bound for
-elsewhere (nmfd.types.Controls). The split ratios are those around the nominal theta0, with the
-dispersion s of the regional model (RegionalModel):
+It is that of the regional model. A price c_i multiplies the travel time through region i by
+1 + c_i for guided drivers bound for elsewhere (nmfd.types.Controls). The split ratios lie around
+the nominal theta0, with the dispersion s (RegionalModel):
 
     theta_ihj ~ theta0_ihj exp(-e_hj / s)
     e_hj = c_h t_hj + sum_g theta0_hgj e_gj        for h != j, otherwise 0
@@ -22,7 +22,7 @@ MAX_DELAY_FACTOR = 20.0  # largest time to leave a region, relative to free flow
 
 
 class Answer(nn.Module):
-    """Split ratios of guided drivers as a function of state and prices, without weights."""
+    """Split ratios as a function of state and prices, without weights."""
 
     def __init__(self, network: RegionalModel):
         super().__init__()
@@ -59,7 +59,7 @@ class Answer(nn.Module):
         return weight / weight.sum(-2, keepdim=True).clamp(min=1e-9)
 
     def _on_own_device(self) -> dynamics.Parameters:
-        """Return the parameters of the network on the device to which the module was moved."""
+        """Return the parameters on the device to which the module was moved."""
         device = self.own.device
         if self._model.adjacency.device != device:
             self._model = dynamics.parameters(self._network, dtype=torch.float32, device=device)

@@ -67,7 +67,7 @@ class Boundaries:
 
     @property
     def shares(self) -> PerPair:
-        """Controlled share (R, R) [-] of the flow, or of the gateways without flow."""
+        """Controlled share (R, R) [-] of the flow, or of gateways without flow."""
         by_count = self.controllable / np.maximum(self.gateways, 1)
         return np.where(self.flow > 0, self.controlled / np.maximum(self.flow, 1e-9), by_count)
 
@@ -228,7 +228,7 @@ def _by_share(largest: float) -> tuple[Answer, float]:
 
 
 def sentences(judgement: Judgement, scenario: str) -> tuple[str, ...]:
-    """Return the answer, what it rests on, and what to do next, a sentence each.
+    """Return the answer, its grounds, and what to do next, a sentence each.
 
     scenario: its folder, for commands
     """

@@ -176,7 +176,9 @@ def screened(
 
 
 def _failed_tests(rows: pd.DataFrame, region: pd.Series) -> pd.DataFrame:
-    """Return for each row and test 1 if it fails, 0 if it passes, NaN if the test does not apply.
+    """Return 1 for each row and test that it fails, and 0 if it passes.
+
+    NaN stands for a test that does not apply.
 
     rows: by detid, day and interval
     region: of each row
@@ -203,14 +205,17 @@ def _failed_tests(rows: pd.DataFrame, region: pd.Series) -> pd.DataFrame:
 
 
 def _held(rows: pd.DataFrame, column: str) -> pd.Series:
-    """Mark the rows of HELD_ROWS or more in a row with one value of a detector and day."""
+    """Return True for rows among HELD_ROWS or more with one value.
+
+    They follow each other and are of one detector and day.
+    """
     columns = rows[["detid", "day", column]]
     run = (columns != columns.shift()).any(axis=1).cumsum()
     return run.groupby(run).transform("size") >= HELD_ROWS
 
 
 def _against_neighbours(rows: pd.DataFrame) -> dict[str, list[str]]:
-    """Return reason -> detectors of one region that cannot be right beside its others.
+    """Return reason -> detectors of a region that contradict its others.
 
     They differ from the others, or count again what others count.
     """
@@ -233,7 +238,7 @@ def _against_neighbours(rows: pd.DataFrame) -> dict[str, list[str]]:
 
 
 def _sums_of_others(flow: np.ndarray) -> np.ndarray:
-    """Return the detectors (D,) bool that count what several others count together.
+    """Return the detectors (D,) bool that count the sum of several others.
 
     flow: intervals in which all detectors report ((n, D))
     """
@@ -259,10 +264,10 @@ def read_detectors(
     where: Path,
     city: str | None = None,
 ) -> pd.DataFrame:
-    """Return region, lane_km, pos_km, x_m, y_m by detid of all detectors in `counts`.
+    """Return region, lane_km, pos_km, x_m, y_m of all detectors, by detid.
 
-    NaN stands for what is unknown. Detectors of one link share its length by station. The last
-    table with a column region counts.
+    They are those in `counts`. NaN stands for what is unknown. Detectors of one link share its
+    length by station. The last table with a column region counts.
 
     path, regions: detectors.csv and regions.csv
     where: file of `counts`
@@ -315,7 +320,7 @@ def _read_links(path: Path, detids: Sequence[str], city: str | None) -> pd.DataF
 
 
 def _placed(table: pd.DataFrame) -> pd.DataFrame:
-    """Return region, lane_km, pos_km, x_m and y_m from the texts of the tables, by detid."""
+    """Return the columns of `read_detectors` from texts, by detid."""
     numbers = table.reindex(columns=["length", "lanes", "pos", "long", "lat", "x", "y"])
     out = numbers.apply(pd.to_numeric, errors="coerce")
     out["region"] = table["region"].str.strip()
@@ -353,7 +358,7 @@ def read_about(path: Path | None, regions: Sequence[str]) -> pd.DataFrame:
 
 
 def read_pairs(path: Path, regions: Sequence[str]) -> np.ndarray:
-    """Return (R, R) bool: the pairs region, neighbour of a csv file, both ways.
+    """Return (R, R) bool: pairs region, neighbour of a csv file, both ways.
 
     Raises: InputError
     """
@@ -441,7 +446,9 @@ def _numbers(
 
 
 def _check_keys(table: pd.DataFrame, key: str, path: Path, *, once: bool = True) -> None:
-    """Check that a key is there in each row and, if it must be there once, not doubled.
+    """Check that no key is missing.
+
+    once: no key is doubled, either
 
     Raises: InputError
     """

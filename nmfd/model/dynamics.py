@@ -1,9 +1,9 @@
-"""The regional model (NMFD) in torch, batched and differentiable: its equations.
+"""The regional model (NMFD) in torch, batched and differentiable.
 
-This is their one definition. It follows Tumu, Shaw Cortez, Drgona, Vrabie and Glavaski,
-"Differentiable Predictive Control for Large-Scale Urban Road Networks", and the multi-region models
-with perimeter control of Geroliminis, Haddad and Ramezani (2013). Regions i, j, h;
-x_i = sum_j x_ij; N_i the regions adjacent to i:
+This is the one definition of its equations. They follow Tumu, Shaw Cortez, Drgona, Vrabie and
+Glavaski, "Differentiable Predictive Control for Large-Scale Urban Road Networks", and the
+multi-region models with perimeter control of Geroliminis, Haddad and Ramezani (2013). Regions i, j,
+h; x_i = sum_j x_ij; N_i the regions adjacent to i:
 
     q_i    = g_i(x_i) / x_i                            defined at x = 0 (nmfd.model.mfd)
     m_ii   = q_i x_ii                                  trips that end in i
@@ -89,9 +89,9 @@ def rate(p: Parameters, accumulation: PerRegion) -> PerRegion:
 def flows(
     p: Parameters, x: PerPair, perimeter: PerPair, splits: PerTurn
 ) -> tuple[PerRegion, PerTurn]:
-    """Return trip completions m_ii (..., R) and transfer flows (..., R, R, R) [veh/s].
+    """Return trip completions (..., R) and transfer flows (..., R, R, R).
 
-    As published, the transfer flows are u_ih m_ihj. Extensions: exit rates k_ij multiply m_ihj and
+    As published, they are m_ii and u_ih m_ihj [veh/s]. Extensions: exit rates k_ij multiply m_ihj and
     m_ii; with capacities, `passing` replaces u_ih.
     """
     accumulation = x.sum(-1)
@@ -109,10 +109,10 @@ def flows(
 
 
 def passing(p: Parameters, wish: PerPair, perimeter: PerPair, accumulation: PerRegion) -> PerPair:
-    """Return the share (..., R, R) [-] of the desired flow that passes each boundary.
+    """Return the share (..., R, R) [-] of the desired flow that passes.
 
-    The limit is u_ih times capacity times the room in h, 1 - x_h / storage_h (as in Geroliminis,
-    Haddad and Ramezani, 2013).
+    The limit of a boundary is u_ih times capacity times the room in h, 1 - x_h / storage_h (as in
+    Geroliminis, Haddad and Ramezani, 2013).
 
     wish: desired flow (veh/s, (..., R, R))
     accumulation: (veh, (..., R))
@@ -124,7 +124,7 @@ def passing(p: Parameters, wish: PerPair, perimeter: PerPair, accumulation: PerR
 def admitted(
     backlog: PerPair, demand: PerPair, metering: PerRegion | None, step: float
 ) -> tuple[PerPair, PerPair]:
-    """Return the admitted demand (..., R, R) [veh/s], and the backlog [veh] after it.
+    """Return the admitted demand (..., R, R) [veh/s] and the new backlog [veh].
 
     backlog: vehicles that wait outside (veh, (..., R, R))
     metering: largest departure rate of each region, shared in proportion (veh/s, (..., R)); None:
@@ -184,7 +184,7 @@ def counted(
     integrator: str = "euler",
     substeps: int = 1,
 ) -> tuple[Any, Any]:
-    """Return `integrated` and the integral of a flow over the step, for the ledger.
+    """Return `integrated` and the integral of a flow, for the ledger.
 
     slope: returns dx/dt and the flow
     """

@@ -1,4 +1,4 @@
-"""Estimation of x_ij from loop detectors, boundary counts and probe vehicles.
+"""Estimation of x_ij from loop detectors, boundary counts and probes.
 
 It is an extended Kalman filter on the NMFD, after Saeedmanesh, Kouvelas and Geroliminis, "An
 extended Kalman filter approach for real-time state estimation in multi-region MFD urban networks",
@@ -130,7 +130,7 @@ class _Prediction(NamedTuple):
 
 
 class _Comparison(NamedTuple):
-    """Readings (m,), NaN where there is none, their expectation and their noise variance."""
+    """Readings (m,), NaN if missing, their expectation and noise variance."""
 
     reading: np.ndarray
     expected: np.ndarray
@@ -138,7 +138,7 @@ class _Comparison(NamedTuple):
 
 
 class _Product(NamedTuple):
-    """Matrices left and right' (m, n) with the events between them, as non-zeros.
+    """Matrices left and right' with events between them, as non-zeros.
 
     places: row, column and event of each non-zero
     values: product of the effects on row and column
@@ -222,7 +222,7 @@ class Estimator:
         return self.belief.mean[self._x].reshape(self._regions, self._regions).copy()
 
     def step(self, controls: Controls, readings: Readings) -> PerPair:
-        """Return the estimate (R, R) [veh] at the end of the interval under `controls`."""
+        """Return the estimate (R, R) [veh] after an interval under `controls`."""
         demand = self._planning.forecast[min(self._k, self._planning.steps - 1)]
         splits = controls.splits
         if splits is None:
@@ -245,7 +245,7 @@ class Estimator:
         return np.where(same & (accumulation > 0), np.nan, accumulation)
 
     def _effects(self) -> tuple[Tensor, Tensor]:
-        """Return what each event changes (rows, events): for vehicles, and for probes.
+        """Return the changes by each event (rows, events), in two matrices.
 
         Rows: x, mean accumulations and crossings of vehicles; probes and departures of probes.
         Events: turns (i, h, j), completed trips in i, departures from i for j, in this order.
@@ -294,7 +294,7 @@ class Estimator:
     def _updated(
         self, prediction: _Prediction, comparison: _Comparison
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and covariance of the state, given the readings that there are."""
+        """Return mean and covariance of the state, given the readings."""
         z, covariance, _ = prediction
         mean = z[: self._states]
         posterior = covariance[: self._states, : self._states]
@@ -461,7 +461,7 @@ class Estimator:
         return _Comparison(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
     def _rows(self, z: np.ndarray, matrix: Tensor) -> Tensor:
-        """Return the Jacobian of the readings by Z times a matrix (size, n): (m, n)."""
+        """Return the Jacobian (m, size) of the readings times a matrix (size, n)."""
         expansion = torch.from_numpy(z[self._expansion])[:, None]
         mean = torch.from_numpy(z[self._mean])[:, None]
         loops = (1.0 + expansion) * matrix[self._mean] + mean * matrix[self._expansion]

@@ -1,4 +1,4 @@
-"""Identification of the regional model from observed runs, by prediction error.
+"""Identification of the regional model from runs, by prediction error.
 
 MFDs fitted to outflow samples absorb what happens at the boundaries: a region that cannot send
 vehicles on looks collapsed. Here MFDs, exit rates, boundary capacities and storage are fitted
@@ -80,7 +80,9 @@ class Windows(NamedTuple):
 
 
 class _Model(torch.nn.Module):
-    """Parameters of the regional model as free numbers, all of which give a valid network.
+    """Parameters of the regional model as free numbers.
+
+    All numbers give a valid network.
 
     fastest: largest rate of any vehicle, the inverse of the integration step (1/s)
     """
@@ -106,9 +108,9 @@ class _Model(torch.nn.Module):
         self.storage = _free(np.log(np.maximum(2.0 * largest, 1.0)))
 
     def shape(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return c, first, second and jam of q = c (1 - first y - second y^2), y = x / jam.
+        """Return c, first, second and jam of q = c (1 - first y - second y^2).
 
-        The rate falls, and q(jam) >= LEAST_RATE c.
+        y is x / jam. The rate q falls, and q(jam) >= LEAST_RATE c.
         """
         drop = (1.0 - LEAST_RATE) * torch.sigmoid(self.drop)
         first = 2.0 * drop * torch.sigmoid(self.bend)
@@ -142,7 +144,7 @@ def _free(values: Any) -> torch.nn.Parameter:
 def observed_split_ratios(
     network: RegionalModel, crossings: Real[np.ndarray, "R R R"]
 ) -> dict[tuple[int, int], dict[int, float]]:
-    """Return (i, j) -> {h: share}, the observed next regions of vehicles in i bound for j.
+    """Return (i, j) -> {h: share}: next regions h from i on the way to j.
 
     crossings: [i, h, j] from i to h, bound for j (veh, (R, R, R))
     """
@@ -213,7 +215,7 @@ def _learning_rate(iteration: int, iterations: int) -> float:
 
 
 def windows(runs: Sequence[Observed], horizon: int) -> Windows:
-    """Return all windows of so many control intervals, at every place of every run."""
+    """Return all pieces of `horizon` control intervals of all runs."""
     long = [run for run in runs if len(run.demand) >= horizon]
 
     def stack(series: Sequence[np.ndarray], length: int) -> Tensor:
@@ -250,7 +252,7 @@ def _misfit(
 
 
 def _rollout(p: dynamics.Parameters, data: Windows, scheme: Mapping[str, Any]) -> Iterator[Tensor]:
-    """Yield the predicted states (N, R, R) [veh] after each interval of the windows."""
+    """Yield the predicted states (N, R, R) [veh] after each interval."""
     x = data.states[:, 0]
     for k in range(data.horizon):
         inputs = data.demand[:, k], data.perimeter[:, k], data.splits[:, k]

@@ -1,4 +1,4 @@
-"""Outflow MFDs: the published cubic, piecewise linear ones, and the protocol of any other.
+"""Outflow MFDs: the published cubic, piecewise linear ones, and others.
 
 Beyond the jam accumulation the outflow is constant. This tail is not published. The benchmark's
 cubic rises again beyond 10,019 vehicles: a jammed region would recover by itself. With g(jam)
@@ -44,7 +44,7 @@ class Mfd(Protocol):
     jam: Any
 
     def rate_up_to_jam(self, accumulation: Any, xp: Any = np) -> Any:
-        """Return the outflow per vehicle q(n) = g(n)/n [1/s], falling and finite at 0.
+        """Return the rate q(n) = g(n)/n [1/s], falling and finite at 0.
 
         accumulation: n, up to the jam accumulation (veh)
         """
@@ -61,11 +61,11 @@ class Mfd(Protocol):
         return (above - below) / (2.0 * step)
 
     def scaled(self, wide: Any, high: Any) -> "Mfd":
-        """Return the curve with its accumulation axis times `wide` and its rate times `high`."""
+        """Return the curve with accumulation times `wide`, rate times `high`."""
         return _Scaled(self, wide, high)
 
     def rate(self, accumulation: Any, xp: Any = np) -> Any:
-        """Return q(n) [1/s] for any n [veh]; beyond the jam the outflow stays g(jam)."""
+        """Return q(n) [1/s] for any n [veh]; beyond the jam it is g(jam) / n."""
         body = xp.minimum(accumulation, self.jam)
         return self.rate_up_to_jam(body, xp) * self.jam / xp.maximum(accumulation, self.jam)
 
@@ -75,7 +75,7 @@ class Mfd(Protocol):
 
     @property
     def critical(self) -> float:
-        """Accumulation of maximum outflow [veh], the smallest if there are several."""
+        """Accumulation of maximum outflow [veh], the smallest of several."""
         if np.ndim(self.jam):
             raise AttributeError("critical: only the curve of one region has it")
         grid = np.linspace(0.0, self.jam, 20001)
@@ -83,7 +83,7 @@ class Mfd(Protocol):
         return float(grid[np.argmax(outflow >= outflow.max() * (1.0 - 1e-13))])
 
     def reaching(self, share: float) -> float:
-        """Return the smallest accumulation [veh] with `share` of the maximum outflow."""
+        """Return the smallest n [veh] with `share` of the maximum outflow."""
         grid = np.linspace(0.0, self.critical, 20001)
         reached = self.outflow(grid) >= share * self.capacity * (1.0 - 1e-12)
         return float(grid[np.argmax(reached)])
@@ -94,7 +94,10 @@ class Mfd(Protocol):
         return float(self.outflow(self.critical))
 
     def problem(self) -> str | None:
-        """Return why this is no MFD, or None: the outflow must be positive up to the jam."""
+        """Return why this is no MFD, or None.
+
+        The outflow must be positive up to the jam.
+        """
         grid = np.linspace(0.0, self.jam, 2001)
         rate = self.rate_up_to_jam(grid)
         if not rate.min() > 0:
@@ -105,7 +108,7 @@ class Mfd(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Cubic(Mfd):
-    """Outflow g(n) = a n^3 + b n^2 + c n, constant beyond the jam accumulation.
+    """Outflow g(n) = a n^3 + b n^2 + c n, constant beyond the jam.
 
     a, b, c: coefficients (veh^-2 s^-1, veh^-1 s^-1, s^-1)
     jam: jam accumulation (veh)
@@ -149,9 +152,9 @@ class Cubic(Mfd):
 
 @dataclass(frozen=True, kw_only=True)
 class PiecewiseLinear(Mfd):
-    """Outflow along straight lines from (0, 0) through points, the last at the jam.
+    """Outflow along straight lines from (0, 0) through points.
 
-    accumulations: rising from above 0 (veh)
+    accumulations: rising from above 0, the last is the jam accumulation (veh)
     outflows: (veh/s)
 
         >>> trapezoid(free=0.004, capacity=6.0, wave=0.001, jam=8000.0).accumulations
@@ -186,7 +189,7 @@ class PiecewiseLinear(Mfd):
         return q
 
     def _kinks(self) -> Iterator[tuple[Any, Any]]:
-        """Yield accumulations, from 0, and the change of the outflow's slope there [1/s]."""
+        """Yield accumulations from 0, and the change of slope there [1/s]."""
         left = 0.0
         low = 0.0
         before = 0.0
@@ -270,7 +273,7 @@ def stacked(mfds: Sequence[Mfd], array: Callable[[Sequence[float]], Any]) -> Mfd
 
 
 def _stacked_numbers(values: Sequence[Any], array: Callable[[Sequence[float]], Any]) -> Any:
-    """Return the values of one attribute of R curves with arrays instead of numbers."""
+    """Return one attribute of R curves with arrays instead of numbers."""
     first = values[0]
     if isinstance(first, tuple):
         return tuple(array(numbers) for numbers in zip(*values, strict=True))
@@ -335,7 +338,7 @@ def fit(
 
 
 def _fit_cubic(x: np.ndarray, g: np.ndarray, jam: float, max_rate: float) -> Cubic:
-    """Return the curve with this jam accumulation [veh] that fits the points best."""
+    """Return the curve with this jam accumulation that fits points best."""
     from scipy.optimize import minimize  # slow to import
 
     # Scaled: g = (A y^2 + B y + C) y with y = x / jam, at most 1. Falling: B <= 0 and 2 A + B <= 0

@@ -1,4 +1,4 @@
-"""Regional plants: the NMFD and its acyclic variant, in float64 (nmfd.types.Plant)."""
+"""Regional plants: the NMFD and its acyclic variant, in float64."""
 
 import numpy as np
 import torch
@@ -71,7 +71,7 @@ class NmfdPlant:
         """Return None: controllers observe the state with noise."""
 
     def _disturb(self) -> float:
-        """Add process noise to each x_ij that is not empty; return the vehicles added [veh]."""
+        """Add process noise to each x_ij above 0; return the vehicles added."""
         if not self._scenario.process_std:
             return 0.0
         before = self._accumulation()

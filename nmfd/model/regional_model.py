@@ -1,4 +1,4 @@
-"""Regions with adjacency, control bounds and MFDs, and the network.toml that holds them."""
+"""Regional model of a city, and the network.toml that holds it."""
 
 import hashlib
 import json
@@ -91,7 +91,7 @@ class RegionalModel:
 
     @property
     def titles(self) -> tuple[str, ...]:
-        """Number and name of each region, such as "3 centre"; "region 3" if that is the name."""
+        """Number and name of each region: "3 centre", or "region 3" without."""
         titles = []
         for number, name in enumerate(self.region_names):
             if name == str(number):
@@ -107,7 +107,7 @@ class RegionalModel:
 
     @property
     def seen_critical(self) -> PerRegion:
-        """Critical accumulations (R,) [veh], NaN where data show no falling branch."""
+        """Critical accumulations (R,) [veh], NaN where they were not seen."""
         critical = self.critical
         critical[list(self.critical_above)] = np.nan
         return critical
@@ -150,7 +150,7 @@ class RegionalModel:
 
     @property
     def open_perimeter(self) -> PerPair:
-        """Perimeter control without a closed gate (R, R) [-]: u_max at every boundary."""
+        """Perimeter control (R, R) [-] with u_max at every boundary."""
         return np.where(self.adjacency, self.u_max, 0.0)
 
     @property
@@ -162,7 +162,10 @@ class RegionalModel:
 
     @cached_property
     def hash(self) -> str:
-        """Hash of all that the dynamics depend on; a policy is valid for one network only."""
+        """Hash of all that the dynamics depend on.
+
+        A policy carries it: it is valid for one network only.
+        """
         mfds = []
         for curve in self.mfds:
             numbers = list(vars(curve).values())
@@ -406,7 +409,7 @@ def _network(table: NetworkTable, folder: Path) -> RegionalModel:
 
 
 def _by_region(rows: Sequence[RegionTable], key: str) -> Any:
-    """Return the values of a key as an array, a row per region; None if it is not given."""
+    """Return the values of a key as an array, a row per region, or None."""
     values = [getattr(row, key) for row in rows]
     if values[0] is None:
         return None
@@ -414,7 +417,10 @@ def _by_region(rows: Sequence[RegionTable], key: str) -> Any:
 
 
 def _by_boundary(rows: Sequence[RegionTable], key: str) -> PerPair | None:
-    """Return the values of a key, given in the order of `adjacent`, as a matrix, or None."""
+    """Return the values of a key as a matrix, or None.
+
+    A row of the table has them in the order of `adjacent`.
+    """
     if getattr(rows[0], key) is None:
         return None
     matrix = np.zeros((len(rows), len(rows)))
@@ -424,7 +430,7 @@ def _by_boundary(rows: Sequence[RegionTable], key: str) -> PerPair | None:
 
 
 def check_step(network: RegionalModel, step: float, where: str) -> None:
-    """Check that forward Euler keeps accumulations non-negative: step * q <= 1.
+    """Check that Euler keeps accumulations non-negative: step * q <= 1.
 
     step: integration step (s)
     where: what the message of an error begins with

@@ -1,4 +1,6 @@
-"""Optimal control of the regional model with known demand: best plan found and lower bound.
+"""Optimal control with known demand: best plan found and lower bound.
+
+Both are those of the regional model.
 
 Best plan found: gradient descent (Adam) on all controls of all intervals at once, through
 `dynamics`, from several starts. The problem is not convex, so the optimum may take less total time
@@ -98,7 +100,7 @@ def compute(
 
 
 def _starting_controllers(scenario: Scenario, *, guidance: bool) -> list[str]:
-    """Return the controllers whose closed loops are starts: PI gating and trained policies."""
+    """Return the controllers whose closed loops are starts."""
     names = []
     if scenario.protected:
         names.append("pi-gating")
@@ -110,7 +112,7 @@ def _starting_controllers(scenario: Scenario, *, guidance: bool) -> list[str]:
 
 
 def neutral_starts(network: RegionalModel, steps: int, *, guidance: bool) -> dict[str, Start]:
-    """Return open boundaries with nominal splits, and mean controls, in every interval."""
+    """Return two constant plans: open boundaries, and mean controls."""
     mask = network.split_mask
     even = network.nominal_splits
     if guidance:
@@ -251,10 +253,11 @@ def _total_time_spent(
 
 @dataclass(frozen=True, kw_only=True)
 class Relaxation:
-    """Linear programme: minimise cost z with upper z <= most, equal z = given, 0 <= z <= 1.
+    """Linear programme: minimise cost z.
 
-    The parts of z are x (points, pairs), step r (points, pairs) and step y (points, turns), all
-    over `vehicles`. A point is an evaluation of the derivative.
+    Constraints: upper z <= most, equal z = given, 0 <= z <= 1. The parts of z are x (points,
+    pairs), step r (points, pairs) and step y (points, turns), all over `vehicles`. A point is an
+    evaluation of the derivative.
 
     pairs: i and j, those that vehicles may use ((P, 2))
     turns: i, h and j, those that vehicles may use ((E, 3))
@@ -366,12 +369,12 @@ def relaxation(scenario: Scenario, *, guidance: bool) -> Relaxation:
 
 
 def _incidence(pairs: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Return (P, E), 1 where the pair (P, 2) is the end (E, 2) of a turn, else 0."""
+    """Return (P, E), 1 where a pair (P, 2) is the end (E, 2) of a turn."""
     return (pairs[:, None] == ends).all(axis=2).astype(float)
 
 
 def _integration(scenario: Scenario) -> tuple[sparse.sparray, sparse.sparray]:
-    """Return two matrices (points - 1, points) of the integration by `dynamics.advance`.
+    """Return two matrices (points - 1, points) of `dynamics.advance`.
 
     Row n of the first has the weights of the derivatives that lead from the begin of the substep to
     point n + 1; row n of the second is the difference of the states there.
@@ -393,9 +396,10 @@ def _integration(scenario: Scenario) -> tuple[sparse.sparray, sparse.sparray]:
 
 
 class _Block(NamedTuple):
-    """Inequalities x X + r (step R) + y (step Y) <= most [veh], which hold at every point.
+    """Inequalities x X + r (step R) + y (step Y) <= most [veh].
 
-    X, R and Y are the variables of the point: x, r, y have a row for each inequality.
+    They hold at every point, of which X, R and Y are the variables; x, r, y have a row for each
+    inequality.
     """
 
     x: np.ndarray

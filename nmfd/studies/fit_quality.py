@@ -1,4 +1,4 @@
-"""Quality of the fit of each region, and doubts about it, as tables and files."""
+"""Quality of the fit of each region, and doubts about it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -88,14 +88,14 @@ def with_guesses(
 
 
 def _falls(curve: mfd.Mfd, most: float) -> bool:
-    """Return True if the outflow has fallen at the largest accumulation `most` [veh]."""
+    """Return True if the outflow has fallen at `most` [veh]."""
     if most <= curve.critical:
         return False
     return curve.outflow(most) <= (1.0 - FALL) * curve.capacity
 
 
 def _largest(samples: Samples, accumulations: States) -> PerRegion:
-    """Return the largest accumulation of each region (R,) [veh] in runs, or else in samples."""
+    """Return the largest accumulations (R,) [veh] in runs, or in samples."""
     if len(accumulations):
         return largest_accumulation(accumulations)
     largest = [np.concatenate(list(cloud.values()))[:, 0].max(initial=0.0) for cloud in samples]
@@ -192,10 +192,10 @@ def nearly_empty(samples: Samples) -> list[int]:
 
 
 def hysteresis(cloud: Mapping[str, Points]) -> float:
-    """Return the excess of outflow while loading over unloading, as a share of it [-].
+    """Return the excess of outflow while loading over unloading [-].
 
-    It is the mean over bins of accumulation with samples of both, weighted by outflow; NaN without
-    such bins.
+    It is a share of the outflow: the mean over bins of accumulation with samples of both, weighted
+    by outflow; NaN without such bins.
     """
     nothing = np.empty((0, 2))
     loading = cloud.get("loading", nothing)
@@ -289,8 +289,9 @@ def _rmse(errors: np.ndarray) -> PerRegion:
 
 
 def prediction_text(errors: pd.DataFrame, step: float) -> str:
-    """Return the means of `predictions` in runs that the fit did not use, as text.
+    """Return the means of `predictions` as text.
 
+    errors: in runs that the fit did not use
     step: control interval (s)
     """
     texts = []

@@ -1,6 +1,7 @@
-"""Identification of MFDs per region from counts and occupancies of real detectors.
+"""Identification of MFDs per region from real detectors.
 
-`load` reads the tables, `_fit` fits a network, and `Identified.write` writes its network.toml.
+They give counts and occupancies. `load` reads their tables, `fit` fits a network, and
+`Identified.write` writes its network.toml.
 
 Density of a region and interval: occupancy of its detectors over the length of a vehicle and a
 loop. Flow: their mean flow. Both are weighted by the lane-kilometres of each detector (Edie's
@@ -137,7 +138,7 @@ def identify(
     skip_bad: bool = False,
     trip_length: float | None = None,
 ) -> Identified:
-    """Fit an MFD to each region and write a network: network.toml and a report.
+    """Fit an MFD to each region; write network.toml and a report.
 
         >>> identified = nmfd.identify(
         ...     "counts.csv", detectors="detectors.csv", trip_length=1500.0, out="mine"
@@ -259,9 +260,9 @@ def _left_lines(
 def _lane_km(
     detectors: pd.DataFrame, about: pd.DataFrame, where: Path
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return lane-kilometres (R,) and the share of them with detectors in use (R,).
+    """Return lane-kilometres (R,) and their share with detectors (R,).
 
-    The share is NaN where it is unknown.
+    The detectors are those in use. The share is NaN where it is unknown.
 
     Raises: InputError if lane-kilometres are unknown or contradict one another
     """
@@ -290,9 +291,10 @@ def _lane_km(
 def _trip_lengths(
     detectors: pd.DataFrame, about: pd.DataFrame, trip_length: float | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean trip lengths within the regions (R,) [km], and which are assumed (R,).
+    """Return mean trip lengths (R,) [km], and which are assumed (R,).
 
-    An assumed one is two thirds of the side of a square as large as the detectors' convex hull.
+    They are those within the regions. An assumed one is two thirds of the side of a square as large
+    as the detectors' convex hull.
 
     trip_length: of regions whose own is not given (m)
 
@@ -318,7 +320,9 @@ def _trip_lengths(
 
 
 def _intervals(rows: pd.DataFrame, detectors: pd.DataFrame, regions: pd.DataFrame) -> pd.DataFrame:
-    """Return the intervals of Identified, those in which enough detectors report.
+    """Return the intervals of Identified.
+
+    They are those in which enough detectors report.
 
     rows: counts
     detectors: those in use
@@ -352,7 +356,7 @@ def _intervals(rows: pd.DataFrame, detectors: pd.DataFrame, regions: pd.DataFram
 
 
 def fit(data: Measured, *, name: str, adjacency: Path | None = None) -> Identified:
-    """Return the network of regions with the MFDs that fit the measured intervals best.
+    """Return the network with the MFDs that fit the intervals best.
 
     name: of the network
     adjacency: csv file region,neighbour; None: by the detectors' positions
@@ -396,7 +400,7 @@ def fit(data: Measured, *, name: str, adjacency: Path | None = None) -> Identifi
 
 
 def _samples(intervals: pd.DataFrame, regions: Sequence[str]) -> list[dict[str, Points]]:
-    """Return the samples of each region (fit_quality.Samples): "loading" and "unloading"."""
+    """Return fit_quality.Samples with labels "loading" and "unloading"."""
     samples = []
     for region in regions:
         part = intervals[intervals["region"] == region]
