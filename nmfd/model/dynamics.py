@@ -91,8 +91,8 @@ def flows(
 ) -> tuple[PerRegion, PerTurn]:
     """Return trip completions (..., R) and transfer flows (..., R, R, R).
 
-    As published, they are m_ii and u_ih m_ihj [veh/s]. Extensions: exit rates k_ij multiply m_ihj and
-    m_ii; with capacities, `passing` replaces u_ih.
+    As published, they are m_ii and u_ih m_ihj [veh/s]. Extensions: exit rates k_ij multiply m_ihj
+    and m_ii; with capacities, `passing` replaces u_ih.
     """
     accumulation = x.sum(-1)
     leaving = rate(p, accumulation).unsqueeze(-1) * x
@@ -124,7 +124,7 @@ def passing(p: Parameters, wish: PerPair, perimeter: PerPair, accumulation: PerR
 def admitted(
     backlog: PerPair, demand: PerPair, metering: PerRegion | None, step: float
 ) -> tuple[PerPair, PerPair]:
-    """Return the admitted demand (..., R, R) [veh/s] and the new backlog [veh].
+    """Return admitted demand (..., R, R) [veh/s] and the new backlog [veh].
 
     backlog: vehicles that wait outside (veh, (..., R, R))
     metering: largest departure rate of each region, shared in proportion (veh/s, (..., R)); None:
