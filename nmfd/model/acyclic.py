@@ -75,9 +75,8 @@ class Acyclic:
 def build(network: RegionalModel) -> Acyclic:
     """Return all cells reachable from x_iiij, and their moves."""
     start = np.arange(network.regions**2).reshape(network.regions, network.regions)
-    cells: dict[tuple[int, int, int, int], int] = {}  # (o, g, i, j) -> number
-    for (i, j), number in np.ndenumerate(start):
-        cells[i, i, i, j] = int(number)
+    # (o, g, i, j) -> number of the cell
+    cells = {(i, i, i, j): int(number) for (i, j), number in np.ndenumerate(start)}
     queue = list(cells)
     move_from: list[int] = []
     move_to: list[int] = []

@@ -164,9 +164,7 @@ def screened(
     mostly_bad = bad.index[bad["days"] >= 0.5 * days[bad.index]]
     on_bad_day = pd.MultiIndex.from_frame(rows[["detid", "day"]]).isin(reasons.index)
     rows = rows[~rows["detid"].isin(mostly_bad) & ~on_bad_day]
-    left = {}
-    for reason, part in bad.groupby("reason"):
-        left[reason] = part["days"].to_dict()
+    left = {reason: part["days"].to_dict() for reason, part in bad.groupby("reason")}
     for _, part in rows.groupby(region_of_row):
         for reason, names in _against_neighbours(part).items():
             if names:

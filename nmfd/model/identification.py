@@ -5,9 +5,9 @@ vehicles on looks collapsed. Here MFDs, exit rates, boundary capacities and stor
 together. They minimise the error of rollouts over several control intervals, from each observed
 state, under observed demand and controls (Ljung, System Identification, 1999, ch. 7).
 
-    windows -> `fit`: gradient descent on the free numbers of `_Model` -> RegionalModel
-                      `_misfit`: errors of `_rollout`, by region and by destination
-    `prediction_errors`: those of a model in runs that the fit did not use
+Steps of `fit`: `windows` cuts the runs into pieces, `_Model` holds the free numbers, `_rollout`
+predicts a piece, `_misfit` weighs the errors by region and by destination, and `_network` makes a
+RegionalModel of the result. `prediction_errors` tests a model on runs that the fit did not use.
 """
 
 import math
@@ -99,6 +99,7 @@ class _Model(torch.nn.Module):
         free_rates = [min(mfd.rate_up_to_jam(0.0), 0.5 * fastest) for mfd in network.mfds]
         capacity = np.log(np.maximum(1.2 * flow, 0.05))
         self._first_capacity = torch.tensor(capacity, dtype=torch.float32)
+        # Shape of the rate q: its value at 0, how far it falls up to the jam, and how it bends.
         self.free_rate = _free(np.log(free_rates))
         self.drop = _free(np.full(network.regions, 0.5))
         self.bend = _free(np.zeros(network.regions))
@@ -152,9 +153,8 @@ def observed_split_ratios(
     ratios = {}
     for i, j in np.argwhere(crossings.sum(axis=1) >= FEWEST_CROSSINGS):
         shares = crossings[i, :, j] / crossings[i, :, j].sum()
-        kept = {}
-        for h in np.flatnonzero(shares >= LEAST_SPLIT):
-            kept[int(h)] = round(float(shares[h]), 4)
+        next_regions = np.flatnonzero(shares >= LEAST_SPLIT)
+        kept = {int(h): round(float(shares[h]), 4) for h in next_regions}
         total = sum(kept.values())
         ratios[int(i), int(j)] = {h: share / total for h, share in kept.items()}
     return ratios
@@ -272,10 +272,9 @@ def _network(network: RegionalModel, model: _Model, runs: Sequence[Observed]) ->
     assert p.storage is not None
     rates = p.exit_rates.double().numpy()
     mean = _mean_exit_rates(rates, runs)
-    curves = {name: numbers.tolist() for name, numbers in vars(p.mfd).items()}
+    curves = [vars(p.mfd)[name].tolist() for name in ("a", "b", "c", "jam")]
     mfds = []
-    for region, factor in enumerate(mean):
-        a, b, c, jam = (curves[name][region] for name in ("a", "b", "c", "jam"))
+    for a, b, c, jam, factor in zip(*curves, mean, strict=True):
         mfds.append(Cubic(a=a * factor, b=b * factor, c=c * factor, jam=jam))
     return replace(
         network,

@@ -372,27 +372,24 @@ def _network(table: NetworkTable, folder: Path) -> RegionalModel:
     """Return the regional model of a checked network.toml."""
     rows = table.regions
     adjacency = np.zeros((len(rows), len(rows)), dtype=bool)
-    names = []
-    mfds = []
     ratios = {}
     critical_above = {}
     for i, row in enumerate(rows):
         adjacency[i, list(row.adjacent)] = True
-        names.append(row.name or str(i))
-        mfds.append((row.mfd or table.mfd).mfd)  # type: ignore[union-attr]  # `_check_region`
         for j, shares in row.observed_split_ratios.items():
             ratios[i, int(j)] = {int(h): share for h, share in shares.items()}
         if row.critical_above is not None:
             critical_above[i] = row.critical_above
+    curves = [row.mfd or table.mfd for row in rows]
     doubts = tuple(row.doubts for row in rows)
     if not any(doubts):
         doubts = ()
     return RegionalModel(
         name=table.name,
-        region_names=tuple(names),
+        region_names=tuple(row.name or str(i) for i, row in enumerate(rows)),
         positions=np.array([row.position for row in rows]),
         adjacency=adjacency,
-        mfds=tuple(mfds),
+        mfds=tuple(curve.mfd for curve in curves),  # type: ignore[union-attr]  # `_check_region`
         u_min=table.perimeter.min,
         u_max=table.perimeter.max,
         observed_split_ratios=ratios,

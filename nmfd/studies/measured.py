@@ -390,11 +390,9 @@ def fit(data: Measured, *, name: str, adjacency: Path | None = None) -> Identifi
         )
     network = fit_quality.with_guesses(network, samples, lane_km)
     fits = fit_quality.region_fits(network, samples, lane_km=lane_km)
-    doubts = []
-    for of_fit, region in zip(fits["doubts"], names, strict=True):
-        doubts.append((*of_fit, *_doubts(data, region)))
-    fits["doubts"] = doubts
-    network = replace(network, doubts=tuple(doubts))
+    own = [_doubts(data, region) for region in names]
+    fits["doubts"] = [(*of_fit, *more) for of_fit, more in zip(fits["doubts"], own, strict=True)]
+    network = replace(network, doubts=tuple(fits["doubts"]))
     text = _report(data, network, fits)
     return Identified(network=network, fits=fits, intervals=data.intervals, text=text)
 
