@@ -181,6 +181,7 @@ class Estimator:
         self._fastest = _fastest(network)
         self._boundaries = np.argwhere(network.adjacency)
         self._turns = np.argwhere(network.split_mask)
+        # The parts of Z, in its order.
         sizes = (2 * regions, regions, cells, regions, len(self._boundaries), cells, cells)
         ends = np.cumsum(sizes)
         parts = [slice(int(end - size), int(end)) for end, size in zip(ends, sizes, strict=True)]

@@ -317,6 +317,7 @@ def relaxation(scenario: Scenario, *, guidance: bool) -> Relaxation:
     """Return the linear programme of `lower_bound`."""
     network = scenario.network
     allowed = network.split_mask if guidance else network.nominal_splits > 0
+    # Pairs (i, j) where vehicles start or depart, and those that they reach over allowed turns.
     present = (scenario.demand > 0).any(axis=0) | (scenario.start > 0)
     for _ in range(network.regions):
         present = present | (present[:, None] & allowed).any(axis=0)
