@@ -193,3 +193,28 @@ def test_exit_rates_scale_what_leaves():
     )
     torch.testing.assert_close(scaled[0], plain[0] * torch.from_numpy(rates.diagonal().copy()))
     torch.testing.assert_close(scaled[1], plain[1] * torch.from_numpy(rates)[:, None, :])
+
+
+@pytest.mark.parametrize("integrator", dynamics.SCHEMES)
+def test_an_interval_that_counts_is_the_same_interval(integrator):
+    """And what it counts is what is missing at its end."""
+    x, demand, perimeter, splits = random_tensors(9, filling=6000.0)
+    options = {"integrator": integrator, "substeps": 2}
+    plain = dynamics.advance(PARAMETERS, x, demand, perimeter, splits, STEP, **options)
+    after, ended = dynamics.advance_counted(
+        PARAMETERS, x, demand, perimeter, splits, STEP, **options
+    )
+    torch.testing.assert_close(after, plain, rtol=1e-12, atol=0.0)
+    torch.testing.assert_close(ended, (x + STEP * demand - after).sum(), rtol=1e-9, atol=0.0)
+
+
+def test_metering_admits_in_proportion_and_keeps_the_rest_waiting():
+    """Two regions: 30 vehicles wait and 1 veh/s comes, in the first, where 1 veh/s may depart."""
+    backlog = torch.tensor([[10.0, 20.0], [0.0, 0.0]])
+    demand = torch.tensor([[0.0, 1.0], [0.2, 0.0]])
+    admitted, waiting = dynamics.admitted(backlog, demand, torch.tensor([1.0, 1.0]), 20.0)
+    torch.testing.assert_close(admitted, torch.tensor([[0.2, 0.8], [0.2, 0.0]]))
+    torch.testing.assert_close(waiting, torch.tensor([[6.0, 24.0], [0.0, 0.0]]))
+    admitted, waiting = dynamics.admitted(backlog, demand, None, 20.0)
+    torch.testing.assert_close(admitted, torch.tensor([[0.5, 2.0], [0.2, 0.0]]))
+    assert not waiting.any()

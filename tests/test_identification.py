@@ -106,6 +106,28 @@ def test_probing_moves_every_gate_and_repeats_itself(scenario):
     assert (trajectory(0, guidance=False).splits == scenario.network.nominal_splits).all()
 
 
+def test_a_fit_begins_at_the_largest_accumulations_and_flows(scenario, runs):
+    made = identification._Model(scenario.network, runs, 30.0, 1.0 / 30.0)
+    largest = np.max([run.accumulation.sum(axis=2).max(axis=0) for run in runs], axis=0)
+    with torch.no_grad():
+        p = made.regional()
+        assert made.penalty().item() == 0.0
+    u_max, adjacency = scenario.network.u_max, scenario.network.adjacency
+    np.testing.assert_allclose(p.mfd.jam, 0.7 * largest, rtol=1e-5)
+    np.testing.assert_allclose(p.storage, 2.0 * largest, rtol=1e-5)
+    np.testing.assert_allclose(u_max * p.capacity, 1.2 * 60.0 / 30.0 * adjacency, rtol=1e-5)
+    assert (p.exit_rates == 1.0).all()
+
+
+def test_a_fit_reports_its_progress(scenario, runs):
+    notes = []
+    identification.fit(
+        scenario.network, runs[:1], step=30.0, iterations=2, progress=lambda *n: notes.append(n)
+    )
+    assert [note[:2] for note in notes] == [(1, 2), (2, 2)]
+    assert all(note[2].startswith("misfit 0.") for note in notes)
+
+
 @pytest.fixture
 def model(scenario, runs):
     """Free numbers far from where a fit begins."""

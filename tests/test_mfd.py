@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nmfd.errors import InputError
-from nmfd.model.mfd import Cubic, fit, trapezoid
+from nmfd.model.mfd import Cubic, fit, guess, guess_beyond, trapezoid
 
 # The published curve with a tenth of its jam accumulation: the coefficients span nine orders of
 # magnitude.
@@ -148,3 +148,15 @@ def test_the_largest_samples_share_a_bin():
     g[-1] *= 9.0
     curve = fit(x, g)
     np.testing.assert_allclose(curve.outflow(X[:-1]), TRUTH.outflow(X[:-1]), rtol=2e-3)
+
+
+def test_a_guess_beyond_the_data_goes_on_where_they_end():
+    """It has the jam accumulation of the lanes, unless the data go beyond its critical one."""
+    free = Cubic(a=0.0, b=0.0, c=0.004, jam=500.0)
+    near = guess_beyond(free, 1000.0, 200.0)
+    assert near.jam == 1000.0
+    assert near.outflow(200.0) == pytest.approx(0.8)
+    far = guess_beyond(free, 1000.0, 500.0)
+    assert far.critical == pytest.approx(500.0, rel=1e-3)
+    assert far.critical > 500.0
+    assert guess_beyond(free, 1000.0, 200.0, max_rate=0.003) == guess(0.003, 1000.0)

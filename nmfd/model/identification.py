@@ -183,7 +183,6 @@ def fit(
     progress: takes iterations done, all, and a note
     """
     with one_thread():  # the same order of sums everywhere
-        torch.manual_seed(seed)
         generator = torch.Generator().manual_seed(seed)
         model = _Model(network, runs, step, fastest=substeps / step)
         horizon = min(HORIZON, max(len(run.demand) for run in runs))
