@@ -100,10 +100,8 @@ def test_wrong_names(scenario):
 
 
 def test_files_that_do_not_fit(scenario, tmp_path):
-    path, start = (
-        tmp_path / "p.npz",
-        bound.neutral_starts(scenario.network, scenario.steps, guidance=False),
-    )
+    path = tmp_path / "p.npz"
+    start = bound.neutral_starts(scenario.network, scenario.steps, guidance=False)
     open_loop.write(bound.solve(scenario, start, guidance=False, iterations=1), scenario, path)
     assert (
         open_loop.read(path, replace(scenario, measurement_std=9.0), guidance=False).start in start
@@ -173,10 +171,8 @@ def test_every_trajectory_meets_the_relaxation(variant, guidance):
         network = replace(network, capacity=1.5 * network.adjacency, storage=np.full(7, 9000.0))
     changes = {"substeps": {"substeps": 3}, "rk4": {"integrator": "rk4"}}.get(variant, {})
     scenario = replace(scenario, network=network, **changes)
-    lp, bounded = (
-        bound.relaxation(scenario, guidance=guidance),
-        bound.lower_bound(scenario, guidance=guidance),
-    )
+    lp = bound.relaxation(scenario, guidance=guidance)
+    bounded = bound.lower_bound(scenario, guidance=guidance)
     runs = list(bound.neutral_starts(network, 12, guidance=guidance).values())
     runs += [random_controls(network, 12, random, guidance=guidance) for _ in range(5)]
     for controls in runs:

@@ -61,11 +61,9 @@ class TripBased:
         self.scenario = scenario
 
     def reset(self, seed):
-        self.k, self.ended, self.groups = (
-            0,
-            0.0,
-            [],
-        )  # i, j, share of the trip length that is left, vehicles
+        self.k = 0
+        self.ended = 0.0
+        self.groups = []  # i, j, share of the trip length that is left, vehicles
         return self.state()
 
     def step(self, controls):
@@ -86,10 +84,8 @@ class TripBased:
             else:
                 moved.append((i, j, left, vehicles))
         demand = s.step * s.demand[self.k]
-        self.k, self.groups = (
-            self.k + 1,
-            moved + [(i, j, 1.0, demand[i, j]) for i, j in np.argwhere(demand > 0)],
-        )
+        self.k += 1
+        self.groups = moved + [(i, j, 1.0, demand[i, j]) for i, j in np.argwhere(demand > 0)]
         return self.state()
 
     def state(self):
@@ -152,10 +148,8 @@ def test_a_policy_cost_constraint_and_days():
 
 
 def test_rollouts_are_the_closed_loop():
-    policy, rollout = (
-        Linear(ring().network).double(),
-        Rollout(planning_model(ring()), dtype=torch.float64),
-    )
+    policy = Linear(ring().network).double()
+    rollout = Rollout(planning_model(ring()), dtype=torch.float64)
     run = rollout.trajectories(
         policy, rollout.start[None], rollout.demand[:, None], torch.Generator()
     )

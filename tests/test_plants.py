@@ -104,10 +104,8 @@ def test_no_way_leads_back_to_the_origin_or_the_previous_region():
 
 
 def test_shares_sum_to_one_and_are_theta_renormalised():
-    model, (_, splits) = (
-        acyclic.build(SCENARIO.network),
-        random_controls(np.random.default_rng(5), SCENARIO.network),
-    )
+    model = acyclic.build(SCENARIO.network)
+    _, splits = random_controls(np.random.default_rng(5), SCENARIO.network)
     theta, forced = acyclic.shares(model, splits)
     sums = np.bincount(model.move_from, theta, minlength=len(model.region))
     np.testing.assert_allclose(sums, model.region != model.destination, atol=1e-12)
