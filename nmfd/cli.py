@@ -16,6 +16,7 @@ import click
 
 import nmfd
 from nmfd.errors import InputError, RunFailed
+from nmfd.runs.files import check_name
 
 FOLDER = click.Path(path_type=Path, file_okay=False)
 FILE = click.Path(path_type=Path, dir_okay=False)
@@ -394,6 +395,7 @@ def new_controller(file: Path) -> None:
       nmfd new-controller mine.py
       nmfd benchmark economic_mpc --controllers no-control,mine.py:MyController
     """
+    check_name(file)
     if file.suffix != ".py":
         raise InputError(
             f"{file}: expected a name that ends in .py, such as {file.with_suffix('.py')}"

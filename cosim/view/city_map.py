@@ -121,15 +121,16 @@ class CityMap:
 
     def choose(self, region: int) -> None:
         """Highlight a region."""
-        width = []
-        line = []
-        fill = []
-        for one in self.regions.data["region"]:
-            chosen = one == region
-            width.append(2.5 if chosen else 1.0)
-            line.append(colours.CHOSEN if chosen else colours.FAINT)
-            fill.append(colours.CHOSEN_LAND if chosen else colours.LAND)
-        patch(self.regions, width=np.array(width), line=line, fill=fill)
+        of_rings = self.regions.data["region"]
+        width = np.ones(len(of_rings))
+        line = [colours.FAINT] * len(of_rings)
+        fill = [colours.LAND] * len(of_rings)
+        for n, of_ring in enumerate(of_rings):
+            if of_ring == region:
+                width[n] = 2.5
+                line[n] = colours.CHOSEN
+                fill[n] = colours.CHOSEN_LAND
+        patch(self.regions, width=width, line=line, fill=fill)
 
     def _add_regions(self) -> ColumnDataSource:
         regions = []
@@ -193,7 +194,7 @@ class CityMap:
             halo=np.zeros(len(gates)),
             size=np.where(signal, 2.0 * GATE_RADIUS + 2.0, GATE_RADIUS),
             radius=np.where(signal, GATE_RADIUS, 0.0),
-            rim=[colours.INK if one else colours.FAINT for one in signal],
+            rim=np.where(signal, colours.INK, colours.FAINT).tolist(),
         )
         plot = self.plot
         glow = {"size": "halo", "color": colours.QUEUE, "alpha": 0.3, "line_color": None}

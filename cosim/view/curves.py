@@ -30,6 +30,7 @@ HOUR = 3600.0  # s
 MINUTE = 60.0  # s
 MARKERS = ("circle", "square")  # of the runs side by side
 OF_REGION = ("accumulation", "outflow", "u", "green")  # columns that depend on the region shown
+COLUMNS = ("time", *OF_REGION, "completed", "spent")  # of a run, a row per whole frame
 
 
 class Load:
@@ -76,7 +77,7 @@ class Load:
 class Curves:
     """All runs in one set of axes, for one region and for the whole city.
 
-    lines: one source per run, with a row per whole frame
+    lines: one source per run, with COLUMNS
     present: filters for the large point in the MFD plane
     titles: of the plots that name the region
     """
@@ -158,22 +159,23 @@ class Curves:
             now.location = time / MINUTE
 
     def _columns(self, whole: Sequence[Frame]) -> dict[str, np.ndarray]:
-        """Return the columns of a source, a row per frame."""
+        """Return COLUMNS of a run, a row per frame."""
         region = self._region
-        columns = {
-            "time": [frame.time / MINUTE for frame in whole],
-            "accumulation": [frame.accumulation[region] for frame in whole],
-            "outflow": [frame.outflow[region] for frame in whole],
-            "u": [mean(frame.perimeter[self._sources, region]) for frame in whole],
-            "green": [mean(frame.green[self._gateways]) for frame in whole],
-            "completed": [frame.completed for frame in whole],
-            "spent": [frame.time_spent / HOUR for frame in whole],
-        }
-        return {name: np.array(column, np.float32) for name, column in columns.items()}
+        rows = np.zeros((len(whole), len(COLUMNS)), np.float32)
+        for row, frame in zip(rows, whole, strict=True):
+            row[:] = (
+                frame.time / MINUTE,
+                frame.accumulation[region],
+                frame.outflow[region],
+                mean(frame.perimeter[self._sources, region]),
+                mean(frame.green[self._gateways]),
+                frame.completed,
+                frame.time_spent / HOUR,
+            )
+        return dict(zip(COLUMNS, rows.T.copy(), strict=True))
 
     def _add_run(self, n: int, name: str, colour: str) -> None:
-        columns = ("time", *OF_REGION, "completed", "spent")
-        source = ColumnDataSource({column: np.zeros(0, np.float32) for column in columns})
+        source = ColumnDataSource(dict.fromkeys(COLUMNS, np.zeros(0, np.float32)))
         line = {"source": source, "color": colour, "line_dash": colours.DASHES[n], "line_width": 2}
         self.region.line("time", "accumulation", legend_label=name, **line)
         self.trips.line("time", "completed", **line)
