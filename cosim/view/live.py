@@ -1,6 +1,6 @@
-"""Live page: runs in processes of their own, and the server that shows them.
+"""Live page: runs in processes of their own, and the server of the page.
 
-The Bokeh server answers on this machine only.
+The server answers on this machine only.
 """
 
 import logging

@@ -4,11 +4,9 @@
     RegionsEnv      pettingzoo.ParallelEnv: one agent per region
     Interface       observations and actions as vectors; actions of a trained agent as controls
 
-Importing this package registers two environments with Gymnasium. The part before the colon imports
-it:
-
-    gymnasium.make("nmfd.rl:nmfd/Hexagon7-v0")
-    gymnasium.make("nmfd.rl:nmfd/Scenario-v0", scenario="FOLDER")
+Importing this package registers `nmfd/Hexagon7-v0` and `nmfd/Scenario-v0` (scenario="FOLDER") with
+Gymnasium. `gymnasium.make("nmfd.rl:nmfd/Hexagon7-v0")` imports it first, by the name before the
+colon.
 
 It needs the extra `rl`.
 """
