@@ -11,7 +11,6 @@ object with `reset` and `act` (see `Controller`; `nmfd new-controller` writes a 
 here are imported at their first use.
 """
 
-import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -89,26 +88,3 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
-
-
-def _register(gymnasium: Any) -> None:
-    for name, options in (("Scenario", {}), ("Hexagon7", {"scenario": "economic_mpc"})):
-        gymnasium.register(id=f"nmfd/{name}-v0", entry_point="nmfd.rl:RegionalEnv", kwargs=options)
-
-
-class _Finder:
-    """Import hook that registers the environments with gymnasium, which has no plug-ins since
-    1.0."""
-
-    @classmethod
-    def find_spec(cls, name: str, *rest: Any) -> Any:
-        others = [finder for finder in sys.meta_path if name == "gymnasium" and finder is not cls]
-        if spec := next(filter(None, (finder.find_spec(name, *rest) for finder in others)), None):
-            execute, loader = spec.loader.exec_module, spec.loader  # type: ignore[union-attr]
-            loader.exec_module = lambda module: (execute(module), _register(module))  # type: ignore
-        return spec
-
-
-if "gymnasium" in sys.modules:
-    _register(sys.modules["gymnasium"])
-sys.meta_path.insert(0, _Finder)

@@ -16,7 +16,7 @@ import click
 
 import nmfd
 from nmfd.errors import InputError, RunFailed
-from nmfd.runs.files import parts_of
+from nmfd.runs.files import check_name, parts_of
 
 FOLDER = click.Path(path_type=Path, file_okay=False)
 FILE = click.Path(path_type=Path, dir_okay=False)
@@ -457,6 +457,7 @@ def new_controller(file: Path) -> None:
       nmfd new-controller mine.py
       nmfd benchmark economic_mpc --controllers no-control,mine.py:MyController
     """
+    check_name(file)
     if file.suffix != ".py":
         raise InputError(
             f"{file}: expected a name that ends in .py, such as {file.with_suffix('.py')}"

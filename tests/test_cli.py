@@ -51,7 +51,8 @@ def test_help_is_quick_fits_a_screen_and_shows_examples(package):
     )
     for name in main.commands:
         text = good(call(package, name, "--help"))
-        assert "Example" in text and f"{package} {name}" in text, name
+        assert "Example" in text, name
+        assert f"{package} {name}" in text, name
     assert time.process_time() - begin < 2.0
     alone = {
         name: value for name, value in os.environ.items() if not name.startswith("COV")

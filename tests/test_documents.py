@@ -42,8 +42,10 @@ PLACEHOLDERS = (
     "SCENARIO",
     "DIR",
 )
-SUFFIXES = r"py|md|toml|csv|png|txt|json|nc|npz|pt|onnx|xml|gz|parquet|css|js|j2|ipynb|html|mp4|log"
-SUFFIXES += r"|tmp|lock"
+SUFFIXES = (
+    "py|md|toml|csv|png|txt|json|nc|npz|pt|onnx|xml|gz|parquet|css|js|j2|ipynb|html|mp4|log|"
+    "tmp|lock"
+)
 PATH = re.compile(rf"(?:\.?[\w+=-]+/)*\.?[\w.+-]*\w\.(?:{SUFFIXES})|(?:\.?[\w+-]+/)+[\w+-]*")
 PYTHON = re.compile(r"(?:nmfd|cosim)(?:\.\w+)+")
 OPTION = re.compile(r"--[a-z][\w-]*")

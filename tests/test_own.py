@@ -98,7 +98,8 @@ def test_sumo_takes_it(place):
     [
         (
             None,
-            "mine.py: no such file for controller mine.py:Mine; write one with: nmfd new-controller ",
+            "mine.py: no such file for controller mine.py:Mine; write one with: "
+            "nmfd new-controller ",
         ),
         ("class Other:\n    act = None\n", "mine.py: has no class Mine; write one"),
         (
@@ -162,7 +163,8 @@ def test_mistakes(place, source, expected):
     with pytest.raises(InputError) as caught:
         nmfd.controller("mine.py:Mine", place / "scenario")
     text = str(caught.value)
-    assert "\n" not in text and (expected in text or re.search(expected, text)), text
+    assert "\n" not in text
+    assert expected in text or re.search(expected, text), text
 
 
 def test_a_mistake_in_mid_run_has_its_line(place):
@@ -173,7 +175,8 @@ def test_a_mistake_in_mid_run_has_its_line(place):
 
 
 def test_rounding_errors_of_float32_are_removed(place):
-    splits = "np.where(np.eye(2, dtype=bool)[:, None, :], 0.0, np.ones((2, 2, 2))) * (1 - np.eye(2))[:, :, None]"
+    elsewhere = "np.where(np.eye(2, dtype=bool)[:, None, :], 0.0, np.ones((2, 2, 2)))"
+    splits = f"{elsewhere} * (1 - np.eye(2))[:, :, None]"
     (place / "mine.py").write_text(
         GOOD.replace("0.5", "0.9000005").replace("splits=None", f"splits={splits} * 1.000001")
     )

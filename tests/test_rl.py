@@ -73,9 +73,22 @@ def test_gymnasium_and_pettingzoo_accept_sumo(peak):
     pettingzoo_check(rl.RegionsEnv(short, SumoPlant(short)), 3)
 
 
-@pytest.mark.parametrize("modules", ["nmfd, gymnasium", "gymnasium, nmfd", "nmfd.rl, gymnasium"])
-def test_environments_have_names_in_any_order_of_imports(modules):
-    code = f"import {modules}; gymnasium.make('nmfd/Hexagon7-v0').reset(seed=1)"
+def test_importing_nmfd_changes_nothing_outside():
+    code = (
+        "import sys, gymnasium\n"
+        "def outside():\n"
+        "    return [*sys.meta_path], [*sys.path_hooks], [*gymnasium.registry]\n"
+        "before = outside()\n"
+        "import nmfd, cosim\n"
+        "assert outside() == before\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("before", ["", "import nmfd; ", "import nmfd.rl; "])
+def test_gymnasium_finds_an_environment_by_its_module(before):
+    code = f"{before}import gymnasium; gymnasium.make('nmfd.rl:nmfd/Hexagon7-v0').reset(seed=1)"
     done = subprocess.run(
         [sys.executable, "-W", "error::UserWarning", "-c", code], capture_output=True, text=True
     )
@@ -83,13 +96,13 @@ def test_environments_have_names_in_any_order_of_imports(modules):
 
 
 def test_environments_have_names(scenario):
-    env = gymnasium.make("nmfd/Hexagon7-v0", guidance=True)
+    env = gymnasium.make("nmfd.rl:nmfd/Hexagon7-v0", guidance=True)
     assert env.reset(seed=1)[0] in env.observation_space
     assert env.unwrapped.interface.action_size > 24
     for _ in range(30):
         seen, *_ = env.step(env.action_space.sample())
         assert seen in env.observation_space
-    own = gymnasium.make("nmfd/Scenario-v0", scenario=str(scenario.folder))
+    own = gymnasium.make("nmfd.rl:nmfd/Scenario-v0", scenario=str(scenario.folder))
     assert own.reset(seed=0)[0] in own.observation_space
 
 

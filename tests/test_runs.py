@@ -70,7 +70,8 @@ def test_xarray_opens_a_run_with_names_and_units(tmp_path):
         assert data.attrs["estimated"] == 1
         assert set(data.data_vars) == {*VARIABLES, *RECORD}
         for name, values in data.variables.items():
-            assert values.attrs["long_name"] and ("units" in values.attrs or name == "note"), name
+            assert values.attrs["long_name"], name
+            assert "units" in values.attrs or name == "note", name
         assert list(data["status"].values) == [0, 0, 0, 3]  # a solver failure and a fallback
         assert list(data["time"].values) == [0.0, 30.0, 60.0, 90.0, 120.0]
         assert data["time"].attrs["units"] == "s"

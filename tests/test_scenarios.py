@@ -189,7 +189,8 @@ def test_guiding_controllers_find_the_model_of_guided_drivers(base, tmp_path):
     scenario = load_scenario(
         beside(
             base,
-            'name = "x"\nbase = "../scenario"\n[controllers."dpc-pcrg+max-pressure"]\nmodel = "../model"\n',
+            'name = "x"\nbase = "../scenario"\n[controllers."dpc-pcrg+max-pressure"]\n'
+            'model = "../model"\n',
         )
     )
     jam = {

@@ -136,7 +136,7 @@ def test_the_table_with_most_words_applies(scenario):
         "dpc-pc+max-pressure+rerouting-30",
         "dpc-pcrg+max-pressure",
     ]
-    scenario = replace(scenario, controller_options=dict.fromkeys(tables, {}))
+    scenario = replace(scenario, controller_options={name: {} for name in tables})
     for name, expected in (
         ("dpc-pc", "dpc-pc"),
         ("dpc-pc+webster", "dpc-pc"),
@@ -150,7 +150,7 @@ def test_the_table_with_most_words_applies(scenario):
 
 
 def test_tables_that_fit_equally_well_are_an_error(scenario):
-    tables = dict.fromkeys(["dpc-pc+max-pressure", "dpc-pc+metering"], {})
+    tables = {"dpc-pc+max-pressure": {}, "dpc-pc+metering": {}}
     rivals = replace(scenario, controller_options=tables)
     with pytest.raises(
         InputError, match=r'fit it equally well; add a table \[controllers."dpc-pc\+metering\+max-p'

@@ -22,6 +22,7 @@ from cosim.importing.partition import finish, own_regions, partition
 from cosim.importing.streets import Streets, read_streets
 from cosim.sumo.net import load_city
 from cosim.sumo.signals import timetabled, without_effect
+from cosim.sumo.xml_files import check_path
 from nmfd.errors import InputError
 from nmfd.model import authority
 from nmfd.model.regional_model import network_toml
@@ -88,6 +89,7 @@ def import_city(
     first = None if begin is None else seconds(begin, "--begin")
     last = None if end is None else seconds(end, "--end")
     for folder in (out, scenario):
+        check_path(folder)
         if folder.name in ("", "..") or "," in str(folder):
             raise InputError(
                 f"--out: expected a folder such as networks/mycity, without a comma, got {folder} instead"

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from nmfd.errors import InputError
-from nmfd.runs.files import check_file
+from nmfd.runs.files import check_file, check_name
 
 # Errors of a file that is cut off, no XML, in an unknown encoding, or without an attribute.
 BROKEN = (OSError, EOFError, zlib.error, ElementTree.ParseError, LookupError, TypeError, ValueError)
@@ -65,6 +65,7 @@ def stream_of(
     kind, remedy: for the message of an error
     Raises: InputError, also for one of BROKEN in the block
     """
+    check_path(path)
     check_file(path)
     try:
         with gzip.open(path, "rb") if path.suffix == ".gz" else path.open("rb") as stream:
@@ -88,12 +89,26 @@ def network_root(net: Path) -> Iterator[ElementTree.Element]:
         yield root
 
 
+def check_path(path: Path) -> None:
+    """Check that SUMO can open a path.
+
+    Raises: InputError for a name that is not UTF-8, or that SUMO would change
+    """
+    check_name(path)
+    if "${" in str(path.absolute()):
+        raise InputError(
+            f"{path}: SUMO puts variables of the system for ${{...}} in a path; rename the file or "
+            "folder"
+        )
+
+
 def file_list(files: Sequence[Path]) -> str:
     """Return files as an option of SUMO, which separates them by commas.
 
     Raises: InputError for a path with a comma
     """
     for file in files:
+        check_path(file)
         if "," in str(file):
             raise InputError(
                 f"{file}: SUMO cannot read a file with a comma in its path; "

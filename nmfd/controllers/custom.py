@@ -16,7 +16,7 @@ import numpy as np
 from nmfd.errors import InputError
 from nmfd.model.commands import admissible
 from nmfd.model.planning import PlanningModel
-from nmfd.runs.files import file_hash
+from nmfd.runs.files import check_name, file_hash
 from nmfd.types import Controller, Controls, Observation
 
 FILE_AND_CLASS = re.compile(r"(?P<file>.+\.py):(?P<cls>[^\W\d]\w*)")
@@ -26,6 +26,7 @@ def load(name: str) -> Any:
     """Return the class FILE.py:CLASS; its module runs once per version of the file. Raise
     InputError."""
     path, cls = _path(name), name.rpartition(":")[2]
+    check_name(path)
     if not path.is_file():
         raise InputError(
             f"{path}: no such file for controller {name}; write one with: nmfd new-controller {path}"

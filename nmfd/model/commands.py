@@ -31,7 +31,7 @@ def admissible(controls: object, network: RegionalModel, where: str) -> Controls
     gates = network.adjacency
     low = np.where(gates, network.u_min, -np.inf)
     high = np.where(gates, network.u_max, np.inf)
-    perimeter = _within(controls.perimeter, low, high, f"{where}: perimeter")
+    perimeter = within(controls.perimeter, low, high, f"{where}: perimeter")
     return replace(
         controls,
         perimeter=np.where(gates, perimeter, 0.0),
@@ -45,7 +45,7 @@ def _splits(splits: ArrayLike | None, network: RegionalModel, where: str) -> np.
     if splits is None:
         return None
     allowed = network.split_mask
-    shares = _within(splits, np.zeros(allowed.shape), allowed.astype(float), where)
+    shares = within(splits, np.zeros(allowed.shape), allowed.astype(float), where)
     sums = shares.sum(axis=1)
     needed = allowed.any(axis=1)
     wrong = np.argwhere(needed & (abs(sums - 1.0) > SUM_TOLERANCE))
@@ -64,10 +64,10 @@ def _up_to(
     if values is None:
         return None
     zeros = np.zeros(network.regions)
-    return _within(values, zeros, zeros + most, where)
+    return within(values, zeros, zeros + most, where)
 
 
-def _within(values: ArrayLike, low: np.ndarray, high: np.ndarray, where: str) -> np.ndarray:
+def within(values: ArrayLike, low: np.ndarray, high: np.ndarray, where: str) -> np.ndarray:
     """Return `values` as an array clipped to `low` and `high`.
 
     Raises: InputError if the shape is another, or if bounds are missed by more than rounding errors

@@ -48,7 +48,8 @@ def temporary_folder(prefix: str = "cosim-", where: Path | None = None) -> Itera
 def write_text(path: Path, text: str) -> None:
     """Write `text` to `path`, whole or not at all."""
     with atomic(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        # A name in the text may not be UTF-8.
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def write_table(path: Path, frame: "pd.DataFrame", **options: str) -> None:
@@ -61,6 +62,21 @@ def check_file(path: Path, remedy: str = "give a file") -> None:
     is none of these."""
     if os.path.exists(path) and not os.path.isfile(path):
         raise InputError(f"{path}: is not a file; {remedy}")
+
+
+def check_name(path: Path | str) -> None:
+    """Check that a path is text, which SUMO and netCDF need.
+
+    Raises: InputError for a name that is not UTF-8
+    """
+    absolute = os.path.abspath(path)
+    try:
+        absolute.encode()
+    except UnicodeEncodeError:
+        raise InputError(
+            f"{absolute}: the name is not UTF-8, and SUMO and netCDF cannot open it; rename the "
+            "file or folder"
+        ) from None
 
 
 def file_hash(path: Path) -> str:

@@ -30,7 +30,7 @@ from filelock import FileLock, Timeout
 from nmfd import __version__
 from nmfd.errors import InputError, RunFailed, need
 from nmfd.metrics import summary
-from nmfd.runs.files import write_table, write_text
+from nmfd.runs.files import check_name, write_table, write_text
 from nmfd.runs.pool import attempt, in_processes, in_subprocess
 from nmfd.runs.progress import Progress, watched
 from nmfd.types import Result
@@ -200,6 +200,7 @@ def locked(out: Path, mark: str = MANIFEST) -> Iterator[None]:
     mark: file that a folder with other files must hold. A command holds its folder around its runs,
         tables and figures
     """
+    check_name(out)
     remedy = "choose another folder with --out"
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file; {remedy}")
