@@ -111,7 +111,7 @@ def test_every_action_is_admissible_and_reaches_the_bounds(hexagon, guidance):
     interface, network = rl.Interface(hexagon.network, guidance=guidance), hexagon.network
     random = np.random.default_rng(0)
     for action in (
-        random.uniform(-1.3, 1.3, interface.action_size),
+        random.uniform(-1.0, 1.0, interface.action_size),
         np.ones(interface.action_size),
     ):
         controls = interface.controls(action)
@@ -171,8 +171,8 @@ def test_an_action_that_is_no_number_is_named(hexagon):
     one.step(action)
     action[30] = np.nan
     with pytest.raises(
-        InputError, match=r"^RegionalEnv: interval 1: action\[30\]: expected a number from -1 to 1"
+        InputError, match=r"^RegionalEnv: interval 1: action\[30\]: expected a finite number"
     ):
         one.step(action)
-    with pytest.raises(InputError, match=r"^region_2: interval 0: action\[0\]: expected a number"):
+    with pytest.raises(InputError, match=r"^region_2: interval 0: action\[0\]: expected a finite number"):
         many.step({"region_2": np.full(many.interfaces["region_2"].action_size, np.nan)})
