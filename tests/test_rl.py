@@ -174,5 +174,7 @@ def test_an_action_that_is_no_number_is_named(hexagon):
         InputError, match=r"^RegionalEnv: interval 1: action\[30\]: expected a finite number"
     ):
         one.step(action)
-    with pytest.raises(InputError, match=r"^region_2: interval 0: action\[0\]: expected a finite number"):
+    with pytest.raises(
+        InputError, match=r"^region_2: interval 0: action\[0\]: expected a finite number"
+    ):
         many.step({"region_2": np.full(many.interfaces["region_2"].action_size, np.nan)})

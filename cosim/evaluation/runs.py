@@ -11,7 +11,7 @@ from cosim.evaluation.simulate import Simulation
 from cosim.plant import incidents
 from cosim.plant.launch import own_vehicles
 from cosim.plant.programmes import check_strategy, scenario_city
-from cosim.plant.settings import FILES, MAX_PRESSURE, own_files, settings
+from cosim.plant.settings import FILES, own_files, settings
 from cosim.plant.strategy import Strategy, check_tables
 from cosim.sumo.net import check_adjacency, city_files
 from cosim.sumo.signals import HELD, read_signals
@@ -77,9 +77,8 @@ def city_key(scenario: Scenario, strategies: Sequence[Strategy]) -> dict[str, ob
     city = scenario_city(scenario, chosen)
     check_adjacency(city, scenario.network)
     own_vehicles(scenario, chosen, city)
-    used = {strategy.settings(scenario).signals for strategy in strategies}
     simple, _ = read_signals(city, own_files(scenario, chosen.additional), HELD)
-    everywhere = MAX_PRESSURE in used
+    everywhere = any(one.settings(scenario).signals_from_outside for one in strategies)
     incidents.check(
         scenario.ordered_faults,
         city,

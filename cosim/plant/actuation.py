@@ -8,7 +8,7 @@ from cosim.plant.gates import GatewaySignal, Green, ResponsiveSignal
 from cosim.plant.incidents import Incidents
 from cosim.plant.max_pressure import FACTS, MaxPressure
 from cosim.plant.room import Room
-from cosim.plant.settings import Settings
+from cosim.plant.settings import SIGNAL_CONTROLS, Settings
 from cosim.plant.supervisor import Supervisor
 from cosim.plant.waits import Waits
 from cosim.sumo.arrays import PerEdge, PerGateway
@@ -45,9 +45,9 @@ class Actuation:
         incidents: Incidents,
         flows: Mapping[tuple[str, str], float] | None,
     ):
-        """step: control interval [s]; steered: signals for max-pressure
+        """step: control interval [s]; steered: signals that are set from outside
 
-        flows: (edge, next edge) -> flow, any unit, if max-pressure runs the signals
+        flows: (edge, next edge) -> flow, any unit, if they are set from outside
         """
         self._session = session
         self._city = city
@@ -63,10 +63,13 @@ class Actuation:
         self._controls: list[MaxPressure | GatewaySignal | ResponsiveSignal] = []
         self._pressure: MaxPressure | None = None
         if flows is not None:
-            self._pressure = MaxPressure(
+            control = SIGNAL_CONTROLS[settings.signals].load()
+            everywhere = control(
                 session, held, steered, flows, show=show, lookahead=settings.lookahead
             )
-            self._controls.append(self._pressure)
+            if isinstance(everywhere, MaxPressure):
+                self._pressure = everywhere
+            self._controls.append(everywhere)
             phases = {signal.id: signal.phases for signal in steered if signal.id in movements}
         self._rationed = np.array([gateway.signal in phases for gateway in held.gateways], bool)
         for name in sorted(movements.keys() - phases.keys()):

@@ -16,7 +16,7 @@ from cosim.plant.metering import Metering
 from cosim.plant.programmes import city_signals, scenario_city
 from cosim.plant.record import Recorder
 from cosim.plant.sampling import SAMPLE_PERIOD_S, StreetMeans, StreetSampler
-from cosim.plant.settings import ESTIMATE, MAX_PRESSURE, Settings, check_lanes
+from cosim.plant.settings import ESTIMATE, Settings, check_lanes
 from cosim.plant.settings import settings as settings_of
 from cosim.plant.stuck import Junctions
 from cosim.plant.waits import Waits
@@ -134,10 +134,10 @@ class SumoPlant:
             ways_return=settings.ways_return,
             period=settings.guidance_period,
             lanes=not settings.mesoscopic,
-            turn_late=settings.signals != MAX_PRESSURE,
+            turn_late=not settings.signals_from_outside,
             random=np.random.default_rng([seed, GUIDANCE]),
         )
-        flows = self._launch.turning_flows() if settings.signals == MAX_PRESSURE else None
+        flows = self._launch.turning_flows() if settings.signals_from_outside else None
         self.actuation = Actuation(
             session,
             city,

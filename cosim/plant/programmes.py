@@ -14,7 +14,6 @@ from cosim.plant.max_pressure import MAX_GREEN_S
 from cosim.plant.settings import (
     ACTUATED,
     FIXED,
-    MAX_PRESSURE,
     Settings,
     check_lanes,
     own_files,
@@ -73,15 +72,15 @@ def city_signals(
     Signals with gateways that stay fixed-time are in neither. Raises InputError if
     `settings.signals` fits none.
     """
-    pressure = settings.signals == MAX_PRESSURE
-    kinds = HELD if pressure else (STATIC,)
+    outside = settings.signals_from_outside
+    kinds = HELD if outside else (STATIC,)
     additional = own_files(scenario, settings.additional)
     simple, others = read_signals(city, additional, kinds)
     left = _left_alone(city, settings, additional, [signal.id for signal in simple])
     others |= left
     simple = [signal for signal in simple if signal.id not in left]
     if settings.signals != FIXED and not simple:
-        kind = "" if pressure else "fixed-time "
+        kind = "" if outside else "fixed-time "
         raise InputError(
             f"{city.net_file}: sumo.signals: {settings.signals} needs {kind}signals with several "
             f"green phases, but none of the {len(others)} signals here is one"

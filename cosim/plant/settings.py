@@ -1,9 +1,10 @@
 """The table [sumo] of scenario.toml: simulation, actuation and measurement of the city."""
 
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Self, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self
 
-from pydantic import model_validator
+from pydantic import AfterValidator, model_validator
 
 from nmfd.errors import InputError
 from nmfd.runs import config
@@ -12,8 +13,45 @@ from nmfd.runs.config import Problem, Seconds, Share, Text, Texts, setting
 if TYPE_CHECKING:  # heavy, and the help of a command imports this module
     from nmfd.model.scenario import Scenario
 
-Signals = Literal["fixed", "webster", "actuated", "max-pressure"]
-FIXED, WEBSTER, ACTUATED, MAX_PRESSURE = get_args(Signals)
+FIXED = "fixed"
+WEBSTER = "webster"
+ACTUATED = "actuated"
+MAX_PRESSURE = "max-pressure"
+
+
+class SignalControl(NamedTuple):
+    """Control of the signals.
+
+    text: what it does, for help
+    outside: "module:Class" that sets all signals itself, as cosim.plant.max_pressure.MaxPressure
+        does; "" if SUMO runs programmes
+    """
+
+    text: str
+    outside: str = ""
+
+    def load(self) -> Any:
+        """Return the class that sets all signals."""
+        module, _, name = self.outside.partition(":")
+        return getattr(import_module(module), name)
+
+
+SIGNAL_CONTROLS = {
+    FIXED: SignalControl("the programmes of the network"),
+    WEBSTER: SignalControl("fixed-time signals, optimised for the scenario's demand"),
+    ACTUATED: SignalControl("signals that extend green while vehicles arrive"),
+    MAX_PRESSURE: SignalControl(
+        "max-pressure control of all signals", "cosim.plant.max_pressure:MaxPressure"
+    ),
+}
+
+
+def _known(name: str) -> str:
+    if name not in SIGNAL_CONTROLS:
+        raise ValueError(f"should be one of {', '.join(SIGNAL_CONTROLS)}")
+    return name
+
+
 EXACT, ESTIMATE = "exact", "estimate"
 FILES = ("routes", "background", "additional")
 
@@ -42,7 +80,9 @@ class Settings(config.Settings):
         "SUMO's options that change the traffic, such as max-depart-delay; other keys of [sumo] override them",
         {},
     )
-    signals: Signals = setting("control of the signals", FIXED)
+    signals: Annotated[str, AfterValidator(_known)] = setting(
+        f"control of the signals: {', '.join(SIGNAL_CONTROLS)}", FIXED
+    )
     lookahead: float = setting(
         "green after a change of stage over which max-pressure compares; less: fewer changes",
         1.0,
@@ -81,6 +121,11 @@ class Settings(config.Settings):
     )
     detector_share: Share = setting("share of the links with loop detectors", 0.3)
     probe_share: Share = setting("share of the vehicles that are probes", 0.1)
+
+    @property
+    def signals_from_outside(self) -> bool:
+        """True if a class of this package sets all signals, such as max-pressure."""
+        return bool(SIGNAL_CONTROLS[self.signals].outside)
 
     @model_validator(mode="after")
     def _is_possible(self) -> Self:
@@ -122,11 +167,16 @@ def own_files(scenario: "Scenario", names: Texts) -> list[Path]:
 
 
 def check_lanes(scenario: "Scenario", settings: Settings) -> None:
-    """Raise InputError for settings that the mesoscopic model, which has no lanes, cannot do."""
-    for key, values, what in (
-        ("signals", (MAX_PRESSURE,), "counts vehicles lane by lane"),
-        ("measurement", (ESTIMATE,), "needs loop detectors on lanes"),
-    ):
-        if settings.mesoscopic and (value := getattr(settings, key)) in values:
-            what += ", but SUMO's mesoscopic model has no lanes; omit it, or import the city without --mesoscopic"
-            raise InputError(f"{scenario.where}: sumo.{key}: {value} {what}")
+    """Raise InputError for settings that need lanes, which the mesoscopic model has not."""
+    if not settings.mesoscopic:
+        return
+    problem = ""
+    if settings.signals_from_outside:
+        problem = f"signals: {settings.signals} counts vehicles lane by lane"
+    elif settings.measurement == ESTIMATE:
+        problem = f"measurement: {ESTIMATE} needs loop detectors on lanes"
+    if problem:
+        remedy = "omit it, or import the city without --mesoscopic"
+        raise InputError(
+            f"{scenario.where}: sumo.{problem}, but SUMO's mesoscopic model has no lanes; {remedy}"
+        )

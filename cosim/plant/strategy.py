@@ -4,13 +4,14 @@ dpc-pc+max-pressure      max-pressure at all signals, DPC limits the green of th
 no-control+rerouting-30  no control, 30 % of the drivers reroute; `rerouting-30` for short
 mine.py:Gate+actuated    a controller of the user's own, actuated signals elsewhere
 
-A new word is one entry of WORDS or NUMBERS.
+A new word is one entry of WORDS or NUMBERS; that of a signal control is its name in
+SIGNAL_CONTROLS.
 """
 
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
-from cosim.plant.settings import Settings, settings
+from cosim.plant.settings import FIXED, SIGNAL_CONTROLS, Settings, settings
 from nmfd.controllers import strategy as regional
 from nmfd.controllers.strategy import ALONE, CONTROLLERS, ControllerLike, Given, split
 from nmfd.errors import InputError, did_you_mean
@@ -37,11 +38,6 @@ class Number(NamedTuple):
 
 
 WORDS: dict[str, Word] = {
-    "webster": Word(
-        "signals", "webster", "fixed-time signals, optimised for the scenario's demand"
-    ),
-    "actuated": Word("signals", "actuated", "signals that extend green while vehicles arrive"),
-    "max-pressure": Word("signals", "max-pressure", "max-pressure control of all signals"),
     "estimate": Word(
         "measurement",
         "estimate",
@@ -132,7 +128,7 @@ def of_finished(name: str) -> Strategy:
 
 def label_of(key: str, value: Any) -> str:
     """Return the word for a setting, or "key=value" if there is none."""
-    for name, word in WORDS.items():
+    for name, word in _plain_words().items():
         if (word.key, word.value) == (key, value):
             return name
     for stem, number in NUMBERS.items():
@@ -145,8 +141,9 @@ def label_of(key: str, value: Any) -> str:
 
 def setting_of(word: str) -> tuple[str, Any] | None:
     """Return key and value of the setting that a word means, None if there is no such word."""
-    if word in WORDS:
-        return WORDS[word].key, WORDS[word].value
+    plain = _plain_words().get(word)
+    if plain is not None:
+        return plain.key, plain.value
     stem, _, digits = word.rpartition("-")
     if stem not in NUMBERS or not digits.isdecimal() or digits != str(int(digits)):
         return None
@@ -159,7 +156,7 @@ def setting_of(word: str) -> tuple[str, Any] | None:
 
 def vocabulary() -> dict[str, str]:
     """Return every word with its text, for help."""
-    words = {f"+{name}": word.text for name, word in WORDS.items()}
+    words = {f"+{name}": word.text for name, word in _plain_words().items()}
     return words | {f"+{stem}-N": number.text for stem, number in NUMBERS.items()}
 
 
@@ -230,8 +227,17 @@ def _check_controller(name: str, first: str) -> None:
         raise InputError(f"{where} is unknown{near}; choose from {allowed}: {_allowed()}") from None
 
 
+def _plain_words() -> dict[str, Word]:
+    """Return the words without a number, those of signal controls first."""
+    words = {}
+    for name, control in SIGNAL_CONTROLS.items():
+        if name != FIXED:
+            words[name] = Word("signals", name, control.text)
+    return words | WORDS
+
+
 def _words() -> list[str]:
-    return [*WORDS, *(f"{stem}-N" for stem in NUMBERS)]
+    return [*_plain_words(), *(f"{stem}-N" for stem in NUMBERS)]
 
 
 def _allowed() -> str:

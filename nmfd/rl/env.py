@@ -37,7 +37,7 @@ class Interface:
 
     Action in [-1, 1]: u_ih of each boundary out of these regions, from u_min to u_max. With
     `guidance` also a logit for each next region h of theta_ihj where there is a choice. Every
-    action is admissible.
+    action of the space is admissible.
     """
 
     def __init__(
