@@ -80,7 +80,7 @@ def test_trip_lengths_stay_within_the_integration_step_and_a_wrong_kind_is_one_l
 
 
 def test_rows_and_picture_of_a_comparison(folder, tmp_path):
-    out, options = tmp_path / "out", {"sigmas": [0.0, 1.0], "scenarios": 2}
+    out, options = tmp_path / "out", {"sigmas": [0.0, 1.0], "seeds": 2}
     rows = robustness(folder, ["pi-gating"], out=out, **options)
     assert {path.name for path in out.iterdir()} >= {
         "runs.csv",

@@ -340,7 +340,7 @@ def test_progress_counts_runs(tmp_path):
         workers=0,
         progress=lambda *what: shown.append(what),
     )
-    assert shown == [(0, 2), (1, 2, "a-0"), (2, 2, "b-0")]
+    assert shown == [(0, 2, ""), (1, 2, "a-0"), (2, 2, "b-0")]
 
 
 @pytest.mark.slow
