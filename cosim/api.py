@@ -113,6 +113,7 @@ def run_controllers(
     out: Path | str | None = None,
     workers: int = 2,
     time_limit: float | None = None,
+    overwrite: bool = False,
     progress: Progress = None,
 ) -> "pd.DataFrame":
     """Run strategies on the same trips with a run folder, as `cosim run`; return a row per run.
@@ -129,7 +130,14 @@ def run_controllers(
     out = default_folder(loaded_one.name) if out is None else Path(out)
     runs = runs_of(loaded_one, strategies, [seed], demand=demand, policies=files)
     with locked(out):
-        rows = run_many(runs, out, workers=workers, time_limit=time_limit, progress=progress)
+        rows = run_many(
+            runs,
+            out,
+            workers=workers,
+            time_limit=time_limit,
+            overwrite=overwrite,
+            progress=progress,
+        )
         raise_failures(rows)
         finished = results.read(out)
         there = [one for level in finished.levels for one in level.results()]
@@ -151,7 +159,7 @@ def demo(out: Path | str = "runs/demo", *, seed: int = 1000) -> "pd.DataFrame":
     scenario = loaded(DEMO)
     strategies = [parse("no-control"), parse("pi-gating")]
     with locked(out):
-        rows = run_many(runs_of(scenario, strategies, [seed]), out, workers=2)
+        rows = run_many(runs_of(scenario, strategies, [seed]), out, workers=2, overwrite=True)
         raise_failures(rows)
         page = html.write_page(out / "report.html", [results.read(out)], seed=seed).resolve()
     if _has_screen():
@@ -210,6 +218,7 @@ def evaluate(
     workers: int = 1,
     scheduler: str | None = None,
     time_limit: float | None = None,
+    overwrite: bool = False,
     progress: Progress = None,
 ) -> "pd.DataFrame":
     """Run controllers x seeds x demand levels in SUMO, as `cosim evaluate`; return a row per run.
@@ -228,6 +237,7 @@ def evaluate(
     workers: runs at a time on this machine
     scheduler: address of a Dask scheduler that does the runs instead
     time_limit: seconds after which a run is ended; see nmfd.runs.run_many
+    overwrite: do finished runs again whose settings have changed
     progress: None for a bar, False for none, or a function called as progress(done, runs, name)
 
     The column `failure` is "" of a finished run, else its reason. Raises InputError.
@@ -253,6 +263,7 @@ def evaluate(
             workers=workers,
             scheduler=scheduler,
             time_limit=time_limit,
+            overwrite=overwrite,
             progress=progress,
         )
         for name in dict.fromkeys(results.finished_rows(rows).get("scenario", ())):

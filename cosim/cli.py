@@ -16,6 +16,7 @@ from nmfd.cli import (
     FILE,
     FOLDER,
     LEVEL,
+    OVERWRITE,
     POLICIES,
     SCENARIO,
     SCHEDULER,
@@ -56,7 +57,7 @@ WORKERS = click.option(
     show_default="one per core",
     help="Parallel runs.",
 )
-RUNNING = combined(WORKERS, SCHEDULER, TIME_LIMIT)
+RUNNING = combined(WORKERS, SCHEDULER, TIME_LIMIT, OVERWRITE)
 
 
 def span(text: str) -> tuple[float, float]:
@@ -116,6 +117,7 @@ def demo(out: Path) -> None:
 @STEPS
 @ONE_DEMAND
 @TIME_LIMIT
+@OVERWRITE
 @click.option(
     "--policy",
     type=FILE,
@@ -244,7 +246,7 @@ def evaluate(
         options["seeds"] = range(first_seed, first_seed + seeds)
     if check is not None:
         running = {"workers": options.pop("workers")}
-        for name in ("scheduler", "time_limit"):
+        for name in ("scheduler", "time_limit", "overwrite"):
             options.pop(name)
         runs, out = cosim.api.planned(scenario, controllers, **options)
         lines = differences(runs, out, check, **running)

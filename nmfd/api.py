@@ -205,6 +205,7 @@ def benchmark(
     workers: int = 1,
     scheduler: str | None = None,
     time_limit: float | None = None,
+    overwrite: bool = False,
     progress: Progress = None,
 ) -> "pd.DataFrame":
     """Run controllers x seeds with a run folder, as `nmfd benchmark`; return one row per run.
@@ -225,6 +226,7 @@ def benchmark(
     workers: runs at a time
     scheduler: address of a Dask scheduler that does the runs instead
     time_limit: seconds after which a run is ended; see nmfd.runs.run_many
+    overwrite: do finished runs again whose settings have changed
     progress: as in `nmfd.run`; your own is called as progress(done, runs, name)
 
     The column `failure` is "" of a finished run, else its reason. `lower_bound_veh_s` bounds the
@@ -267,6 +269,7 @@ def benchmark(
             workers=workers_for(strategies, workers),
             scheduler=scheduler,
             time_limit=time_limit,
+            overwrite=overwrite,
             progress=progress,
         )
         rows = benchmark_study.with_bounds(rows, lower, levels[0])
@@ -287,6 +290,7 @@ def robustness(
     workers: int = 1,
     scheduler: str | None = None,
     time_limit: float | None = None,
+    overwrite: bool = False,
     progress: Progress = None,
 ) -> "pd.DataFrame":
     """Run controllers, and no control, in perturbed scenarios; draw the gain and return the runs.
@@ -329,6 +333,7 @@ def robustness(
             workers=workers_for(strategies, workers),
             scheduler=scheduler,
             time_limit=time_limit,
+            overwrite=overwrite,
             progress=progress,
         )
         if (rows["failure"] == "").any():

@@ -238,7 +238,10 @@ TIME_LIMIT = click.option(
     help="Time after which a run in a process of its own is ended. [default: ten times the "
     "expected one, at least 600]",
 )
-RUNNING = combined(WORKERS, SCHEDULER, TIME_LIMIT)
+OVERWRITE = click.option(
+    "--overwrite", is_flag=True, help="Do finished runs again whose settings have changed."
+)
+RUNNING = combined(WORKERS, SCHEDULER, TIME_LIMIT, OVERWRITE)
 LEVEL = Number(0.0, 10.0, min_open=True)
 STEPS = click.option(
     "--steps", type=COUNT, help="Number of control intervals. [default: as in the scenario]"

@@ -60,7 +60,7 @@ class Settings(config.Settings):
     """The city in SUMO. Files are relative to the scenario's folder."""
 
     step_length: float = setting(
-        "time step, a divisor of the control interval", 1.0, unit="s", gt=0.0, le=1.0
+        "time step, a divisor of the control interval", 1.0, unit="s", ge=0.01, le=1.0
     )
     time_to_teleport: float = setting(
         "waiting time before SUMO moves a vehicle on; -1: never", -1.0, unit="s", ge=-1.0
@@ -155,7 +155,8 @@ def settings(scenario: "Scenario") -> Settings:
                 raise config.error(
                     path, f"sumo.{key}", f"no such file: {file}; give the path of an existing one"
                 )
-    if abs(scenario.step / result.step_length - round(scenario.step / result.step_length)) > 1e-9:
+    steps = scenario.step / result.step_length
+    if steps < 1.0 or abs(steps - round(steps)) > 1e-9:
         expected = f"a divisor of the control interval {scenario.step:g} s"
         raise config.error(path, "sumo.step_length", config.got(expected, result.step_length))
     return result

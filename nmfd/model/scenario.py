@@ -37,6 +37,7 @@ from nmfd.runs.config import (
     whole,
 )
 
+SHORTEST_STEP_S = 0.1
 LONGEST_STEP_S = 86_400.0
 MOST_STEPS = 10**6
 MOST_FLOW_VEH_S = 1e6
@@ -305,7 +306,7 @@ class ScenarioTable(Settings):
         "folder or shipped name of a scenario that gives the keys omitted here", None
     )
     network: Text = setting("folder or shipped name of the network")
-    step: float = setting("control interval", unit="s", gt=0.0, le=LONGEST_STEP_S)
+    step: float = setting("control interval", unit="s", ge=SHORTEST_STEP_S, le=LONGEST_STEP_S)
     steps: int = whole("control intervals", low=1, high=MOST_STEPS)
     integrator: Literal["euler", "rk4"] = setting(
         "integration scheme of the regional model", "euler"

@@ -3,7 +3,9 @@
 import hashlib
 import os
 import re
+import shutil
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
@@ -11,10 +13,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import quote
 
+from filelock import FileLock, Timeout
+
 from nmfd.errors import InputError
 
 if TYPE_CHECKING:
     import pandas as pd
+
+
+HELD = ".held"  # locked as long as the process of a temporary folder lives
+NEW_S = 2.0  # age up to which a temporary folder is left alone
 
 
 @contextmanager
@@ -39,10 +47,28 @@ def atomic(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def temporary_folder(prefix: str = "cosim-", where: Path | None = None) -> Iterator[Path]:
-    """Yield a new folder in `where`, or in the system's place for such folders, and remove it at
-    the end."""
+    """Yield a new folder and remove it at the end, and those of killed processes first.
+
+    where: folder above, the system's place for temporary folders if None
+    """
+    parent = Path(tempfile.gettempdir() if where is None else where)
+    sweep(parent, prefix)
     with tempfile.TemporaryDirectory(prefix=prefix, dir=where, ignore_cleanup_errors=True) as name:
-        yield Path(name)
+        with FileLock(Path(name) / HELD):
+            yield Path(name)
+
+
+def sweep(parent: Path, prefix: str) -> None:
+    """Remove temporary folders whose process was killed."""
+    for folder in parent.glob(f"{prefix}*"):
+        lock = folder / HELD
+        try:
+            old = time.time() - lock.stat().st_mtime > NEW_S
+            if old:
+                with FileLock(lock, timeout=0):
+                    shutil.rmtree(folder, ignore_errors=True)
+        except (OSError, Timeout):  # it has no lock, is in use, or belongs to somebody else
+            continue
 
 
 def write_text(path: Path, text: str) -> None:
