@@ -39,14 +39,13 @@ from nmfd.errors import RunFailed
 from nmfd.metrics import summary
 from nmfd.model.scenario import Scenario
 from nmfd.runs.files import default_folder, file_name, write_table
+from nmfd.runs.frame import Table
 from nmfd.runs.progress import Progress, watched
 from nmfd.runs.run_many import Run, locked, raise_failures, run_many
 from nmfd.studies.benchmark import REFERENCE, draw_accumulations
 from nmfd.types import Result
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from nmfd.controllers.base import Options
 
 DEMO = "demo"  # a shipped scenario
@@ -115,7 +114,7 @@ def run_controllers(
     time_limit: float | None = None,
     overwrite: bool = False,
     progress: Progress = None,
-) -> "pd.DataFrame":
+) -> Table:
     """Run strategies on the same trips with a run folder, as `cosim run`; return a row per run.
 
     policies: files by controller, if not SCENARIO/NAME.pt
@@ -143,12 +142,12 @@ def run_controllers(
         there = [one for level in finished.levels for one in level.results()]
         draw_accumulations(out, loaded_one, there)
         write_table(out / "signals.csv", sheets(there), float_format="%g")
-    table = finished.rows
+    table = Table(finished.rows)
     table.attrs["folder"] = str(out)
     return table
 
 
-def demo(out: Path | str = "runs/demo", *, seed: int = 1000) -> "pd.DataFrame":
+def demo(out: Path | str = "runs/demo", *, seed: int = 1000) -> Table:
     """Run the demo city with and without gates, and write and open a page about both.
 
     The page is `table.attrs["page"]`.
@@ -164,7 +163,7 @@ def demo(out: Path | str = "runs/demo", *, seed: int = 1000) -> "pd.DataFrame":
         page = html.write_page(out / "report.html", [results.read(out)], seed=seed).resolve()
     if _has_screen():
         webbrowser.open(page.as_uri())
-    table = rows[rows["seed"] == seed]
+    table = Table(rows[rows["seed"] == seed])
     table.attrs["page"] = str(page)
     return table
 
@@ -220,7 +219,7 @@ def evaluate(
     time_limit: float | None = None,
     overwrite: bool = False,
     progress: Progress = None,
-) -> "pd.DataFrame":
+) -> Table:
     """Run controllers x seeds x demand levels in SUMO, as `cosim evaluate`; return a row per run.
 
     Tables and figures are written to the folder.
@@ -308,7 +307,7 @@ def planned(
     return evaluation.plan(suite, strategies, chosen, files), Path(out)
 
 
-def compare(folder: Path | str) -> "pd.DataFrame":
+def compare(folder: Path | str) -> Table:
     """Compare finished runs with what the regional model predicts; return a row per run.
 
     A table and figures are written beside the runs.
@@ -316,7 +315,7 @@ def compare(folder: Path | str) -> "pd.DataFrame":
     folder = Path(folder)
     finished = results.read(folder)
     with locked(folder):
-        rows = model_validation.compare(finished)
+        rows = Table(model_validation.compare(finished))
         write_table(folder / "foresight.csv", rows, float_format="%.6g")
     rows.attrs["scenario"] = finished.scenario.name
     return rows
@@ -352,7 +351,7 @@ class Tuned:
     folder: where both were written
     """
 
-    table: "pd.DataFrame"
+    table: Table
     best: "Options | None"
     text: str
     folder: Path
@@ -407,7 +406,7 @@ def tune(
     table = tuning.tune(order, workers=workers, time_limit=time_limit, progress=progress)
     best = strategy.options(tuning.best_of(order, table))
     text = (order.out / "tune.toml").read_text(encoding="utf-8")
-    return Tuned(table=table, best=best, text=text, folder=order.out)
+    return Tuned(table=Table(table), best=best, text=text, folder=order.out)
 
 
 def get(name: str | None, out: Path | str | None = None) -> str:

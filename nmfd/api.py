@@ -45,11 +45,11 @@ from nmfd.studies.measured import identify as identify
 from nmfd.types import Controller, Plant, Result
 
 if TYPE_CHECKING:
-    import pandas as pd
     import torch
     from torch import nn
 
     from nmfd.controllers.dpc.rollout import Trajectories
+    from nmfd.runs.frame import Table
 
     Cost: TypeAlias = Callable[[Trajectories], torch.Tensor]
     Sample: TypeAlias = Callable[[torch.Generator, int], tuple]
@@ -207,7 +207,7 @@ def benchmark(
     time_limit: float | None = None,
     overwrite: bool = False,
     progress: Progress = None,
-) -> "pd.DataFrame":
+) -> "Table":
     """Run controllers x seeds with a run folder, as `nmfd benchmark`; return one row per run.
 
         >>> rows = nmfd.benchmark("economic_mpc", ["no-control", nmfd.PiGating()], out="runs/mine")
@@ -292,7 +292,7 @@ def robustness(
     time_limit: float | None = None,
     overwrite: bool = False,
     progress: Progress = None,
-) -> "pd.DataFrame":
+) -> "Table":
     """Run controllers, and no control, in perturbed scenarios; draw the gain and return the runs.
 
     kind: "demand", "demand-total", "mfd-scale", "mfd-axis" or "trip-lengths"

@@ -24,6 +24,7 @@ from cosim.plant.strategy import Strategy
 from nmfd.api import load_scenario
 from nmfd.model.scenario import Scenario
 from nmfd.runs import config, files
+from nmfd.runs.frame import Table
 from nmfd.runs.run_many import TABLE, Run, read_manifest, run_many
 from nmfd.runs.tables import markdown_table
 from nmfd.types import HOST_TIMES
@@ -59,7 +60,7 @@ def read_suite(
     return scenarios, suite.seeds
 
 
-def evaluate(runs: Sequence[Run], out: Path, **how: Any) -> pd.DataFrame:
+def evaluate(runs: Sequence[Run], out: Path, **how: Any) -> Table:
     """Do the runs that are not in `out`, write the tables, and return one row per run; how: see
     nmfd.runs.run_many."""
     rows = run_many(runs, out, **how)

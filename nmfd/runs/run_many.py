@@ -38,7 +38,7 @@ from nmfd.runs.progress import Progress, watched
 from nmfd.types import Result
 
 if TYPE_CHECKING:
-    import pandas as pd
+    from nmfd.runs.frame import Table
 
 MANIFEST, TABLE, LOCK = "manifest.json", "runs.csv", ".lock"
 DASK_PATIENCE_S = 10.0  # for the scheduler to answer
@@ -107,7 +107,7 @@ def run_many(
     time_limit: float | None = None,
     overwrite: bool = False,
     progress: Progress = None,
-) -> "pd.DataFrame":
+) -> "Table":
     """Do the `runs` whose files are not in the folder `out`, and return one row per run.
 
     Columns are those of `nmfd.metrics.summary`, `folder` if there are several, and `failure`: "" of
@@ -180,7 +180,7 @@ def check_names(runs: Sequence[Run]) -> None:
             raise InputError(f"controller {run.place.controller}: {problem}; shorten it")
 
 
-def raise_failures(rows: "pd.DataFrame") -> None:
+def raise_failures(rows: "Table") -> None:
     """Raise RunFailed that names all failed runs in the rows of `run_many`."""
     failed = rows[rows["failure"] != ""]
     if len(failed):
@@ -400,14 +400,16 @@ def place_of(file: str) -> Place:
     return Place(match["folder"] or "", unquote(match["controller"]), int(match["seed"]))
 
 
-def _table(rows: Sequence[dict]) -> "pd.DataFrame":
-    import pandas as pd
+def _table(rows: Sequence[dict]) -> "Table":
+    from nmfd.runs.frame import Table  # pandas takes half a second
 
     if not rows:
-        return pd.DataFrame(columns=["controller", "seed", "failure"])
-    table = pd.DataFrame(rows)
+        return Table(columns=["controller", "seed", "failure"])
+    table = Table(rows)
     table.insert(len(table.columns) - 1, "failure", table.pop("failure"))
-    return table if any(table["folder"]) else table.drop(columns="folder")
+    if not any(table["folder"]):
+        del table["folder"]
+    return table
 
 
 def provenance() -> dict:

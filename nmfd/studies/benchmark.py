@@ -30,6 +30,8 @@ from nmfd.types import Plant, Result
 if TYPE_CHECKING:
     import pandas as pd
 
+    from nmfd.runs.frame import Table
+
 PLANTS: dict[str, Callable[[Scenario], Plant]] = {"nmfd": NmfdPlant, "acyclic": AcyclicPlant}
 REFERENCE = "no-control"
 CAPTION = (
@@ -146,9 +148,7 @@ def lower_bound(scenario: Scenario, strategy: Strategy, plant: str) -> float:
         return math.nan
 
 
-def with_bounds(
-    rows: "pd.DataFrame", lower: Mapping[tuple[str, float], float], level: float
-) -> "pd.DataFrame":
+def with_bounds(rows: "Table", lower: Mapping[tuple[str, float], float], level: float) -> "Table":
     """Return the rows with columns `lower_bound_veh_s`, and `impossible` of a row below it.
 
     lower: (controller, factor of the demand) -> lower bound (veh s)
@@ -160,9 +160,10 @@ def with_bounds(
         if math.isnan(factor):
             factor = level
         bounds.append(lower.get((row["controller"], factor), math.nan))
-    rows = rows.assign(lower_bound_veh_s=bounds)
+    rows["lower_bound_veh_s"] = bounds
     spent = rows.get("total_time_spent_veh_s", math.nan)
-    return rows.assign(impossible=spent < rows["lower_bound_veh_s"] * (1.0 - BOUND_TOLERANCE))
+    rows["impossible"] = spent < rows["lower_bound_veh_s"] * (1.0 - BOUND_TOLERANCE)
+    return rows
 
 
 def draw(folder: Path, scenarios: Mapping[float, Scenario], rows: "pd.DataFrame") -> None:
