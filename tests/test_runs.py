@@ -196,7 +196,7 @@ def test_runs_are_done_once_and_come_in_the_order_asked_for(tmp_path):
     assert list(again["controller"]) == ["c", "a", "b"]
     assert len(calls) == 3
     pd.testing.assert_frame_equal(
-        pd.read_csv(out / "runs.csv", keep_default_na=False), again, check_dtype=False
+        again, pd.read_csv(out / "runs.csv", keep_default_na=False), check_dtype=False
     )
     manifest = read_manifest(out)
     assert [session["seeds"] for session in manifest["sessions"]] == [[0, 1], [0]]
