@@ -1,10 +1,10 @@
-"""Many independent runs in a folder: finished ones are skipped, each result is written whole or not
-at all.
+"""Many independent runs in a folder.
 
-<folder>/manifest.json                       keys of all runs; commands, commits, versions and seeds of all sessions
-<folder>/runs.csv                            one row per run (nmfd.metrics.summary), the reason of a failure in the last
-                                             column
-<folder>/[<subfolder>/]<controller>-<seed>.nc    the Dataset of a run (nmfd.types.Result)
+Finished ones are skipped. Each result is written whole or not at all.
+
+<folder>/manifest.json    keys of all runs; commands, commits, versions and seeds of all sessions
+<folder>/runs.csv         one row per run (nmfd.metrics.summary), the reason of a failure last
+<folder>/[<subfolder>/]<controller>-<seed>.nc    Dataset of a run (nmfd.types.Result)
 """
 
 import json
@@ -38,7 +38,9 @@ from nmfd.types import Result
 if TYPE_CHECKING:
     import pandas as pd
 
-MANIFEST, TABLE, LOCK = "manifest.json", "runs.csv", ".lock"
+MANIFEST = "manifest.json"
+TABLE = "runs.csv"
+LOCK = ".lock"
 DASK_PATIENCE_S = 10.0  # for the scheduler to answer
 LONGER = 10.0  # time limit of a run, in expected times
 LEAST_LIMIT_S = 600.0
@@ -85,7 +87,7 @@ def run_many(
     time_limit: float | None = None,
     progress: Progress = None,
 ) -> "pd.DataFrame":
-    """Do the `runs` whose files are not in the folder `out`, and return one row per run.
+    """Do the runs whose files are not in a folder; return one row per run.
 
     Columns are those of `nmfd.metrics.summary`, `folder` if there are several, and `failure`: "" of
     a finished run, else the reason with file and line. Finished runs of earlier calls that share
@@ -102,18 +104,17 @@ def run_many(
     out = Path(out)
     with locked(out):
         keys = _write_manifest(out, runs, workers)
-        rows = {
-            file: _row(file, result)
-            for file, key in keys.items()
-            if (result := _finished(out / file, key))
-        }
+        rows = {}
+        for file, key in keys.items():
+            result = _finished(out / file, key)
+            if result is not None:
+                rows[file] = _row(file, result)
         todo = [run for run in runs if run.file not in rows]
         minutes = sum(run.expected for run in todo) / max(workers, 1) / 60.0
-        if said := minutes > 0.5 and scheduler is None:
-            print(
-                f"{len(todo)} runs take about {minutes:.0f} min, {workers} at a time",
-                file=sys.stderr,
-            )
+        said = minutes > 0.5 and scheduler is None
+        if said:
+            text = f"{len(todo)} runs take about {minutes:.0f} min, {workers} at a time"
+            print(text, file=sys.stderr)
         try:
             with (
                 watched("runs", progress, said=said) as show,
@@ -130,9 +131,8 @@ def run_many(
                     if show:
                         show(done, len(todo), run.name)
         except KeyboardInterrupt:
-            raise KeyboardInterrupt(
-                f"finished runs are in {out}; the same command with --out {out} goes on"
-            ) from None
+            kept = f"finished runs are in {out}; the same command with --out {out} goes on"
+            raise KeyboardInterrupt(kept) from None
         finally:
             table = _table([rows[file] for file in keys if file in rows])
             write_table(out / TABLE, table)
@@ -143,18 +143,14 @@ def raise_failures(rows: "pd.DataFrame") -> None:
     """Raise RunFailed that names all failed runs in the rows of `run_many`."""
     failed = rows[rows["failure"] != ""]
     if len(failed):
-        labels = failed["controller"] + ", seed " + failed["seed"].astype(str)
-        raise RunFailed(
-            "; ".join(
-                f"{label}: {why}" for label, why in zip(labels, failed["failure"], strict=True)
-            )
-        )
+        runs = failed["controller"] + ", seed " + failed["seed"].astype(str)
+        raise RunFailed("; ".join(runs + ": " + failed["failure"]))
 
 
 def _outcomes(
     todo: Sequence[Run], workers: int, scheduler: str | None, time_limit: float | None
 ) -> Generator[tuple[Run, Any]]:
-    """Yield every run with its result or the reason of its failure, as they end."""
+    """Yield runs as they end, each with its result or the reason of its failure."""
     if scheduler is not None and todo:
         with _dask(scheduler) as executor:
             futures = {executor.submit(in_subprocess, run.job, os.getcwd()): run for run in todo}
@@ -172,16 +168,19 @@ def _outcomes(
 
 @contextmanager
 def _dask(address: str) -> Iterator[Executor]:
-    """Connect to a Dask scheduler; its workers see the same files under the same paths. Raises
-    InputError."""
+    """Connect to a Dask scheduler.
+
+    Its workers see the same files under the same paths. Raises: InputError
+    """
     need("--scheduler", "dask", "distributed")
     from distributed import Client  # of an extra
 
     try:
         client = Client(address, timeout=DASK_PATIENCE_S, set_as_default=False)
     except (OSError, ValueError, TypeError, RuntimeError) as error:
+        reason = " ".join(str(error).split())
         raise InputError(
-            f"--scheduler: no Dask scheduler answers at {address!r} ({' '.join(str(error).split())}); start one with "
+            f"--scheduler: no Dask scheduler answers at {address!r} ({reason}); start one with "
             "'dask scheduler' and give its address, such as tcp://host:8786"
         ) from None
     executor = client.get_executor(pure=False)
@@ -194,11 +193,13 @@ def _dask(address: str) -> Iterator[Executor]:
 
 @contextmanager
 def locked(out: Path, mark: str = MANIFEST) -> Iterator[None]:
-    """Make the folder, hold it against other processes, and remove it if nothing comes into it.
-    Raises InputError.
+    """Make a folder and hold it against other processes.
 
-    mark: file that a folder with other files must hold. A command holds its folder around its runs,
-        tables and figures
+    It is removed if nothing comes into it. A command holds its folder around its runs, tables and
+    figures.
+
+    mark: file that a folder with other files must hold
+    Raises: InputError
     """
     check_name(out)
     remedy = "choose another folder with --out"
@@ -215,27 +216,34 @@ def locked(out: Path, mark: str = MANIFEST) -> Iterator[None]:
                 if [path.name for path in out.glob("*")] == [LOCK]:
                     shutil.rmtree(out, ignore_errors=True)
     except Timeout:
-        raise InputError(
-            f"{out}: another process is writing to it; wait for its end, or {remedy}"
-        ) from None
+        problem = "another process is writing to it; wait for its end"
+        raise InputError(f"{out}: {problem}, or {remedy}") from None
 
 
 def read_manifest(folder: Path) -> dict:
-    """Return manifest.json of a folder of runs: its folders and sessions. Raises InputError."""
+    """Return manifest.json of a folder of runs: its folders and sessions.
+
+    Raises: InputError
+    """
+    file = folder / MANIFEST
     try:
-        content = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
-        content["folders"].items(), content["sessions"][0]
+        content = json.loads(file.read_text(encoding="utf-8"))
+        content["folders"].items()
+        content["sessions"][0]
     except (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError):
-        raise InputError(
-            f"{folder / MANIFEST}: is no manifest of runs; choose another folder with --out"
-        ) from None
+        remedy = "choose another folder with --out"
+        raise InputError(f"{file}: is no manifest of runs; {remedy}") from None
     return content
 
 
 def _write_manifest(out: Path, runs: Sequence[Run], workers: int) -> dict[str, dict]:
-    """Add `runs` and this session to the manifest; return file -> key of these runs, then of others
-    in the folders."""
-    manifest = read_manifest(out) if (out / MANIFEST).is_file() else {"folders": {}, "sessions": []}
+    """Add `runs` and this session to the manifest.
+
+    Return file -> key: of these runs, then of others in the folders.
+    """
+    manifest: dict = {"folders": {}, "sessions": []}
+    if (out / MANIFEST).is_file():
+        manifest = read_manifest(out)
     folders = manifest["folders"]
     for run in runs:
         key = json.loads(json.dumps(run.key))
@@ -246,30 +254,28 @@ def _write_manifest(out: Path, runs: Sequence[Run], workers: int) -> dict[str, d
     seeds = sorted({_place(run.file)[2] for run in runs})
     manifest["sessions"].append({**provenance(), "seeds": seeds, "workers": workers})
     write_text(out / MANIFEST, json.dumps(manifest, indent=2) + "\n")
-    there = [
-        path.relative_to(out).as_posix()
-        for name in folders
-        for path in sorted((out / name).glob("[!.]*-*.nc"))
-    ]
+    there = [run.file for run in runs]
+    for name in folders:
+        for path in sorted((out / name).glob("[!.]*-*.nc")):
+            there.append(path.relative_to(out).as_posix())
     keys = {}
-    for file in (*(run.file for run in runs), *there):
+    for file in there:
         folder, controller, _ = _place(file)
-        if controller in folders[folder]["controllers"]:
-            keys[file] = {
-                **folders[folder]["key"],
-                "controller": folders[folder]["controllers"][controller],
-            }
+        controllers = folders[folder]["controllers"]
+        if controller in controllers:
+            keys[file] = {**folders[folder]["key"], "controller": controllers[controller]}
     return keys
 
 
 def _finished(path: Path, key: Mapping) -> Result | None:
-    """Return the result in `path`; None if there is none, or its key is another one."""
+    """Return the result in `path`; None if there is none with this key."""
     try:
         result = Result.read(path)
         kept = json.loads(result.key)
     except (InputError, AttributeError, ValueError):  # missing, cut off, or not of this package
         return None
-    if changed := sorted(name for name in {**kept, **key} if kept.get(name) != key.get(name)):
+    changed = sorted(name for name in {**kept, **key} if kept.get(name) != key.get(name))
+    if changed:
         with suppress(BrokenPipeError):  # perhaps nobody reads on
             print(f"{path}: out of date, {', '.join(changed)} changed", file=sys.stderr)
         return None
@@ -277,12 +283,11 @@ def _finished(path: Path, key: Mapping) -> Result | None:
 
 
 def _row(file: str, outcome: Result | str) -> dict:
-    row = dict(zip(("folder", "controller", "seed"), _place(file), strict=True))
-    return (
-        {**row, "failure": outcome}
-        if isinstance(outcome, str)
-        else {**row, **summary(outcome), "failure": ""}
-    )
+    folder, controller, seed = _place(file)
+    row = {"folder": folder, "controller": controller, "seed": seed}
+    if isinstance(outcome, str):
+        return {**row, "failure": outcome}
+    return {**row, **summary(outcome), "failure": ""}
 
 
 def _place(file: str) -> tuple[str, str, int]:
@@ -299,11 +304,16 @@ def _table(rows: Sequence[dict]) -> "pd.DataFrame":
         return pd.DataFrame(columns=["controller", "seed", "failure"])
     table = pd.DataFrame(rows)
     table.insert(len(table.columns) - 1, "failure", table.pop("failure"))
-    return table if any(table["folder"]) else table.drop(columns="folder")
+    if not any(table["folder"]):
+        del table["folder"]
+    return table
 
 
 def provenance() -> dict:
-    """Return date, command, versions, and the commit of the checkout, None outside one."""
+    """Return date, command, versions, and the commit of the checkout.
+
+    The commit is None outside a checkout.
+    """
     commit, dirty = _checkout()
     versions = {"python": platform.python_version(), "perimeter-cosim": __version__}
     for package in PACKAGES:
@@ -320,22 +330,22 @@ def provenance() -> dict:
 
 @cache
 def _checkout() -> tuple[str | None, bool | None]:
-    """Return the commit of this package, and whether files differ from it, at the first call."""
+    """Return the commit of this package, and True if files differ from it.
+
+    Both are those at the first call.
+    """
+    here = Path(__file__).resolve()
 
     def git(*arguments: str) -> str:
-        command = [
-            "git",
-            "--no-optional-locks",
-            "-C",
-            str(Path(__file__).resolve().parent),
-            *arguments,
-        ]
-        return subprocess.run(
-            command, capture_output=True, text=True, timeout=10, check=True
-        ).stdout.strip()
+        command = ["git", "--no-optional-locks", *arguments]
+        done = subprocess.run(
+            command, cwd=here.parent, capture_output=True, text=True, timeout=10, check=True
+        )
+        return done.stdout.strip()
 
-    try:  # an installed copy may lie inside another checkout: the commit counts only if this file is tracked
-        git("ls-files", "--error-unmatch", Path(__file__).name)
+    try:
+        # An installed copy may lie inside another checkout, which does not track this file.
+        git("ls-files", "--error-unmatch", here.name)
         return git("rev-parse", "HEAD"), bool(git("status", "--porcelain", "--untracked-files=no"))
     except (OSError, subprocess.SubprocessError):
         return None, None
