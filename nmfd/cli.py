@@ -140,7 +140,10 @@ class Commands(click.Group):
 
 
 def combined(*decorators: Callable) -> Callable:
-    """Return one decorator that applies several, so that their options appear in this order."""
+    """Return one decorator that applies several.
+
+    Their options appear in this order.
+    """
 
     def decorate(command: Callable) -> Callable:
         for decorator in reversed(decorators):
@@ -282,7 +285,10 @@ def seed_option(text: str = "Random seed.") -> Callable:
 def out_option(
     default: str, text: str = "Run folder; finished runs in it are not repeated."
 ) -> Callable:
-    """Return the option --out of a folder; `default` says where results go without it."""
+    """Return the option --out of a folder.
+
+    default: where results go without it
+    """
     return click.option("--out", type=FOLDER, metavar="DIR", help=f"{text} [default: {default}]")
 
 
@@ -303,7 +309,7 @@ def out_option(
 )
 @VERSION
 def main() -> None:
-    """Perimeter control and route guidance on the regional traffic model (NMFD).
+    """Perimeter control and route guidance on the regional model (NMFD).
 
     \b
     Begin with `nmfd show`, then

@@ -101,7 +101,9 @@ class Observation:
 
 @dataclass(frozen=True, kw_only=True)
 class Controls:
-    """Command of a controller for one control interval; `Controls(perimeter=u)` is enough.
+    """Command of a controller for one control interval.
+
+    `Controls(perimeter=u)` is enough.
 
     perimeter: u_ih, share of the desired transfer flow from i to h that may pass
         (-, (R, R) [i, h]); ignored where h is not adjacent to i
@@ -404,7 +406,7 @@ class Result:
         return name in self.data.variables
 
     def assign(self, **values: Any) -> "Result":
-        """Return the result with other arrays of its variables, or other attributes."""
+        """Return the result with other arrays or other attributes."""
         data = self.data.copy()
         for name, value in values.items():
             if name in data.variables:

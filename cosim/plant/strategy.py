@@ -1,4 +1,6 @@
-"""Strategies in a city: a controller, and what else the city does, as words or as Settings.
+"""Strategies in a city: a controller and what else the city does.
+
+Words or Settings say what the city does:
 
 dpc-pc+max-pressure      max-pressure at all signals, DPC limits the green of the gateways
 no-control+rerouting-30  no control, 30 % of the drivers reroute; `rerouting-30` for short
@@ -28,7 +30,10 @@ class Word(NamedTuple):
 
 
 class Number(NamedTuple):
-    """Word with a number N, WORD-N, from `least` to `largest`; percent become shares."""
+    """Word with a number, WORD-N with N from `least` to `largest`.
+
+    Percent become shares.
+    """
 
     key: str
     least: int
@@ -118,7 +123,10 @@ def parse(controller: ControllerLike, city: Settings | str | None = None) -> Str
 
 
 def of_finished(name: str) -> Strategy:
-    """Return the strategy of finished runs; only the name is known of the user's objects."""
+    """Return the strategy of finished runs.
+
+    Only the name is known of the user's objects.
+    """
     try:
         return parse(name)
     except InputError:
@@ -140,7 +148,10 @@ def label_of(key: str, value: Any) -> str:
 
 
 def setting_of(word: str) -> tuple[str, Any] | None:
-    """Return key and value of the setting that a word means, None if there is no such word."""
+    """Return key and value of the setting that a word means.
+
+    It is None if there is no such word.
+    """
     plain = _plain_words().get(word)
     if plain is not None:
         return plain.key, plain.value
@@ -192,7 +203,10 @@ def _with_words(strategy: Strategy, words: tuple[str, ...]) -> Strategy:
 
 
 def _with_city(strategy: Strategy, city: Settings | str) -> Strategy:
-    """Return a strategy with more changes of the city. Raise InputError if two differ."""
+    """Return a strategy with more changes of the city.
+
+    Raises: InputError if two of them exclude each other
+    """
     if isinstance(city, str):
         words = tuple(word for word in city.split("+") if word)
         name = "+".join([strategy.name, *words])
@@ -215,7 +229,10 @@ def _with_city(strategy: Strategy, city: Settings | str) -> Strategy:
 
 
 def _check_controller(name: str, first: str) -> None:
-    """Raise InputError that knows the words, too, if there is no such controller."""
+    """Check that there is such a controller.
+
+    Raises: InputError that knows the words, too
+    """
     try:
         regional.parse(first)
     except InputError as error:

@@ -1,4 +1,4 @@
-"""Controllers of the user's own: a class in a file, `path/to/file.py:Class`.
+"""Controllers of the user's own: classes `path/to/file.py:Class`.
 
 template.py shows how to write one.
 """

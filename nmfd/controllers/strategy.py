@@ -405,7 +405,9 @@ def split(name: str) -> tuple[str, tuple[str, ...]]:
 
 
 def named(options: Options) -> BuiltIn:
-    """Return a built-in controller with given options, which its name contains.
+    """Return a built-in controller with given options.
+
+    Its name contains them.
 
     >>> named(PiGating(kp=2.0)).name
     'pi-gating(kp=2.0)'

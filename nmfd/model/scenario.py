@@ -145,7 +145,7 @@ class Scenario(Horizon):
             self.protected,
             self.controller_options,
         ]
-        # A hash from before an option existed stays valid where the option is not used.
+        # What is not used does not count: hashes of finished runs stay valid.
         if self.faults:
             content.append(self.faults)
         if self.process_std:
@@ -299,7 +299,10 @@ def perturbed(scenario: Scenario, sigma: float, seed: int, kind: str = "demand")
 
 
 class DemandTable(Settings):
-    """One flow, a trapezoid over time; flows of the same pair of regions add up."""
+    """One flow, a trapezoid over time.
+
+    Flows of the same pair of regions add up.
+    """
 
     origin: config.Region = setting("origin region", alias="from")
     to: config.Region = setting("destination region")
@@ -444,7 +447,11 @@ def read_tables(folder: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
 
 
 def _relocate(own: dict, folder: Path, here: Path) -> None:
-    """Rewrite the paths in a scenario.toml in `folder` relative to the folder `here`."""
+    """Rewrite the paths of a scenario.toml, so that they begin elsewhere.
+
+    folder: where they begin now
+    here: where they shall begin
+    """
 
     def seen(name: str, *kinds: str) -> str:
         return files.relative(shipped.found(name, *kinds, beside=folder), here)
@@ -502,9 +509,9 @@ def _demand(table: ScenarioTable, network: RegionalModel, folder: Path) -> Pairs
 
 
 def _demand_rows(path: Path, regions: int) -> np.ndarray:
-    """Return the rows of a csv file: interval, origin, destination, flow (veh/s).
+    """Return the rows of a csv file of demand.
 
-    Raises: InputError
+    They hold interval, origin, destination and flow (veh/s). Raises: InputError
     """
     files.check_file(path, "give a csv file")
     try:

@@ -161,11 +161,11 @@ def _first_problem(invalid: ValidationError) -> str:
     path = ""
     for place in first["loc"]:
         path += f"[{place}]" if isinstance(place, int) else f".{place}"
+    path = path.lstrip(".")
     problem = first.get("ctx", {}).get("error")
     if isinstance(problem, Problem):
-        path = f"{path}.{problem.key}".lstrip(".")
-        return f"{path}: {problem}"
-    path = path.lstrip(".")
+        parts = [part for part in (path, problem.key) if part]
+        return f"{'.'.join(parts)}: {problem}"
     if first["type"] == "missing":
         return f"{path}: missing; add it"
     text = re.sub(r"^(Value error, |(Input|String|Tuple|List|Value) (?=should))", "", first["msg"])

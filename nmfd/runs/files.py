@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 def atomic(path: Path) -> Iterator[Path]:
     """Yield a temporary file name beside `path`.
 
-    The file becomes `path` if the block succeeds. It has the suffix of `path`, by which matplotlib and NumPy choose the format.
+    The file becomes `path` if the block succeeds. It has the suffix of `path`, by which matplotlib
+    and NumPy choose the format.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.stem}-{os.getpid()}.tmp{path.suffix}")

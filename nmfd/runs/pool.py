@@ -185,7 +185,7 @@ def _environment(changes: Mapping[str, str]) -> Iterator[None]:
 class Watchdog:
     """Time limit (s) of decisions, as a context of each.
 
-    It ends the process of a run. Elsewhere it does nothing: in a user's own process there is Ctrl-C.
+    It ends the process of a run. In a user's own process it does nothing: there is Ctrl-C.
     """
 
     def __init__(self, limit: float):

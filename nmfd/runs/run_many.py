@@ -150,7 +150,7 @@ def raise_failures(rows: "pd.DataFrame") -> None:
 def _outcomes(
     todo: Sequence[Run], workers: int, scheduler: str | None, time_limit: float | None
 ) -> Generator[tuple[Run, Any]]:
-    """Yield runs as they end, each with its result or the reason of its failure."""
+    """Yield runs as they end, with their result or reason of failure."""
     if scheduler is not None and todo:
         with _dask(scheduler) as executor:
             futures = {executor.submit(in_subprocess, run.job, os.getcwd()): run for run in todo}
