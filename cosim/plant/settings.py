@@ -166,7 +166,7 @@ def own_files(scenario: "Scenario", names: Texts) -> list[Path]:
 
 
 def check_lanes(scenario: "Scenario", settings: Settings) -> None:
-    """Check that the mesoscopic model, which has no lanes, needs none.
+    """Check that no setting needs lanes if the city is mesoscopic.
 
     Raises: InputError
     """

@@ -213,18 +213,22 @@ def _with_city(strategy: Strategy, city: Settings | str) -> Strategy:
         return _with_words(replace(strategy, name=name), strategy.labels + words)
     if not isinstance(city, Settings):
         raise InputError(f"city: expected cosim.Settings or words, got {city!r}")
-    given = {name: getattr(city, name) for name in sorted(city.model_fields_set)}
-    own = {name: getattr(strategy.city, name) for name in strategy.city.model_fields_set}
-    for key, value in given.items():
-        if own.get(key, value) != value:
-            problem = f"{label_of(key, own[key])} and {label_of(key, value)} exclude each other"
+    values = {name: getattr(strategy.city, name) for name in strategy.city.model_fields_set}
+    labels = []
+    for key in sorted(city.model_fields_set):
+        value = getattr(city, key)
+        label = label_of(key, value)
+        if key not in values:
+            values[key] = value
+            labels.append(label)
+        elif values[key] != value:
+            problem = f"{label_of(key, values[key])} and {label} exclude each other"
             raise InputError(f"strategy {strategy.name!r}: {problem}; omit one of them")
-    labels = [label_of(key, value) for key, value in given.items() if key not in own]
     return replace(
         strategy,
         name="+".join([strategy.name, *labels]),
         labels=(*strategy.labels, *labels),
-        city=Settings(**own, **{key: given[key] for key in given if key not in own}),
+        city=Settings(**values),
     )
 
 

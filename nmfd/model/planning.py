@@ -1,6 +1,7 @@
 """Planning model of a controller.
 
-It may differ from the simulated city. It shares no array with the scenario, so that a controller cannot change the plant.
+It may differ from the simulated city. It shares no array with the scenario, so that a controller
+cannot change the plant.
 """
 
 import copy

@@ -183,9 +183,11 @@ def _environment(changes: Mapping[str, str]) -> Iterator[None]:
 
 
 class Watchdog:
-    """Time limit (s) of decisions, as a context of each.
+    """Time limit of a decision, as a context around it.
 
     It ends the process of a run. In a user's own process it does nothing: there is Ctrl-C.
+
+    limit: longest decision (s)
     """
 
     def __init__(self, limit: float):
