@@ -1,4 +1,4 @@
-"""Python interface of `cosim`: a function for every command, and single runs.
+"""Python interface of `cosim`: functions for commands and single runs.
 
 Studies return tables; the command line prints them. Bokeh and Optuna are imported in the functions
 that need them: they take a second.
@@ -115,7 +115,7 @@ def run_controllers(
     overwrite: bool = False,
     progress: Progress = None,
 ) -> Table:
-    """Run strategies on the same trips with a run folder, as `cosim run`; return a row per run.
+    """Run strategies on the same trips in a folder; return a row per run.
 
     policies: files by controller, if not SCENARIO/NAME.pt
     out: run folder, runs/SCENARIO-TIME if None; it is `table.attrs["folder"]`
@@ -148,7 +148,7 @@ def run_controllers(
 
 
 def demo(out: Path | str = "runs/demo", *, seed: int = 1000) -> Table:
-    """Run the demo city with and without gates, and write and open a page about both.
+    """Run the demo city with and without gates, and open a page about both.
 
     The page is `table.attrs["page"]`.
     """
@@ -178,7 +178,9 @@ def watch(
     port: int = 0,
     gui: bool = False,
 ) -> dict[str, dict]:
-    """Show runs on a live page until they end and the page is closed; return their figures by name.
+    """Show runs on a live page; return their figures by name.
+
+    It returns when the runs have ended and the page is closed.
 
     port: port of the page, any that is free if 0
     gui: show the first run in sumo-gui instead; nothing is returned if its window is closed early
@@ -220,7 +222,7 @@ def evaluate(
     overwrite: bool = False,
     progress: Progress = None,
 ) -> Table:
-    """Run controllers x seeds x demand levels in SUMO, as `cosim evaluate`; return a row per run.
+    """Run controllers x seeds x demand levels; return a row per run.
 
     Tables and figures are written to the folder.
 
@@ -283,7 +285,10 @@ def planned(
     policies: Mapping[str, Path | str] | None = None,
     out: Path | str | None = None,
 ) -> tuple[list[Run], Path]:
-    """Return the runs of `evaluate` with these arguments, and their folder. Raise InputError."""
+    """Return the runs of `evaluate` with these arguments, and their folder.
+
+    Raises: InputError
+    """
     name = ""
     suite: list[tuple[Scenario, Sequence[float]]]
     if not isinstance(scenario, Scenario) and Path(scenario).suffix == ".toml":
@@ -308,7 +313,7 @@ def planned(
 
 
 def compare(folder: Path | str) -> Table:
-    """Compare finished runs with what the regional model predicts; return a row per run.
+    """Compare finished runs with the regional model; return a row per run.
 
     A table and figures are written beside the runs.
     """
@@ -410,14 +415,17 @@ def tune(
 
 
 def get(name: str | None, out: Path | str | None = None) -> str:
-    """Download a published city to a folder, cities/NAME if None; without a name list them."""
+    """Download a published city; without a name list them.
+
+    out: folder, cities/NAME if None
+    """
     if name is None:
         return cities.listed()
-    return cities.get(name, Path("cities") / name if out is None else Path(out))
+    return cities.get(name, Path("cities", name) if out is None else Path(out))
 
 
 def catalogue() -> dict[str, dict[str, str]]:
-    """Return what is shipped, all controllers, and all words of strategies, with a line each."""
+    """Return what is shipped, controllers, and words, with a line each."""
     words = strategies_of.vocabulary()
     return regional_catalogue() | {"Words behind a controller, for a city": words}
 
@@ -427,13 +435,16 @@ def _base(kind: BuiltIn) -> str:
 
 
 def _reference_first(strategies: Sequence[Strategy]) -> list[Strategy]:
-    """Return the strategies, first no control, else the last one: the others are compared with it."""
+    """Return the strategies, the one that others are compared with first.
+
+    It is no control, else the last one.
+    """
     turned = list(reversed(strategies))
     return sorted(turned, key=lambda strategy: strategy.name != REFERENCE)
 
 
 def _has_screen() -> bool:
-    """Return True if a browser may be opened: there is a screen and a terminal."""
+    """Return True if there are a screen for a browser and a terminal."""
     screen = not sys.platform.startswith("linux")
     screen |= "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
     return screen and sys.stdout.isatty()

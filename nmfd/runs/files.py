@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all; names and fingerprints of files and folders."""
+"""Files that are written whole or not at all; names and fingerprints."""
 
 import hashlib
 import os
@@ -27,10 +27,10 @@ NEW_S = 2.0  # age up to which a temporary folder is left alone
 
 @contextmanager
 def atomic(path: Path) -> Iterator[Path]:
-    """Yield a temporary file name in the folder of `path`, which becomes `path` if the block
-    succeeds.
+    """Yield a temporary file name beside `path`.
 
-    It has the suffix of `path`, by which matplotlib and NumPy choose the format.
+    The file becomes `path` if the block succeeds. It has the suffix of `path`, by which matplotlib
+    and NumPy choose the format.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.stem}-{os.getpid()}.tmp{path.suffix}")
@@ -79,13 +79,18 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_table(path: Path, frame: "pd.DataFrame", **options: str) -> None:
-    """Write `frame` as a csv file, whole or not at all; options: of DataFrame.to_csv."""
+    """Write `frame` as a csv file, whole or not at all.
+
+    options: those of DataFrame.to_csv
+    """
     write_text(path, frame.to_csv(index=False, **options))
 
 
 def check_file(path: Path, remedy: str = "give a file") -> None:
-    """Raise InputError for a folder, pipe or device, which would be read for ever; a missing file
-    is none of these."""
+    """Check that a path is a file, or does not exist.
+
+    Raises: InputError for a folder, pipe or device, which would be read for ever
+    """
     if os.path.exists(path) and not os.path.isfile(path):
         raise InputError(f"{path}: is not a file; {remedy}")
 
@@ -99,21 +104,24 @@ def check_name(path: Path | str) -> None:
     try:
         absolute.encode()
     except UnicodeEncodeError:
-        raise InputError(
-            f"{absolute}: the name is not UTF-8, and SUMO and netCDF cannot open it; rename the "
-            "file or folder"
-        ) from None
+        problem = "the name is not UTF-8, and SUMO and netCDF cannot open it"
+        raise InputError(f"{absolute}: {problem}; rename the file or folder") from None
 
 
 def file_hash(path: Path) -> str:
-    """Return a fingerprint of the bytes of a file. Raises InputError if it is not a file."""
+    """Return a fingerprint of the bytes of a file.
+
+    Raises: InputError if it is not a file
+    """
     check_file(path)
     return hashlib.sha256(Path(path).read_bytes()).hexdigest()[:16]
 
 
 def relative(path: Path, folder: Path) -> str:
-    """Return `path` relative to `folder`, with / between its parts; absolute on another drive of
-    Windows."""
+    """Return `path` relative to `folder`, with / between its parts.
+
+    On another drive of Windows, return the absolute path.
+    """
     try:
         return Path(os.path.relpath(path, folder)).as_posix()
     except ValueError:
@@ -126,7 +134,7 @@ def file_name(name: str) -> str:
 
 
 def parts_of(text: str, sign: str = ",") -> list[str]:
-    """Return the parts of a text between signs that do not stand in parentheses.
+    """Return the parts of a text between signs outside of parentheses.
 
     >>> parts_of("no-control, pi-gating(kp=2.0, ki=0.1)")
     ['no-control', 'pi-gating(kp=2.0, ki=0.1)']
@@ -136,13 +144,22 @@ def parts_of(text: str, sign: str = ",") -> list[str]:
 
 
 def run_name(controller: str, seed: int) -> str:
-    """Return the stem of the file of a run; of a controller path/to/file.py:Class, too."""
+    """Return the stem of the file of a run.
+
+    The controller may be path/to/file.py:Class.
+    """
     return f"{quote(controller, safe='+,-._ ()=')}-{seed}"
 
 
 def default_folder(scenario: str) -> Path:
-    """Return runs/<scenario>-<timestamp> in the current folder, a name that is not taken; scenario:
-    its name."""
+    """Return runs/<scenario>-<timestamp>, a name that is not taken.
+
+    scenario: its name
+    """
     stem = f"{file_name(scenario)}-{datetime.now():%Y%m%d-%H%M%S}"
-    names = (stem, *(f"{stem}-{n}" for n in range(2, 1000)))
-    return next(Path("runs", name) for name in names if not Path("runs", name).exists())
+    folder = Path("runs", stem)
+    number = 1
+    while folder.exists():
+        number += 1
+        folder = Path("runs", f"{stem}-{number}")
+    return folder

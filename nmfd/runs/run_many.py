@@ -1,10 +1,10 @@
-"""Many independent runs in a folder: finished ones are skipped, each result is written whole or not
-at all.
+"""Many independent runs in a folder.
 
-<folder>/manifest.json                       keys of all runs; commands, commits, versions and seeds of all sessions
-<folder>/runs.csv                            one row per run (nmfd.metrics.summary), the reason of a failure in the last
-                                             column
-<folder>/[<subfolder>/]<controller>-<seed>.nc    the Dataset of a run (nmfd.types.Result)
+Finished ones are skipped. Each result is written whole or not at all.
+
+<folder>/manifest.json    keys of all runs; commands, commits, versions and seeds of all sessions
+<folder>/runs.csv         one row per run (nmfd.metrics.summary), the reason of a failure last
+<folder>/[<subfolder>/]<controller>-<seed>.nc    Dataset of a run (nmfd.types.Result)
 """
 
 import json
@@ -40,7 +40,9 @@ from nmfd.types import Result
 if TYPE_CHECKING:
     from nmfd.runs.frame import Table
 
-MANIFEST, TABLE, LOCK = "manifest.json", "runs.csv", ".lock"
+MANIFEST = "manifest.json"
+TABLE = "runs.csv"
+LOCK = ".lock"
 DASK_PATIENCE_S = 10.0  # for the scheduler to answer
 RUN_FILE = re.compile(r"((?P<folder>.+)/)?(?P<controller>[^/]+)-(?P<seed>\d+)\.nc")
 LONGEST_NAME = 200  # of a run (bytes); systems allow 255, some of which temporary files need
@@ -108,7 +110,7 @@ def run_many(
     overwrite: bool = False,
     progress: Progress = None,
 ) -> "Table":
-    """Do the `runs` whose files are not in the folder `out`, and return one row per run.
+    """Do the runs whose files are not in a folder; return one row per run.
 
     Columns are those of `nmfd.metrics.summary`, `folder` if there are several, and `failure`: "" of
     a finished run, else the reason with file and line. Finished runs of earlier calls that share
@@ -142,11 +144,10 @@ def run_many(
                 rows[file] = kept[file].row
         todo = [run for run in runs if run.file not in rows]
         minutes = sum(run.expected for run in todo) / max(workers, 1) / 60.0
-        if said := minutes > 0.5 and scheduler is None:
-            print(
-                f"{len(todo)} runs take about {minutes:.0f} min, {workers} at a time",
-                file=sys.stderr,
-            )
+        said = minutes > 0.5 and scheduler is None
+        if said:
+            text = f"{len(todo)} runs take about {minutes:.0f} min, {workers} at a time"
+            print(text, file=sys.stderr)
         try:
             with (
                 watched("runs", progress, said=said) as show,
@@ -163,9 +164,8 @@ def run_many(
                     if show:
                         show(done, len(todo), run.name)
         except KeyboardInterrupt:
-            raise KeyboardInterrupt(
-                f"finished runs are in {out}; the same command with --out {out} goes on"
-            ) from None
+            left = f"finished runs are in {out}; the same command with --out {out} goes on"
+            raise KeyboardInterrupt(left) from None
         finally:
             table = _table([rows[file] for file in keys if file in rows])
             write_table(out / TABLE, table)
@@ -184,18 +184,14 @@ def raise_failures(rows: "Table") -> None:
     """Raise RunFailed that names all failed runs in the rows of `run_many`."""
     failed = rows[rows["failure"] != ""]
     if len(failed):
-        labels = failed["controller"] + ", seed " + failed["seed"].astype(str)
-        raise RunFailed(
-            "; ".join(
-                f"{label}: {why}" for label, why in zip(labels, failed["failure"], strict=True)
-            )
-        )
+        runs = failed["controller"] + ", seed " + failed["seed"].astype(str)
+        raise RunFailed("; ".join(runs + ": " + failed["failure"]))
 
 
 def _outcomes(
     todo: Sequence[Run], workers: int, scheduler: str | None, time_limit: float | None
 ) -> Generator[tuple[Run, Any]]:
-    """Yield every run with its result or the reason of its failure, as they end."""
+    """Yield runs as they end, with their result or reason of failure."""
     if scheduler is not None and todo:
         with _dask(scheduler) as executor:
             futures = {executor.submit(in_subprocess, run.job, os.getcwd()): run for run in todo}
@@ -213,16 +209,19 @@ def _outcomes(
 
 @contextmanager
 def _dask(address: str) -> Iterator[Executor]:
-    """Connect to a Dask scheduler; its workers see the same files under the same paths. Raises
-    InputError."""
+    """Connect to a Dask scheduler.
+
+    Its workers see the same files under the same paths. Raises: InputError
+    """
     need("--scheduler", "dask", "distributed")
     from distributed import Client  # of an extra
 
     try:
         client = Client(address, timeout=DASK_PATIENCE_S, set_as_default=False)
     except (OSError, ValueError, TypeError, RuntimeError) as error:
+        reason = " ".join(str(error).split())
         raise InputError(
-            f"--scheduler: no Dask scheduler answers at {address!r} ({' '.join(str(error).split())}); start one with "
+            f"--scheduler: no Dask scheduler answers at {address!r} ({reason}); start one with "
             "'dask scheduler' and give its address, such as tcp://host:8786"
         ) from None
     executor = client.get_executor(pure=False)
@@ -235,11 +234,13 @@ def _dask(address: str) -> Iterator[Executor]:
 
 @contextmanager
 def locked(out: Path, mark: str = MANIFEST) -> Iterator[None]:
-    """Make the folder, hold it against other processes, and remove it if nothing comes into it.
-    Raises InputError.
+    """Make a folder and hold it against other processes.
 
-    mark: file that a folder with other files must hold. A command holds its folder around its runs,
-        tables and figures
+    It is removed if nothing comes into it. A command holds its folder around its runs, tables and
+    figures.
+
+    mark: file that a folder with other files must hold
+    Raises: InputError
     """
     check_name(out)
     remedy = "choose another folder with --out"
@@ -256,9 +257,8 @@ def locked(out: Path, mark: str = MANIFEST) -> Iterator[None]:
                 if [path.name for path in out.glob("*")] == [LOCK]:
                     shutil.rmtree(out, ignore_errors=True)
     except Timeout:
-        raise InputError(
-            f"{out}: another process is writing to it; wait for its end, or {remedy}"
-        ) from None
+        problem = "another process is writing to it; wait for its end"
+        raise InputError(f"{out}: {problem}, or {remedy}") from None
 
 
 class FolderOfRuns(BaseModel):
@@ -276,7 +276,10 @@ class Manifest(BaseModel):
 
 
 def read_manifest(folder: Path) -> dict:
-    """Return manifest.json of a folder of runs: its folders and sessions. Raise InputError."""
+    """Return manifest.json of a folder of runs: its folders and sessions.
+
+    Raises: InputError
+    """
     file = folder / MANIFEST
     check_file(file)
     try:
@@ -413,7 +416,10 @@ def _table(rows: Sequence[dict]) -> "Table":
 
 
 def provenance() -> dict:
-    """Return date, command, versions, and the commit of the checkout, None outside one."""
+    """Return date, command, versions, and the commit of the checkout.
+
+    The commit is None outside a checkout.
+    """
     commit, dirty = _checkout()
     versions = {"python": platform.python_version(), "perimeter-cosim": __version__}
     for package in PACKAGES:
@@ -430,22 +436,22 @@ def provenance() -> dict:
 
 @cache
 def _checkout() -> tuple[str | None, bool | None]:
-    """Return the commit of this package, and whether files differ from it, at the first call."""
+    """Return the commit of this package, and True if files differ from it.
+
+    Both are those at the first call.
+    """
+    here = Path(__file__).resolve()
 
     def git(*arguments: str) -> str:
-        command = [
-            "git",
-            "--no-optional-locks",
-            "-C",
-            str(Path(__file__).resolve().parent),
-            *arguments,
-        ]
-        return subprocess.run(
-            command, capture_output=True, text=True, timeout=10, check=True
-        ).stdout.strip()
+        command = ["git", "--no-optional-locks", *arguments]
+        done = subprocess.run(
+            command, cwd=here.parent, capture_output=True, text=True, timeout=10, check=True
+        )
+        return done.stdout.strip()
 
-    try:  # an installed copy may lie inside another checkout: the commit counts only if this file is tracked
-        git("ls-files", "--error-unmatch", Path(__file__).name)
+    try:
+        # An installed copy may lie inside another checkout, which does not track this file.
+        git("ls-files", "--error-unmatch", here.name)
         return git("rev-parse", "HEAD"), bool(git("status", "--porcelain", "--untracked-files=no"))
     except (OSError, subprocess.SubprocessError):
         return None, None
