@@ -20,7 +20,7 @@ from scipy.spatial import ConvexHull, Delaunay, QhullError
 
 from nmfd.arrays import Adjacency, Points
 from nmfd.errors import InputError
-from nmfd.model import detector_tables, mfd
+from nmfd.model import detector_doubts, detector_tables, mfd
 from nmfd.model.detector_tables import VEHICLE_LENGTH_M
 from nmfd.model.regional_model import NetworkTable, RegionalModel, network_toml
 from nmfd.runs import config, files
@@ -34,8 +34,10 @@ LEAST_REPORTING = (
 STOP_LINE_KM = 0.03  # before a junction, where queues stand
 FAR = 3.0  # times the median distance between neighbouring detectors: no boundary lies between
 LEAST_COVERAGE, BIASED_SHARE, LEAST_DAYS = 0.3, 0.5, 3
+LEAST_INTERVALS = 100  # of a region: a rush hour alone has fewer
 UNKNOWN, SMALL, LOOPS = "coverage unknown", "low coverage", "loops at stop lines"
 ASSUMED, SINGLE, LEFT = "trip length assumed", "days", "detectors left out"
+SHORT, MISCOUNT = "intervals", "odd counts"
 MEANINGS = {
     **fit_quality.MEANINGS,
     UNKNOWN: "accumulation and outflow are those of links with detectors; give lane_km with --about",
@@ -43,6 +45,8 @@ MEANINGS = {
     LOOPS: f"most loops lie within {1000 * STOP_LINE_KM:g} m of a junction, where standing queues bias the density",
     ASSUMED: "two thirds of the side of a square as large as the region; give it with --trip-length or --about",
     LEFT: "their counts cannot be right, see below; lane-kilometres stand for the links of the others",
+    SHORT: f"fewer than {LEAST_INTERVALS}: the curve may be that of one rush hour only",
+    MISCOUNT: "detectors whose flow does not fit their occupancy, see below; they bias the curve",
     SINGLE: f"fewer than {LEAST_DAYS} days: the difference between days is unknown",
 }
 UNKNOWN_PARTS = (
@@ -116,6 +120,7 @@ def identify(
         raise InputError(f"{counts}: flow and occ give {what}; expected {expected}")
     read, days, count = len(rows), rows["day"].nunique(), rows["detid"].nunique()
     rows, faulty = detector_tables.screened(rows, stations["region"])
+    odd = detector_doubts.miscounting(rows, stations["region"])
     stations = stations.drop(
         list(faulty.get(detector_tables.SUM, ()))
     )  # its lanes are those of the others
@@ -128,6 +133,11 @@ def identify(
         )
         for reason, of in faulty.items()
     ]
+    for region, factors in odd.items():
+        shown = ", ".join(f"{name} ({factor:.2f})" for name, factor in factors.items())
+        broken.append(
+            f"region {region}: flow of detectors over that of others at the same occupancy: {shown}"
+        )
     table = detector_tables.read_about(paths[2], names)
     lane_km, coverage = _lane_km(stations, used, table, paths[2] or counts)
     trip_km, assumed = _trip_lengths(stations, table, trip_length)
@@ -165,6 +175,7 @@ def identify(
         (
             *doubts,
             *_doubts(stations[stations["region"] == region], used, coverage[n], lengths[n], days),
+            *_sample_doubts((intervals["region"] == region).sum(), len(odd.get(region, ()))),
         )
         for n, (region, doubts) in enumerate(zip(names, fits["doubts"], strict=True))
     ]
@@ -320,6 +331,16 @@ def _adjacency(path: Path | None, detectors: pd.DataFrame, regions: Sequence[str
     for i, h in own[edges[distance <= FAR * np.median(distance)]]:
         adjacency[i, h] = adjacency[h, i] = i != h
     return adjacency
+
+
+def _sample_doubts(intervals: int, odd: int) -> list[str]:
+    """Return doubts about the samples of a region; odd: detectors with odd counts."""
+    doubts = []
+    if intervals < LEAST_INTERVALS:
+        doubts.append(f"{SHORT}: {intervals}")
+    if odd:
+        doubts.append(f"{MISCOUNT}: {odd} detectors")
+    return doubts
 
 
 def _doubts(
