@@ -238,7 +238,8 @@ def test_options_and_includes_of_the_user_count(config, tmp_path):
     case = read_sumo_input(tmp_path / "city.sumocfg")
     assert case.reading == {"scale": "2.5"}
     assert case.mesoscopic
-    assert case.left_out == ()
+    assert case.left_out == {}
+    assert case.ignored == ("tripinfo-output",)
     assert case.options["max-depart-delay"] == "60"
     assert case.options["meso-junction-control"] == "false"
     text = good(
@@ -252,6 +253,7 @@ def test_options_and_includes_of_the_user_count(config, tmp_path):
         )
     )
     assert "150 vehicles in" in text
+    assert "that only write files: tripinfo-output" in text
     scenario = load_scenario(tmp_path / "scenarios" / "x")
     assert scenario.demand_factor == 1.0
     assert scenario.demand.sum() * scenario.step == pytest.approx(150.0)

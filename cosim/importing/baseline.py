@@ -4,7 +4,7 @@ driven."""
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cosim.importing.case import Progress
+from cosim.importing.comparison import ALL_TRIPS, NEVER, Trip, read_trips
 from cosim.importing.streets import Streets
 from cosim.sumo.arrays import EdgeNumbers, PerEdge
 from cosim.sumo.programs import run_sumo
@@ -20,6 +21,7 @@ from cosim.sumo.recorded_trips import (
     MESOSCOPIC,
     draw,
     read_recorded_trips,
+    run_files,
     write_recorded_trips,
 )
 from cosim.sumo.xml_files import attribute, child, file_list, read_xml
@@ -32,6 +34,7 @@ RECORDED = ("exit-times", "last-route", "write-unfinished")
 SILENT = dict.fromkeys(
     ("no-step-log", "no-warnings", "ignore-route-errors", "duration-log.statistics"), "true"
 )
+SILENT |= ALL_TRIPS
 SILENT |= {f"vehroute-output.{name}": "true" for name in RECORDED}
 
 
@@ -41,9 +44,11 @@ class Baseline:
 
     presence: (K, E) [veh s] on every edge in intervals of INTERVAL_S
     ways: (edges that a vehicle drove to the end, last edge of its route) -> number of vehicles
-    teleports; waiting: vehicles not inserted at the end; running: on the road at the end
-    dropped: vehicles of the demand that SUMO gave up
+    teleports: of all vehicles
+    waiting: private vehicles not inserted at the end; running: those on the road at the end
+    dropped: those that SUMO gave up before they departed; removed: those taken out on their way
     slowness: trip time over free-flow time of completed trips [-], NaN without any
+    trips: of all vehicles
     """
 
     presence: Float[np.ndarray, "K E"]
@@ -52,7 +57,9 @@ class Baseline:
     waiting: int
     running: int
     dropped: int = 0
+    removed: int = 0
     slowness: float = np.nan
+    trips: Mapping[str, Trip] = field(default_factory=dict)
 
     def density(self, streets: Streets) -> PerEdge:
         """Return the density (E,) [veh/m of lane] in the quarter of an hour with the most
@@ -127,6 +134,7 @@ def averaged_runs(
             jitter = JITTER_S if seed else 0.0
             drawn = draw(original, seed=seed, factor=factor, jitter=jitter, begin=begin)
             write_recorded_trips(original, drawn, scratch / "vehicles.rou.xml")
+            route_files = run_files(scratch / "vehicles.rou.xml", background, seed)
             measure = scratch / "measure.add.xml"
             data = (
                 f'<edgeData id="all" freq="{INTERVAL_S:g}" file="edges.xml" excludeEmpty="true"/>'
@@ -134,11 +142,12 @@ def averaged_runs(
             measure.write_text(f"<additional>{data}</additional>", encoding="utf-8")
             options |= {
                 "net-file": file_list([streets.path]),
-                "route-files": file_list([scratch / "vehicles.rou.xml", *background]),
+                "route-files": file_list(route_files),
                 "additional-files": file_list([*additional, measure]),
                 "seed": seed,
                 "vehroute-output": scratch / "ways.xml",
                 "statistic-output": scratch / "statistic.xml",
+                "tripinfo-output": scratch / "trips.xml",
             }
             run_sumo(
                 "sumo",
@@ -154,19 +163,20 @@ def _measured(
 ) -> Baseline:
     """Read the outputs of a run with these vehicles of the demand."""
     statistic = ElementTree.parse(folder / "statistic.xml").getroot()
-    counts = child(statistic, "vehicles")
-    waiting = int(attribute(counts, "waiting"))
-    trips = child(statistic, "vehicleTripStatistics")
-    duration, loss = (float(attribute(trips, name)) for name in ("duration", "timeLoss"))
-    ways, driven = _ways(folder / "ways.xml", streets)
+    totals = child(statistic, "vehicleTripStatistics")
+    duration, loss = (float(attribute(totals, name)) for name in ("duration", "timeLoss"))
+    trips = read_trips(folder / "trips.xml", end)
+    private = [trips[name] for name in vehicles if name in trips]
     return Baseline(
         presence=_presence(folder / "edges.xml", streets, begin, end),
-        ways=ways,
+        ways=_ways(folder / "ways.xml", streets),
         teleports=int(attribute(child(statistic, "teleports"), "total")),
-        waiting=waiting,
-        running=int(attribute(counts, "running")),
-        dropped=max(len(vehicles - driven) - waiting, 0),
+        waiting=sum(trip.depart == NEVER for trip in private),
+        running=sum(trip.depart < NEVER and trip.arrival == NEVER for trip in private),
+        dropped=len(vehicles) - len(private),
+        removed=sum(trip.removed for trip in private),
         slowness=duration / (duration - loss) if duration > loss else np.nan,
+        trips=trips,
     )
 
 
@@ -185,13 +195,11 @@ def _presence(path: Path, streets: Streets, begin: float, end: float) -> np.ndar
     return presence
 
 
-def _ways(path: Path, streets: Streets) -> tuple[Counter[tuple[tuple[int, ...], int]], set[str]]:
-    """Read Baseline.ways, and the vehicles that drove, from SUMO's vehroute output."""
+def _ways(path: Path, streets: Streets) -> Counter[tuple[tuple[int, ...], int]]:
+    """Read Baseline.ways from SUMO's vehroute output."""
     ways: Counter[tuple[tuple[int, ...], int]] = Counter()
-    driven_by = set()
     for _, element in ElementTree.iterparse(path):
         if element.tag == "vehicle":
-            driven_by.add(attribute(element, "id"))
             route = element.find("route")
             if route is not None and (names := route.get("edges")):
                 edges = [streets.number.get(edge, -1) for edge in names.split()]
@@ -202,4 +210,4 @@ def _ways(path: Path, streets: Streets) -> tuple[Counter[tuple[tuple[int, ...], 
                 if edges[-1] >= 0:
                     ways[driven, edges[-1]] += 1
             element.clear()
-    return ways, driven_by
+    return ways

@@ -2,6 +2,7 @@
 box."""
 
 import math
+import os
 import re
 import subprocess
 import xml.etree.ElementTree as ElementTree
@@ -12,33 +13,34 @@ from pathlib import Path
 from typing import Protocol
 from urllib.parse import unquote
 
-import numpy as np
-
 from cosim.sumo.programs import HOME, run_sumo, run_tool
 from cosim.sumo.xml_files import attribute, file_list, read_xml, stream_of
 from nmfd.errors import InputError
 from nmfd.runs.files import temporary_folder
 
 ENDLESS_S = 1e9  # a later end is none
-# Groups of options, in SUMO's own words, that change what is written or shown, or how it is read,
-# but not the traffic.
-IDLE = set(
-    [
-        "configuration",
-        "output",
-        "report",
-        "emissions",
-        "traci_server",
-        "random_number",
-        "gui_only",
-        "example_device",
-        "ssm_device",
-        "fcd_device",
-        "tripinfo_device",
-        "vehroutes_device",
-    ]
-)
-WRITING = re.compile(r".*(output|threads)|xml-validation.*|scale-suffix")  # others of this kind
+# Groups of options, in SUMO's own words, that change what is shown, but not the traffic.
+SHOWING = {"configuration", "report", "gui_only"}
+# Groups that change what is written: an import says that it does not take them over.
+WRITING_GROUPS = {
+    "output",
+    "emissions",
+    "traci_server",
+    "random_number",
+    "example_device",
+    "ssm_device",
+    "fcd_device",
+    "tripinfo_device",
+    "vehroutes_device",
+}
+WRITING = re.compile(r".*(output|threads)|scale-suffix")  # others of this kind
+# SUMO draws a random number for every vehicle and every device with a probability, from one stream
+# in the order in which it builds the vehicles. So all are drawn once, when the vehicles are read.
+DRAWING = re.compile(r"device\.(\w+)\.(probability|deterministic)")
+NOBODY, EVERYBODY = "1e-12", "1"
+# If it is not given at all, vehicles without a route are rerouted periodically.
+REROUTING = "device.rerouting.probability"
+GIVEN_FILES = ("net-file", "route-files", "additional-files")
 READ = (
     "load-state",
     "load-state.offset",
@@ -70,7 +72,7 @@ LICENCE = (
     "The streets are those of OpenStreetMap: (c) OpenStreetMap contributors, Open Database License 1.0\n"
     "(SPDX ODbL-1.0, https://opendatacommons.org/licenses/odbl/1-0/), https://www.openstreetmap.org/copyright\n"
 )
-LEFT_HAND = Path(__file__).with_name("left_hand.csv")
+VARIABLE = re.compile(r"\$\{(.+?)\}")  # of the environment, in a sumocfg
 SERVERS = "hpi,oapi,pcoffee"  # osmGet.py's names of public ones
 SERVER_TIME_LIMIT_S = 600.0
 OWN_DEFAULTS = {"collision.action": "teleport"}  # of SUMO, where a scenario has others
@@ -94,7 +96,9 @@ class SumoInput:
     options: all others that change the traffic; reading: those that matter only to the reading of
         vehicles
     gaps: SUMO drives routes with gaps
-    left_out: options that may change the traffic and are not taken over, as NAME = VALUE
+    left_out: options that may change the traffic and are not taken over
+    ignored: names of options that every run sets itself, or that only write files
+    devices: kinds that SUMO gives to some vehicles by chance
     notice: required by the licence of the data
     """
 
@@ -110,22 +114,29 @@ class SumoInput:
     options: Mapping[str, str] = field(default_factory=lambda: dict(OWN_DEFAULTS))
     reading: Mapping[str, str] = field(default_factory=dict)
     gaps: bool = False
-    left_out: tuple[str, ...] = ()
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    ignored: tuple[str, ...] = ()
+    devices: tuple[str, ...] = ()
     notice: str = ""
 
 
 @contextmanager
-def sumo_input(source: Path | Box, progress: Progress) -> Iterator[SumoInput]:
+def sumo_input(
+    source: Path | Box, progress: Progress, *, left_hand: bool = False
+) -> Iterator[SumoInput]:
     """Provide the simulation of a source; a network that is built for it goes at the end of the
     block.
 
     source: a sumocfg, a net.xml(.gz), a file of OpenStreetMap, or a box of it
+    left_hand: traffic keeps left in OpenStreetMap, which does not say so
     Raises: InputError for a source that cannot be read, or no answer for a box
     """
     if isinstance(source, Path) and source.suffix == ".pbf":
         osm = source.stem.removesuffix(".osm")
         raise InputError(f"{source}: convert pbf first: osmium cat {source.name} -o {osm}.osm")
     if isinstance(source, Path) and _root(source).tag != "osm":
+        if left_hand:
+            raise InputError(f"--left-hand: {source} says itself where traffic keeps; omit it")
         yield read_sumo_input(source)
         return
     with temporary_folder() as folder:
@@ -139,12 +150,8 @@ def sumo_input(source: Path | Box, progress: Progress) -> Iterator[SumoInput]:
             "type-files": types,
             "output-file": net,
         }
-        run_sumo("netconvert", options, *NETCONVERT, where=str(source))
-        west, south, east, north = map(
-            float, _root(net, "location").attrib["origBoundary"].split(",")
-        )
-        if keeps_left((west + east) / 2, (south + north) / 2):
-            run_sumo("netconvert", options, *NETCONVERT, "--lefthand", where=str(source))
+        flags = [*NETCONVERT, "--lefthand"] if left_hand else NETCONVERT
+        run_sumo("netconvert", options, *flags, where=str(source))
         net.write_bytes(
             re.sub(rb"<!--.*?-->\s*", b"", net.read_bytes(), count=1, flags=re.DOTALL)
         )  # date and folder
@@ -158,69 +165,123 @@ def read_sumo_input(path: Path) -> SumoInput:
         return SumoInput(source=path, net=path)
     if root.tag not in ("configuration", "sumoConfiguration"):
         raise InputError(
-            f"{path}: expected a sumocfg, a net.xml or a file of OpenStreetMap, got a file of <{root.tag}> instead"
+            f"{path}: expected a sumocfg, a net.xml or a file of OpenStreetMap, got a file of "
+            f"<{root.tag}> instead"
         )
-    with temporary_folder() as folder:
-        saved = folder / "read.sumocfg"
-        run_sumo(
-            "sumo",
-            {"configuration-file": path.absolute(), "save-configuration": saved},
-            where=str(path),
-        )
-        groups = read_xml(saved)
-    options = {
-        e.tag: attribute(e, "value") for group in groups if group.tag not in IDLE for e in group
-    }
-    options = {name: value for name, value in options.items() if not WRITING.fullmatch(name)}
-    files: dict[str, tuple[Path, ...]] = {}
-    for key in ("net-file", "route-files", "additional-files"):
-        names = [
-            unquote(name).split("/")
-            for name in options.pop(key, "").split(",")
-            if unquote(name).strip()
-        ]
-        files[key] = tuple(Path("/".join(part.strip() for part in parts)) for parts in names)
-        for file in files[key]:
-            if not file.is_file():
-                raise InputError(
-                    f"{path}: {key}: no such file: {file}; correct the name or add the file"
-                )
+    options, ignored = _options(path)
+    files = {key: _files(path, key, options.pop(key, "")) for key in GIVEN_FILES}
     if not files["net-file"]:
         raise InputError(
             f'{path}: net-file: missing; add <net-file value="city.net.xml"/> to its <input>'
         )
-
-    def number(name: str, default: str) -> float:
-        return seconds(options.pop(name, default), f"{path}: {name}")
-
-    end, teleport = number("end", "-1"), number("time-to-teleport", "300")
     begin = "0"
     if state := options.get("load-state"):
-        options["load-state"] = unquote(state)
+        options["load-state"] = _file(path, state)
         begin = _root(Path(options["load-state"])).get("time", begin)
-    mesoscopic, gaps = (
-        options.pop(name, "").lower() in ("true", "1", "yes", "on", "x")
-        for name in ("mesosim", "ignore-route-errors")
-    )
-    own = OWN_DEFAULTS | ({"meso-junction-control": "false"} if mesoscopic else {})
+    begin, end = options.pop("begin", begin), options.pop("end", "-1")
+    teleport, step = options.pop("time-to-teleport", "300"), options.pop("step-length", "1")
+    time_to_teleport = seconds(teleport, f"{path}: time-to-teleport")
+    last = seconds(end, f"{path}: end")
+    mesoscopic = _is_true(options.pop("mesosim", ""))
+    gaps = _is_true(options.pop("ignore-route-errors", ""))
+    driven, reading, left_out = dict(OWN_DEFAULTS), {}, {}
+    if mesoscopic:
+        driven["meso-junction-control"] = "false"
+    devices = []
+    for name, value in options.items():
+        device = DRAWING.fullmatch(name)
+        if device:
+            reading[name] = value
+            devices.append(device[1])
+            if name == REROUTING:
+                driven[name] = "0"
+        elif name in READ:
+            reading[name] = value
+        elif FILES.fullmatch(name):
+            left_out[name] = value
+        else:
+            driven[name] = value
     return SumoInput(
         source=path,
         net=files["net-file"][0],
         routes=files["route-files"],
         additional=files["additional-files"],
-        begin=number("begin", begin),
-        end=end if 0 < end < ENDLESS_S else None,
-        step_length=number("step-length", "1"),
-        time_to_teleport=teleport if teleport > 0 else -1.0,
+        begin=seconds(begin, f"{path}: begin"),
+        end=last if 0 < last < ENDLESS_S else None,
+        step_length=seconds(step, f"{path}: step-length"),
+        time_to_teleport=time_to_teleport if time_to_teleport > 0 else -1.0,
         mesoscopic=mesoscopic,
-        options=own
-        | {k: v for k, v in options.items() if k not in READ and not FILES.fullmatch(k)},
-        reading={name: options[name] for name in READ if name in options},
+        options=driven,
+        reading=reading,
         gaps=gaps,
-        left_out=tuple(
-            f"{name} = {value}" for name, value in sorted(options.items()) if FILES.fullmatch(name)
-        ),
+        left_out=left_out,
+        ignored=ignored,
+        devices=tuple(sorted(set(devices))),
     )
+
+
+def _options(path: Path) -> tuple[dict[str, str], tuple[str, ...]]:
+    """Return the options of a sumocfg that change the traffic, in SUMO's words, and the names of
+    those that write files or that every run sets itself."""
+    with temporary_folder() as folder:
+        saved = folder / "read.sumocfg"
+        given = {"configuration-file": path.absolute(), "save-configuration": saved}
+        run_sumo("sumo", given, where=str(path))
+        groups = read_xml(saved)
+    options, ignored = {}, []
+    for group in groups:
+        for element in group:
+            name, value = element.tag, attribute(element, "value")
+            if group.tag in WRITING_GROUPS or WRITING.fullmatch(name):
+                ignored.append(name)
+            elif name in (*GIVEN_FILES, "load-state"):
+                options[name] = value
+            elif group.tag not in SHOWING:
+                options[name] = _substituted(value)
+            if group.tag in WRITING_GROUPS and name.endswith(".probability"):
+                options[name] = EVERYBODY if group.tag == "tripinfo_device" else NOBODY
+    for name in ignored:  # such a device needs no random number
+        if name.endswith(".deterministic"):
+            options.pop(f"{name.removesuffix('.deterministic')}.probability", None)
+    return options, tuple(sorted(ignored))
+
+
+def _files(path: Path, key: str, names: str) -> tuple[Path, ...]:
+    """Return the files of an option of a sumocfg. Raises InputError if there is none."""
+    files = []
+    for name in names.split(","):
+        parts = [part.strip() for part in _file(path, name).split("/")]
+        if not any(parts):
+            continue
+        file = Path("/".join(parts))
+        if not file.is_file():
+            raise InputError(
+                f"{path}: {key}: no such file: {file}; correct the name or add the file"
+            )
+        files.append(file)
+    return tuple(files)
+
+
+def _file(path: Path, name: str) -> str:
+    """Return a file that the saved form of a sumocfg names.
+
+    SUMO has put the folder before every name that looked relative, even if it began with an
+    environment variable that holds a whole path.
+    """
+    text = unquote(name)
+    own = text.removeprefix(f"{path.absolute().parent}/").strip()
+    if own.startswith("${") and Path(_substituted(own)).is_absolute():
+        return _substituted(own)
+    return _substituted(text)
+
+
+def _substituted(text: str) -> str:
+    """Replace ${NAME} by the environment variable, by nothing if there is none, as SUMO does."""
+    return VARIABLE.sub(lambda name: os.environ.get(name[1], ""), text)
+
+
+def _is_true(value: str) -> bool:
+    return value.lower() in ("true", "1", "yes", "on", "x")
 
 
 def seconds(text: str, where: str) -> float:
@@ -239,20 +300,6 @@ def seconds(text: str, where: str) -> float:
         for part, unit in zip(reversed(parts), (1.0, 60.0, 3600.0, 86400.0), strict=False)
     )
     return -size if text.startswith("-") else size
-
-
-def keeps_left(longitude: float, latitude: float) -> bool:
-    """Return True if traffic keeps left at a place [degrees], as in the nearest city of LEFT_HAND.
-
-    >>> keeps_left(100.5, 13.75), keeps_left(102.6, 17.97)  # Bangkok, Vientiane
-    (True, False)
-    """
-    east, north, left = np.loadtxt(LEFT_HAND, delimiter=",", skiprows=2, unpack=True)
-    a, b, turn = np.radians(latitude), np.radians(north), np.radians(east - longitude)
-    nearness = np.sin(a) * np.sin(b) + np.cos(a) * np.cos(b) * np.cos(
-        turn
-    )  # cosine of the angle between both
-    return bool(left[np.argmax(nearness)])
 
 
 def parse_box(text: str) -> Box:
@@ -287,9 +334,8 @@ def fetch_osm(box: Box, folder: Path) -> Path:
         ) from None
 
 
-def _root(path: Path, tag: str | None = None) -> ElementTree.Element:
-    """Read the root of an XML file, or its first element `tag`, with its attributes only. Raises
-    InputError."""
+def _root(path: Path) -> ElementTree.Element:
+    """Read the root of an XML file, with its attributes only. Raises InputError."""
     with stream_of(path) as stream:
-        elements = (element for _, element in ElementTree.iterparse(stream, events=("start",)))
-        return next(element for element in elements if tag in (None, element.tag))
+        _, root = next(iter(ElementTree.iterparse(stream, events=("start",))))
+        return root

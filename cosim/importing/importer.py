@@ -16,7 +16,17 @@ from cosim.importing import maps, model, quality
 from cosim.importing.assignment import GAP, ITERATIONS, Assigned, assign
 from cosim.importing.baseline import Baseline, averaged_runs
 from cosim.importing.case import Progress, SumoInput, parse_box, seconds, sumo_input
-from cosim.importing.demand import Traffic, read_traffic, wrapped
+from cosim.importing.comparison import compare, plain_trips
+from cosim.importing.demand import (
+    FAST,
+    FROM_FLOWS,
+    NO_ROUTE,
+    NOWHERE,
+    ON_ROAD,
+    Traffic,
+    read_traffic,
+    wrapped,
+)
 from cosim.importing.generated import morning_peak
 from cosim.importing.partition import finish, own_regions, partition
 from cosim.importing.streets import Streets, read_streets
@@ -39,6 +49,8 @@ FILES = {
     "background": "background.rou.xml.gz",
     "additional": "city.add.xml.gz",
 }
+PERSONS = ("person", "personFlow")
+CHANGES = (FAST, NOWHERE, NO_ROUTE, ON_ROAD)  # notes that explain another traffic
 TYPES = ("vType", "vTypeDistribution")
 COMMENT = """Imported from {}. The MFDs are PLACEHOLDERS from lane length and speed limits:
 # cosim identify replaces them by measured ones."""
@@ -63,6 +75,7 @@ def import_city(
     seed: int = 0,
     seeds: int = 3,
     iterations: int = ITERATIONS,
+    left_hand: bool = False,
 ) -> str:
     """Write the network and the scenario of a SUMO city; return a report.
 
@@ -77,6 +90,7 @@ def import_city(
     begin, end: time window, in seconds or as h:m:s, instead of the sumocfg's
     seeds: runs without control whose densities are averaged
     iterations: of the assignment of the peak
+    left_hand: traffic keeps left in OpenStreetMap
     Raises: InputError for input that cannot be used; nothing is written then
     """
     count = int(str(regions)) if str(regions).isdecimal() else None
@@ -101,7 +115,7 @@ def import_city(
 
         progress("reading")
         case, scratch = (
-            stack.enter_context(sumo_input(place, progress)),
+            stack.enter_context(sumo_input(place, progress, left_hand=left_hand)),
             stack.enter_context(temporary_folder()),
         )
         case = replace(
@@ -126,10 +140,12 @@ def import_city(
             factor = 1.0
         elif not len(traffic.depart):
             raise InputError(
-                f"{case.source}: names no vehicles for the streets of cars{_notes(traffic)}; give a sumocfg with "
-                "route-files, or add --routes FILE or --demand peak"
+                f"{case.source}: names no vehicles for the streets of cars{_notes(traffic)}"
+                + "".join(f"; {remark}" for remark in traffic.remarks)
+                + "; give a sumocfg with route-files, or add --routes FILE or --demand peak"
             )
-        elif begin is None:
+        whole = case
+        if demand is None and begin is None:
             case = model.without_idle(case, traffic)
         clock = model.clock(case, streets, traffic)
         net_folder, folder = scratch / "network", scratch / "scenario"
@@ -139,6 +155,9 @@ def import_city(
         baseline = averaged_runs(
             streets, folder, files, model.options(case, clock), factor, meso, seeds, progress
         )
+        same = ""
+        if demand is None:
+            same = _compared(whole, traffic, clock, baseline, meso, factor, progress)
         progress("partition")
         left = quality.left_alone(streets, traffic.switched)
         if count is not None:
@@ -165,7 +184,11 @@ def import_city(
                 f"WARNING: {_left_out(traffic)}: this is not the traffic of {case.source.name}"
             )
             verdict = replace(verdict, sentences=(*verdict.sentences, warning))
-        report = _report(case, streets, traffic, clock, tables, baseline, assigned)
+        if traffic.unread > LEFT_OUT:
+            warning = f"WARNING: SUMO does not read {traffic.unread:.1%} of the vehicles and flows"
+            verdict = replace(verdict, sentences=(*verdict.sentences, warning))
+        report = _report(case, streets, traffic, clock, tables, baseline, assigned, same)
+        report += quality.doubts(streets, labels, network.region_names)
         if count is not None and network.regions < count:
             report.append(
                 f"{network.regions} regions instead of {count}: others could not be reached, or fell apart"
@@ -302,6 +325,52 @@ def _notes(traffic: Traffic) -> str:
     return "".join(f"; {note}: {count:,}" for note, count in sorted(traffic.notes.items()))
 
 
+def _compared(
+    case: SumoInput,
+    traffic: Traffic,
+    clock: model.Clock,
+    baseline: Baseline,
+    mesoscopic: bool,
+    factor: float,
+    progress: Progress,
+) -> str:
+    """Compare the run without control of seed 0 with the case as SUMO itself runs it."""
+    if factor != 1.0:
+        return f"not compared with plain SUMO: the demand is {factor:g} times its own"
+    progress("simulating the city's own files")
+    end = min(clock.end, traffic.end)
+    try:
+        plain = plain_trips(case, end, mesoscopic=mesoscopic)
+    except InputError as error:
+        return f"not compared with plain SUMO, which refuses the city: {error}"
+    comparison = compare(
+        plain,
+        baseline.trips,
+        is_private=traffic.is_private,
+        end=end,
+        step=case.step_length,
+    )
+    return comparison.text(_differences(case, traffic, clock))
+
+
+def _differences(case: SumoInput, traffic: Traffic, clock: model.Clock) -> list[str]:
+    """Return what makes an import differ from the city's own files."""
+    reasons = [f"{name} is not taken over" for name in sorted(case.left_out)]
+    step = float(model.options(case, clock)["step-length"])
+    if step != case.step_length:
+        reasons.append(f"steps of {step:g} s instead of {case.step_length:g} s")
+    for note in CHANGES:
+        if note in traffic.notes:
+            reasons.append(f"{note}: {traffic.notes[note]:,}")
+    if any(element.tag == "calibrator" for element in traffic.shared):
+        reasons.append("calibrators")
+    if any(element.tag in PERSONS for element in traffic.background):
+        reasons.append("persons")
+    if FROM_FLOWS in traffic.notes:
+        reasons.append("flows, whose vehicles look for another route while they wait to enter")
+    return reasons
+
+
 def _report(
     case: SumoInput,
     streets: Streets,
@@ -310,6 +379,7 @@ def _report(
     tables: quality.Tables,
     baseline: Baseline,
     assigned: Assigned | None,
+    same: str,
 ) -> list[str]:
     """Return what was imported, left alone and left out, in lines."""
     lines = [
@@ -319,7 +389,10 @@ def _report(
         f"{clock.step:g} s; {_left_out(traffic)}{_notes(traffic)}",
         text_table(tables.quality, CAPTION),
         f"without control: {baseline.teleports} teleports; at the end {baseline.running} vehicles on the road and "
-        f"{baseline.waiting} waiting to enter; {baseline.dropped:,} without a route or a free lane",
+        f"{baseline.waiting} waiting to enter; {baseline.dropped:,} without a route or a free lane"
+        + (f"; {baseline.removed:,} removed on their way" if baseline.removed else ""),
+        *([same] if same else []),
+        *traffic.remarks,
     ]
     if assigned is not None:
         gap, iteration, count = assigned.gaps[assigned.best], assigned.best + 1, len(assigned.gaps)
@@ -330,9 +403,14 @@ def _report(
             lines.append(
                 f"WARNING: a relative gap above {100 * GAP:g} %: rerouting gains what drivers know already"
             )
-    changed = list(case.left_out)
+    changed = [f"{name} = {value}" for name, value in sorted(case.left_out.items())]
     if case.step_length != (step := float(model.options(case, clock)["step-length"])):
         changed.append(f"step-length = {case.step_length:g}, not {step:g}")
     if changed:
         lines.append(f"not taken over from {case.source.name}: {', '.join(changed)}")
+    if case.ignored:
+        lines.append(
+            f"options of {case.source.name} that every run sets itself, or that only write files: "
+            + ", ".join(case.ignored)
+        )
     return lines

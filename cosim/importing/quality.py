@@ -16,6 +16,7 @@ from nmfd.model import authority
 from nmfd.model.authority import Boundaries, Verdict
 from nmfd.model.regional_model import RegionalModel
 
+SMALLEST_LANE_KM = 3.0  # of a region: a few hundred vehicles would fill it
 CONTROLLED = "controlled"  # gateway with a signal that perimeter control uses
 
 
@@ -90,6 +91,27 @@ def tables(
     return Tables(
         quality=[*rows, row("all", "all regions", regions >= 0, gateways)], gateways=gateways
     )
+
+
+def doubts(streets: Streets, regions: EdgeNumbers, names: Sequence[str]) -> list[str]:
+    """Return sentences about what makes a partition doubtful: streets apart, small regions."""
+    sentences = []
+    total = streets.lane_metres.sum()
+    apart = streets.drivable & ~streets.main_part
+    if apart.any():
+        away = streets.lane_metres[apart].sum()
+        sentences.append(
+            f"the streets fall into {streets.parts} parts without a connection; {away / total:.1%} "
+            "of the lanes lie outside the largest, and count for the region nearest to them"
+        )
+    for region, name in enumerate(names):
+        lane_km = streets.lane_metres[regions == region].sum() / 1000.0
+        if lane_km < SMALLEST_LANE_KM:
+            sentences.append(
+                f"region {region} {name} has {lane_km:.1f} lane-kilometres, too few for an MFD "
+                f"(below {SMALLEST_LANE_KM:g}); take fewer regions, or your own"
+            )
+    return sentences
 
 
 def left_alone(streets: Streets, switched: Sequence[str] = ()) -> dict[str, str]:

@@ -70,6 +70,12 @@ class Streets:
         """Length times lanes for cars (E,) [m]."""
         return self.length * self.lanes
 
+    @property
+    def parts(self) -> int:
+        """Number of parts into which the drivable edges fall, without a connection between them."""
+        _, part = connected_components(graph(self.links, len(self.edges)), directed=False)
+        return len(np.unique(part[self.drivable]))
+
     @cached_property
     def main_part(self) -> EdgeMask:
         """Drivable edges (E,) of the weakly connected part with the most lane metres."""

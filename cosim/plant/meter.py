@@ -6,7 +6,7 @@ last edge of the final route, else a removal.
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -17,6 +17,7 @@ from jaxtyping import Float
 from cosim.plant.metering import Metering
 from cosim.sumo.arrays import PerGateway
 from cosim.sumo.net import City
+from cosim.sumo.departures import original
 from cosim.sumo.outputs import End, TripReader
 from cosim.sumo.session import REFUSALS, Session
 from nmfd.arrays import PerPair
@@ -41,10 +42,11 @@ class _Vehicle:
     destination: int
     edge: str  # last one of its route
     free: bool  # guidance may reroute it
-    private: bool  # `Session.is_private`
+    private: bool  # a trip of the demand
     public: bool  # `Session.is_public`
     due: float = 0.0  # [s]
     waited: float = 0.0  # departure delay [s]
+    phantom: bool = False  # neither in the demand nor in the city's other files
     departed: bool = False
     region: int = 0  # the present one, since the departure
     announced: int = 0  # region of its last Event, perhaps ahead
@@ -92,6 +94,7 @@ class Meter:
 
     Since the beginning [veh]:
     departures (R, R); probe_departures (R, R), of probes; arrivals (R,), completed trips
+    private_arrivals (R,), of these the private ones
     removals (R, R) [i, j], vehicles taken out in i on their way to j; given_up (R, R), trips
     dropped before they began crossings (R, R, R) [i, h, j] from i to h by a gateway; jumps (R, R,
     R), without one: teleports, streets closed to
@@ -107,11 +110,17 @@ class Meter:
         probes: frozenset[str] = frozenset(),
         trips: TripReader | None = None,
         metering: Metering | None = None,
+        demand: Container[str] | None = None,
+        beside: Container[str] = frozenset(),
     ):
         """probes: vehicles that are also counted apart; metering: trips that wait outside
 
         trips: ends of trips; None if SUMO cannot write them at once: all are arrivals then
+        demand: private trips; None: all vehicles but public transport and the like
+        beside: other vehicles and flows of the city's files. All others are made, and perhaps
+            dropped again, by calibrators and persons
         """
+        self._demand, self._beside = demand, beside
         self._metering = metering
         self._session, self._city, self._probes, self._trips = session, city, probes, trips
         self._vehicles: dict[str, _Vehicle] = {}
@@ -133,7 +142,7 @@ class Meter:
         self._running, self.departures, self.probe_departures, self.removals, self.given_up = (
             np.zeros((5, regions, regions), dtype=int)
         )
-        self.arrivals = np.zeros(regions, dtype=int)
+        self.arrivals, self.private_arrivals = np.zeros((2, regions), dtype=int)
         self.crossings, self.jumps, self.redirected = np.zeros(
             (3, regions, regions, regions), dtype=int
         )
@@ -149,7 +158,7 @@ class Meter:
             time=time,
             accumulation=self.accumulation(step),
             backlog=self.backlog(),
-            completed=float(self.arrivals.sum()),
+            completed=float(self.private_arrivals.sum()),
             removed=(self.removals + self.given_up).astype(float),
         )
 
@@ -170,8 +179,10 @@ class Meter:
             try:
                 self._load(vehicle)
             except REFUSALS:  # gone already: SUMO found no route when it was due
-                self.given_up[0, 0] += 1
-                self._end(Trip(0, True, GIVEN_UP, 0.0, 0.0))
+                if not self._is_phantom(vehicle):
+                    self.given_up[0, 0] += 1
+                    private = self._demand is None or vehicle in self._demand
+                    self._end(Trip(0, private, GIVEN_UP, 0.0, 0.0))
         for vehicle in session.started_teleport():
             self.teleports += 1
             self._teleporting.add(vehicle)
@@ -358,6 +369,7 @@ class Meter:
             self.removals[h, j] += 1
         else:
             self.arrivals[h] += 1
+            self.private_arrivals[h] += gone.private
             self.redirected[i, j, h] += h != j
             j = h
         (self.crossings if (i, h) in self._joined else self.jumps)[i, h, j] += h != i
@@ -369,13 +381,22 @@ class Meter:
                 self._city.region_of.get(edge, 0) for edge in (route[0], route[-1])
             )
             private = session.is_private(vehicle)
+            if self._demand is not None:
+                private = private and vehicle in self._demand
             public = not private and session.is_public(vehicle)
             known = _Vehicle(
                 origin, destination, route[-1], session.is_free(vehicle), private, public
             )
+            known.phantom = self._is_phantom(vehicle)
             self._vehicles[vehicle] = known
             self._time(vehicle, known)
         return self._vehicles[vehicle]
+
+    def _is_phantom(self, vehicle: str) -> bool:
+        """Return True for a vehicle that a calibrator or a person made."""
+        if self._demand is None or vehicle in self._demand:
+            return False
+        return not original(vehicle, self._beside)
 
     def _time(self, vehicle: str, known: _Vehicle) -> None:
         """Note when a vehicle was due, and its departure delay until now."""
@@ -423,6 +444,8 @@ class Meter:
         self._teleporting.discard(vehicle)
         known, ended = self._vehicles.pop(vehicle), self._session.time - self._session.step_length
         if not known.departed:  # given up before it departed
+            if known.phantom:
+                return
             self.given_up[known.origin, known.destination] += 1
             self._end(_trip(known, GIVEN_UP, ended))
             return

@@ -104,7 +104,13 @@ class SumoPlant:
         estimated = settings.measurement == ESTIMATE
         known = probes(self._launch.vehicles, settings.probe_share if estimated else 0.0, seed)
         self.meter = meter = Meter(
-            session, city, known, self._trips if session.flush else None, self._metering
+            session,
+            city,
+            known,
+            self._trips if session.flush else None,
+            self._metering,
+            demand=frozenset(self._launch.vehicles),
+            beside=self._launch.beside,
         )
         self._estimation = None
         if estimated:

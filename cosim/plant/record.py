@@ -14,6 +14,7 @@ from nmfd.types import Quantity, Result
 BOOKS = (
     "departures",
     "arrivals",
+    "private_arrivals",
     "removals",
     "given_up",
     "crossings",
@@ -49,7 +50,7 @@ def settled(result: Result) -> Result:
     )
     return result.assign(
         accumulation=np.concatenate([result.accumulation[:-1], inside[None].astype(float)]),
-        completed=since_start(result.arrivals.sum(axis=1)),
+        completed=since_start(result.private_arrivals.sum(axis=1)),
         removed=since_start(result.removals + result.given_up),
     )
 

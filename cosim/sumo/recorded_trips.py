@@ -182,6 +182,16 @@ def read_routes(paths: Sequence[Path]) -> dict[str, tuple[str, ...]]:
     return shared
 
 
+def ids(paths: Sequence[Path]) -> frozenset[str]:
+    """Return the ids of the vehicles and flows in SUMO's files."""
+    found = set()
+    for path in paths:
+        for element in read_xml(path):
+            if element.tag in ("vehicle", "trip", "flow"):
+                found.add(element.get("id", "").strip())
+    return frozenset(found)
+
+
 def edges_of(
     element: ElementTree.Element, shared: Mapping[str, Sequence[str]]
 ) -> tuple[Sequence[str], bool]:
@@ -264,6 +274,16 @@ def write_recorded_trips(originals: RecordedTrips, drawn: Sequence[DrawnTrip], p
             *(_departing(originals.elements[n], name, depart) for depart, n, name in drawn),
         ],
     )
+
+
+def run_files(path: Path, beside: Sequence[Path], seed: int) -> list[Path]:
+    """Return the route files of one run: that of its private vehicles and those `beside` it.
+
+    With seed 0 vehicles queue as in the city's own files (`merge`, which changes `path`).
+    """
+    if beside and not seed:
+        return merge(path, beside, path.with_name("beside.rou.xml"))
+    return [path, *beside]
 
 
 def merge(path: Path, beside: Sequence[Path], rest: Path) -> list[Path]:
