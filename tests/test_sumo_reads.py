@@ -366,6 +366,7 @@ def test_what_sumo_does_not_read_is_named_and_counted(tmp_path):
     report = imported(config)
     assert said in report
     assert "same city: 3 of 3 trips" in report
+    assert "vehicles depart in 1 control intervals of 90 s, too few for an MFD" in report
     warning = "WARNING: SUMO does not read 40.0% of the vehicles and flows"
     assert warning in (tmp_path / "networks" / "x" / "verdict.txt").read_text()
 

@@ -189,6 +189,7 @@ def import_city(
             verdict = replace(verdict, sentences=(*verdict.sentences, warning))
         report = _report(case, streets, traffic, clock, tables, baseline, assigned, same)
         report += quality.doubts(streets, labels, network.region_names)
+        report += quality.short_demand(traffic.depart, clock.begin, clock.step)
         if count is not None and network.regions < count:
             report.append(
                 f"{network.regions} regions instead of {count}: others could not be reached, or fell apart"

@@ -1,5 +1,6 @@
 """Tables of regions and gateways, and the verdict on control at the gateways."""
 
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -9,7 +10,7 @@ import pandas as pd
 
 from cosim.importing.baseline import INTERVAL_S, Baseline
 from cosim.importing.streets import Streets
-from cosim.sumo.arrays import EdgeMask, EdgeNumbers
+from cosim.sumo.arrays import EdgeMask, EdgeNumbers, PerTrip
 from cosim.sumo.net import City
 from cosim.sumo.signals import HELD, STATIC
 from nmfd.model import authority
@@ -17,6 +18,7 @@ from nmfd.model.authority import Boundaries, Verdict
 from nmfd.model.regional_model import RegionalModel
 
 SMALLEST_LANE_KM = 3.0  # of a region: a few hundred vehicles would fill it
+FEWEST_INTERVALS = 10  # with departures
 CONTROLLED = "controlled"  # gateway with a signal that perimeter control uses
 
 
@@ -112,6 +114,17 @@ def doubts(streets: Streets, regions: EdgeNumbers, names: Sequence[str]) -> list
                 f"(below {SMALLEST_LANE_KM:g}); take fewer regions, or your own"
             )
     return sentences
+
+
+def short_demand(depart: PerTrip, begin: float, step: float) -> list[str]:
+    """Return a sentence if vehicles depart (N,) [s] in too few control intervals of `step` [s]."""
+    intervals = math.ceil((float(depart[-1]) - begin) / step) if len(depart) else 0
+    if intervals >= FEWEST_INTERVALS:
+        return []
+    return [
+        f"vehicles depart in {intervals} control intervals of {step:g} s, too few for an MFD "
+        f"(below {FEWEST_INTERVALS}); import a longer time"
+    ]
 
 
 def left_alone(streets: Streets, switched: Sequence[str] = ()) -> dict[str, str]:

@@ -16,8 +16,8 @@ from jaxtyping import Float
 
 from cosim.plant.metering import Metering
 from cosim.sumo.arrays import PerGateway
-from cosim.sumo.net import City
 from cosim.sumo.departures import original
+from cosim.sumo.net import City
 from cosim.sumo.outputs import End, TripReader
 from cosim.sumo.session import REFUSALS, Session
 from nmfd.arrays import PerPair

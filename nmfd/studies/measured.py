@@ -133,11 +133,10 @@ def identify(
         )
         for reason, of in faulty.items()
     ]
-    for region, factors in odd.items():
+    for own, factors in odd.items():
         shown = ", ".join(f"{name} ({factor:.2f})" for name, factor in factors.items())
-        broken.append(
-            f"region {region}: flow of detectors over that of others at the same occupancy: {shown}"
-        )
+        what = "flow of detectors over that of others at the same occupancy"
+        broken.append(f"region {own}: {what}: {shown}")
     table = detector_tables.read_about(paths[2], names)
     lane_km, coverage = _lane_km(stations, used, table, paths[2] or counts)
     trip_km, assumed = _trip_lengths(stations, table, trip_length)
