@@ -7,7 +7,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import pytest
 from commands import cosim, error_line, good
 
-from cosim.importing import case
+from cosim.importing import case, osm
 from cosim.importing.streets import read_streets
 
 SIDE = 4  # junctions along a side
@@ -77,8 +77,8 @@ def test_a_box_is_asked_of_a_server(tmp_path, monkeypatch):
 
     with ThreadingHTTPServer(("127.0.0.1", 0), Overpass) as server:
         threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
-        monkeypatch.setattr(case, "SERVERS", f"http://127.0.0.1:{server.server_port}/")
-        file = case.fetch_osm((-0.5, 44.48, 11.34, 44.5), tmp_path)
+        monkeypatch.setattr(osm, "SERVERS", f"http://127.0.0.1:{server.server_port}/")
+        file = osm.fetch((-0.5, 44.48, 11.34, 44.5), tmp_path)
         server.shutdown()
     assert 'w="-0.5"' in asked[0]
     assert 'n="44.5"' in asked[0]
@@ -135,7 +135,7 @@ def test_import_makes_a_scenario_and_names_the_licence(tmp_path):
 )
 def test_one_line(tmp_path, monkeypatch, arguments, expected):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(case, "SERVERS", "http://127.0.0.1:1/")
+    monkeypatch.setattr(osm, "SERVERS", "http://127.0.0.1:1/")
     files = {
         "empty.osm": "<osm/>",
         "city.osm.pbf": "",

@@ -360,15 +360,14 @@ def test_what_sumo_does_not_read_is_named_and_counted(tmp_path):
     config = given(tmp_path, "".join(lines))
     traffic = read(config)
     assert [vehicle.get("id") for vehicle in traffic.vehicles] == ["a", "d", "e"]
-    assert traffic.notes == {"vehicles and flows that SUMO itself does not read": 2}
+    assert traffic.notes == {}
     said = "SUMO says: Route file should be sorted by departure time, ignoring 'b'! (2 in all)"
-    assert traffic.remarks == ("trip b is not read by SUMO (2 in all)", said)
+    assert traffic.remarks == (said,)
     report = imported(config)
     assert said in report
     assert "same city: 3 of 3 trips" in report
     assert "vehicles depart in 1 control intervals of 90 s, too few for an MFD" in report
-    warning = "WARNING: SUMO does not read 40.0% of the vehicles and flows"
-    assert warning in (tmp_path / "networks" / "x" / "verdict.txt").read_text()
+    assert f"WARNING: {said}" in (tmp_path / "networks" / "x" / "verdict.txt").read_text()
 
 
 def test_vehicles_of_another_network_are_named(tmp_path):
@@ -384,7 +383,7 @@ def test_vehicles_of_another_network_are_named(tmp_path):
     report = imported(config)
     assert remark in report
     assert "50.0% of the vehicles and 50.0% of the distance left out" in report
-    assert "not compared with plain SUMO, which refuses the city" in report
+    assert "not compared with plain SUMO: it refuses the city" in report
     config.with_name("c.rou.xml").write_text(f"<routes>{flow}</routes>")
     with pytest.raises(InputError, match="names no vehicles .* edge nowhere of flow g is not in"):
         imported(config)

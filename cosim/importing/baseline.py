@@ -1,9 +1,9 @@
-"""Runs of the imported city without control by SUMO's own program: densities of its streets, routes
-driven."""
+"""Runs of the imported city without control by SUMO's own program: densities of its streets,
+routes driven."""
 
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -30,12 +30,22 @@ from nmfd.runs.files import temporary_folder
 
 INTERVAL_S = 300.0  # of the densities
 PEAK_INTERVALS = 3  # in a row: those with the most vehicles count for the partition
-RECORDED = ("exit-times", "last-route", "write-unfinished")
-SILENT = dict.fromkeys(
-    ("no-step-log", "no-warnings", "ignore-route-errors", "duration-log.statistics"), "true"
+# SUMO's options of all runs.
+SILENT = {
+    "no-step-log": "true",
+    "no-warnings": "true",
+    "ignore-route-errors": "true",
+    "duration-log.statistics": "true",
+    **ALL_TRIPS,
+    "vehroute-output.exit-times": "true",
+    "vehroute-output.last-route": "true",
+    "vehroute-output.write-unfinished": "true",
+}
+MEASURE = (
+    f'<additional><edgeData id="all" freq="{INTERVAL_S:g}" file="edges.xml" excludeEmpty="true"/>'
+    "</additional>"
 )
-SILENT |= ALL_TRIPS
-SILENT |= {f"vehroute-output.{name}": "true" for name in RECORDED}
+Way = tuple[tuple[int, ...], int]  # edges that a vehicle drove to the end, last edge of its route
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +53,7 @@ class Baseline:
     """Measurements of a run without control.
 
     presence: (K, E) [veh s] on every edge in intervals of INTERVAL_S
-    ways: (edges that a vehicle drove to the end, last edge of its route) -> number of vehicles
+    ways: way -> number of vehicles
     teleports: of all vehicles
     waiting: private vehicles not inserted at the end; running: those on the road at the end
     dropped: those that SUMO gave up before they departed; removed: those taken out on their way
@@ -52,7 +62,7 @@ class Baseline:
     """
 
     presence: Float[np.ndarray, "K E"]
-    ways: Mapping[tuple[tuple[int, ...], int], int]
+    ways: Mapping[Way, int]
     teleports: int
     waiting: int
     running: int
@@ -65,9 +75,8 @@ class Baseline:
         """Return the density (E,) [veh/m of lane] in the quarter of an hour with the most
         vehicles."""
         total = self.presence.sum(axis=1)
-        first = int(
-            np.argmax(np.convolve(total, np.ones(min(PEAK_INTERVALS, len(total))), mode="valid"))
-        )
+        window = np.ones(min(PEAK_INTERVALS, len(total)))
+        first = int(np.argmax(np.convolve(total, window, mode="valid")))
         mean = self.presence[first : first + PEAK_INTERVALS].mean(axis=0) / INTERVAL_S
         return np.where(streets.lane_metres > 0, mean / np.maximum(streets.lane_metres, 1.0), 0.0)
 
@@ -91,12 +100,15 @@ class Baseline:
     def metres_per_visit(self, streets: Streets, regions: EdgeNumbers) -> PerRegion:
         """Return the distance (R,) [m] driven in a region per visit; NaN without visits."""
         count = int(regions.max()) + 1
-        metres, visits = np.zeros(count), np.zeros(count)
+        metres = np.zeros(count)
+        visits = np.zeros(count)
         for (way, _), vehicles in self.ways.items():
-            if way:
-                seen = regions[list(way)]
-                np.add.at(metres, seen, vehicles * streets.length[list(way)])
-                np.add.at(visits, seen[np.flatnonzero(np.diff(seen, prepend=-1))], vehicles)
+            if not way:
+                continue
+            seen = regions[list(way)]
+            np.add.at(metres, seen, vehicles * streets.length[list(way)])
+            entries = np.flatnonzero(np.diff(seen, prepend=-1))
+            np.add.at(visits, seen[entries], vehicles)
         return np.where(visits > 0, metres / np.maximum(visits, 1.0), np.nan)
 
 
@@ -117,97 +129,114 @@ def averaged_runs(
     factor: multiplies the demand [-]; seed 0 departs as recorded
     Raises: InputError with SUMO's own words if it refuses
     """
-    begin, end = float(times["begin"]), float(times["end"])
-    background, additional = (
-        [folder / name for name in files[key]] for key in ("background", "additional")
-    )
+    begin = float(times["begin"])
+    end = float(times["end"])
+    background = [folder / name for name in files["background"]]
+    additional = [folder / name for name in files["additional"]]
     original = read_recorded_trips([folder / name for name in files["routes"]])
-    options: dict[str, object] = dict(times)
+    options: dict[str, object] = dict(SILENT)
+    if mesoscopic:
+        options |= MESOSCOPIC
+    options |= times
     # A vehicle with a new route by a rerouter makes SUMO fail when it writes the times of the edges
     # it has left.
-    if any(next(read_xml(path).iter("routeProbReroute"), None) is not None for path in additional):
+    if _reroutes(additional):
         options["vehroute-output.exit-times"] = "false"
     runs = []
     for seed in range(seeds):
         progress(f"simulating without control, {seed + 1} of {seeds}", seed / seeds)
         with temporary_folder() as scratch:
+            vehicles = scratch / "vehicles.rou.xml"
+            measure = scratch / "measure.add.xml"
             jitter = JITTER_S if seed else 0.0
             drawn = draw(original, seed=seed, factor=factor, jitter=jitter, begin=begin)
-            write_recorded_trips(original, drawn, scratch / "vehicles.rou.xml")
-            route_files = run_files(scratch / "vehicles.rou.xml", background, seed)
-            measure = scratch / "measure.add.xml"
-            data = (
-                f'<edgeData id="all" freq="{INTERVAL_S:g}" file="edges.xml" excludeEmpty="true"/>'
-            )
-            measure.write_text(f"<additional>{data}</additional>", encoding="utf-8")
+            write_recorded_trips(original, drawn, vehicles)
+            measure.write_text(MEASURE, encoding="utf-8")
             options |= {
                 "net-file": file_list([streets.path]),
-                "route-files": file_list(route_files),
+                "route-files": file_list(run_files(vehicles, background, seed)),
                 "additional-files": file_list([*additional, measure]),
                 "seed": seed,
                 "vehroute-output": scratch / "ways.xml",
                 "statistic-output": scratch / "statistic.xml",
                 "tripinfo-output": scratch / "trips.xml",
             }
-            run_sumo(
-                "sumo",
-                SILENT | (MESOSCOPIC if mesoscopic else {}) | options,
-                where=str(streets.path),
-            )
-            runs.append(_measured(scratch, streets, begin, end, {name for _, _, name in drawn}))
+            run_sumo("sumo", options, where=str(streets.path))
+            names = [name for _, _, name in drawn]
+            runs.append(_measured(scratch, streets, begin, end, names))
     return replace(runs[0], presence=np.mean([run.presence for run in runs], axis=0))
 
 
+def _reroutes(additional: Sequence[Path]) -> bool:
+    """Return True if a rerouter of the files gives new routes."""
+    for path in additional:
+        if next(read_xml(path).iter("routeProbReroute"), None) is not None:
+            return True
+    return False
+
+
 def _measured(
-    folder: Path, streets: Streets, begin: float, end: float, vehicles: set[str]
+    folder: Path, streets: Streets, begin: float, end: float, vehicles: Collection[str]
 ) -> Baseline:
     """Read the outputs of a run with these vehicles of the demand."""
     statistic = ElementTree.parse(folder / "statistic.xml").getroot()
     totals = child(statistic, "vehicleTripStatistics")
-    duration, loss = (float(attribute(totals, name)) for name in ("duration", "timeLoss"))
+    duration = float(attribute(totals, "duration"))
+    loss = float(attribute(totals, "timeLoss"))
+    slowness = duration / (duration - loss) if duration > loss else np.nan
     trips = read_trips(folder / "trips.xml", end)
     private = [trips[name] for name in vehicles if name in trips]
+    waiting = running = removed = 0
+    for trip in private:
+        waiting += trip.depart == NEVER
+        running += trip.depart < NEVER and trip.arrival == NEVER
+        removed += trip.removed
     return Baseline(
         presence=_presence(folder / "edges.xml", streets, begin, end),
         ways=_ways(folder / "ways.xml", streets),
         teleports=int(attribute(child(statistic, "teleports"), "total")),
-        waiting=sum(trip.depart == NEVER for trip in private),
-        running=sum(trip.depart < NEVER and trip.arrival == NEVER for trip in private),
+        waiting=waiting,
+        running=running,
         dropped=len(vehicles) - len(private),
-        removed=sum(trip.removed for trip in private),
-        slowness=duration / (duration - loss) if duration > loss else np.nan,
+        removed=removed,
+        slowness=slowness,
         trips=trips,
     )
 
 
 def _presence(path: Path, streets: Streets, begin: float, end: float) -> np.ndarray:
     """Read Baseline.presence from SUMO's edgeData."""
-    presence = np.zeros((max(1, int(np.ceil((end - begin) / INTERVAL_S))), len(streets.edges)))
+    intervals = max(1, int(np.ceil((end - begin) / INTERVAL_S)))
+    presence = np.zeros((intervals, len(streets.edges)))
     for _, element in ElementTree.iterparse(path):
-        if element.tag == "interval":
-            k = int((float(attribute(element, "begin")) - begin) / INTERVAL_S + 0.5)
+        if element.tag != "interval":
+            continue
+        k = int((float(attribute(element, "begin")) - begin) / INTERVAL_S + 0.5)
+        if k < intervals:
             for edge in element:
-                if (n := streets.number.get(attribute(edge, "id"))) is not None and k < len(
-                    presence
-                ):
+                n = streets.number.get(attribute(edge, "id"))
+                if n is not None:
                     presence[k, n] += float(attribute(edge, "sampledSeconds"))
-            element.clear()
+        element.clear()
     return presence
 
 
-def _ways(path: Path, streets: Streets) -> Counter[tuple[tuple[int, ...], int]]:
+def _ways(path: Path, streets: Streets) -> Counter[Way]:
     """Read Baseline.ways from SUMO's vehroute output."""
-    ways: Counter[tuple[tuple[int, ...], int]] = Counter()
+    ways: Counter[Way] = Counter()
     for _, element in ElementTree.iterparse(path):
-        if element.tag == "vehicle":
-            route = element.find("route")
-            if route is not None and (names := route.get("edges")):
-                edges = [streets.number.get(edge, -1) for edge in names.split()]
-                left = [float(time) >= 0 for time in route.get("exitTimes", "").split()] or (
-                    [element.get("arrival") is not None] * len(edges)
-                )
-                driven = tuple(n for n, gone in zip(edges, left, strict=False) if gone and n >= 0)
-                if edges[-1] >= 0:
-                    ways[driven, edges[-1]] += 1
-            element.clear()
+        if element.tag != "vehicle":
+            continue
+        route = element.find("route")
+        if route is not None and route.get("edges"):
+            edges = [streets.number.get(edge, -1) for edge in attribute(route, "edges").split()]
+            times = route.get("exitTimes", "").split()
+            if times:
+                left = [float(time) >= 0 for time in times]
+            else:
+                left = [element.get("arrival") is not None] * len(edges)
+            driven = tuple(n for n, gone in zip(edges, left, strict=False) if gone and n >= 0)
+            if edges[-1] >= 0:
+                ways[driven, edges[-1]] += 1
+        element.clear()
     return ways

@@ -1,10 +1,8 @@
-"""Sources of an import: a sumocfg with all it names, a bare network, OpenStreetMap as a file or a
-box."""
+"""Sources of an import: a sumocfg with all it names, a bare network, or OpenStreetMap."""
 
 import math
 import os
 import re
-import subprocess
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -13,11 +11,13 @@ from pathlib import Path
 from typing import Protocol
 from urllib.parse import unquote
 
-from cosim.sumo.programs import HOME, run_sumo, run_tool
-from cosim.sumo.xml_files import attribute, file_list, read_xml, stream_of
+from cosim.importing.osm import LICENCE, Box, convert, fetch
+from cosim.sumo.programs import run_sumo
+from cosim.sumo.xml_files import attribute, read_xml, stream_of
 from nmfd.errors import InputError
 from nmfd.runs.files import temporary_folder
 
+UNITS_S = (1.0, 60.0, 3600.0, 86400.0)
 ENDLESS_S = 1e9  # a later end is none
 # Groups of options, in SUMO's own words, that change what is shown, but not the traffic.
 SHOWING = {"configuration", "report", "gui_only"}
@@ -37,7 +37,8 @@ WRITING = re.compile(r".*(output|threads)|scale-suffix")  # others of this kind
 # SUMO draws a random number for every vehicle and every device with a probability, from one stream
 # in the order in which it builds the vehicles. So all are drawn once, when the vehicles are read.
 DRAWING = re.compile(r"device\.(\w+)\.(probability|deterministic)")
-NOBODY, EVERYBODY = "1e-12", "1"
+NOBODY = "1e-12"
+EVERYBODY = "1"
 # If it is not given at all, vehicles without a route are rerouted periodically.
 REROUTING = "device.rerouting.probability"
 GIVEN_FILES = ("net-file", "route-files", "additional-files")
@@ -51,32 +52,8 @@ READ = (
 FILES = re.compile(
     r"weight-files|astar\..*|pedestrian\.jupedsim\..*|phemlight-path|device\.fcd-replay\..*"
 )
-# As SUMO's documentation recommends: sumo.dlr.de/docs/Networks/Import/OpenStreetMap.html.
-# OpenStreetMap does not say what signals show: they come out actuated.
-NETCONVERT = [
-    "--geometry.remove",
-    "--ramps.guess",
-    "--junctions.join",
-    "--tls.guess-signals",
-    "--tls.discard-simple",
-    "--tls.join",
-    "--tls.default-type",
-    "actuated",
-    "--keep-edges.by-vclass",
-    "passenger",
-    "--remove-edges.isolated",
-    "--no-turnarounds.except-deadend",
-    "--no-warnings",
-]
-LICENCE = (
-    "The streets are those of OpenStreetMap: (c) OpenStreetMap contributors, Open Database License 1.0\n"
-    "(SPDX ODbL-1.0, https://opendatacommons.org/licenses/odbl/1-0/), https://www.openstreetmap.org/copyright\n"
-)
 VARIABLE = re.compile(r"\$\{(.+?)\}")  # of the environment, in a sumocfg
-SERVERS = "hpi,oapi,pcoffee"  # osmGet.py's names of public ones
-SERVER_TIME_LIMIT_S = 600.0
 OWN_DEFAULTS = {"collision.action": "teleport"}  # of SUMO, where a scenario has others
-Box = tuple[float, float, float, float]  # west, south, east, north [degrees]
 
 
 class Progress(Protocol):
@@ -142,19 +119,9 @@ def sumo_input(
     with temporary_folder() as folder:
         if not isinstance(source, Path):
             progress("fetching OpenStreetMap")
-            source = fetch_osm(source, folder)
+            source = fetch(source, folder)
         progress("netconvert")
-        net, types = folder / "osm.net.xml", HOME / "data" / "typemap" / "osmNetconvert.typ.xml"
-        options = {
-            "osm-files": file_list([source.resolve()]),
-            "type-files": types,
-            "output-file": net,
-        }
-        flags = [*NETCONVERT, "--lefthand"] if left_hand else NETCONVERT
-        run_sumo("netconvert", options, *flags, where=str(source))
-        net.write_bytes(
-            re.sub(rb"<!--.*?-->\s*", b"", net.read_bytes(), count=1, flags=re.DOTALL)
-        )  # date and folder
+        net = convert(source, folder, left_hand=left_hand)
         yield SumoInput(source=source, net=net, notice=LICENCE)
 
 
@@ -174,17 +141,24 @@ def read_sumo_input(path: Path) -> SumoInput:
         raise InputError(
             f'{path}: net-file: missing; add <net-file value="city.net.xml"/> to its <input>'
         )
-    begin = "0"
-    if state := options.get("load-state"):
-        options["load-state"] = _file(path, state)
-        begin = _root(Path(options["load-state"])).get("time", begin)
-    begin, end = options.pop("begin", begin), options.pop("end", "-1")
-    teleport, step = options.pop("time-to-teleport", "300"), options.pop("step-length", "1")
-    time_to_teleport = seconds(teleport, f"{path}: time-to-teleport")
-    last = seconds(end, f"{path}: end")
+    loaded = "0"
+    if "load-state" in options:
+        state = _file(path, options["load-state"])
+        options["load-state"] = state
+        loaded = _root(Path(state)).get("time", loaded)
+
+    def time(name: str, default: str) -> float:
+        return seconds(options.pop(name, default), f"{path}: {name}")
+
+    begin = time("begin", loaded)
+    end = time("end", "-1")
+    step_length = time("step-length", "1")
+    teleport = time("time-to-teleport", "300")
     mesoscopic = _is_true(options.pop("mesosim", ""))
     gaps = _is_true(options.pop("ignore-route-errors", ""))
-    driven, reading, left_out = dict(OWN_DEFAULTS), {}, {}
+    driven = dict(OWN_DEFAULTS)
+    reading = {}
+    left_out = {}
     if mesoscopic:
         driven["meso-junction-control"] = "false"
     devices = []
@@ -206,10 +180,10 @@ def read_sumo_input(path: Path) -> SumoInput:
         net=files["net-file"][0],
         routes=files["route-files"],
         additional=files["additional-files"],
-        begin=seconds(begin, f"{path}: begin"),
-        end=last if 0 < last < ENDLESS_S else None,
-        step_length=seconds(step, f"{path}: step-length"),
-        time_to_teleport=time_to_teleport if time_to_teleport > 0 else -1.0,
+        begin=begin,
+        end=end if 0 < end < ENDLESS_S else None,
+        step_length=step_length,
+        time_to_teleport=teleport if teleport > 0 else -1.0,
         mesoscopic=mesoscopic,
         options=driven,
         reading=reading,
@@ -228,10 +202,12 @@ def _options(path: Path) -> tuple[dict[str, str], tuple[str, ...]]:
         given = {"configuration-file": path.absolute(), "save-configuration": saved}
         run_sumo("sumo", given, where=str(path))
         groups = read_xml(saved)
-    options, ignored = {}, []
+    options = {}
+    ignored = []
     for group in groups:
         for element in group:
-            name, value = element.tag, attribute(element, "value")
+            name = element.tag
+            value = attribute(element, "value")
             if group.tag in WRITING_GROUPS or WRITING.fullmatch(name):
                 ignored.append(name)
             elif name in (*GIVEN_FILES, "load-state"):
@@ -295,43 +271,10 @@ def seconds(text: str, where: str) -> float:
         raise InputError(
             f"{where}: expected seconds or hours:minutes:seconds, got {text!r} instead"
         ) from None
-    size = sum(
-        abs(part) * unit
-        for part, unit in zip(reversed(parts), (1.0, 60.0, 3600.0, 86400.0), strict=False)
-    )
+    size = 0.0
+    for part, unit in zip(reversed(parts), UNITS_S, strict=False):
+        size += abs(part) * unit
     return -size if text.startswith("-") else size
-
-
-def parse_box(text: str) -> Box:
-    """Parse --bbox. Raises InputError."""
-    try:
-        west, south, east, north = (float(part) for part in text.split(","))
-    except ValueError:
-        west = south = east = north = 0.0
-    if not (-180.0 <= west < east <= 180.0 and -90.0 <= south < north <= 90.0):
-        raise InputError(
-            f"--bbox: expected west,south,east,north in degrees, such as 11.32,44.48,11.36,44.50, got {text!r} instead"
-        )
-    return west, south, east, north
-
-
-def fetch_osm(box: Box, folder: Path) -> Path:
-    """Fetch the streets within a box by SUMO's osmGet.py from a public server. Raises
-    InputError."""
-    where = ",".join(f"{value:g}" for value in box)
-    options = [f"--bbox={where}", "--prefix", "osm", "--gzip", "--url", SERVERS, "--retries", "2"]
-    options += ["--road-types", '{"highway": ["."]}']
-    try:
-        run_tool(
-            "osmGet.py", *options, folder=folder, seconds=SERVER_TIME_LIMIT_S
-        ).check_returncode()
-        return next(folder.glob("osm_bbox.osm.xml.gz"))
-    except (subprocess.SubprocessError, StopIteration) as error:
-        reason = (getattr(error, "stderr", "") or str(error)).strip().splitlines()[-1:]
-        raise InputError(
-            f"--bbox: {where}: osmGet.py got nothing from OpenStreetMap ({' '.join(reason)}); without internet access "
-            "give a file of the area, exported at https://www.openstreetmap.org/export"
-        ) from None
 
 
 def _root(path: Path) -> ElementTree.Element:

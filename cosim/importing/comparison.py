@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import unquote
 
+from cosim.importing import quiet_files
 from cosim.importing.case import SumoInput
-from cosim.importing.demand import quiet_files, write_files
 from cosim.sumo.programs import run_sumo
 from cosim.sumo.recorded_trips import MESOSCOPIC
 from cosim.sumo.xml_files import attribute, file_list
@@ -37,12 +37,29 @@ class Trip(NamedTuple):
     metres: float
     removed: bool = False
 
-    def until(self, end: float) -> "Trip":
-        """Return the trip as a simulation shows it that ends at `end` [s]."""
-        if self.arrival < end:
-            return self
-        depart = self.depart if self.depart < end else NEVER
-        return Trip(self.due, depart, NEVER, 0.0)
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """Comparison of the private trips of an import with those of plain SUMO.
+
+    trips: in plain SUMO; equal: those with the same departure, arrival and length in the import
+    spent: time of all in the import over that in plain SUMO, minus 1 [-]
+    first: what happens to the first trip that differs, "" without any
+    """
+
+    trips: int
+    equal: int
+    spent: float
+    first: str
+
+    def text(self, reasons: Sequence[str]) -> str:
+        """Return the result in one sentence; reasons: why trips may differ."""
+        percent = round(100.0 * self.spent, 1) + 0.0  # no -0.0
+        counts = f"{self.equal:,} of {self.trips:,} trips, time spent {percent:+.1f} %"
+        if not self.first:
+            return f"same city: {counts}"
+        why = "; ".join([self.first, *reasons])
+        return f"not the same city as in plain SUMO: {counts}; {why}"
 
 
 def read_trips(path: Path, end: float) -> dict[str, Trip]:
@@ -53,14 +70,15 @@ def read_trips(path: Path, end: float) -> dict[str, Trip]:
             continue
         depart = float(attribute(element, "depart"))
         arrival = float(attribute(element, "arrival"))
-        begun = depart if depart >= 0 else end
-        trips[attribute(element, "id")] = Trip(
-            due=round(begun - float(attribute(element, "departDelay")), 3),
-            depart=depart if depart >= 0 else NEVER,
-            arrival=arrival if arrival >= 0 else NEVER,
-            metres=float(attribute(element, "routeLength")) if arrival >= 0 else 0.0,
-            removed=arrival >= 0 and bool(element.get("vaporized")),
-        )
+        waited = float(attribute(element, "departDelay"))
+        trip = Trip(end - waited, NEVER, NEVER, 0.0)
+        if depart >= 0:
+            trip = trip._replace(due=round(depart - waited, 3), depart=depart)
+        if arrival >= 0:
+            metres = float(attribute(element, "routeLength"))
+            removed = bool(element.get("vaporized"))
+            trip = trip._replace(arrival=arrival, metres=metres, removed=removed)
+        trips[attribute(element, "id")] = trip
         element.clear()
     return trips
 
@@ -86,36 +104,10 @@ def plain_trips(case: SumoInput, end: float, *, mesoscopic: bool) -> dict[str, T
     options |= {**case.options, **case.reading, **QUIET, **ALL_TRIPS}
     options |= {name: unquote(value) for name, value in case.left_out.items()}
     with temporary_folder() as folder:
-        options |= write_files(quiet_files(case), folder)
+        options |= quiet_files.write(quiet_files.read(case), folder)
         options["tripinfo-output"] = folder / "trips.xml"
         run_sumo("sumo", options, where=str(case.source))
         return read_trips(folder / "trips.xml", end)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Comparison:
-    """Comparison of the private trips of an import with those of plain SUMO.
-
-    trips: in plain SUMO; equal: those with the same departure, arrival and length in the import
-    spent: time of all in the import over that in plain SUMO, minus 1 [-]
-    first: what happens to the first trip that differs, "" without any
-    """
-
-    trips: int
-    equal: int
-    spent: float
-    first: str
-
-    def text(self, reasons: Sequence[str]) -> str:
-        """Return the result in one sentence; reasons: why trips may differ."""
-        percent = 100.0 * self.spent
-        if abs(percent) < 0.05:
-            percent = 0.0
-        counts = f"{self.equal:,} of {self.trips:,} trips, time spent {percent:+.1f} %"
-        if not self.first:
-            return f"same city: {counts}"
-        why = "; ".join([self.first, *reasons])
-        return f"not the same city as in plain SUMO: {counts}; {why}"
 
 
 def compare(
@@ -129,64 +121,56 @@ def compare(
     """Compare the private trips that may depart before `end` [s]; step: of the simulation [s]."""
     expected = _shown(plain, is_private, end, step)
     found = _shown(imported, is_private, end, step)
-    changes = []  # departure, vehicle, what happens to it
+    changes = []  # time, vehicle, what happens to it
     for name, trip in expected.items():
-        other = found.get(name)
-        if other is None:
+        if name not in found:
             changes.append((trip.due, name, "is missing"))
-        elif other[1:] != trip[1:]:
-            changes.append((min(trip.depart, other.depart), name, _change(trip, other)))
+        elif found[name][1:] != trip[1:]:
+            changes.append((trip.due, name, _change(trip, found[name])))
     equal = len(expected) - len(changes)
     for name in found.keys() - expected.keys():
         changes.append((found[name].due, name, "does not run there"))
-    spent = _time_spent(expected, end, step)
     first = ""
     if changes:
-        _, name, change = min(changes)
-        first = f"vehicle {name} {change}"
-    return Comparison(
-        trips=len(expected),
-        equal=equal,
-        spent=_time_spent(found, end, step) / spent - 1.0 if spent else 0.0,
-        first=first,
-    )
+        _, vehicle, change = min(changes)
+        first = f"vehicle {vehicle} {change}"
+    before = _time_spent(expected, end)
+    spent = _time_spent(found, end) / before - 1.0 if before else 0.0
+    return Comparison(trips=len(expected), equal=equal, spent=spent, first=first)
 
 
 def _shown(
     trips: Mapping[str, Trip], is_private: Callable[[str], bool], end: float, step: float
 ) -> dict[str, Trip]:
-    """Return the private trips that may depart before `end` [s], as shown then."""
+    """Return the private trips that may depart before `end` [s], as they are known then.
+
+    They are due in the first step in which they may depart.
+    """
     shown = {}
     for name, trip in trips.items():
-        if _first_step(trip, step) < end and is_private(name):
-            shown[name] = trip.until(end)
+        due = math.ceil(round(trip.due / step, 6)) * step
+        if due >= end or not is_private(name):
+            continue
+        shown[name] = trip._replace(due=due)
+        if trip.arrival >= end:
+            depart = trip.depart if trip.depart < end else NEVER
+            shown[name] = Trip(due, depart, NEVER, 0.0)
     return shown
-
-
-def _first_step(trip: Trip, step: float) -> float:
-    """Return the first step of the simulation in which a vehicle may depart [s]."""
-    return math.ceil(round(trip.due / step, 6)) * step
 
 
 def _change(expected: Trip, found: Trip) -> str:
     """Return how a trip of the import differs from the one in plain SUMO."""
     if found.depart != expected.depart:
         return f"departs {_at(found.depart)} instead of {_at(expected.depart)}"
-    if found.removed != expected.removed:
-        return "is removed on its way, or not, other than there"
     if found.arrival != expected.arrival:
         return f"arrives {_at(found.arrival)} instead of {_at(expected.arrival)}"
-    return f"drives {found.metres:g} m instead of {expected.metres:g} m"
+    return f"takes another way of {found.metres:g} m instead of {expected.metres:g} m"
 
 
 def _at(time: float) -> str:
     return "never" if time == NEVER else f"at {time:g} s"
 
 
-def _time_spent(trips: Mapping[str, Trip], end: float, step: float) -> float:
-    """Return the total time spent until `end` [s], from the first step in which a vehicle may
-    depart."""
-    total = 0.0
-    for trip in trips.values():
-        total += max(min(trip.arrival, end) - _first_step(trip, step), 0.0)
-    return total
+def _time_spent(trips: Mapping[str, Trip], end: float) -> float:
+    """Return the total time spent until `end` [s]."""
+    return sum(max(min(trip.arrival, end) - trip.due, 0.0) for trip in trips.values())

@@ -6,57 +6,33 @@ from collections import Counter
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import chain
-from pathlib import Path
-from xml.etree.ElementTree import Element, ElementTree, SubElement
+from typing import NamedTuple
+from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 
+from cosim.importing import quiet_files
 from cosim.importing.case import SumoInput, seconds
 from cosim.importing.streets import Streets
 from cosim.sumo.arrays import PerTrip, TripNumbers
 from cosim.sumo.departures import Departure, Departures, original, read_departures
 from cosim.sumo.recorded_trips import BOUND, QUEUED_AFTER
-from cosim.sumo.xml_files import file_list, read_xml
+from cosim.sumo.xml_files import file_list
 from nmfd.errors import InputError
 from nmfd.runs.files import temporary_folder
 
-FILES = {
-    "additional": "additional-files",
-    "routes": "route-files",
-}  # root of a file -> option of SUMO
 DRIVERS = ("vehicle", "trip", "flow")
 OTHERS = ("person", "personFlow", "container", "containerFlow")
-DROPPED = (
-    "poly",
-    "poi",
-    "edgeData",
-    "laneData",
-    "timedEvent",
-    "vTypeProbe",
-    "interval",
-)  # no traffic
 ACTING = ("calibrator", "rerouter")  # they act on every run, and not on what SUMO reads
-WRITERS = (
-    "Detector",
-    "Loop",
-    "calibrator",
-    "routeProbe",
-)  # ends of names of elements that write files
-WRITING = (
-    "file",
-    "has.ssm.device",
-    "device.toc.file",
-)  # parameters that only make SUMO write files
 SAFE_SPEEDS = ("max", "random", "0", "0.0", "0.00")  # departure speeds that can wait for a green
 FLOW = ("begin", "end", "number", "period", "vehsPerHour", "perHour", "probability")
 ZONES = ("fromTaz", "toTaz", "fromJunction", "toJunction")
 TRIGGERED = ("triggered", "containerTriggered", "split")  # departures without a time
 DEFAULT_TYPE = "DEFAULT_VEHTYPE"
-NAMES = re.compile(r"'[^']*'|[\d.]+")  # of things, in SUMO's words
-SHORT_DELAY_S = 60.0  # of waiting to enter, after which SUMO gives up vehicles
 ENDLESS_FLOW_S = 3600.0  # length of a simulation without an end that has a flow without an end
-# What was changed or left out; a report counts it.
+SHORT_DELAY_S = 60.0  # of waiting to enter, after which SUMO gives up vehicles
+NAMES = re.compile(r"'[^']*'|[\d.]+")  # of things, in SUMO's words
+# Notes: what was changed or left out, to be counted.
 ENDLESS = "s are simulated, as a flow has no end (--end for another time)"
 FAST = "fixed speeds at the departure, made the highest safe ones"
 FROM_FLOWS = "vehicles from flows"
@@ -66,7 +42,6 @@ BUSES = "public transport and other classes left alone"
 ALONE = "persons, containers and vehicles left alone, in all"
 NOWHERE = "vehicles on edges that the network has not, left out"
 NO_ROUTE = "vehicles without a route that SUMO could drive, left out"
-UNREAD = "vehicles and flows that SUMO itself does not read"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +57,6 @@ class Traffic:
     remarks: examples of what was left out, and SUMO's own words about the files
     left_out: shares of SUMO's vehicles, and of the distance that they would drive [-], that are not
         taken over
-    unread: share of the vehicles and flows of the files that SUMO itself does not read [-]
     given: ids of all vehicles and flows of the files
     end: later vehicles were not read [s]
     """
@@ -97,7 +71,6 @@ class Traffic:
     notes: Mapping[str, int] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
     left_out: tuple[float, float] = (0.0, 0.0)
-    unread: float = 0.0
     given: frozenset[str] = frozenset()
     end: float = math.inf
 
@@ -114,42 +87,26 @@ class Traffic:
         return {element.get("id", "").strip() for element in self.background}
 
 
+class _Trip(NamedTuple):
+    """Trip of the demand; first, last: numbers of edges."""
+
+    depart: float
+    first: int
+    last: int
+    element: Element
+
+
 def read_traffic(case: SumoInput, streets: Streets, seed: int) -> Traffic:
     """Return what SUMO reads from all route and additional files of a case.
 
     Flows become single vehicles; what is random is drawn by SUMO with `seed`. Raises InputError.
     """
     reading = Reading(case, streets)
-    for root in quiet_files(case):
+    for root in quiet_files.read(case):
         reading.file(root)
-    reading.departed(reading.departures(seed))
-    return reading.traffic()
-
-
-def quiet_files(case: SumoInput) -> list[Element]:
-    """Return the additional files of a case, then its route files, without output and decoration.
-
-    Each is the root of an XML file, and its tag a key of FILES.
-    """
-    files = []
-    for tag, paths in (("additional", case.additional), ("routes", case.routes)):
-        for path in paths:
-            root = Element(tag)
-            for element in read_xml(path):
-                if element.tag not in DROPPED:
-                    root.append(_silent(element))
-            files.append(root)
-    return files
-
-
-def write_files(files: Sequence[Element], folder: Path) -> dict[str, str]:
-    """Write the roots of `quiet_files` into a folder; return SUMO's options that name them."""
-    paths: dict[str, list[Path]] = {option: [] for option in FILES.values()}
-    for n, root in enumerate(files):
-        path = folder / f"{n}.xml"
-        ElementTree(root).write(path)
-        paths[FILES[root.tag]].append(path)
-    return {option: file_list(names) for option, names in paths.items() if names}
+    departures = reading.departures(seed)
+    reading.departed(departures)
+    return reading.traffic(departures)
 
 
 class Reading:
@@ -158,43 +115,40 @@ class Reading:
 
     def __init__(self, case: SumoInput, streets: Streets):
         self._case, self._streets = case, streets
-        self._files: list[Element] = []
-        self._given: dict[str, Element] = {}
+        # What the files hold.
+        self._files: list[Element] = []  # for SUMO to read
+        self._given: dict[str, Element] = {}  # id -> vehicle, trip or flow
+        self._astray: dict[str, str] = {}  # of these, those on an edge that does not exist
         self._background: list[Element] = []
         self._shared: list[Element] = []
-        self._switched: set[str] = set()
         self._end = case.end
         self._latest = 0.0  # when the last vehicle, person or flow begins [s]
-        self._notes = Counter[str]()
-        self._remarks: list[str] = []
-        self._astray: dict[str, str] = {}  # vehicle or flow -> an edge that does not exist
-        self._routeless: list[str] = []
-        self._unread: list[str] = []
-        self._kept: list[tuple[float, int, int, Element]] = []
+        # What SUMO makes of it.
+        self._trips: list[_Trip] = []
         self._ids: set[str] = set()
-        self._metres = self._metres_kept = 0.0  # that all vehicles would drive, and those kept
-        self._before = Counter[float]()  # departure -> kept vehicles
-        delay = seconds(case.options.get("max-depart-delay", "-1"), f"{case.source}")
-        self._patience = delay if delay >= 0.0 else math.inf  # of SUMO with waiting vehicles [s]
-        self._queued: dict[int, float] = {}  # simulation step -> last departure in its queue
+        self._routeless: list[str] = []
+        self._metres = 0.0  # that all vehicles would drive
+        self._metres_kept = 0.0
+        self._queued: dict[int, float] = {}  # step of the simulation -> last departure
+        self._cars_at = Counter[float]()  # departure -> trips
+        self._notes = Counter[str]()
 
     def file(self, root: Element) -> None:
-        """Take the contents of a file of `quiet_files`."""
-        read = Element(root.tag)
+        """Take the contents of a file of quiet_files."""
+        for_sumo = Element(root.tag)
         for element in root:
+            read = element
             if element.tag in DRIVERS:
-                element = self._driver(element)
+                read = self._driver(element)
             elif element.tag in OTHERS:
                 self._background.append(element)
             else:
-                for part in element.iter("wautJunction"):
-                    self._switched.add(part.get("junctionID", ""))
                 self._shared.append(element)
-            if element.tag in DRIVERS or element.tag in OTHERS:
+            if element.tag in (*DRIVERS, *OTHERS):
                 self._latest = max(self._latest, departure(element))
             if element.tag not in ACTING:
-                read.append(element)
-        self._files.append(read)
+                for_sumo.append(read)
+        self._files.append(for_sumo)
 
     def _driver(self, element: Element) -> Element:
         """Take a vehicle, trip or flow; return what SUMO shall read for it."""
@@ -202,11 +156,8 @@ class Reading:
         self._given[name] = element
         if _waits(element):
             self._background.append(element)
-        if (
-            element.tag == "flow"
-            and self._end is None
-            and not {"end", "number"} & set(element.keys())
-        ):
+        is_endless = element.tag == "flow" and not {"end", "number"} & element.attrib.keys()
+        if is_endless and self._end is None:
             self._end = self._case.begin + ENDLESS_FLOW_S
             self._notes[ENDLESS] = int(ENDLESS_FLOW_S)
         for edge in _edges(element):
@@ -216,9 +167,9 @@ class Reading:
         return element
 
     def departures(self, seed: int) -> Departures:
-        """Let SUMO read the vehicles of all files."""
+        """Let SUMO read the vehicles of all files. Raises InputError."""
         case = self._case
-        options = {
+        options: dict[str, object] = {
             "net-file": file_list([case.net.absolute()]),
             "begin": case.begin,
             "step-length": case.step_length,
@@ -227,39 +178,36 @@ class Reading:
             **case.options,
             **case.reading,
         }
-        waits = {name: _waits(element) for name, element in self._given.items()}
         with temporary_folder() as folder:
+            options |= quiet_files.write(self._files, folder)
             return read_departures(
-                options | write_files(self._files, folder),
-                given=waits,
+                options,
+                given={name: _waits(element) for name, element in self._given.items()},
                 devices=case.devices,
                 end=self._end,
                 latest=self._latest,
                 where=str(case.source),
             )
 
-    def departed(self, read: Departures) -> None:
-        """Take the vehicles that SUMO read."""
-        shared = [part for element in self._shared for part in element.iter()]
-        routes = {part.get("id", "") for part in shared if part.tag == "route"}
-        for vehicle in read.vehicles:
-            self._vehicle(vehicle, routes)
-        self._notes[WAITING] = len(read.timeless)
-        self._routeless += read.dropped
-        self._find_unread(read)
-        for part in shared:
+    def departed(self, departures: Departures) -> None:
+        """Take the vehicles that SUMO read. Raises InputError if two have one id."""
+        parts = [part for element in self._shared for part in element.iter()]
+        routes = {part.get("id", "") for part in parts if part.tag == "route"}
+        for part in parts:
             if part.tag == "vType":
                 part.attrib.pop("scale", None)  # SUMO has multiplied its vehicles already
-        self._remark(read.warnings)
+        for vehicle in departures.vehicles:
+            self._vehicle(vehicle, routes)
+        self._routeless += departures.dropped
+        self._notes[WAITING] = len(departures.timeless)
 
     def _vehicle(self, vehicle: Departure, routes: Container[str]) -> None:
         """Take a vehicle that SUMO read; routes: ids of shared ones."""
         name = original(vehicle.id, self._given)
-        source = self._given.get(name)
         if name in self._astray:
             self._notes[NOWHERE] += 1
             return
-        if source is None and vehicle.place is None:
+        if not name and vehicle.place is None:
             return  # of a person, who makes it in every run
         number = self._streets.number
         edges = [number[edge] for edge in vehicle.edges if edge in number]
@@ -275,31 +223,19 @@ class Reading:
             )
         self._ids.add(vehicle.id)
         self._metres_kept += metres
-        element = _single(vehicle, source, routes)
         depart = self._place(vehicle)
+        element = self._element(vehicle, self._given.get(name), routes)
         element.set("depart", f"{depart:.10g}")
-        for device in vehicle.devices:
-            SubElement(element, "param", {"key": f"has.{device}.device", "value": "true"})
-        if vehicle.place is not None:
-            self._notes[ON_ROAD] += 1
-        elif source is not None and source.tag == "flow":
-            self._notes[FROM_FLOWS] += 1
-        # SUMO deletes a vehicle that cannot stop from its departure speed at a signal whose
-        # programme never gives it green; a signal that is switched from outside has no programme
-        # that does.
-        if element.get("departSpeed", "max") not in SAFE_SPEEDS:
-            element.set("departSpeed", "max")
-            self._notes[FAST] += 1
         if vehicle.line or vehicle.kind in BOUND:
-            ahead = str(self._before[depart])
-            SubElement(element, "param", {"key": QUEUED_AFTER, "value": ahead})
+            cars_before = str(self._cars_at[depart])
+            SubElement(element, "param", {"key": QUEUED_AFTER, "value": cars_before})
             self._background.append(element)
             self._notes[BUSES] += 1
             return
-        self._before[depart] += 1
-        first = _index(element.get("departEdge", ""), 0)
-        last = _index(element.get("arrivalEdge", ""), -1)
-        self._kept.append((depart, edges[first], edges[last], element))
+        self._cars_at[depart] += 1
+        first = edges[_index(element.get("departEdge", ""), 0)]
+        last = edges[_index(element.get("arrivalEdge", ""), -1)]
+        self._trips.append(_Trip(depart, first, last, element))
 
     def _place(self, vehicle: Departure) -> float:
         """Return a departure [s] with which the vehicle keeps its place in SUMO's queue.
@@ -310,86 +246,90 @@ class Reading:
         flow's in the step that builds it. Where it soon gives up vehicles that wait, the exact
         departure matters more.
         """
-        milliseconds = round(1000.0 * self._case.step_length)
-        step = math.ceil(round(1000.0 * vehicle.depart) / milliseconds)
         depart = vehicle.depart
-        if vehicle.routed and self._patience > SHORT_DELAY_S:
+        milliseconds = round(1000.0 * self._case.step_length)
+        step = math.ceil(round(1000.0 * depart) / milliseconds)
+        patience = self._case.options.get("max-depart-delay", "-1")
+        gives_up = 0.0 <= seconds(patience, str(self._case.source)) <= SHORT_DELAY_S
+        if vehicle.routed and not gives_up:
             depart = max(depart, min(vehicle.built, step * milliseconds / 1000.0))
         depart = max(depart, self._queued.get(step, depart))
         self._queued[step] = depart
         return depart
 
-    def _find_unread(self, read: Departures) -> None:
-        """Find the vehicles of the files that SUMO should have read and has not."""
-        options = self._case.reading
-        if float(options.get("scale", 1.0)) < 1.0 or "random-depart-offset" in options:
-            return  # SUMO leaves some out on purpose
-        names = chain((vehicle.id for vehicle in read.vehicles), read.timeless, read.dropped)
-        seen = {original(name, self._given) for name in names}
-        end = math.inf if self._end is None else self._end - self._case.step_length
-        thinned = self._thinned_types()
-        for name, element in self._given.items():
-            if name in seen or element.get("type", DEFAULT_TYPE).strip() in thinned:
-                continue
-            if self._case.begin <= _first_departure(element) <= end:
-                self._unread.append(name)
-        self._notes[UNREAD] = len(self._unread)
+    def _element(
+        self, vehicle: Departure, source: Element | None, routes: Container[str]
+    ) -> Element:
+        """Return a vehicle for the scenario, and note how it differs from what was given.
 
-    def _thinned_types(self) -> set[str]:
-        """Return the types of which SUMO leaves out vehicles on purpose."""
-        thinned = set()
+        source: its element, or that of its flow; routes: ids of shared ones
+        """
+        if vehicle.place is not None or source is None:
+            element = _on_road(vehicle)
+            self._notes[ON_ROAD] += 1
+        else:
+            element = _single(vehicle, source, routes)
+            self._notes[FROM_FLOWS] += source.tag == "flow"
+        # SUMO deletes a vehicle that cannot stop from its departure speed at a signal whose
+        # programme never gives it green; a signal that is switched from outside has no programme
+        # that does.
+        if element.get("departSpeed", "max") not in SAFE_SPEEDS:
+            element.set("departSpeed", "max")
+            self._notes[FAST] += 1
+        for device in vehicle.devices:
+            SubElement(element, "param", {"key": f"has.{device}.device", "value": "true"})
+        return element
+
+    def traffic(self, departures: Departures) -> Traffic:
+        """Return all that was taken."""
+        trips = sorted(self._trips, key=lambda trip: trip.depart)
+        switched = set()
         for element in self._shared:
-            for kind in element.iter("vType"):
-                if float(kind.get("scale", 1.0)) < 1.0:
-                    thinned |= {kind.get("id", ""), element.get("id", "")}
-        return thinned
+            for part in element.iter("wautJunction"):
+                switched.add(part.get("junctionID", ""))
+        self._notes[NO_ROUTE] = len(self._routeless)
+        self._notes[ALONE] = len(self._background)
+        return Traffic(
+            vehicles=tuple(trip.element for trip in trips),
+            depart=np.array([trip.depart for trip in trips], dtype=float),
+            origin=np.array([trip.first for trip in trips], dtype=int),
+            destination=np.array([trip.last for trip in trips], dtype=int),
+            background=tuple(sorted(self._background, key=departure)),
+            shared=tuple(self._shared),
+            switched=tuple(sorted(switched - {""})),
+            notes={note: count for note, count in self._notes.items() if count},
+            remarks=tuple(self._remarks(departures.warnings)),
+            left_out=self._left_out(),
+            given=frozenset(self._given),
+            end=math.inf if self._end is None else self._end,
+        )
 
-    def _remark(self, warnings: Sequence[str]) -> None:
-        """Give an example of all that was left out, and SUMO's words, alike ones once."""
-        for name, edge in [*self._astray.items()][:1]:
+    def _left_out(self) -> tuple[float, float]:
+        """Return Traffic.left_out."""
+        nowhere = self._notes[NOWHERE]
+        left = nowhere + len(self._routeless)
+        known = len(self._trips) + len(self._background) + len(self._routeless)
+        # Those on edges of another network would drive as far as the others.
+        metres = self._metres * (1.0 + nowhere / max(known, 1))
+        distance = (metres - self._metres_kept) / max(metres, 1.0)
+        return left / max(known + nowhere, 1), distance
+
+    def _remarks(self, warnings: Sequence[str]) -> list[str]:
+        """Return an example of all that was left out, and SUMO's words, alike ones once."""
+        remarks = []
+        if self._astray:
+            name, edge = next(iter(self._astray.items()))
             what = f"edge {edge} of {self._given[name].tag} {name} is not in {self._case.net.name}"
-            self._remarks.append(what + _in_all(self._notes[NOWHERE]))
-        for name in self._routeless[:1]:
-            what = f"vehicle {name} has no route that SUMO could drive"
-            self._remarks.append(what + _in_all(len(self._routeless)))
-        for name in self._unread[:1]:
-            what = f"{self._given[name].tag} {name} is not read by SUMO"
-            self._remarks.append(what + _in_all(len(self._unread)))
+            remarks.append(what + _in_all(self._notes[NOWHERE]))
+        if self._routeless:
+            what = f"vehicle {self._routeless[0]} has no route that SUMO could drive"
+            remarks.append(what + _in_all(len(self._routeless)))
         alike: dict[str, list[str]] = {}
         for words in warnings:
             alike.setdefault(NAMES.sub("", words), []).append(words)
         for several in alike.values():
-            self._remarks.append(f"SUMO says: {several[0]}{_in_all(len(several))}")
-
-    def traffic(self) -> Traffic:
-        """Return all that was taken."""
-        count = len(self._kept) + len(self._background)
-        nowhere, routeless = self._notes[NOWHERE], len(self._routeless)
-        self._notes[NO_ROUTE] = routeless
-        self._notes[ALONE] = len(self._background)
-        left = nowhere + routeless
-        # How far those would drive that name an edge of another network is unknown: as the others.
-        mean = self._metres / max(count + routeless, 1)
-        metres = self._metres + nowhere * mean
-        self._kept.sort(key=lambda row: row[0])
-        return Traffic(
-            vehicles=tuple(element for *_, element in self._kept),
-            depart=np.array([depart for depart, *_ in self._kept], dtype=float),
-            origin=np.array([first for _, first, *_ in self._kept], dtype=int),
-            destination=np.array([last for *_, last, _ in self._kept], dtype=int),
-            background=tuple(sorted(self._background, key=departure)),
-            shared=tuple(self._shared),
-            switched=tuple(sorted(self._switched - {""})),
-            notes={note: number for note, number in self._notes.items() if number},
-            remarks=tuple(self._remarks),
-            left_out=(
-                left / max(count + left, 1),
-                (metres - self._metres_kept) / max(metres, 1.0),
-            ),
-            unread=len(self._unread) / max(len(self._given), 1),
-            given=frozenset(self._given),
-            end=math.inf if self._end is None else self._end,
-        )
+            remarks.append(f"SUMO says: {several[0]}{_in_all(len(several))}")
+        return remarks
 
 
 def _in_all(count: int) -> str:
@@ -406,31 +346,6 @@ def _waits(element: Element) -> bool:
     return element.get("depart", element.get("begin")) in TRIGGERED
 
 
-def _first_departure(element: Element) -> float:
-    """Return when a vehicle, or the first one of a flow, departs for sure [s]; inf if unknown."""
-    if element.get("number") == "0" or element.get("probability"):
-        return math.inf
-    if element.get("period", "").startswith("exp"):
-        return math.inf
-    try:
-        return seconds(element.get("depart") or element.get("begin") or "0", "")
-    except InputError:  # triggered, or some other word
-        return math.inf
-
-
-def _stand_in(element: Element, streets: Streets) -> Element:
-    """Return what SUMO can read for a vehicle on an edge that the network has not.
-
-    SUMO then counts its vehicles, and draws the same random numbers for all others.
-    """
-    kept = ("id", "depart", "type", *FLOW)
-    attributes = {key: value for key, value in element.attrib.items() if key in kept}
-    single = Element("flow" if element.tag == "flow" else "vehicle", attributes)
-    edge = streets.edges[int(np.argmax(streets.drivable))]
-    SubElement(single, "route", {"edges": edge})
-    return single
-
-
 def _edges(element: Element) -> list[str]:
     """Return the edges that a vehicle names, without those of shared routes."""
     texts = [element.get(key, "") for key in ("from", "to", "via")]
@@ -438,57 +353,64 @@ def _edges(element: Element) -> list[str]:
     return " ".join(texts).split()
 
 
-def _single(departure: Departure, source: Element | None, names: Container[str]) -> Element:
-    """Return the vehicle of a departure, as it was given, with what SUMO drew for it.
+def _stand_in(element: Element, streets: Streets) -> Element:
+    """Return what SUMO can read for a vehicle on an edge that the network has not.
 
-    source: its element, or that of its flow; names: ids of shared routes
+    SUMO then counts its vehicles, and draws the same random numbers for all others.
     """
-    own = {
-        "id": departure.id,
-        "depart": f"{departure.depart:.10g}",
-        "speedFactor": f"{departure.speed_factor:.6g}",
-    }
-    route = Element("route", {"edges": " ".join(departure.edges)})
-    if source is None or departure.place is not None:
-        lane, position = departure.place or ("best", "base")
-        own |= {
-            "type": departure.type,
-            "departLane": lane,
-            "departPos": position,
-            "departSpeed": "max",
-        }
-        single = Element("vehicle", own)
-        single.append(route)
-        return single
-    parts = [part for part in source if part.tag not in ("route", "routeDistribution")]
-    routed = source.get("route") is not None or len(parts) < len(source)
-    out = {*FLOW, *(ZONES if routed else ())}
-    kept = {key: " ".join(value.split()) for key, value in source.attrib.items() if key not in out}
-    single = Element("vehicle" if routed else "trip", kept | own)
-    if departure.type != source.get("type", DEFAULT_TYPE).strip():
-        single.set("type", departure.type)
-    if routed and (nested := source.find("route")) is not None:
-        nested.attrib.pop("id", None)
-        parts.insert(0, nested)
-    elif routed and departure.route in names:
-        single.set("route", departure.route)
-    elif routed:
-        single.attrib.pop("route", None)
-        parts.insert(0, route)
-    single.extend(parts)
+    single = Element("flow" if element.tag == "flow" else "vehicle")
+    for key in ("id", "depart", "type", *FLOW):
+        if key in element.attrib:
+            single.set(key, element.attrib[key])
+    edge = streets.edges[int(np.argmax(streets.drivable))]
+    SubElement(single, "route", {"edges": edge})
     return single
 
 
-def _silent(element: Element) -> Element:
-    """Redirect the files that an element writes to nowhere; return it."""
-    for part in element.iter():
-        if part.tag.endswith(WRITERS):
-            for key in {"file", "output"} & set(part.keys()):
-                part.set(key, "NUL")
-        for parameter in part.findall("param"):
-            if parameter.get("key") in WRITING:
-                part.remove(parameter)
+def _drawn(vehicle: Departure) -> dict[str, str]:
+    """Return the attributes that SUMO gave to a vehicle."""
+    return {
+        "id": vehicle.id,
+        "depart": f"{vehicle.depart:.10g}",
+        "speedFactor": f"{vehicle.speed_factor:.6g}",
+    }
+
+
+def _on_road(vehicle: Departure) -> Element:
+    """Return a vehicle that is on the road in a loaded state."""
+    lane, position = vehicle.place or ("best", "base")
+    place = {"departLane": lane, "departPos": position, "departSpeed": "max"}
+    element = Element("vehicle", {**_drawn(vehicle), "type": vehicle.type, **place})
+    SubElement(element, "route", {"edges": " ".join(vehicle.edges)})
     return element
+
+
+def _single(vehicle: Departure, source: Element, routes: Container[str]) -> Element:
+    """Return a vehicle as it was given, with what SUMO drew for it.
+
+    source: its element, or that of its flow; routes: ids of shared ones
+    """
+    parts = [part for part in source if part.tag not in ("route", "routeDistribution")]
+    routed = source.get("route") is not None or len(parts) < len(source)
+    single = Element("vehicle" if routed else "trip")
+    for key, value in source.attrib.items():
+        if key not in FLOW and not (routed and key in ZONES):
+            single.set(key, " ".join(value.split()))
+    single.attrib.update(_drawn(vehicle))
+    if vehicle.type != source.get("type", DEFAULT_TYPE).strip():
+        single.set("type", vehicle.type)
+    if routed:
+        nested = source.find("route")
+        if nested is not None:
+            nested.attrib.pop("id", None)
+            single.append(nested)
+        elif vehicle.route in routes:
+            single.set("route", vehicle.route)
+        else:  # of a distribution
+            single.attrib.pop("route", None)
+            SubElement(single, "route", {"edges": " ".join(vehicle.edges)})
+    single.extend(parts)
+    return single
 
 
 def departure(element: Element) -> float:

@@ -11,7 +11,7 @@ import pandas as pd
 from cosim.importing.baseline import INTERVAL_S, Baseline
 from cosim.importing.streets import Streets
 from cosim.sumo.arrays import EdgeMask, EdgeNumbers, PerTrip
-from cosim.sumo.net import City
+from cosim.sumo.net import City, Gateway
 from cosim.sumo.signals import HELD, STATIC
 from nmfd.model import authority
 from nmfd.model.authority import Boundaries, Verdict
@@ -23,8 +23,11 @@ CONTROLLED = "controlled"  # gateway with a signal that perimeter control uses
 
 
 class Tables(NamedTuple):
-    """Rows of quality.csv (one per region, and one for all) and of gateways.csv (one per movement
-    over a boundary)."""
+    """Rows of two tables.
+
+    quality: of quality.csv, one per region, and one for all
+    gateways: of gateways.csv, one per movement over a boundary
+    """
 
     quality: Sequence[Mapping]
     gateways: Sequence[Mapping]
@@ -43,27 +46,15 @@ def tables(
     baseline: the run without control; None leaves densities and flows at zero
     left_alone: signal -> reason why perimeter control does not use it
     """
-    moves = Counter() if baseline is None else baseline.moves()
-    kinds = {
-        signal: "fixed" if logic.kind == STATIC else logic.kind
-        for signal, logic in streets.logics.items()
-    }
-    gateways = [
-        {
-            "source": g.source,
-            "target": g.target,
-            "from_edge": g.from_edge,
-            "to_edge": g.to_edge,
-            "lanes": " ".join(map(str, g.lanes)),
-            "signal": g.signal or "",
-            "links": " ".join(map(str, g.links)),
-            "control": "no signal" if g.signal is None else left_alone.get(g.signal, CONTROLLED),
-            "kind": kinds.get(g.signal or "", ""),
-            "flow_veh": moves[streets.number[g.from_edge], streets.number[g.to_edge]],
-        }
-        for g in city.gateways
-    ]
-    density = np.zeros(len(regions)) if baseline is None else 1000.0 * baseline.density(streets)
+    moves: Mapping[tuple[int, int], int] = Counter()
+    density = np.zeros(len(regions))
+    if baseline is not None:
+        moves = baseline.moves()
+        density = 1000.0 * baseline.density(streets)
+    gateways = []
+    for gateway in city.gateways:
+        move = streets.number[gateway.from_edge], streets.number[gateway.to_edge]
+        gateways.append(_gateway(gateway, streets, left_alone, moves[move]))
     approaches = pd.Series(
         {edge: regions[streets.number[edge]] for edge in city.signals}, dtype=int
     )
@@ -88,11 +79,36 @@ def tables(
             "uncontrolled_share": round(free / flow, 3) if flow else np.nan,
         }
 
-    own = [[g for g in gateways if n in (g["source"], g["target"])] for n in range(len(names))]
-    rows = [row(str(n), name, regions == n, own[n]) for n, name in enumerate(names)]
-    return Tables(
-        quality=[*rows, row("all", "all regions", regions >= 0, gateways)], gateways=gateways
-    )
+    rows = []
+    for n, name in enumerate(names):
+        own = [gateway for gateway in gateways if n in (gateway["source"], gateway["target"])]
+        rows.append(row(str(n), name, regions == n, own))
+    rows.append(row("all", "all regions", regions >= 0, gateways))
+    return Tables(quality=rows, gateways=gateways)
+
+
+def _gateway(
+    gateway: Gateway, streets: Streets, left_alone: Mapping[str, str], flow: int
+) -> dict[str, object]:
+    """Return a row of gateways.csv; flow: vehicles that passed in the run without control."""
+    control = "no signal"
+    kind = ""
+    if gateway.signal is not None:
+        control = left_alone.get(gateway.signal, CONTROLLED)
+        if gateway.signal in streets.logics:
+            kind = streets.logics[gateway.signal].kind
+    return {
+        "source": gateway.source,
+        "target": gateway.target,
+        "from_edge": gateway.from_edge,
+        "to_edge": gateway.to_edge,
+        "lanes": " ".join(map(str, gateway.lanes)),
+        "signal": gateway.signal or "",
+        "links": " ".join(map(str, gateway.links)),
+        "control": control,
+        "kind": "fixed" if kind == STATIC else kind,
+        "flow_veh": flow,
+    }
 
 
 def doubts(streets: Streets, regions: EdgeNumbers, names: Sequence[str]) -> list[str]:
@@ -132,14 +148,15 @@ def left_alone(streets: Streets, switched: Sequence[str] = ()) -> dict[str, str]
 
     switched: signals whose programme a timetable changes
     """
-    reasons = {
-        signal: "no programme"
-        for signal in streets.link_signals
-        if signal and signal not in streets.logics
-    }
+    reasons = {}
+    for signal in streets.link_signals:
+        if signal and signal not in streets.logics:
+            reasons[signal] = "no programme"
     for signal, logic in streets.logics.items():
-        if logic.programme == "off" or logic.kind not in HELD:
-            reasons[signal] = "switched off" if logic.programme == "off" else f"{logic.kind} signal"
+        if logic.programme == "off":
+            reasons[signal] = "switched off"
+        elif logic.kind not in HELD:
+            reasons[signal] = f"{logic.kind} signal"
     return reasons | dict.fromkeys(switched, "programme follows a timetable")
 
 
@@ -151,14 +168,12 @@ def import_verdict(
     scenario: str,
 ) -> Verdict:
     """Judge from the run without control whether perimeter control can help; scenario: its name."""
-    crossings = (
-        (row["source"], row["target"], row["flow_veh"], row["control"] == CONTROLLED)
-        for row in gateways
-    )
-    inside = (
-        np.array([np.bincount(regions, row, network.regions) for row in baseline.presence])
-        / INTERVAL_S
-    )
+    crossings = []
+    for row in gateways:
+        controlled = row["control"] == CONTROLLED
+        crossings.append((row["source"], row["target"], row["flow_veh"], controlled))
+    vehicle_seconds = [np.bincount(regions, row, network.regions) for row in baseline.presence]
+    inside = np.array(vehicle_seconds) / INTERVAL_S
     started = np.zeros(network.regions)
     for (way, _), vehicles in baseline.ways.items():
         if way:

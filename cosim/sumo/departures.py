@@ -139,7 +139,8 @@ class _Reader:
 
     def __init__(self, given: Mapping[str, bool], devices: Sequence[str]):
         """given: id of every vehicle and flow -> True if it waits; devices: kinds to ask for"""
-        self._given, self._devices = given, devices
+        self._given = given
+        self._devices = devices
         self._numbers = count()  # vehicles in the order in which SUMO builds them
         self._due: list[tuple[float, int, str, float]] = []  # depart, number, id, built
         self._found: dict[int, Departure] = {}
@@ -172,7 +173,8 @@ class _Reader:
             for name in libsumo.person.getIDList():
                 libsumo.person.remove(name)
             libsumo.simulationStep()
-            self._step, self._now = self._now, libsumo.simulation.getTime()
+            self._step = self._now
+            self._now = libsumo.simulation.getTime()
 
     def departures(self, log: str) -> Departures:
         """Return what was read. log: SUMO's error log"""
