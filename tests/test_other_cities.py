@@ -81,7 +81,8 @@ def test_files_are_found_wherever_they_are(net, tmp_path):
     (below.parent / "c.rou.xml").write_text(f"<routes>{FLOW}</routes>")
     config = below / "\u57ce.sumocfg"
     config.write_text(
-        '<configuration><net-file value="../../n\u00e9t 1.net.xml"/><route-files v="../c.rou.xml"/></configuration>'
+        '<configuration><net-file value="../../n\u00e9t 1.net.xml"/>'
+        '<route-files v="../c.rou.xml"/></configuration>'
     )
     out = tmp_path / "networks" / 'd\'"x" \\ y'
     scenario = imported(config, out=out)[1]
@@ -90,7 +91,7 @@ def test_files_are_found_wherever_they_are(net, tmp_path):
 
 
 def test_files_are_found_by_the_environment(net, tmp_path, monkeypatch):
-    """As SUMO replaces ${NAME}: a whole path or a part, in lists too, nothing for an unknown one."""
+    """As SUMO replaces ${NAME}: a whole path or a part, in lists too; an unknown one is empty."""
     below = tmp_path / "a b"
     below.mkdir()
     (below / "c.rou.xml").write_text(f"<routes>{FLOW}</routes>")
@@ -250,8 +251,8 @@ def test_cars_for_streets_that_are_closed_to_them(net, city, tmp_path):
     (tmp_path / "closed.net.xml").write_text(text)
     said, scenario = imported(
         city(
-            FLOW
-            + '<vType id="lorry" vClass="truck"/><trip id="lorry" type="lorry" depart="9" from="A1B1" to="C1D1"/>'
+            FLOW + '<vType id="lorry" vClass="truck"/>'
+            '<trip id="lorry" type="lorry" depart="9" from="A1B1" to="C1D1"/>'
             '<vehicle id="over" depart="10"><route edges="B1C1 C1D1 D1D2"/></vehicle>'
             '<trip id="car" depart="12" from="A1B1" to="D1D2"/>',
             net_file="closed.net.xml",
@@ -269,15 +270,17 @@ def test_what_else_changes_routes_and_vehicles(city, tmp_path, monkeypatch):
     exact; vehicles that SUMO gives up are told; nothing is written where the user is."""
     monkeypatch.chdir(tmp_path)
     config = city(
-        FLOW
-        + '<trip id="shut" depart="100" from="C2D2" to="D1D0"/><trip id="begins" depart="begin" from="A1B1" '
-        'to="D1D0"><param key="has.ssm.device" value="true"/></trip>',
-        '<routeProbe id="probe" edge="A1B1" freq="60" file="probe.xml"/><route id="other" edges="B1C1 C1C2"/>'
-        '<route id="more" edges="B2C2 C2D2"/>'
-        '<rerouter id="r" edges="B1C1"><interval begin="0" end="600"><routeProbReroute id="other" probability="1"/>'
-        '</interval></rerouter><rerouter id="s" edges="C2D2"><interval begin="0" end="600"><closingReroute id="C2D2" '
-        'disallow="passenger"/></interval></rerouter><calibrator id="c" edge="B2C2" pos="0" output="calibrator.xml" '
-        'routeProbe="probe" freq="60"><flow begin="0" end="600" route="more" vehsPerHour="600"/></calibrator>',
+        FLOW + '<trip id="shut" depart="100" from="C2D2" to="D1D0"/>'
+        '<trip id="begins" depart="begin" from="A1B1" to="D1D0">'
+        '<param key="has.ssm.device" value="true"/></trip>',
+        '<routeProbe id="probe" edge="A1B1" freq="60" file="probe.xml"/>'
+        '<route id="other" edges="B1C1 C1C2"/><route id="more" edges="B2C2 C2D2"/>'
+        '<rerouter id="r" edges="B1C1"><interval begin="0" end="600">'
+        '<routeProbReroute id="other" probability="1"/></interval></rerouter>'
+        '<rerouter id="s" edges="C2D2"><interval begin="0" end="600">'
+        '<closingReroute id="C2D2" disallow="passenger"/></interval></rerouter>'
+        '<calibrator id="c" edge="B2C2" pos="0" output="calibrator.xml" routeProbe="probe" '
+        'freq="60"><flow begin="0" end="600" route="more" vehsPerHour="600"/></calibrator>',
     )
     text, scenario = imported(config)
     assert " 1 without a route or a free lane" in text
@@ -420,8 +423,9 @@ def test_speeds_and_coordinates(city):
     driven."""
     traffic = traffic_of(
         city(
-            '<trip id="a" depart="1" from="A1B1" to="C1D1" departSpeed="13.9"/><trip id="b" depart="1" fromXY="1,1" '
-            'toXY="9,9"/><trip id="c" depart="1" from="A1B1" to="C1D1" departSpeed="random"/>'
+            '<trip id="a" depart="1" from="A1B1" to="C1D1" departSpeed="13.9"/>'
+            '<trip id="b" depart="1" fromXY="1,1" toXY="9,9"/>'
+            '<trip id="c" depart="1" from="A1B1" to="C1D1" departSpeed="random"/>'
         )
     )
     assert [vehicle.get("departSpeed") for vehicle in traffic.vehicles] == ["max", None, "random"]

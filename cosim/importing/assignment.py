@@ -1,4 +1,4 @@
-"""Routes of a generated demand: an iterated assignment by SUMO's duaIterate.py.
+"""Routes of a generated demand, assigned by SUMO's duaIterate.py.
 
 All drivers start on a fastest route at free flow. Then, repeatedly, the city is simulated, and
 drivers choose among the routes that were fastest so far by Gawron's probabilities (1998). The
@@ -32,7 +32,10 @@ MESOSCOPIC = ["--mesosim", "--meso-junctioncontrol"]
 
 
 class _Model(NamedTuple):
-    """Model of SUMO in which routes are assigned, for at most so many iterations."""
+    """Model of SUMO in which routes are assigned.
+
+    iterations: at most
+    """
 
     label: str
     iterations: int
@@ -64,8 +67,9 @@ def assign(
     additional: Sequence[Path] = (),
     progress: Progress = lambda stage, share=0.0: None,
 ) -> Assigned:
-    """Assign routes to vehicles that have routes at free flow. The same seed gives the same routes.
+    """Assign routes to vehicles that have routes at free flow.
 
+    The same seed gives the same routes.
     net: an absolute path; elements: the vehicle types, and the vehicles by departure
     iterations: at most, one or more; mesoscopic: the city is driven in the mesoscopic model
     Raises: InputError with SUMO's own words if it refuses
@@ -136,8 +140,9 @@ def _reason(log: Path) -> str:
 
 
 def _relative_gap(folder: Path, net: Path, n: int, *, begin: float, seed: int) -> float:
-    """Return the relative gap [-] of iteration n: what drivers could save, over their least time.
+    """Return the relative gap [-] of iteration n.
 
+    It is what drivers could save, over their least time, estimated from a sample.
     It is estimated from a sample.
     """
     (weights,) = (folder / f"{n:03d}").glob("dump_*.xml.gz")

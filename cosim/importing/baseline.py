@@ -1,5 +1,7 @@
-"""Runs of the imported city without control by SUMO's own program: densities of its streets,
-routes driven."""
+"""Runs of the imported city without control by SUMO's own program.
+
+They give the densities of its streets, and the routes driven.
+"""
 
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
@@ -72,8 +74,10 @@ class Baseline:
     trips: Mapping[str, Trip] = field(default_factory=dict)
 
     def density(self, streets: Streets) -> PerEdge:
-        """Return the density (E,) [veh/m of lane] in the quarter of an hour with the most
-        vehicles."""
+        """Return the density (E,) [veh/m of lane] at the peak.
+
+        That is the quarter of an hour with the most vehicles.
+        """
         total = self.presence.sum(axis=1)
         window = np.ones(min(PEAK_INTERVALS, len(total)))
         first = int(np.argmax(np.convolve(total, window, mode="valid")))
@@ -89,7 +93,7 @@ class Baseline:
         return count
 
     def crossings(self, regions: EdgeNumbers) -> PerTurn:
-        """Count the vehicles [i, h, j] that crossed from region i to h on the way to j."""
+        """Count the vehicles [i, h, j] from region i to h on the way to j."""
         count = np.zeros((int(regions.max()) + 1,) * 3)
         for (way, last), vehicles in self.ways.items():
             seen = regions[list(way)]
@@ -98,7 +102,10 @@ class Baseline:
         return count
 
     def metres_per_visit(self, streets: Streets, regions: EdgeNumbers) -> PerRegion:
-        """Return the distance (R,) [m] driven in a region per visit; NaN without visits."""
+        """Return the distance (R,) [m] driven in a region per visit.
+
+        NaN stands for no visits.
+        """
         count = int(regions.max()) + 1
         metres = np.zeros(count)
         visits = np.zeros(count)
@@ -122,8 +129,9 @@ def averaged_runs(
     seeds: int,
     progress: Progress,
 ) -> Baseline:
-    """Run the city with seeds 0, 1, ... and average the presence; all else is that of seed 0.
+    """Run the city with seeds 0, 1, ... and average the presence.
 
+    All else is that of seed 0.
     files: routes of the demand, background and additional -> names of files in the folder
     times: SUMO's options begin, end [s], and all others that change the traffic
     factor: multiplies the demand [-]; seed 0 departs as recorded

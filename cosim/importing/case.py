@@ -1,4 +1,4 @@
-"""Sources of an import: a sumocfg with all it names, a bare network, or OpenStreetMap."""
+"""Sources of an import: a sumocfg, a bare network, or OpenStreetMap."""
 
 import math
 import os
@@ -101,9 +101,9 @@ class SumoInput:
 def sumo_input(
     source: Path | Box, progress: Progress, *, left_hand: bool = False
 ) -> Iterator[SumoInput]:
-    """Provide the simulation of a source; a network that is built for it goes at the end of the
-    block.
+    """Provide the simulation of a source.
 
+    A network that is built for it goes at the end of the block.
     source: a sumocfg, a net.xml(.gz), a file of OpenStreetMap, or a box of it
     left_hand: traffic keeps left in OpenStreetMap, which does not say so
     Raises: InputError for a source that cannot be read, or no answer for a box
@@ -126,7 +126,10 @@ def sumo_input(
 
 
 def read_sumo_input(path: Path) -> SumoInput:
-    """Read a sumocfg, or take a net.xml(.gz) as a simulation without demand. Raises InputError."""
+    """Read a sumocfg, or take a net.xml(.gz) as a case without demand.
+
+    Raises: InputError
+    """
     root = _root(path)
     if root.tag == "net":
         return SumoInput(source=path, net=path)
@@ -195,8 +198,10 @@ def read_sumo_input(path: Path) -> SumoInput:
 
 
 def _options(path: Path) -> tuple[dict[str, str], tuple[str, ...]]:
-    """Return the options of a sumocfg that change the traffic, in SUMO's words, and the names of
-    those that write files or that every run sets itself."""
+    """Return the options of a sumocfg that change the traffic.
+
+    And the names of those that write files or that every run sets itself.
+    """
     with temporary_folder() as folder:
         saved = folder / "read.sumocfg"
         given = {"configuration-file": path.absolute(), "save-configuration": saved}
@@ -223,7 +228,10 @@ def _options(path: Path) -> tuple[dict[str, str], tuple[str, ...]]:
 
 
 def _files(path: Path, key: str, names: str) -> tuple[Path, ...]:
-    """Return the files of an option of a sumocfg. Raises InputError if there is none."""
+    """Return the files of an option of a sumocfg.
+
+    Raises: InputError if one is not there
+    """
     files = []
     for name in names.split(","):
         parts = [part.strip() for part in _file(path, name).split("/")]
@@ -252,7 +260,10 @@ def _file(path: Path, name: str) -> str:
 
 
 def _substituted(text: str) -> str:
-    """Replace ${NAME} by the environment variable, by nothing if there is none, as SUMO does."""
+    """Replace ${NAME} by the environment variable, as SUMO does.
+
+    An unknown one is empty.
+    """
     return VARIABLE.sub(lambda name: os.environ.get(name[1], ""), text)
 
 
@@ -261,8 +272,11 @@ def _is_true(value: str) -> bool:
 
 
 def seconds(text: str, where: str) -> float:
-    """Convert a SUMO time, seconds or [days:]hours:minutes:seconds; `where` is named by an
-    InputError."""
+    """Convert a SUMO time: seconds or [days:]hours:minutes:seconds.
+
+    where: named by an error
+    Raises: InputError
+    """
     try:
         parts = [float(part) for part in text.split(":")]
         if not 1 <= len(parts) <= 4 or len(parts) == 2 or not all(map(math.isfinite, parts)):
@@ -278,7 +292,10 @@ def seconds(text: str, where: str) -> float:
 
 
 def _root(path: Path) -> ElementTree.Element:
-    """Read the root of an XML file, with its attributes only. Raises InputError."""
+    """Read the root of an XML file, with its attributes only.
+
+    Raises: InputError
+    """
     with stream_of(path) as stream:
         _, root = next(iter(ElementTree.iterparse(stream, events=("start",))))
         return root

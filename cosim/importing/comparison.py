@@ -1,4 +1,4 @@
-"""Comparison of an imported city with the city as SUMO itself runs it, trip by trip."""
+"""Comparison of an imported city with plain SUMO, trip by trip."""
 
 import math
 import xml.etree.ElementTree as ElementTree
@@ -63,7 +63,10 @@ class Comparison:
 
 
 def read_trips(path: Path, end: float) -> dict[str, Trip]:
-    """Read SUMO's tripinfo of a simulation until `end` [s]: vehicle -> its trip."""
+    """Read SUMO's tripinfo of a simulation: vehicle -> its trip.
+
+    end: of the simulation [s]
+    """
     trips = {}
     for _, element in ElementTree.iterparse(path):
         if element.tag != "tripinfo":
@@ -84,8 +87,9 @@ def read_trips(path: Path, end: float) -> dict[str, Trip]:
 
 
 def plain_trips(case: SumoInput, end: float, *, mesoscopic: bool) -> dict[str, Trip]:
-    """Run the files of a case in SUMO with seed 0 until `end` [s], and return the trips.
+    """Return the trips of SUMO on the files of a case, with seed 0.
 
+    end: of the simulation [s]
     mesoscopic: in the model that the import simulates, even if the case has another one
     Raises: InputError with SUMO's own words if it refuses
     """
@@ -118,7 +122,10 @@ def compare(
     end: float,
     step: float,
 ) -> Comparison:
-    """Compare the private trips that may depart before `end` [s]; step: of the simulation [s]."""
+    """Compare the private trips that may depart before `end` [s].
+
+    step: of the simulation [s]
+    """
     expected = _shown(plain, is_private, end, step)
     found = _shown(imported, is_private, end, step)
     changes = []  # time, vehicle, what happens to it
@@ -142,8 +149,9 @@ def compare(
 def _shown(
     trips: Mapping[str, Trip], is_private: Callable[[str], bool], end: float, step: float
 ) -> dict[str, Trip]:
-    """Return the private trips that may depart before `end` [s], as they are known then.
+    """Return the private trips that may depart before `end` [s].
 
+    They are as known then, and due in the first step in which they may depart.
     They are due in the first step in which they may depart.
     """
     shown = {}

@@ -1,4 +1,4 @@
-"""Traffic of a city: its private vehicles one by one, and all that runs beside them unchanged."""
+"""Traffic of a city: private vehicles one by one, and all beside them."""
 
 import math
 import re
@@ -110,8 +110,10 @@ def read_traffic(case: SumoInput, streets: Streets, seed: int) -> Traffic:
 
 
 class Reading:
-    """Traffic of a case while it is read: its files, and then the vehicles that SUMO makes of
-    them."""
+    """Traffic of a case while it is read.
+
+    First come its files, and then the vehicles that SUMO makes of them.
+    """
 
     def __init__(self, case: SumoInput, streets: Streets):
         self._case, self._streets = case, streets
@@ -238,7 +240,7 @@ class Reading:
         self._trips.append(_Trip(depart, first, last, element))
 
     def _place(self, vehicle: Departure) -> float:
-        """Return a departure [s] with which the vehicle keeps its place in SUMO's queue.
+        """Return a departure [s] that keeps the place in SUMO's queue.
 
         SUMO inserts the vehicles of a step in the order in which it built them, and a file is
         sorted by time: so none may have an earlier time than one before it in the queue. SUMO
@@ -260,7 +262,7 @@ class Reading:
     def _element(
         self, vehicle: Departure, source: Element | None, routes: Container[str]
     ) -> Element:
-        """Return a vehicle for the scenario, and note how it differs from what was given.
+        """Return a vehicle for the scenario, and note what was changed.
 
         source: its element, or that of its flow; routes: ids of shared ones
         """
@@ -315,7 +317,10 @@ class Reading:
         return left / max(known + nowhere, 1), distance
 
     def _remarks(self, warnings: Sequence[str]) -> list[str]:
-        """Return an example of all that was left out, and SUMO's words, alike ones once."""
+        """Return examples of what was left out, and SUMO's words.
+
+        Alike words are there once.
+        """
         remarks = []
         if self._astray:
             name, edge = next(iter(self._astray.items()))
@@ -337,7 +342,7 @@ def _in_all(count: int) -> str:
 
 
 def _index(text: str, default: int) -> int:
-    """Return a departEdge or arrivalEdge; `default` if it is a word such as "random"."""
+    """Return a departEdge or arrivalEdge; `default` for a word."""
     return int(text) if text.isdecimal() else default
 
 
@@ -354,7 +359,7 @@ def _edges(element: Element) -> list[str]:
 
 
 def _stand_in(element: Element, streets: Streets) -> Element:
-    """Return what SUMO can read for a vehicle on an edge that the network has not.
+    """Return what SUMO can read for a vehicle on an unknown edge.
 
     SUMO then counts its vehicles, and draws the same random numbers for all others.
     """
@@ -414,8 +419,7 @@ def _single(vehicle: Departure, source: Element, routes: Container[str]) -> Elem
 
 
 def departure(element: Element) -> float:
-    """Return the time [s] at which a vehicle, person or flow of them begins, 0 if that is no
-    time."""
+    """Return when a vehicle, person or flow begins [s], 0 if unknown."""
     try:
         return seconds(element.get("depart") or element.get("begin") or "0", "")
     except InputError:

@@ -1,5 +1,6 @@
-"""Morning peak for a city without demand: towards the centre, through traffic, a background.
+"""Morning peak for a city without demand.
 
+It has trips towards the centre, through traffic and a background.
 The centre is where the signals are. All drivers take a fastest route at free flow, with a delay for
 every junction and a longer one for a signal, as one of DRIVER_CLASSES groups of drivers perceives
 the times.
@@ -36,8 +37,9 @@ PILOT_TRIPS = 1500  # from which the mean trip time is estimated
 
 
 def morning_peak(streets: Streets, *, level: float, begin: float, seed: int) -> Traffic:
-    """Generate trips on the largest part of the network of which each edge reaches each.
+    """Generate trips on the largest part of the network.
 
+    There every edge can be reached from every other.
     level: 1 keeps PEAK_DENSITY under way if vehicles meet no queue; begin: of the peak [s]
     Raises: InputError for a network that is too small
     """
@@ -143,7 +145,7 @@ class _Ends:
 
 
 def _times(uniform: np.ndarray) -> np.ndarray:
-    """Return departures [s] after the beginning, of a trapezoid, from uniform random numbers."""
+    """Return departures [s] of a trapezoid from uniform random numbers."""
     clock = np.linspace(0.0, RAMP_UP_S + FLAT_S + RAMP_DOWN_S, 541)
     rate = np.minimum(np.minimum(clock / RAMP_UP_S, 1.0), (clock[-1] - clock) / RAMP_DOWN_S)
     share = np.concatenate([[0.0], np.cumsum((rate[1:] + rate[:-1]) / 2)])

@@ -1,4 +1,4 @@
-"""Cities of others, fetched from their owners with their licences: `cosim get`."""
+"""Published cities, fetched with their licences: `cosim get`."""
 
 import os
 import shutil
@@ -23,8 +23,11 @@ def published() -> Mapping[str, Mapping[str, str]]:
 
 
 def get(name: str, out: Path) -> str:
-    """Fetch a city into a new folder, whole or not at all; return its licence and the next step.
-    Raises InputError."""
+    """Fetch a city into a new folder; return its licence and the next step.
+
+    It comes whole or not at all.
+    Raises: InputError
+    """
     cities = published()
     if name not in cities:
         raise InputError(

@@ -1,4 +1,4 @@
-"""`cosim import`: a SUMO city or OpenStreetMap becomes networks/NAME and scenarios/NAME."""
+"""`cosim import`: makes a network and a scenario of a city."""
 
 import gzip
 import os
@@ -169,7 +169,10 @@ def import_city(
 
 
 def _count(regions: str) -> int | None:
-    """Return the number of regions to find, None for a file. Raises InputError."""
+    """Return the number of regions to find, None for a file.
+
+    Raises: InputError
+    """
     if not regions.isdecimal():
         return None
     if int(regions) < 2:
@@ -199,7 +202,10 @@ def _progress(show: Callable[..., None] | None) -> Progress:
 
 
 def _as_requested(case: SumoInput, request: Request) -> SumoInput:
-    """Return a case with the time window and the vehicles of a request. Raises InputError."""
+    """Return a case with the time window and vehicles of a request.
+
+    Raises: InputError
+    """
     begin = case.begin
     end = case.end
     if request.begin is not None:
@@ -213,7 +219,10 @@ def _as_requested(case: SumoInput, request: Request) -> SumoInput:
 
 
 def _imported(request: Request, case: SumoInput, folder: Path, progress: Progress) -> City:
-    """Return the city, after the runs without control; write its vehicles into a folder."""
+    """Return the city, after the runs without control.
+
+    folder: its vehicles are written there
+    """
     streets = read_streets(case.net, case.additional)
     given = None if request.count is not None else own_regions(streets, request.regions)
     traffic = read_traffic(case, streets, request.seed)
@@ -275,7 +284,7 @@ def _peak(
     mesoscopic: bool,
     progress: Progress,
 ) -> tuple[Traffic, Assigned]:
-    """Generate a morning peak beside the city's other traffic, and assign its routes."""
+    """Generate a morning peak beside other traffic; assign its routes."""
     if len(beside.depart):
         raise InputError(
             f"--demand: {case.source} has {len(beside.depart):,} vehicles; omit --demand, or give "
@@ -323,7 +332,10 @@ def _peak(
 
 
 def _write_traffic(folder: Path, traffic: Traffic) -> dict[str, list[str]]:
-    """Write vehicles, background and what they refer to; return the file names by key of [sumo]."""
+    """Write vehicles, background and what they refer to.
+
+    Return the file names by key of [sumo].
+    """
     contents = {
         "routes": traffic.vehicles,
         "background": traffic.background,
@@ -353,8 +365,10 @@ def _compared(
     baseline: Baseline,
     mesoscopic: bool,
 ) -> Comparison | str:
-    """Compare the run without control of seed 0 with SUMO on the city's own files, or say why
-    that cannot be."""
+    """Compare the run without control of seed 0 with plain SUMO.
+
+    Return the reason if that cannot be.
+    """
     if request.level != 1.0:
         return f"the demand is {request.level:g} times its own"
     if request.seed:
@@ -423,7 +437,7 @@ def _write(city: City, network_folder: Path, scenario_folder: Path) -> list[str]
 def _report(
     city: City, network: RegionalModel, tables: quality.Tables, verdict: Verdict
 ) -> list[str]:
-    """Return what was imported, left alone and left out, and what to expect, in lines."""
+    """Return what was imported and what to expect, in lines."""
     request = city.request
     traffic = city.traffic
     clock = city.clock
@@ -477,7 +491,7 @@ def _scenario_text(city: City, network: RegionalModel) -> str:
 
 
 def _write_demand(path: Path, city: City) -> None:
-    """Write the demand between regions, a row for each interval and pair with any."""
+    """Write the demand between regions, by interval and pair."""
     flows = model.region_demand(city.traffic, city.labels, city.clock)
     rows = [(k, i, j, f"{flows[k, i, j]:.6g}") for k, i, j in np.argwhere(flows > 0)]
     table = pd.DataFrame(rows, columns=["interval", "from", "to", "veh_s"])

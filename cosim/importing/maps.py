@@ -1,4 +1,4 @@
-"""Maps of regions: streets in the colour of their region, gateways, outlines."""
+"""Maps of regions, with gateways and outlines."""
 
 from collections.abc import Sequence
 
@@ -116,7 +116,7 @@ def rings_round(
 
 
 def _sampled(shapes: Sequence[Points]) -> tuple[np.ndarray, np.ndarray]:
-    """Return points (n, 2) along the shapes of the edges, and the edge (n,) of each point."""
+    """Return points (n, 2) along the edges, and their edges (n,)."""
 
     def marks(length: float) -> np.ndarray:
         return np.linspace(0.0, length, max(2, int(length / POINT_SPACING_M) + 1))
@@ -126,6 +126,6 @@ def _sampled(shapes: Sequence[Points]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _area(ring: Points) -> float:
-    """Return the area [m^2] of a polygon (n, 2) [m]; negative if it runs clockwise."""
+    """Return the area [m^2] of a ring (n, 2) [m], < 0 if clockwise."""
     x, y = ring.T
     return float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum()) / 2

@@ -41,7 +41,10 @@ class Clock:
 
 
 def without_idle(case: SumoInput, traffic: Traffic) -> SumoInput:
-    """Begin the case later if its first vehicle departs more than IDLE_S after the beginning."""
+    """Begin the case later if its first vehicle departs much later.
+
+    That is more than IDLE_S after the beginning.
+    """
     first = min([*traffic.depart[:1], *map(departure, traffic.background)], default=case.begin)
     if first - case.begin <= IDLE_S:
         return case
@@ -118,7 +121,10 @@ def network_of(
 
 
 def step_length(case: SumoInput, clock: Clock) -> float:
-    """Return the city's own step length [s] if it divides the control interval, else 1 s."""
+    """Return the step length [s]: the city's own if possible, else 1 s.
+
+    It must divide the control interval.
+    """
     own = case.step_length
     if not 0.0 < own <= 1.0:
         return 1.0
@@ -146,9 +152,9 @@ def scenario_text(
     leave: Sequence[str],
     **values: str | float,
 ) -> str:
-    """Return the scenario.toml; `files` maps routes, background and additional to file names beside
-    it.
+    """Return the scenario.toml.
 
+    files: routes, background and additional -> file names beside it
     values: name, network_path, protected (region), factor of the demand, mesoscopic
     """
     fastest = max(mfd.rate_up_to_jam(0.0) for mfd in network.mfds)

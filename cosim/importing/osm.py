@@ -1,4 +1,4 @@
-"""Streets of OpenStreetMap: fetched from a public server, converted to a SUMO network."""
+"""Streets of OpenStreetMap, converted to a SUMO network."""
 
 import re
 import subprocess
@@ -74,7 +74,7 @@ def fetch(box: Box, folder: Path) -> Path:
 
 
 def convert(source: Path, folder: Path, *, left_hand: bool) -> Path:
-    """Convert a file of OpenStreetMap to a network in a folder; return its path."""
+    """Convert a file of OpenStreetMap to a network in a folder."""
     net = folder / "osm.net.xml"
     options = {
         "osm-files": file_list([source.resolve()]),

@@ -1,5 +1,4 @@
-"""Regions of similar density by Ward's criterion on the road graph, or the regions of the user's
-own table.
+"""Regions of similar density by Ward's criterion, or the user's own.
 
 The aims are those of Ji and Geroliminis, "On the spatial partitioning of urban transportation
 networks" (2012): regions that are homogeneous in density, connected and compact. Perimeter control
@@ -64,8 +63,9 @@ class Blocks:
 
 
 def own_regions(streets: Streets, path: Path) -> EdgeNumbers:
-    """Read the region of every edge from a table edge,region; -1 for edges it does not name.
+    """Read the region of every edge from a table edge,region.
 
+    Edges that it does not name have -1.
     Raises: InputError
     """
     given = read_regions(path)
@@ -117,7 +117,7 @@ def partition(
 def cluster(
     blocks: Blocks, feature: Float[np.ndarray, "B F"], regions: int
 ) -> Int[np.ndarray, " B"]:
-    """Return the cluster of every block; -1 in clusters that are too small for a region."""
+    """Return the cluster of every block, -1 in too small clusters."""
     # Its import takes a second, which other commands do not need.
     from sklearn.cluster import AgglomerativeClustering
 
@@ -212,7 +212,10 @@ def _without_signals(
 
 
 def _opposite(streets: Streets) -> list[tuple[int, int]]:
-    """Return pairs of edges between the same two junctions in opposite directions, one each."""
+    """Return pairs of edges in opposite directions, one each.
+
+    They lie between the same two junctions.
+    """
     waiting: dict[tuple[int, int], list[int]] = {}
     pairs = []
     for n, (begin, end) in enumerate(streets.junctions):
@@ -224,7 +227,7 @@ def _opposite(streets: Streets) -> list[tuple[int, int]]:
 
 
 def finish(streets: Streets, labels: EdgeNumbers, *, renumber: bool = True) -> EdgeNumbers:
-    """Return a region for every edge, from labels of the edges for cars, -1 for none.
+    """Return a region for every edge from labels, -1 for none.
 
     Regions become connected, and each can be reached from each; those that fail join a neighbour.
     Other edges join an adjoining region or the nearest. Regions are numbered from north to south,
@@ -282,7 +285,7 @@ def connect(streets: Streets, regions: EdgeNumbers) -> EdgeNumbers:
 
 
 def digraph(streets: Streets, regions: EdgeNumbers) -> Int[np.ndarray, "R R"]:
-    """Count the connections [i, h] from an edge of region i to one of region h, i != h."""
+    """Count the connections [i, h] from region i to another one h."""
     count = int(regions[streets.drivable].max()) + 1
     crossing = np.zeros((count, count), dtype=int)
     pairs = regions[streets.links]
@@ -292,7 +295,10 @@ def digraph(streets: Streets, regions: EdgeNumbers) -> Int[np.ndarray, "R R"]:
 
 
 def _not_reachable(streets: Streets, regions: np.ndarray) -> int | None:
-    """Return the smallest region outside the largest set that can be reached from each other."""
+    """Return a region to dissolve, None if there is none.
+
+    It is the smallest one outside the largest set that can be reached from each other.
+    """
     inside = streets.main_part
     used, numbers = np.unique(regions[inside], return_inverse=True)
     links = np.searchsorted(used, regions[streets.links[inside[streets.links].all(axis=1)]])
@@ -307,7 +313,10 @@ def _not_reachable(streets: Streets, regions: np.ndarray) -> int | None:
 def _spread(
     streets: Streets, regions: np.ndarray, links: np.ndarray, wanted: np.ndarray
 ) -> np.ndarray:
-    """Give the `wanted` edges without a region that of a linked edge, else of the nearest."""
+    """Give `wanted` edges without a region that of a linked edge.
+
+    If there is none, that of the nearest.
+    """
     regions = regions.copy()
     both = np.concatenate([links, links[:, ::-1]])
     while True:
@@ -325,7 +334,7 @@ def _spread(
 
 
 def _numbered(streets: Streets, regions: np.ndarray) -> np.ndarray:
-    """Number the regions 0, 1, ... from north to south, ties from west to east."""
+    """Number the regions from north to south, ties from west to east."""
     used = np.unique(regions)
     places = []
     for region in used:

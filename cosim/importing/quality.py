@@ -1,4 +1,4 @@
-"""Tables of regions and gateways, and the verdict on control at the gateways."""
+"""Tables of regions and gateways, and the verdict on their control."""
 
 import math
 from collections import Counter
@@ -90,7 +90,10 @@ def tables(
 def _gateway(
     gateway: Gateway, streets: Streets, left_alone: Mapping[str, str], flow: int
 ) -> dict[str, object]:
-    """Return a row of gateways.csv; flow: vehicles that passed in the run without control."""
+    """Return a row of gateways.csv.
+
+    flow: vehicles that passed in the run without control
+    """
     control = "no signal"
     kind = ""
     if gateway.signal is not None:
@@ -112,7 +115,7 @@ def _gateway(
 
 
 def doubts(streets: Streets, regions: EdgeNumbers, names: Sequence[str]) -> list[str]:
-    """Return sentences about what makes a partition doubtful: streets apart, small regions."""
+    """Return sentences about streets apart and small regions."""
     sentences = []
     total = streets.lane_metres.sum()
     apart = streets.drivable & ~streets.main_part
@@ -133,7 +136,10 @@ def doubts(streets: Streets, regions: EdgeNumbers, names: Sequence[str]) -> list
 
 
 def short_demand(depart: PerTrip, begin: float, step: float) -> list[str]:
-    """Return a sentence if vehicles depart (N,) [s] in too few control intervals of `step` [s]."""
+    """Return a sentence if vehicles depart in too few intervals.
+
+    depart: (N,) [s]; begin, step: of the control intervals [s]
+    """
     intervals = math.ceil((float(depart[-1]) - begin) / step) if len(depart) else 0
     if intervals >= FEWEST_INTERVALS:
         return []
@@ -167,7 +173,10 @@ def import_verdict(
     baseline: Baseline,
     scenario: str,
 ) -> Verdict:
-    """Judge from the run without control whether perimeter control can help; scenario: its name."""
+    """Judge from the run without control if perimeter control can help.
+
+    scenario: its name
+    """
     crossings = []
     for row in gateways:
         controlled = row["control"] == CONTROLLED

@@ -18,8 +18,9 @@ WRITING = ("file", "has.ssm.device", "device.toc.file")
 
 
 def read(case: SumoInput) -> list[Element]:
-    """Return the additional files of a case, then its route files; their tags are keys of OPTIONS.
+    """Return the additional files of a case, then its route files.
 
+    Their tags are keys of OPTIONS.
     Raises: InputError
     """
     files = []

@@ -29,7 +29,7 @@ def no_vehicles(case: SumoInput, traffic: Traffic) -> str:
 
 
 def summary(case: SumoInput, streets: Streets, traffic: Traffic, clock: model.Clock) -> str:
-    """Return the size of the city and of its traffic, and notes about the vehicles."""
+    """Return the size of the city and its traffic, and notes."""
     side = "left" if streets.left_hand else "right"
     return (
         f"{case.source.name}: {len(streets.edges):,} edges, {streets.drivable.sum():,} for cars, "
@@ -59,7 +59,7 @@ def outcome(baseline: Baseline) -> str:
 def comparison(
     same: Comparison | str, case: SumoInput, traffic: Traffic, clock: model.Clock
 ) -> str:
-    """Return whether the city is that of plain SUMO, and what may make it another one."""
+    """Return the comparison with plain SUMO, and known reasons."""
     if isinstance(same, str):
         return f"not compared with plain SUMO: {same}"
     reasons = [f"{name} is not taken over" for name in sorted(case.left_out)]

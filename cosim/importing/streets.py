@@ -1,4 +1,4 @@
-"""Road graph of a SUMO network as arrays, with shapes and signal programmes."""
+"""Road graph of a SUMO network as arrays, with signal programmes."""
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Mapping, Sequence
@@ -33,8 +33,9 @@ class Logic:
 
 @dataclass(frozen=True, kw_only=True)
 class Streets:
-    """Road graph of E normal edges, sorted by id, including those closed to cars.
+    """Road graph of E normal edges, sorted by id.
 
+    It includes those closed to cars.
     drivable: (E,) bool, with a lane for cars
     length [m], lanes (those for cars), speed [m/s]: (E,)
     shapes: E arrays (n, 2) [m]; centre: (E, 2) [m], half way along
@@ -75,13 +76,16 @@ class Streets:
 
     @property
     def parts(self) -> int:
-        """Number of parts into which the drivable edges fall, without a connection between them."""
+        """Number of parts into which the drivable edges fall."""
         _, part = connected_components(graph(self.links, len(self.edges)), directed=False)
         return len(np.unique(part[self.drivable]))
 
     @cached_property
     def main_part(self) -> EdgeMask:
-        """Drivable edges (E,) of the weakly connected part with the most lane metres."""
+        """Drivable edges (E,) of the largest weakly connected part.
+
+        That is the one with the most lane metres.
+        """
         return self._largest("weak")
 
     @cached_property
@@ -103,7 +107,10 @@ def graph(pairs: Int[np.ndarray, "_ 2"], size: int) -> csr_array:
 
 
 class _Edge(NamedTuple):
-    """Edge of the file; cars: indices of the lanes for them; start, end: junctions."""
+    """Edge of the file.
+
+    cars: indices of the lanes for them; start, end: junctions
+    """
 
     cars: frozenset[int]
     length: float
@@ -114,8 +121,9 @@ class _Edge(NamedTuple):
 
 
 def read_streets(net: Path, additional: Iterable[Path] = ()) -> Streets:
-    """Read a net.xml(.gz), and signal programmes of additional files, which replace those there.
+    """Read a net.xml(.gz), and signal programmes of additional files.
 
+    The latter replace those of the network.
     Raises: InputError
     """
     rows: dict[str, _Edge] = {}

@@ -1,5 +1,7 @@
-"""Vehicles as SUMO reads them from a city's files, with all that it draws for them. None of them is
-driven."""
+"""Vehicles as SUMO reads them, with all that it draws for them.
+
+None of them is driven.
+"""
 
 import heapq
 import math
@@ -108,7 +110,7 @@ def _read(
     latest: float,
     where: str,
 ) -> Departures | InputError:
-    """Return what `_Reader` reads, or an error with SUMO's words if it refuses the files."""
+    """Return what SUMO reads, or an error with its words."""
     with temporary_folder() as folder, chdir(folder):  # some devices of vehicles write files
         log = Path("said.log")
         command = ["sumo", "--error-log", str(log)]
@@ -127,8 +129,11 @@ def _read(
 
 
 def original(name: str, given: Container[str]) -> str:
-    """Return the id that a vehicle's comes from: its own, or that of a flow or of a multiplied
-    vehicle; "" if there is none, as of the vehicles of calibrators and persons."""
+    """Return the id of the element that a vehicle comes from.
+
+    It is its own, or that of a flow or of a multiplied vehicle. It is "" for the vehicles of
+    calibrators and persons.
+    """
     while name and name not in given:
         name = name.rpartition(".")[0]
     return name
@@ -138,7 +143,10 @@ class _Reader:
     """Steps through a simulation and takes every vehicle out when it is due."""
 
     def __init__(self, given: Mapping[str, bool], devices: Sequence[str]):
-        """given: id of every vehicle and flow -> True if it waits; devices: kinds to ask for"""
+        """given: id of every vehicle and flow -> True if it waits
+
+        devices: kinds to ask for
+        """
         self._given = given
         self._devices = devices
         self._numbers = count()  # vehicles in the order in which SUMO builds them
@@ -150,8 +158,9 @@ class _Reader:
         self._now = libsumo.simulation.getTime()
 
     def read(self, end: float, latest: float) -> None:
-        """Read until `end` [s], or until all vehicles are read; the last begins at `latest` [s].
+        """Read until `end` [s], or until all vehicles are read.
 
+        latest: when the last one begins [s]
         Raises InputError if so much time passes before it that nobody can have meant it.
         """
         self._take_from_road()
@@ -190,8 +199,10 @@ class _Reader:
         )
 
     def _take_from_road(self) -> None:
-        """Take the vehicles of a loaded state, one on a junction at the end of the street
-        before it."""
+        """Take the vehicles of a loaded state.
+
+        One on a junction is at the end of the street before it.
+        """
         for name in libsumo.vehicle.getIDList():
             position = libsumo.vehicle.getLanePosition(name)
             if libsumo.vehicle.getRoadID(name).startswith(":"):
@@ -200,7 +211,7 @@ class _Reader:
             self._take(next(self._numbers), name, self._now, -math.inf, place)
 
     def _load(self) -> bool:
-        """Put the vehicles that the last step built into the queue; return False without any."""
+        """Queue the vehicles that the last step built; False without any."""
         names = libsumo.simulation.getLoadedIDList()
         for name in names:
             if self._waits(name):

@@ -1,4 +1,4 @@
-"""Vehicles of a city: those of its route files, or trips made from the demand.
+"""Vehicles of a city: of its route files, or made from the demand.
 
 Those of files are varied by seed and demand factor.
 """
@@ -85,7 +85,10 @@ class HeldTrips:
 
 
 def read_recorded_trips(paths: Sequence[Path]) -> RecordedTrips:
-    """Return the `vehicle` and `trip` elements of SUMO route files. Raises InputError."""
+    """Return the `vehicle` and `trip` elements of SUMO route files.
+
+    Raises: InputError
+    """
     elements: list[ElementTree.Element] = []
     departs: list[float] = []
     known: set[str] = set()
@@ -130,7 +133,7 @@ def _departure(element: ElementTree.Element, path: Path) -> float:
 
 
 def as_recorded(trips: Trips) -> RecordedTrips:
-    """Return trips that are made from a demand as vehicles v0, v1, ... by departure."""
+    """Return trips made from a demand as vehicles v0, v1, ..."""
     elements = []
     for n, (route, arrival) in enumerate(zip(trips.routes, trips.arrival, strict=True)):
         own = {"id": f"v{n}", "arrivalPos": f"{arrival:.1f}"}
@@ -145,7 +148,10 @@ def as_recorded(trips: Trips) -> RecordedTrips:
 
 
 def check_edges(originals: RecordedTrips, city: City, where: str) -> None:
-    """Raise InputError for a vehicle on an unknown edge, which SUMO would drop silently."""
+    """Raise InputError for a vehicle on an unknown edge.
+
+    SUMO would drop it silently.
+    """
     for element in originals.elements:
         edges = [element.get(key) for key in ("from", "to") if element.get(key)]
         edges += element.get("via", "").split()
@@ -201,7 +207,7 @@ def ids(paths: Sequence[Path]) -> frozenset[str]:
 def edges_of(
     element: ElementTree.Element, shared: Mapping[str, Sequence[str]]
 ) -> tuple[Sequence[str], bool]:
-    """Return (the edges of a vehicle's route, True), or (the edges that it must pass, False)."""
+    """Return (edges of a vehicle's route, True), or (edges to pass, False)."""
     route = element.find("route")
     if route is not None:
         return route.get("edges", "").split(), True
@@ -214,8 +220,9 @@ def edges_of(
 def own_flows(
     city: City, originals: RecordedTrips, shared: Mapping[str, Sequence[str]], factor: float
 ) -> Mapping[tuple[str, str], float]:
-    """Return (edge, next edge) -> flow [veh/s] in the busiest quarter of an hour.
+    """Return (edge, next edge) -> flow [veh/s] in the peak.
 
+    That is the busiest quarter of an hour.
     Trips without a route take a fastest one.
     shared: `read_routes`; factor: multiplies the flows
     """
@@ -244,8 +251,9 @@ def own_flows(
 def draw(
     originals: RecordedTrips, *, seed: int, factor: float, jitter: float, begin: float
 ) -> list[DrawnTrip]:
-    """Return (departure [s], number of the vehicle, its id) of one run, sorted by departure.
+    """Return departure [s], number and id of the vehicles of one run.
 
+    They are sorted by departure.
     factor: vehicles are left out, or drive several times (ids with .1, .2 ...), by seeded choice
     jitter: departures are moved by up to this, either way, but not before `begin` [s]
     """
@@ -282,8 +290,9 @@ def write_recorded_trips(originals: RecordedTrips, drawn: Sequence[DrawnTrip], p
 
 
 def run_files(path: Path, beside: Sequence[Path], seed: int) -> list[Path]:
-    """Return the route files of one run: that of its private vehicles and those `beside` it.
+    """Return the route files of one run.
 
+    path: of its private vehicles; beside: of all others
     With seed 0 vehicles queue as in the city's own files (`merge`, which changes `path`).
     """
     if beside and not seed:
@@ -292,9 +301,9 @@ def run_files(path: Path, beside: Sequence[Path], seed: int) -> list[Path]:
 
 
 def merge(path: Path, beside: Sequence[Path], rest: Path) -> list[Path]:
-    """Put the timed vehicles of the files `beside` into the route file `path`, and all else of them
-    into `rest`.
+    """Put timed vehicles of the files `beside` into the file `path`.
 
+    rest: for all else of them
     In one file vehicles queue in the order of their departures and, at the same time, of
     QUEUED_AFTER, as in the city's own files. Returns both files, types first.
     """

@@ -1,4 +1,4 @@
-"""Demand between regions to individual trips with static routes, and the turning flows of these."""
+"""Individual trips of a demand between regions, with static routes."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -45,8 +45,9 @@ class Trips:
 def turning_flows(
     city: City, demand: PairsOverTime, step: float
 ) -> Mapping[tuple[str, str], float]:
-    """Return (edge, next edge) -> flow [veh/s] in the busiest quarter of an hour.
+    """Return (edge, next edge) -> flow [veh/s] in the peak.
 
+    That is the busiest quarter of an hour.
     demand: (T, R, R) [veh/s], intervals of `step` [s]
     Trips take static routes without delays; the mean of several planning seeds. Unused movements
     are missing.
@@ -61,7 +62,10 @@ def turning_flows(
 
 
 def busiest(depart: PerTrip, window: float) -> slice:
-    """Return the trips that depart in the busiest `window` [s]; depart: (N,) [s], sorted."""
+    """Return the trips that depart in the busiest `window` [s].
+
+    depart: (N,) [s], sorted
+    """
     if not len(depart):
         return slice(0)
     ends = np.searchsorted(depart, depart + window)
@@ -70,8 +74,9 @@ def busiest(depart: PerTrip, window: float) -> slice:
 
 
 def make_trips(city: City, demand: PairsOverTime, step: float, seed: int) -> Trips:
-    """Return individual trips of `demand` (T, R, R) [veh/s], intervals of `step` [s].
+    """Return individual trips of a demand between regions.
 
+    demand: (T, R, R) [veh/s], intervals of `step` [s]
     Every pair of regions gets its number of vehicles to within one, at the times at which its
     cumulated demand passes whole numbers, shifted by a random phase. Edges are drawn by length
     times lanes. Each route is the fastest one in free flow as one of `DRIVER_CLASSES` groups of
@@ -119,7 +124,7 @@ def make_trips(city: City, demand: PairsOverTime, step: float, seed: int) -> Tri
 def _departures(
     demand: PairsOverTime, step: float, rng: np.random.Generator
 ) -> tuple[PerTrip, TripNumbers, TripNumbers]:
-    """Return departures rounded to 0.01 s and sorted, origins and destinations."""
+    """Return departures to 0.01 s, sorted, origins and destinations."""
     clock = step * np.arange(len(demand) + 1)
     times, origins, destinations = [], [], []
     for i in range(demand.shape[1]):
@@ -148,7 +153,10 @@ class _Ends(NamedTuple):
 
 
 def _ends(city: City, region: int, *, departing: bool) -> _Ends:
-    """Return the edges where trips of a region start or end, good ones if there are any."""
+    """Return the edges where trips of a region start or end.
+
+    They are good ones if there are any.
+    """
     edges = [edge for edge in city.edges if city.region_of[edge] == region]
     onward: Mapping[str, Sequence[str]] = city.successors if departing else city.before
     good = []
@@ -162,7 +170,10 @@ def _ends(city: City, region: int, *, departing: bool) -> _Ends:
 
 
 def _stays(city: City, edge: str, onward: Mapping[str, Sequence[str]]) -> bool:
-    """Return True if a way on from the edge stays in its region; a dead end does not."""
+    """Return True if a way on from the edge stays in its region.
+
+    A dead end does not.
+    """
     here = edge
     seen = {edge}
     while len(onward[here]) == 1 and onward[here][0] not in seen:
@@ -188,7 +199,7 @@ def _draw(ends: _Ends, uniform: float) -> str:
 
 
 def perception(edges: int, rng: np.random.Generator) -> Float[np.ndarray, "classes E"]:
-    """Draw the factors [-] with which each class of drivers sees the travel times of the edges."""
+    """Draw the factors [-] on travel times by class of drivers."""
     return np.exp(CLASS_SPREAD * rng.standard_normal((DRIVER_CLASSES, edges)))
 
 
@@ -225,8 +236,9 @@ def fastest_routes(
     links: Int[np.ndarray, "M 2"],
     turn: PerMove,
 ) -> list[tuple[int, ...]]:
-    """Return the fastest route of every trip in free flow, () if there is none.
+    """Return the fastest route of every trip in free flow.
 
+    It is () if there is none.
     A route is a tuple of numbers of edges.
     ends: first and last edge (N,) of the trips; tastes: (N,), class of each driver
     noise: [-], factor of every class of drivers on time [s] of the edges; turn: [s] over the
