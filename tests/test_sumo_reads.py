@@ -403,6 +403,8 @@ def test_another_traffic_is_told_with_a_reason(tmp_path):
     assert re.search(r"not the same city as in plain SUMO: [0-8] of 9 trips, time spent", report)
     assert re.search(r"; vehicle s\.\d arrives at \d+ s instead of at \d+ s; ", report)
     assert "fixed speeds at the departure, made the highest safe ones: 9" in report
+    report = imported(config, mesoscopic=True)
+    assert re.search(r"same city.* of 9 trips, time spent .* %, both in SUMO's queue model", report)
     assert "not compared with plain SUMO: the demand is 2 times its own" in imported(
         config, level=2.0
     )

@@ -45,17 +45,21 @@ class Comparison:
     trips: in plain SUMO; equal: those with the same departure, arrival and length in the import
     spent: time of all in the import over that in plain SUMO, minus 1 [-]
     first: what happens to the first trip that differs, "" without any
+    queue_model: both are in SUMO's queue model, although the city is not
     """
 
     trips: int
     equal: int
     spent: float
     first: str
+    queue_model: bool = False
 
     def text(self, reasons: Sequence[str]) -> str:
         """Return the result in one sentence; reasons: why trips may differ."""
         percent = round(100.0 * self.spent, 1) + 0.0  # no -0.0
         counts = f"{self.equal:,} of {self.trips:,} trips, time spent {percent:+.1f} %"
+        if self.queue_model:
+            counts += ", both in SUMO's queue model"
         if not self.first:
             return f"same city: {counts}"
         why = "; ".join([self.first, *reasons])
@@ -110,7 +114,7 @@ def plain_trips(case: SumoInput, end: float, *, mesoscopic: bool) -> dict[str, T
     with temporary_folder() as folder:
         options |= quiet_files.write(quiet_files.read(case), folder)
         options["tripinfo-output"] = folder / "trips.xml"
-        run_sumo("sumo", options, where=str(case.source))
+        run_sumo("sumo", options, where=case.source.name)
         return read_trips(folder / "trips.xml", end)
 
 

@@ -378,13 +378,10 @@ def _compared(
         plain = plain_trips(case, end, mesoscopic=mesoscopic)
     except InputError as error:
         return f"it refuses the city: {error}"
-    return compare(
-        plain,
-        baseline.trips,
-        is_private=traffic.is_private,
-        end=end,
-        step=case.step_length,
+    result = compare(
+        plain, baseline.trips, is_private=traffic.is_private, end=end, step=case.step_length
     )
+    return replace(result, queue_model=mesoscopic and not case.mesoscopic)
 
 
 def _write(city: City, network_folder: Path, scenario_folder: Path) -> list[str]:

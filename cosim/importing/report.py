@@ -71,8 +71,9 @@ def comparison(
             reasons.append(f"{note}: {traffic.notes[note]:,}")
     if any(element.tag == "calibrator" for element in traffic.shared):
         reasons.append("calibrators")
-    if any(element.tag.startswith("person") for element in traffic.background):
-        reasons.append("persons")
+    for kind in ("person", "container"):
+        if any(element.tag.startswith(kind) for element in traffic.background):
+            reasons.append(f"{kind}s")
     if FROM_FLOWS in traffic.notes:
         reasons.append("flows, whose vehicles look for another route while they wait to enter")
     return same.text(reasons)
