@@ -96,8 +96,8 @@ def network_of(
     """
     count = int(regions.max()) + 1
     lanes = np.bincount(regions, streets.lane_metres, count)
-    lanes_by_speed = np.bincount(regions, streets.lane_metres * streets.speed, count)
-    speed = lanes_by_speed / np.maximum(lanes, 1.0)
+    lane_speed = np.bincount(regions, streets.lane_metres * streets.speed, count)
+    speed = lane_speed / np.maximum(lanes, 1.0)
     sizes = [np.ptp(streets.centre[regions == region], axis=0) for region in range(count)]
     across = np.array([np.sqrt(size.prod()) for size in sizes])
     measured = baseline.metres_per_visit(streets, regions)
