@@ -37,7 +37,13 @@ def stopped(program, *arguments, out, by, after="[!.]*.nc", wait=0.0):
 
 
 @pytest.mark.parametrize(
-    "after, wait", [("*", 0.15), ("*", 1.0), (".lock", 0.0), ("manifest.json", 0.3)]
+    "after, wait",
+    [
+        ("*", 0.15),
+        pytest.param("*", 1.0, marks=pytest.mark.slow),
+        pytest.param(".lock", 0.0, marks=pytest.mark.slow),
+        ("manifest.json", 0.3),
+    ],
 )
 def test_ctrl_c_at_any_moment_is_one_line(tmp_path, after, wait):
     command = (
@@ -109,8 +115,9 @@ def test_a_stopped_benchmark_continues(tmp_path, by, status):
         assert said.splitlines()[-1].startswith("nmfd: interrupted: finished runs are in"), said
     first = runs(tmp_path / "out")
     assert 0 < len(first) < 20
-    good(nmfd(*command, "--out", tmp_path / "out"))
-    good(nmfd(*command, "--out", tmp_path / "whole"))
+    here = (*command, "--workers", 0)
+    good(nmfd(*here, "--out", tmp_path / "out"))
+    good(nmfd(*here, "--out", tmp_path / "whole"))
     whole = runs(tmp_path / "whole")
     assert len(whole) == 20
     assert same(runs(tmp_path / "out"), whole)

@@ -64,7 +64,7 @@ def test_open_gateways_leave_sumo_alone(scenario, plant_of):
             step(),
             states.append([session.signal_state(s) for s in session.signals()]),
         )
-        final = [plant.step(open_gateways) for _ in range(3)][-1]
+        final = [plant.step(open_gateways) for _ in range(2)][-1]
         shown.append((states, final.accumulation.tolist()))
     assert shown[0] == shown[1]
 

@@ -33,6 +33,8 @@ def test_benchmarks(tmp_path):
         "mpc-pcrg,probing-pcrg",
         "--plant",
         "acyclic",
+        "--set",
+        "steps=8",
         "--out",
     )
     good(nmfd(*command, tmp_path / "a"))

@@ -86,7 +86,13 @@ def test_importing_nmfd_changes_nothing_outside():
     assert (done.returncode, done.stderr) == (0, "")
 
 
-@pytest.mark.parametrize("before", ["", "import nmfd; ", "import nmfd.rl; "])
+@pytest.mark.parametrize(
+    "before",
+    [
+        "",
+        *(pytest.param(f"import {name}; ", marks=pytest.mark.slow) for name in ("nmfd", "nmfd.rl")),
+    ],
+)
 def test_gymnasium_finds_an_environment_by_its_module(before):
     code = f"{before}import gymnasium; gymnasium.make('nmfd.rl:nmfd/Hexagon7-v0').reset(seed=1)"
     done = subprocess.run(
