@@ -157,8 +157,18 @@ def random_controls(network, steps, random, *, guidance):
     return u, theta / np.maximum(theta.sum(axis=2, keepdims=True), 1e-300)
 
 
-@pytest.mark.parametrize("guidance", [False, True])
-@pytest.mark.parametrize("variant", ["euler", "substeps", "rk4", "exit rates", "capacity"])
+VARIANTS = ("euler", "substeps", "rk4", "exit rates", "capacity")
+
+
+@pytest.mark.parametrize(
+    "variant, guidance",
+    [
+        *((variant, False) for variant in VARIANTS),
+        ("euler", True),
+        *(pytest.param(variant, True, marks=pytest.mark.slow) for variant in VARIANTS[1:3]),
+        *((variant, True) for variant in VARIANTS[3:]),
+    ],
+)
 def test_every_trajectory_meets_the_relaxation(variant, guidance):
     """Random, neutral and greedy controls, into gridlock; and the optimum is below what they
     spend."""

@@ -13,6 +13,7 @@ import tiny
 import torch
 from commands import error_line, good, nmfd, runs, same
 
+from nmfd import api
 from nmfd.controllers import training
 
 
@@ -115,9 +116,9 @@ def test_a_stopped_benchmark_continues(tmp_path, by, status):
         assert said.splitlines()[-1].startswith("nmfd: interrupted: finished runs are in"), said
     first = runs(tmp_path / "out")
     assert 0 < len(first) < 20
-    here = (*command, "--workers", 0)
-    good(nmfd(*here, "--out", tmp_path / "out"))
-    good(nmfd(*here, "--out", tmp_path / "whole"))
+    good(nmfd(*command, "--out", tmp_path / "out"))
+    controllers = ["no-control", "pi-gating"]
+    api.benchmark(scenario, controllers, seeds=10, out=tmp_path / "whole", workers=0)
     whole = runs(tmp_path / "whole")
     assert len(whole) == 20
     assert same(runs(tmp_path / "out"), whole)

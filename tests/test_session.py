@@ -88,7 +88,7 @@ def test_a_city_is_its_settings(tmp_path):
 
 def test_an_evaluation_is_a_table_and_its_runs_are_found(tmp_path):
     controllers = ["no-control", "pi-gating+max-pressure", nmfd.PiGating(kp=0.4)]
-    table = cosim.evaluate("demo", controllers, seeds=2, steps=2, out=tmp_path / "ev")
+    table = cosim.evaluate("demo", controllers, seeds=2, steps=1, out=tmp_path / "ev")
     assert isinstance(table, pd.DataFrame)
     assert len(table) == 6
     seed = table["seed"].iloc[0]

@@ -145,7 +145,7 @@ def test_a_run_says_that_signals_break_rules(imported, tmp_path):
     for settings_, said in (({"faults": faults}, True), ({}, False)):
         out = tmp_path / str(said)
         changed = load_scenario(scenario, settings_)
-        rows = run_controllers(changed, ["no-control+max-pressure"], steps=8, out=out)
+        rows = run_controllers(changed, ["no-control+max-pressure"], steps=6, out=out)
         table = pd.read_csv(out / "signals.csv")
         assert list(table)[2] == "signal"
         assert sorted(table.signal) == ["B1", "B2", "C1", "C2"]
