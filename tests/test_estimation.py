@@ -139,11 +139,11 @@ def rmse(error):
 
 @pytest.fixture(scope="module")
 def runs():
-    """Truth, estimates and detectors of four cities, with and without the readings."""
+    """Truth, estimates and detectors of six cities, with and without the readings."""
     known = equipped()
     return [
         (*watch(seed, known), watch(seed, known, changed=lambda observation: nothing())[1])
-        for seed in range(4)
+        for seed in range(6)
     ]
 
 
