@@ -59,7 +59,7 @@ def test_plans_are_admissible_and_replayed_exactly(name):
 
 def test_the_bound_is_not_above_the_closed_loop_it_started_from(scenario):
     crowded = replace(scenario, demand=3.0 * scenario.demand)
-    plan = bound.compute(crowded, "bound-pc", iterations=200)
+    plan = bound.compute(crowded, "bound-pc", iterations=120)
     # A sigmoid never quite reaches the bounds of u.
     assert plan.totals[plan.start] <= (1.0 + 1e-4) * closed(
         crowded, api.controller("pi-gating", crowded)

@@ -80,9 +80,9 @@ def test_demand_and_steps_are_arguments(scenario):
 
 def test_a_city_is_its_settings(tmp_path):
     city = cosim.Settings(signals="max-pressure", guided=True)
-    run = cosim.run("demo", nmfd.PiGating(), city=city, seed=1, steps=4)
+    run = cosim.run("demo", nmfd.PiGating(), city=city, seed=1, steps=2)
     assert run.controller == "pi-gating+guided+max-pressure"
-    named = cosim.run("demo", "pi-gating()+guided+max-pressure", seed=1, steps=4)
+    named = cosim.run("demo", "pi-gating()+guided+max-pressure", seed=1, steps=2)
     np.testing.assert_array_equal(named["accumulation"], run["accumulation"])
 
 
