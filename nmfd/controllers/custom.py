@@ -101,7 +101,7 @@ class OwnController:
 
     def act(self, observation: Observation) -> Controls:
         command = _located(self.name, "act", lambda: self._controller.act(observation))
-        return rounded(command, self._network, f"{self.name}: interval {observation.step}")
+        return rounded(command, self._network, f"{self.name}: act: interval {observation.step}")
 
 
 def _path(name: str) -> Path:
