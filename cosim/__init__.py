@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from cosim.plant.plant import SumoPlant
     from cosim.plant.settings import Settings, settings
     from cosim.plant.strategy import Strategy
-    from cosim.report.city import City
+    from cosim.reporting.city import City
     from nmfd.types import Result
 
 _MODULES = {
@@ -50,7 +50,7 @@ _MODULES = {
     "cosim.plant.plant": ("SumoPlant",),
     "cosim.plant.settings": ("Settings", "settings"),
     "cosim.plant.strategy": ("Strategy",),
-    "cosim.report.city": ("City",),
+    "cosim.reporting.city": ("City",),
     "nmfd.types": ("Result",),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}

@@ -23,7 +23,7 @@ SHAPED = [
     "cosim.evaluation",
     "cosim.importing",
     "cosim.plant",
-    "cosim.report",
+    "cosim.reporting",
     "cosim.sumo.net",
     "cosim.sumo.trips",
 ]

@@ -2,6 +2,7 @@
 command line."""
 
 import json
+import pkgutil
 import pydoc
 import re
 import subprocess
@@ -31,6 +32,14 @@ def test_the_python_of_the_readmes(package, monkeypatch, tmp_path):
         short = block.replace("seed=1)", "seed=1, steps=3)")
         exec(short.replace("seeds=10)", "seeds=1, steps=2)"), {})
     assert blocks
+
+
+@pytest.mark.parametrize("package", [nmfd, cosim], ids=str)
+def test_no_public_name_is_that_of_a_module(package):
+    # Python would put the module in its place as soon as something imports it.
+    modules = {module.name for module in pkgutil.iter_modules(package.__path__)}
+    assert "api" in modules
+    assert modules.isdisjoint(package.__all__)
 
 
 def test_importing_the_packages_imports_nothing_heavy():

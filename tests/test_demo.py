@@ -9,7 +9,7 @@ import pytest
 from commands import cosim, good
 
 from cosim import api
-from cosim.report import html
+from cosim.reporting import html
 from nmfd.api import load_scenario
 
 

@@ -89,7 +89,7 @@ def test_the_folder_is_held_until_its_figures_are_drawn(city, tmp_path, ran, mon
         with pytest.raises(Timeout):
             FileLock(tmp_path / "out" / ".lock", timeout=0).acquire()
 
-    monkeypatch.setattr("cosim.report.figures.draw_all", draw)
+    monkeypatch.setattr("cosim.reporting.figures.draw_all", draw)
     good(
         cosim(
             "evaluate", city, "--controllers", "no-control", "--seeds", 1, "--out", tmp_path / "out"

@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 from trajectories import trajectory
 
-from cosim.report import figures
+from cosim.reporting import figures
 from nmfd.studies import plots
 
 

@@ -105,7 +105,7 @@ def test_the_sdist_makes_the_same_wheel(built):
 def test_what_is_in_the_wheel(built):
     names = contents(built[1])
     assert not [name for name in names if any(word in f"/{name}" for word in NOT_FOR_USERS)]
-    assert {"nmfd/CITATION.cff", "nmfd/py.typed", "cosim/report/report.html.j2"} <= set(names)
+    assert {"nmfd/CITATION.cff", "nmfd/py.typed", "cosim/reporting/report.html.j2"} <= set(names)
     for kind in ("scenario", "network"):
         for file in ROOT.glob(f"{kind}s/*/{kind}.toml"):
             assert f"nmfd/data/{file.relative_to(ROOT).as_posix()}" in names

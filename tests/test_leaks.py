@@ -14,7 +14,7 @@ from test_responsive import CARS, CONFIG
 
 from cosim.api import run_controllers
 from cosim.evaluation.simulate import leaking_share
-from cosim.report.city import City
+from cosim.reporting.city import City
 from cosim.sumo.signals import free_light
 from cosim.sumo.xml_files import read_xml
 from cosim.view.picture import CityPicture

@@ -10,7 +10,7 @@ from commands import good, nmfd
 from made_up import rows_of
 
 from cosim.evaluation import statistics
-from cosim.report import figures
+from cosim.reporting import figures
 from nmfd.studies.benchmark import interval
 
 

@@ -11,7 +11,7 @@ import pytest
 from commands import cosim, error_line
 
 from cosim.evaluation import results, statistics
-from cosim.report import figures, html
+from cosim.reporting import figures, html
 from nmfd.studies import plots
 
 EVIL = "<script>alert(1)</script>"

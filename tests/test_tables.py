@@ -7,7 +7,7 @@ import pytest
 from made_up import rows_of
 
 from cosim.evaluation import statistics
-from cosim.report import figures
+from cosim.reporting import figures
 
 
 def test_paired_interval_of_a_worked_example():

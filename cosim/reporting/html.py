@@ -21,7 +21,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from cosim.evaluation import explain, statistics
 from cosim.evaluation.results import Finished, Level
-from cosim.report import figures
+from cosim.reporting import figures
 from cosim.view.page import with_slider
 from cosim.view.picture import CityPicture, frames, totals
 from nmfd.errors import InputError
@@ -62,7 +62,7 @@ def write_page(path: Path, runs: Sequence[Finished], *, seed: int | None = None)
     Raises: InputError if there is no run with this seed
     """
     shown, script, div = _map(runs[0], seed)
-    loader = PackageLoader("cosim.report", ".")
+    loader = PackageLoader("cosim.reporting", ".")
     environment = Environment(
         loader=loader, autoescape=True, trim_blocks=True, undefined=StrictUndefined
     )
