@@ -42,13 +42,32 @@ def observed(result: Result) -> Observed:
 
     Its demand is the departures.
     """
+    crossings = net_crossings(result)
+    exits = crossings.sum(axis=2)
+    own = np.arange(exits.shape[1])
+    exits[:, own, own] = result["arrivals"]
     return Observed(
         accumulation=result["accumulation"],
         demand=result["departures"] / result.step,
         perimeter=result["perimeter"],
         splits=result["splits"],
-        crossings=result["crossings"].sum(axis=3),
+        crossings=crossings.sum(axis=3),
+        exits=exits,
     )
+
+
+def net_crossings(result: Result) -> np.ndarray:
+    """Return crossings [i, h, j] from i to h, bound for j (veh, (T, R, R, R)).
+
+    In the model no vehicle leaves the region of its destination. Those that do, and come back
+    later, are taken off the vehicles that come.
+    """
+    crossings = result["crossings"].astype(float)
+    own = np.arange(crossings.shape[1])
+    leaving = crossings[:, own, :, own]  # [i, t, h] from i to h, bound for i
+    crossings[:, own, :, own] = 0.0
+    crossings[:, :, own, own] -= np.moveaxis(leaving, (0, 1, 2), (2, 0, 1))
+    return crossings
 
 
 def predict(scenario: Scenario, result: Result) -> Result:

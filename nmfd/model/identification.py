@@ -51,6 +51,7 @@ class Observed:
     perimeter: (-, (T, R, R))
     splits: (-, (T, R, R, R))
     crossings: [i, h] from i to h (veh, (T, R, R))
+    exits: [i, j] vehicles bound for j that left i, or for j = i ended their trip (veh, (T, R, R))
     """
 
     accumulation: StatesOverTime
@@ -58,6 +59,7 @@ class Observed:
     perimeter: PairsOverTime
     splits: TurnsOverTime
     crossings: Real[np.ndarray, "T R R"]
+    exits: PairsOverTime | None = None
 
 
 class Windows(NamedTuple):
