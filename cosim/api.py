@@ -1,4 +1,4 @@
-"""Python interface of `cosim`: a function for every command, and single runs.
+"""Python interface of `cosim`: functions for commands and single runs.
 
 Studies return tables; the command line prints them. Bokeh and Optuna are imported in the functions
 that need them: they take a second.
@@ -39,14 +39,13 @@ from nmfd.errors import RunFailed
 from nmfd.metrics import summary
 from nmfd.model.scenario import Scenario
 from nmfd.runs.files import default_folder, file_name, write_table
+from nmfd.runs.frame import Table
 from nmfd.runs.progress import Progress, watched
 from nmfd.runs.run_many import Run, locked, raise_failures, run_many
 from nmfd.studies.benchmark import REFERENCE, draw_accumulations
 from nmfd.types import Result
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from nmfd.controllers.base import Options
 
 DEMO = "demo"  # a shipped scenario
@@ -113,9 +112,10 @@ def run_controllers(
     out: Path | str | None = None,
     workers: int = 2,
     time_limit: float | None = None,
+    overwrite: bool = False,
     progress: Progress = None,
-) -> "pd.DataFrame":
-    """Run strategies on the same trips with a run folder, as `cosim run`; return a row per run.
+) -> Table:
+    """Run strategies on the same trips in a folder; return a row per run.
 
     policies: files by controller, if not SCENARIO/NAME.pt
     out: run folder, runs/SCENARIO-TIME if None; it is `table.attrs["folder"]`
@@ -129,19 +129,26 @@ def run_controllers(
     out = default_folder(loaded_one.name) if out is None else Path(out)
     runs = runs_of(loaded_one, strategies, [seed], demand=demand, policies=files)
     with locked(out):
-        rows = run_many(runs, out, workers=workers, time_limit=time_limit, progress=progress)
+        rows = run_many(
+            runs,
+            out,
+            workers=workers,
+            time_limit=time_limit,
+            overwrite=overwrite,
+            progress=progress,
+        )
         raise_failures(rows)
         finished = results.read(out)
         there = [one for level in finished.levels for one in level.results()]
         draw_accumulations(out, loaded_one, there)
         write_table(out / "signals.csv", sheets(there), float_format="%g")
-    table = finished.rows
+    table = Table(finished.rows)
     table.attrs["folder"] = str(out)
     return table
 
 
-def demo(out: Path | str = "runs/demo", *, seed: int = 1000) -> "pd.DataFrame":
-    """Run the demo city with and without gates, and write and open a page about both.
+def demo(out: Path | str = "runs/demo", *, seed: int = 1000) -> Table:
+    """Run the demo city with and without gates, and open a page about both.
 
     The page is `table.attrs["page"]`.
     """
@@ -151,12 +158,12 @@ def demo(out: Path | str = "runs/demo", *, seed: int = 1000) -> "pd.DataFrame":
     scenario = loaded(DEMO)
     strategies = [parse("no-control"), parse("pi-gating")]
     with locked(out):
-        rows = run_many(runs_of(scenario, strategies, [seed]), out, workers=2)
+        rows = run_many(runs_of(scenario, strategies, [seed]), out, workers=2, overwrite=True)
         raise_failures(rows)
         page = html.write_page(out / "report.html", [results.read(out)], seed=seed).resolve()
     if _has_screen():
         webbrowser.open(page.as_uri())
-    table = rows[rows["seed"] == seed]
+    table = Table(rows[rows["seed"] == seed])
     table.attrs["page"] = str(page)
     return table
 
@@ -171,7 +178,9 @@ def watch(
     port: int = 0,
     gui: bool = False,
 ) -> dict[str, dict]:
-    """Show runs on a live page until they end and the page is closed; return their figures by name.
+    """Show runs on a live page; return their figures by name.
+
+    It returns when the runs have ended and the page is closed.
 
     port: port of the page, any that is free if 0
     gui: show the first run in sumo-gui instead; nothing is returned if its window is closed early
@@ -210,9 +219,10 @@ def evaluate(
     workers: int = 1,
     scheduler: str | None = None,
     time_limit: float | None = None,
+    overwrite: bool = False,
     progress: Progress = None,
-) -> "pd.DataFrame":
-    """Run controllers x seeds x demand levels in SUMO, as `cosim evaluate`; return a row per run.
+) -> Table:
+    """Run controllers x seeds x demand levels; return a row per run.
 
     Tables and figures are written to the folder.
 
@@ -228,6 +238,7 @@ def evaluate(
     workers: runs at a time on this machine
     scheduler: address of a Dask scheduler that does the runs instead
     time_limit: seconds after which a run is ended; see nmfd.runs.run_many
+    overwrite: do finished runs again whose settings have changed
     progress: None for a bar, False for none, or a function called as progress(done, runs, name)
 
     The column `failure` is "" of a finished run, else its reason. Raises InputError.
@@ -253,6 +264,7 @@ def evaluate(
             workers=workers,
             scheduler=scheduler,
             time_limit=time_limit,
+            overwrite=overwrite,
             progress=progress,
         )
         for name in dict.fromkeys(results.finished_rows(rows).get("scenario", ())):
@@ -273,7 +285,10 @@ def planned(
     policies: Mapping[str, Path | str] | None = None,
     out: Path | str | None = None,
 ) -> tuple[list[Run], Path]:
-    """Return the runs of `evaluate` with these arguments, and their folder. Raise InputError."""
+    """Return the runs of `evaluate` with these arguments, and their folder.
+
+    Raises: InputError
+    """
     name = ""
     suite: list[tuple[Scenario, Sequence[float]]]
     if not isinstance(scenario, Scenario) and Path(scenario).suffix == ".toml":
@@ -297,15 +312,15 @@ def planned(
     return evaluation.plan(suite, strategies, chosen, files), Path(out)
 
 
-def compare(folder: Path | str) -> "pd.DataFrame":
-    """Compare finished runs with what the regional model predicts; return a row per run.
+def compare(folder: Path | str) -> Table:
+    """Compare finished runs with the regional model; return a row per run.
 
     A table and figures are written beside the runs.
     """
     folder = Path(folder)
     finished = results.read(folder)
     with locked(folder):
-        rows = model_validation.compare(finished)
+        rows = Table(model_validation.compare(finished))
         write_table(folder / "foresight.csv", rows, float_format="%.6g")
     rows.attrs["scenario"] = finished.scenario.name
     return rows
@@ -341,7 +356,7 @@ class Tuned:
     folder: where both were written
     """
 
-    table: "pd.DataFrame"
+    table: Table
     best: "Options | None"
     text: str
     folder: Path
@@ -396,18 +411,21 @@ def tune(
     table = tuning.tune(order, workers=workers, time_limit=time_limit, progress=progress)
     best = strategy.options(tuning.best_of(order, table))
     text = (order.out / "tune.toml").read_text(encoding="utf-8")
-    return Tuned(table=table, best=best, text=text, folder=order.out)
+    return Tuned(table=Table(table), best=best, text=text, folder=order.out)
 
 
 def get(name: str | None, out: Path | str | None = None) -> str:
-    """Download a published city to a folder, cities/NAME if None; without a name list them."""
+    """Download a published city; without a name list them.
+
+    out: folder, cities/NAME if None
+    """
     if name is None:
         return cities.listed()
-    return cities.get(name, Path("cities") / name if out is None else Path(out))
+    return cities.get(name, Path("cities", name) if out is None else Path(out))
 
 
 def catalogue() -> dict[str, dict[str, str]]:
-    """Return what is shipped, all controllers, and all words of strategies, with a line each."""
+    """Return what is shipped, controllers, and words, with a line each."""
     words = strategies_of.vocabulary()
     return regional_catalogue() | {"Words behind a controller, for a city": words}
 
@@ -417,13 +435,16 @@ def _base(kind: BuiltIn) -> str:
 
 
 def _reference_first(strategies: Sequence[Strategy]) -> list[Strategy]:
-    """Return the strategies, first no control, else the last one: the others are compared with it."""
+    """Return the strategies, the one that others are compared with first.
+
+    It is no control, else the last one.
+    """
     turned = list(reversed(strategies))
     return sorted(turned, key=lambda strategy: strategy.name != REFERENCE)
 
 
 def _has_screen() -> bool:
-    """Return True if a browser may be opened: there is a screen and a terminal."""
+    """Return True if there are a screen for a browser and a terminal."""
     screen = not sys.platform.startswith("linux")
     screen |= "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
     return screen and sys.stdout.isatty()

@@ -16,6 +16,7 @@ from nmfd.cli import (
     FILE,
     FOLDER,
     LEVEL,
+    OVERWRITE,
     POLICIES,
     SCENARIO,
     SCHEDULER,
@@ -39,9 +40,9 @@ CONTROLLER = click.option(
     type=ControllerName(),
     required=True,
     metavar="NAME[+...]",
-    help="Controller from `nmfd show` or FILE:Class, and options of the city, joined by +: actuated "
-    "or max-pressure (signals), rerouting-N and compliance-N (percent of drivers), guided, guidance-period-N (s), "
-    "metering, estimate.",
+    help="Controller from `nmfd show` or FILE:Class, and options of the city, joined by +: "
+    "actuated or max-pressure (signals), rerouting-N and compliance-N (percent of drivers), "
+    "guided, guidance-period-N (s), metering, estimate.",
 )
 AGAINST = click.option(
     "--against", metavar="NAME[+...]", help="Second controller, run on the same trips."
@@ -56,7 +57,7 @@ WORKERS = click.option(
     show_default="one per core",
     help="Parallel runs.",
 )
-RUNNING = combined(WORKERS, SCHEDULER, TIME_LIMIT)
+RUNNING = combined(WORKERS, SCHEDULER, TIME_LIMIT, OVERWRITE)
 
 
 def span(text: str) -> tuple[float, float]:
@@ -98,10 +99,9 @@ def demo(out: Path) -> None:
     """
     rows = cosim.api.demo(out)
     for row in rows.to_dict("records"):
-        click.echo(
-            f"{row['controller'] + ':':12} {row['completed_veh']:,.0f} of {row['trips']:,.0f} trips "
-            f"completed, {row['mean_trip_time_s'] / 60:.1f} minutes per trip"
-        )
+        completed = f"{row['completed_veh']:,.0f} of {row['trips']:,.0f} trips completed"
+        minutes = f"{row['mean_trip_time_s'] / 60:.1f} minutes per trip"
+        click.echo(f"{row['controller'] + ':':12} {completed}, {minutes}")
     click.echo(
         f"Both side by side: {rows.attrs['page']}; "
         f"next: cosim watch {cosim.api.DEMO} --controller pi-gating"
@@ -116,6 +116,7 @@ def demo(out: Path) -> None:
 @STEPS
 @ONE_DEMAND
 @TIME_LIMIT
+@OVERWRITE
 @click.option(
     "--policy",
     type=FILE,
@@ -139,7 +140,7 @@ def run(
     \b
     Examples:
       cosim run grid7_peak --controller dpc-pcrg --against no-control
-      cosim run grid7_peak --controller pi-gating --set controllers.pi-gating.kp=2 --set sumo.chain_limit=0.4
+      cosim run grid7_peak --controller pi-gating --set controllers.pi-gating.kp=2
     """
     from cosim.evaluation.statistics import text
 
@@ -189,10 +190,9 @@ def watch(
     loaded = nmfd.load_scenario(scenario, settings)
     rows = cosim.api.watch(loaded, _both(controller, against), gui=gui, **options)
     for name, row in rows.items():
-        click.echo(
-            f"{name}, seed {options['seed']}: total time spent "
-            f"{row['total_time_spent_veh_s']:.4g} veh s, {row['completed_veh']:,.0f} trips completed"
-        )
+        spent = f"total time spent {row['total_time_spent_veh_s']:.4g} veh s"
+        completed = f"{row['completed_veh']:,.0f} trips completed"
+        click.echo(f"{name}, seed {options['seed']}: {spent}, {completed}")
     if gui and not rows:
         click.echo("The window was closed before the end.")
 
@@ -234,7 +234,7 @@ def evaluate(
     \b
     Examples:
       cosim evaluate grid7_peak --controllers no-control,pi-gating,dpc-pc --workers 4
-      cosim evaluate grid7_peak --controllers no-control,dpc-pc --demand 0.8,1.0,1.3 --out runs/levels
+      cosim evaluate grid7_peak --controllers no-control,dpc-pc --demand 0.8,1,1.3 --out runs/x
     """
     from cosim.evaluation import results, statistics
     from cosim.evaluation.evaluate import check as differences
@@ -244,7 +244,7 @@ def evaluate(
         options["seeds"] = range(first_seed, first_seed + seeds)
     if check is not None:
         running = {"workers": options.pop("workers")}
-        for name in ("scheduler", "time_limit"):
+        for name in ("scheduler", "time_limit", "overwrite"):
             options.pop(name)
         runs, out = cosim.api.planned(scenario, controllers, **options)
         lines = differences(runs, out, check, **running)
@@ -316,7 +316,8 @@ def report(folders: tuple[Path, ...], **options: Any) -> None:
     multiple=True,
     metavar="KEY=LOW:HIGH",
     callback=parsed("KEY=LOW:HIGH, such as kp=0.1:10", span),
-    help="Option of the controller and its range; KEY[0], KEY[1] for numbers of a list. May be repeated.",
+    help="Option of the controller and its range; KEY[0], KEY[1] for numbers of a list. "
+    "May be repeated.",
 )
 @click.option(
     "--candidates",

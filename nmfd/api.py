@@ -45,11 +45,11 @@ from nmfd.studies.measured import identify as identify
 from nmfd.types import Controller, Plant, Result
 
 if TYPE_CHECKING:
-    import pandas as pd
     import torch
     from torch import nn
 
     from nmfd.controllers.dpc.rollout import Trajectories
+    from nmfd.runs.frame import Table
 
     Cost: TypeAlias = Callable[[Trajectories], torch.Tensor]
     Sample: TypeAlias = Callable[[torch.Generator, int], tuple]
@@ -61,7 +61,7 @@ MOST_DEMAND = 10.0  # factor of a scenario's demand
 
 
 def load_scenario(folder: Path | str, settings: Mapping[str, Any] | None = None) -> Scenario:
-    """Read a scenario and its network, and check the options of its controllers.
+    """Read a scenario and its network, and check all its options.
 
         >>> nmfd.load_scenario("economic_mpc").network.region_names
         ('north-west', 'north-east', 'west', 'centre', 'east', 'south-west', 'south-east')
@@ -86,8 +86,9 @@ def loaded(
     demand: float = 1.0,
     settings: Mapping[str, Any] | None = None,
 ) -> Scenario:
-    """Return a scenario by name, folder or as it is, shortened and with another demand.
+    """Return a scenario, shortened and with another demand.
 
+    scenario: a Scenario, or as in `load_scenario`
     steps: control intervals; the scenario's if None
     demand: factor of the scenario's demand
     settings: as in `load_scenario`
@@ -103,12 +104,19 @@ def loaded(
 
 def levels_of(demand: float | Iterable[float]) -> list[float]:
     """Return the factors of the demand of a study as a list."""
-    return [float(demand)] if isinstance(demand, int | float) else [float(one) for one in demand]
+    if isinstance(demand, int | float):
+        return [float(demand)]
+    return [float(one) for one in demand]
 
 
 def seeds_of(seeds: int | Iterable[int], first: int = 0) -> list[int]:
-    """Return the seeds of a study: so many from `first`, or those given. Raise InputError."""
-    chosen = list(range(first, first + seeds)) if isinstance(seeds, int) else list(seeds)
+    """Return the seeds of a study: so many from `first` on, or those given.
+
+    Raises: InputError if there is none
+    """
+    if isinstance(seeds, int):
+        seeds = range(first, first + seeds)
+    chosen = list(seeds)
     if not chosen:
         raise InputError("seeds: expected a number from 1 up or a sequence, got none")
     return chosen
@@ -205,9 +213,10 @@ def benchmark(
     workers: int = 1,
     scheduler: str | None = None,
     time_limit: float | None = None,
+    overwrite: bool = False,
     progress: Progress = None,
-) -> "pd.DataFrame":
-    """Run controllers x seeds with a run folder, as `nmfd benchmark`; return one row per run.
+) -> "Table":
+    """Run controllers x seeds in a run folder, and return one row per run.
 
         >>> rows = nmfd.benchmark("economic_mpc", ["no-control", nmfd.PiGating()], out="runs/mine")
         >>> rows.groupby("controller")["completed_veh"].mean().round(-2).to_dict()
@@ -225,6 +234,7 @@ def benchmark(
     workers: runs at a time
     scheduler: address of a Dask scheduler that does the runs instead
     time_limit: seconds after which a run is ended; see nmfd.runs.run_many
+    overwrite: do finished runs again whose settings have changed
     progress: as in `nmfd.run`; your own is called as progress(done, runs, name)
 
     The column `failure` is "" of a finished run, else its reason. `lower_bound_veh_s` bounds the
@@ -267,6 +277,7 @@ def benchmark(
             workers=workers_for(strategies, workers),
             scheduler=scheduler,
             time_limit=time_limit,
+            overwrite=overwrite,
             progress=progress,
         )
         rows = benchmark_study.with_bounds(rows, lower, levels[0])
@@ -287,9 +298,12 @@ def robustness(
     workers: int = 1,
     scheduler: str | None = None,
     time_limit: float | None = None,
+    overwrite: bool = False,
     progress: Progress = None,
-) -> "pd.DataFrame":
-    """Run controllers, and no control, in perturbed scenarios; draw the gain and return the runs.
+) -> "Table":
+    """Run controllers in perturbed scenarios, and return one row per run.
+
+    No control runs as well; a figure shows the gain over it.
 
     kind: "demand", "demand-total", "mfd-scale", "mfd-axis" or "trip-lengths"
         (nmfd.model.scenario.perturbed)
@@ -329,6 +343,7 @@ def robustness(
             workers=workers_for(strategies, workers),
             scheduler=scheduler,
             time_limit=time_limit,
+            overwrite=overwrite,
             progress=progress,
         )
         if (rows["failure"] == "").any():
@@ -386,7 +401,7 @@ def train(
     anyway: bool = False,
     progress: Progress = None,
 ) -> "Path | nn.Module":
-    """Train a DPC policy and return its file; or a module of your own, which is returned.
+    """Train a DPC policy and return its file, or your own module.
 
     controller: its name or nmfd.Dpc(...); with `policy` the one whose settings and planning model
         are used
@@ -451,8 +466,9 @@ def bound(
     iterations: int = bound_study.ITERATIONS,
     progress: Progress = None,
 ) -> open_loop.Plan:
-    """Find the best plan "bound-pc" or "bound-pcrg" for known demand, and a lower bound.
+    """Find the best plan for known demand, and a lower bound.
 
+    controller: "bound-pc" or, with route guidance, "bound-pcrg"
     out: plan file, SCENARIO/NAME.npz if None
     iterations: Adam steps
     """
@@ -465,7 +481,7 @@ def bound(
 
 
 def bound_report(plan: open_loop.Plan) -> str:
-    """Return the total time spent from every start, and the lower bound, as text."""
+    """Return the totals of all starts of a plan, and the lower bound."""
     totals = sorted(plan.totals.items(), key=lambda item: item[1])
     lines = []
     for name, total in totals:
@@ -561,7 +577,10 @@ def _regional(controller: ControllerLike) -> Strategy:
 
 
 def check_policies(policies: Mapping[str, Path], strategies: Sequence[Strategy]) -> None:
-    """Raise InputError for a policy file of a controller that is not among the strategies."""
+    """Check that every policy file is of one of the strategies.
+
+    Raises: InputError
+    """
     known = [strategy.name for strategy in strategies]
     for name in policies:
         if name not in known:

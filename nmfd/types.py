@@ -1,4 +1,4 @@
-"""Types that plants, controllers and the closed loop exchange, and the result of a run."""
+"""Types that plants, controllers and the closed loop exchange."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -17,7 +17,9 @@ if TYPE_CHECKING:
 
 
 class Status(Flag):
-    """Status of one decision: OK, or a combination of these. `Controls.note` gives the reason.
+    """Status of one decision: OK, or a combination of these.
+
+    `Controls.note` gives the reason.
 
     SOLVER_FAILURE: the solver failed, diverged or stopped short of its tolerance
     FALLBACK: the controls are those of a fallback, not of the controller
@@ -40,8 +42,9 @@ class Status(Flag):
 
 @dataclass(frozen=True, kw_only=True)
 class State:
-    """True state of a plant at the start of control interval `step`; controllers get an Observation
-    instead.
+    """True state of a plant at the start of control interval `step`.
+
+    Controllers get an Observation instead.
 
     step: k = 0, 1, ...
     time: since the start (s)
@@ -67,16 +70,21 @@ class State:
 
     @property
     def unfinished(self) -> PerPair:
-        """Return the vehicles (R, R) that spend time: running, waiting to enter, and removed
-        (nmfd.metrics)."""
+        """Return the vehicles that spend time (veh, (R, R)).
+
+        They run, wait to enter, or were removed (nmfd.metrics).
+        """
         spending = self.accumulation + self.backlog
-        return spending if self.removed is None else spending + self.removed
+        if self.removed is None:
+            return spending
+        return spending + self.removed
 
 
 @dataclass(frozen=True, kw_only=True)
 class Observation:
-    """Input of a controller at the start of control interval `step`: with noise, with faults, or an
-    estimate.
+    """Input of a controller at the start of control interval `step`.
+
+    It has noise and faults, or is an estimate.
 
     step, time: those of the State
     accumulation: (R, R) [veh], [i, j] = in region i bound for j
@@ -93,10 +101,12 @@ class Observation:
 
 @dataclass(frozen=True, kw_only=True)
 class Controls:
-    """Command of a controller for one control interval; `Controls(perimeter=u)` is enough.
+    """Command of a controller for one control interval.
 
-    perimeter: u_ih, share of the desired transfer flow from i to h that may pass (-, (R, R) [i, h]);
-        ignored where h is not adjacent to i
+    `Controls(perimeter=u)` is enough.
+
+    perimeter: u_ih, share of the desired transfer flow from i to h that may pass
+        (-, (R, R) [i, h]); ignored where h is not adjacent to i
     splits: theta_ihj, share of the vehicles in i bound for j that head for h (-, (R, R, R)
         [i, h, j]); None without route guidance: drivers keep their routes (in the regional model
         the nominal splits)
@@ -119,8 +129,10 @@ class Controls:
 
 @runtime_checkable
 class Plant(Protocol):
-    """City, regional or microscopic. `step` is one control interval. A method `close` releases what
-    it holds."""
+    """City, regional or microscopic.
+
+    `step` is one control interval. A method `close` releases what the plant holds.
+    """
 
     def reset(self, seed: int) -> State:
         """Start again from the beginning."""
@@ -129,8 +141,10 @@ class Plant(Protocol):
         """Apply `controls` for one control interval; return the state at its end."""
 
     def observe(self) -> Observation | None:
-        """Return the estimate of the plant's own instruments; None without any: the state is
-        measured with noise."""
+        """Return the estimate of the plant's own instruments.
+
+        It is None without any; the state is then measured with noise.
+        """
 
 
 @runtime_checkable
@@ -140,11 +154,13 @@ class Controller(Protocol):
     name: str
 
     def reset(self, seed: int = 0) -> None:
-        """Start a new run; all random draws of the controller follow from `seed`."""
+        """Start a new run; all random draws follow from `seed`."""
 
     def act(self, observation: Observation) -> Controls:
-        """Return the controls of the interval that begins now; `observation` is the controller's
-        own copy."""
+        """Return the controls of the interval that begins now.
+
+        observation: the controller's own copy
+        """
 
 
 class Quantity(NamedTuple):
@@ -155,7 +171,7 @@ class Quantity(NamedTuple):
     text: str
 
     def variable(self, values: Any) -> tuple:
-        """Return `values` as xarray.Dataset takes them: dimensions, array and attributes."""
+        """Return dimensions, array and attributes, as xarray.Dataset takes them."""
         array = np.asarray(values)
         if array.dtype.kind == "U":
             array = array.astype(object)  # as netCDF returns texts
@@ -193,13 +209,8 @@ VARIABLES: dict[str, Quantity] = {
 }
 SHOWN_FACTS = 30  # in the representation of a result
 SHOWN_CHARACTERS = 60  # of a fact
-HOST_TIMES = (
-    "decision_time",
-    "wall_time",
-    "sumo_time_s",
-    "setup_time_s",
-    "overhead_share",
-)  # differ between two runs
+# These differ between two runs of the same seed.
+HOST_TIMES = ("decision_time", "wall_time", "sumo_time_s", "setup_time_s", "overhead_share")
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,7 +300,11 @@ class Result:
     def make(
         cls, attrs: Mapping[str, Any], region_names: Sequence[str] = (), **arrays: Any
     ) -> "Result":
-        """Return the result of a closed loop with these `attrs` and the arrays of VARIABLES."""
+        """Return the result of a closed loop.
+
+        attrs: facts of the run
+        arrays: those of VARIABLES
+        """
         import xarray  # half a second, which few commands need
 
         times = attrs["step"] * np.arange(len(arrays["accumulation"]))
@@ -326,26 +341,23 @@ class Result:
         except Exception as error:
             reason = str(error).partition("\n")[0]
             raise InputError(f"{path}: is no run ({reason}); delete it and run again") from None
-        data.attrs = {
-            name: v.item() if isinstance(v, np.generic) else v for name, v in data.attrs.items()
-        }
+        for name, value in data.attrs.items():
+            if isinstance(value, np.generic):
+                data.attrs[name] = value.item()
         return cls(data)
 
     def write(self, path: Path | str) -> None:
         """Write the Dataset to the netCDF file `path`, whole or not at all."""
         data = self.data.copy()
-        data.attrs = {
-            name: int(value) if isinstance(value, bool) else value
-            for name, value in data.attrs.items()
-        }
+        for name, value in data.attrs.items():
+            if isinstance(value, bool):  # netCDF has no such type
+                data.attrs[name] = int(value)
+        encoding = {}
         for name, variable in data.variables.items():
-            if variable.dtype == np.float16:  # netCDF has no such type
+            if variable.dtype == np.float16:  # nor this one
                 data[name] = variable.astype(np.float32)
-        encoding = {
-            name: {"zlib": True, "_FillValue": None}
-            for name, variable in data.variables.items()
-            if variable.dtype.kind in "fiu"
-        }
+            if variable.dtype.kind in "fiu":
+                encoding[name] = {"zlib": True, "_FillValue": None}
         path = Path(path)
         temporary = path.with_name(f".{path.stem}-{os.getpid()}.tmp")
         try:
@@ -383,9 +395,8 @@ class Result:
             shown["completed_trips"] = f"{self.completed_trips:,.0f}"
         for name, value in self.data.attrs.items():
             if len(shown) < SHOWN_FACTS and len(str(value)) <= SHOWN_CHARACTERS:
-                shown.setdefault(
-                    str(name), f"{value:g}" if isinstance(value, float) else f"{value}"
-                )
+                text = f"{value:g}" if isinstance(value, float) else str(value)
+                shown.setdefault(str(name), text)
         return shown
 
     def __getitem__(self, name: str) -> np.ndarray:
@@ -395,7 +406,7 @@ class Result:
         return name in self.data.variables
 
     def assign(self, **values: Any) -> "Result":
-        """Return the result with other arrays of its variables, or other attributes."""
+        """Return the result with other arrays or other attributes."""
         data = self.data.copy()
         for name, value in values.items():
             if name in data.variables:
@@ -418,7 +429,10 @@ class Result:
         return Result(self.data.assign(variables).assign_attrs(attrs))
 
     def label(self, **names: Sequence[str]) -> "Result":
-        """Return the result with the names of the entries of a dimension, `gateway` or `edge`."""
+        """Return the result with names of the entries of some dimensions.
+
+        names: `gateway` or `edge` -> names
+        """
         coordinates = {}
         for dimension, values in names.items():
             about = Quantity((dimension,), "", f"name of the {dimension}")
@@ -426,12 +440,13 @@ class Result:
         return Result(self.data.assign_coords(coordinates))
 
     def without_times(self) -> "xarray.Dataset":
-        """Return the Dataset without wall times and key: the same for every run of the same
-        seed."""
+        """Return the Dataset without wall times and key.
+
+        It is the same for every run of the same seed.
+        """
         data = self.data.drop_vars(HOST_TIMES, errors="ignore")
-        data.attrs = {
-            name: value for name, value in data.attrs.items() if name not in (*HOST_TIMES, "key")
-        }
+        for name in (*HOST_TIMES, "key"):
+            data.attrs.pop(name, None)
         return data
 
     def _repr_html_(self) -> str:

@@ -1,4 +1,4 @@
-"""Runs in SUMO for nmfd.runs.run_many: jobs, and everything that their results depend on."""
+"""Runs in SUMO for nmfd.runs.run_many: jobs and what they depend on."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -40,37 +40,38 @@ def runs_of(
     folder: below that of all runs
     Raises: InputError if a strategy cannot run in this city
     """
+    if city is None:
+        city = city_key(scenario, strategies)
+    if policies is None:
+        policies = {}
     flows = np.ascontiguousarray(with_demand(scenario, factor=demand).demand)
     shared = {
-        **(city or city_key(scenario, strategies)),
+        **city,
         "steps": scenario.steps,
         "demand": float(demand),
         "demand_hash": hashlib.sha256(flows.tobytes()).hexdigest()[:16],
     }
-    own = policies or {}
+    keys = {}
     for strategy in strategies:
-        strategy.make(scenario, own.get(strategy.name))  # reports mistakes before the first run
-    keys = {
-        s.name: {**shared, "controller": s.fingerprint(scenario, own.get(s.name))}
-        for s in strategies
-    }
-    cost = SECONDS_PER_TRIP * scenario.step * float(flows.sum())
-    return [
-        Run(
-            run_name(s.name, seed),
-            keys[s.name],
-            Simulation(scenario, s, seed, demand, own.get(s.name)),
-            folder,
-            cost,
-        )
-        for seed in seeds
-        for s in strategies
-    ]
+        policy = policies.get(strategy.name)
+        strategy.make(scenario, policy)  # reports mistakes before the first run
+        own = strategy.fingerprint(scenario, policy)
+        keys[strategy.name] = {**shared, "controller": own}
+    expected = SECONDS_PER_TRIP * scenario.step * float(flows.sum())
+    runs = []
+    for seed in seeds:
+        for strategy in strategies:
+            name = strategy.name
+            job = Simulation(scenario, strategy, seed, demand, policies.get(name))
+            runs.append(Run(run_name(name, seed), keys[name], job, folder, expected))
+    return runs
 
 
 def city_key(scenario: Scenario, strategies: Sequence[Strategy]) -> dict[str, object]:
-    """Check that the strategies can run in the city; return what all runs there depend on. Raises
-    InputError."""
+    """Return what all runs in the city depend on.
+
+    Raises: InputError if a strategy cannot run in it
+    """
     chosen = settings(scenario)
     check_tables(scenario)
     files = city_files(scenario.network)
@@ -78,23 +79,18 @@ def city_key(scenario: Scenario, strategies: Sequence[Strategy]) -> dict[str, ob
     check_adjacency(city, scenario.network)
     own_vehicles(scenario, chosen, city)
     simple, _ = read_signals(city, own_files(scenario, chosen.additional), HELD)
-    everywhere = any(one.settings(scenario).signals_from_outside for one in strategies)
-    incidents.check(
-        scenario.ordered_faults,
-        city,
-        "faults",
-        [signal.id for signal in simple] if everywhere else (),
-    )
+    driven = []
+    if any(one.settings(scenario).signals_from_outside for one in strategies):
+        driven = [signal.id for signal in simple]
+    incidents.check(scenario.ordered_faults, city, "faults", driven)
     for path in own_files(scenario, (*chosen.background, *chosen.additional)):
         read_xml(path)
     for strategy in strategies:
         check_strategy(strategy, scenario, city)
     sumo = chosen.model_dump(mode="json", exclude_defaults=True)
-    hashes = {
-        key: [file_hash(path) for path in own_files(scenario, sumo[key])]
-        for key in FILES
-        if key in sumo
-    }
+    for key in FILES:
+        if key in sumo:
+            sumo[key] = [file_hash(path) for path in own_files(scenario, sumo[key])]
     return {
         "scenario": scenario.name,
         "network": scenario.network.name,
@@ -103,7 +99,7 @@ def city_key(scenario: Scenario, strategies: Sequence[Strategy]) -> dict[str, ob
         "net_file_hash": file_hash(files.net_file),
         "regions_hash": file_hash(files.regions_csv),
         "measurement_std_veh": scenario.measurement_std,
-        "sumo": {**sumo, **hashes},
+        "sumo": sumo,
         "libsumo": metadata.version("libsumo"),
         "faults": list(scenario.faults),
     }

@@ -142,15 +142,18 @@ def _with_facts(
 
 
 def regional_outflow(record: Mapping[str, np.ndarray] | Result, step: float) -> RegionCounts:
-    """Return trips that ended in every region and vehicles that left it (T, R) [veh/s].
+    """Return the outflow of every region (veh/s, (T, R)).
 
-    record: arrays of cosim.plant.record.RECORD; step: control interval [s]
+    It counts trips that end there and vehicles that leave.
+
+    record: arrays of cosim.plant.record.RECORD
+    step: control interval (s)
     """
     return (record["arrivals"] + record["crossings"].sum(axis=(2, 3))) / step
 
 
 def trip_measures(trips: Sequence[Trip], regions: int) -> tuple[dict[str, float], PerRegion]:
-    """Return counts and times (s) of the trips that were due, and mean times by origin.
+    """Return measures of the trips that were due, and times by origin.
 
     Measures are of private vehicles, and apart of others; the mean time (s, (R,)) of private ones
     by region of origin is NaN without any.
@@ -200,10 +203,10 @@ def queue_facts(result: Result, city: City) -> dict[str, float]:
 
 
 def estimation_errors(result: Result, critical: PerRegion) -> dict[str, float]:
-    """Return the root mean square errors of estimated states, NaN if they were exact.
+    """Return root mean square errors of estimated states.
 
     They are those of the accumulation of a region, as a share of `critical` (veh, (R,)), and of its
-    parts with vehicles (veh).
+    parts with vehicles (veh); NaN if the states were exact.
     """
     if not result.estimated:
         return {"estimate_rmse_share": math.nan, "estimate_cell_rmse_veh": math.nan}
@@ -214,11 +217,16 @@ def estimation_errors(result: Result, critical: PerRegion) -> dict[str, float]:
 
 
 def _rms(values: ArrayLike) -> float:
-    return float(np.sqrt(np.mean(np.square(values)))) if np.size(values) else 0.0
+    if not np.size(values):
+        return 0.0
+    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def leaking_share(result: Result, city: City, leaks: Collection[Gateway]) -> float:
-    """Return the share of the boundary flow that passes gateways without a signal under control."""
+    """Return the share of the boundary flow without a signal under control.
+
+    leaks: gateways that nothing controls
+    """
     flow = result["gateway_flow"].sum(axis=0)
     leaking = 0.0
     for gateway, passed in zip(city.gateways, flow, strict=True):

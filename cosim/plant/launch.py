@@ -1,7 +1,7 @@
 """Start of SUMO for one run: vehicles, additional files and command line."""
 
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from functools import cached_property
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from cosim.sumo.trips import PLANNING_SEEDS, make_trips, turning_flows
 from cosim.sumo.xml_files import file_list
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
+from nmfd.runs.files import temporary_folder
 
 # Equipped drivers take the fastest route by the mean speeds of the last 180 s: at the departure,
 # for which their route must be read no earlier, and every minute from then on.
@@ -70,8 +71,8 @@ class Launch:
         self._layout = layout
         self._kept = trip_file is not None
         self._gui = gui
-        self._temporary = tempfile.TemporaryDirectory(prefix="cosim-", ignore_cleanup_errors=True)
-        self._folder = Path(self._temporary.name)
+        self._temporary = ExitStack()
+        self._folder = self._temporary.enter_context(temporary_folder())
         self.vehicles: list[str] = []
         self.held: HeldTrips | None = None
         self.trip_file = trip_file or self._folder / "tripinfo.xml"
@@ -107,7 +108,7 @@ class Launch:
         )
 
     def close(self) -> None:
-        self._temporary.cleanup()
+        self._temporary.close()
 
     def _options(self) -> list[str]:
         """Return SUMO's options, as on its command line."""

@@ -1,4 +1,4 @@
-"""The table [sumo] of scenario.toml: simulation, actuation and measurement of the city."""
+"""The table [sumo]: simulation, actuation and measurement of a city."""
 
 from importlib import import_module
 from pathlib import Path
@@ -52,7 +52,8 @@ def _known(name: str) -> str:
     return name
 
 
-EXACT, ESTIMATE = "exact", "estimate"
+EXACT = "exact"
+ESTIMATE = "estimate"
 FILES = ("routes", "background", "additional")
 
 
@@ -60,7 +61,7 @@ class Settings(config.Settings):
     """The city in SUMO. Files are relative to the scenario's folder."""
 
     step_length: float = setting(
-        "time step, a divisor of the control interval", 1.0, unit="s", gt=0.0, le=1.0
+        "time step, a divisor of the control interval", 1.0, unit="s", ge=0.01, le=1.0
     )
     time_to_teleport: float = setting(
         "waiting time before SUMO moves a vehicle on; -1: never", -1.0, unit="s", ge=-1.0
@@ -77,7 +78,8 @@ class Settings(config.Settings):
     )
     additional: Texts = setting("additional files: vehicle types, stops, signal programmes", ())
     options: dict[Text, Text] = setting(
-        "SUMO's options that change the traffic, such as max-depart-delay; other keys of [sumo] override them",
+        "SUMO's options that change the traffic, such as max-depart-delay; other keys of [sumo] "
+        "override them",
         {},
     )
     signals: Annotated[str, AfterValidator(_known)] = setting(
@@ -91,8 +93,8 @@ class Settings(config.Settings):
     )
     leave_signals: Texts = setting("signals that perimeter control does not change", ())
     chain_limit: Share = setting(
-        "share of the room before a gateway beyond which no command holds vehicles there; 0: no limit, and the same "
-        "share for all gateways of a boundary",
+        "share of the room before a gateway beyond which no command holds vehicles there; 0: no "
+        "limit, and the same share for all gateways of a boundary",
         0.6,
     )
     gateways_fixed: bool = setting(
@@ -130,8 +132,8 @@ class Settings(config.Settings):
     @model_validator(mode="after")
     def _is_possible(self) -> Self:
         if self.measurement == ESTIMATE and self.detector_share == self.probe_share == 0:
-            problem = '"estimate" needs sumo.detector_share or sumo.probe_share, but both are 0; raise one of them'
-            raise Problem("measurement", problem)
+            problem = '"estimate" needs sumo.detector_share or sumo.probe_share, but both are 0'
+            raise Problem("measurement", f"{problem}; raise one of them")
         return self
 
 
@@ -143,19 +145,16 @@ def settings(scenario: "Scenario") -> Settings:
     """
     path = scenario.where
     if scenario.initial is not None:
-        raise config.error(
-            path,
-            "initial",
-            "a city in SUMO begins empty; remove it, or use the regional model (nmfd)",
-        )
+        remedy = "remove it, or use the regional model (nmfd)"
+        raise config.error(path, "initial", f"a city in SUMO begins empty; {remedy}")
     result = config.checked(Settings, scenario.sumo, path, "sumo.")
     for key in FILES:
         for file in own_files(scenario, getattr(result, key)):
             if not file.is_file():
-                raise config.error(
-                    path, f"sumo.{key}", f"no such file: {file}; give the path of an existing one"
-                )
-    if abs(scenario.step / result.step_length - round(scenario.step / result.step_length)) > 1e-9:
+                problem = f"no such file: {file}; give the path of an existing one"
+                raise config.error(path, f"sumo.{key}", problem)
+    steps = scenario.step / result.step_length
+    if steps < 1.0 or abs(steps - round(steps)) > 1e-9:
         expected = f"a divisor of the control interval {scenario.step:g} s"
         raise config.error(path, "sumo.step_length", config.got(expected, result.step_length))
     return result
@@ -167,7 +166,10 @@ def own_files(scenario: "Scenario", names: Texts) -> list[Path]:
 
 
 def check_lanes(scenario: "Scenario", settings: Settings) -> None:
-    """Raise InputError for settings that need lanes, which the mesoscopic model has not."""
+    """Check that no setting needs lanes if the city is mesoscopic.
+
+    Raises: InputError
+    """
     if not settings.mesoscopic:
         return
     problem = ""
@@ -176,7 +178,6 @@ def check_lanes(scenario: "Scenario", settings: Settings) -> None:
     elif settings.measurement == ESTIMATE:
         problem = f"measurement: {ESTIMATE} needs loop detectors on lanes"
     if problem:
+        problem += ", but SUMO's mesoscopic model has no lanes"
         remedy = "omit it, or import the city without --mesoscopic"
-        raise InputError(
-            f"{scenario.where}: sumo.{problem}, but SUMO's mesoscopic model has no lanes; {remedy}"
-        )
+        raise InputError(f"{scenario.where}: sumo.{problem}; {remedy}")

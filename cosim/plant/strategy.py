@@ -1,4 +1,6 @@
-"""Strategies in a city: a controller, and what else the city does, as words or as Settings.
+"""Strategies in a city: a controller and what else the city does.
+
+Words or Settings say what the city does:
 
 dpc-pc+max-pressure      max-pressure at all signals, DPC limits the green of the gateways
 no-control+rerouting-30  no control, 30 % of the drivers reroute; `rerouting-30` for short
@@ -28,7 +30,10 @@ class Word(NamedTuple):
 
 
 class Number(NamedTuple):
-    """Word with a number N, WORD-N, from `least` to `largest`; percent become shares."""
+    """Word with a number, WORD-N with N from `least` to `largest`.
+
+    Percent become shares.
+    """
 
     key: str
     least: int
@@ -118,7 +123,10 @@ def parse(controller: ControllerLike, city: Settings | str | None = None) -> Str
 
 
 def of_finished(name: str) -> Strategy:
-    """Return the strategy of finished runs; only the name is known of the user's objects."""
+    """Return the strategy of finished runs.
+
+    Only the name is known of the user's objects.
+    """
     try:
         return parse(name)
     except InputError:
@@ -140,7 +148,10 @@ def label_of(key: str, value: Any) -> str:
 
 
 def setting_of(word: str) -> tuple[str, Any] | None:
-    """Return key and value of the setting that a word means, None if there is no such word."""
+    """Return key and value of the setting that a word means.
+
+    It is None if there is no such word.
+    """
     plain = _plain_words().get(word)
     if plain is not None:
         return plain.key, plain.value
@@ -192,30 +203,40 @@ def _with_words(strategy: Strategy, words: tuple[str, ...]) -> Strategy:
 
 
 def _with_city(strategy: Strategy, city: Settings | str) -> Strategy:
-    """Return a strategy with more changes of the city. Raise InputError if two differ."""
+    """Return a strategy with more changes of the city.
+
+    Raises: InputError if two of them exclude each other
+    """
     if isinstance(city, str):
         words = tuple(word for word in city.split("+") if word)
         name = "+".join([strategy.name, *words])
         return _with_words(replace(strategy, name=name), strategy.labels + words)
     if not isinstance(city, Settings):
         raise InputError(f"city: expected cosim.Settings or words, got {city!r}")
-    given = {name: getattr(city, name) for name in sorted(city.model_fields_set)}
-    own = {name: getattr(strategy.city, name) for name in strategy.city.model_fields_set}
-    for key, value in given.items():
-        if own.get(key, value) != value:
-            problem = f"{label_of(key, own[key])} and {label_of(key, value)} exclude each other"
+    values = {name: getattr(strategy.city, name) for name in strategy.city.model_fields_set}
+    labels = []
+    for key in sorted(city.model_fields_set):
+        value = getattr(city, key)
+        label = label_of(key, value)
+        if key not in values:
+            values[key] = value
+            labels.append(label)
+        elif values[key] != value:
+            problem = f"{label_of(key, values[key])} and {label} exclude each other"
             raise InputError(f"strategy {strategy.name!r}: {problem}; omit one of them")
-    labels = [label_of(key, value) for key, value in given.items() if key not in own]
     return replace(
         strategy,
         name="+".join([strategy.name, *labels]),
         labels=(*strategy.labels, *labels),
-        city=Settings(**own, **{key: given[key] for key in given if key not in own}),
+        city=Settings(**values),
     )
 
 
 def _check_controller(name: str, first: str) -> None:
-    """Raise InputError that knows the words, too, if there is no such controller."""
+    """Check that there is such a controller.
+
+    Raises: InputError that knows the words, too
+    """
     try:
         regional.parse(first)
     except InputError as error:

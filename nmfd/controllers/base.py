@@ -81,11 +81,14 @@ def check_fit(options: Options, planning: PlanningModel, where: str) -> None:
         raise InputError(f"{where}{problem.key}: {problem}")
 
 
-O = TypeVar("O", bound=Options)
+Declared = TypeVar("Declared", bound=Options)
 
 
-def from_table(declaration: type[O], planning: PlanningModel, name: str) -> O:
-    """Return the options of the scenario's table [controllers.NAME]. Raise InputError."""
+def from_table(declaration: type[Declared], planning: PlanningModel, name: str) -> Declared:
+    """Return the options of the scenario's table [controllers.NAME].
+
+    Raises: InputError
+    """
     prefix = f"controllers.{name}."
     table = planning.controller_options.get(name, {})
     options = config.checked(declaration, table, planning.where, prefix)

@@ -1,5 +1,7 @@
-"""Controllers of the user's own: a class in a file, `path/to/file.py:Class` (template.py shows how
-to write one)."""
+"""Controllers of the user's own: classes `path/to/file.py:Class`.
+
+template.py shows how to write one.
+"""
 
 import hashlib
 import re
@@ -23,14 +25,16 @@ FILE_AND_CLASS = re.compile(r"(?P<file>.+\.py):(?P<cls>[^\W\d]\w*)")
 
 
 def load(name: str) -> Any:
-    """Return the class FILE.py:CLASS; its module runs once per version of the file. Raise
-    InputError."""
-    path, cls = _path(name), name.rpartition(":")[2]
+    """Return the class FILE.py:CLASS.
+
+    Its module runs once per version of the file. Raises: InputError
+    """
+    path = _path(name)
+    cls = name.rpartition(":")[2]
     check_name(path)
     if not path.is_file():
-        raise InputError(
-            f"{path}: no such file for controller {name}; write one with: nmfd new-controller {path}"
-        )
+        remedy = f"write one with: nmfd new-controller {path}"
+        raise InputError(f"{path}: no such file for controller {name}; {remedy}")
     key = f"{path}:{path.stat().st_mtime_ns}"
     if key not in sys.modules:
         module = sys.modules[key] = ModuleType(key)  # dataclasses look up their module there
@@ -42,22 +46,28 @@ def load(name: str) -> Any:
         except InputError:
             del sys.modules[key]
             raise
-    if not callable(getattr(sys.modules[key], cls, None)):
+    found = getattr(sys.modules[key], cls, None)
+    if not callable(found):
         raise InputError(f"{path}: has no class {cls}; write one with the methods reset and act")
-    return getattr(sys.modules[key], cls)
+    return found
 
 
 def fingerprint(name: str) -> dict[str, object]:
     """Return hashes of the file and of those that the class names in `files`."""
-    paths = [
-        _path(name),
-        *(_path(name).parent / str(file) for file in getattr(load(name), "files", ())),
-    ]
-    return {f"{path.name}_hash": file_hash(path) if path.is_file() else None for path in paths}
+    file = _path(name)
+    paths = [file]
+    paths += [file.parent / str(other) for other in getattr(load(name), "files", ())]
+    hashes: dict[str, object] = {}
+    for path in paths:
+        hashes[f"{path.name}_hash"] = file_hash(path) if path.is_file() else None
+    return hashes
 
 
 def object_fingerprint(controller: Controller) -> str:
-    """Return a hash of an object with its code and state. Raise InputError if it has none."""
+    """Return a hash of an object with its code and state.
+
+    Raises: InputError if it cannot be pickled
+    """
     try:
         content = cloudpickle.dumps(controller)
     except Exception as error:
@@ -68,7 +78,10 @@ def object_fingerprint(controller: Controller) -> str:
 
 
 class OwnController:
-    """Controller of a user's file, whose mistakes are InputErrors with file and line."""
+    """Controller of a user's file.
+
+    Its mistakes become InputErrors with file and line.
+    """
 
     def __init__(self, name: str, planning: PlanningModel):
         """Make the controller and try it on an empty city. Raise InputError."""
@@ -94,21 +107,19 @@ def _path(name: str) -> Path:
 
 
 def _located(name: str, doing: str, function: Callable, *arguments: Any) -> Any:
-    """Return `function(*arguments)`; raise what the user's code raises as an InputError with file
-    and line."""
+    """Return `function(*arguments)`, which calls the user's code.
+
+    Raises: InputError with file and line for what that code raises
+    """
     try:
         return function(*arguments)
     except (Exception, SystemExit) as error:
-        places = [
-            (frame.filename, frame.lineno) for frame in traceback.extract_tb(error.__traceback__)
-        ]
-        own = [place for place in places if place[0] == str(_path(name))]
-        file, line = (
-            (error.filename, error.lineno)
-            if isinstance(error, SyntaxError)
-            else (own or places)[-1]
-        )
+        frames = traceback.extract_tb(error.__traceback__)
+        own = [frame for frame in frames if frame.filename == str(_path(name))]
+        place = (own or frames)[-1]
+        where = f"{place.filename}:{place.lineno}"
+        if isinstance(error, SyntaxError):
+            where = f"{error.filename}:{error.lineno}"
         text = " ".join(str(error).split())
-        raise InputError(
-            f"{file}:{line}: {name}: {doing}: {type(error).__name__}: {text}"
-        ) from error
+        problem = f"{type(error).__name__}: {text}"
+        raise InputError(f"{where}: {name}: {doing}: {problem}") from error

@@ -1,4 +1,4 @@
-"""Rule-based controllers: open gates, guidance by travel times, PI gating, greedy, excitation."""
+"""Rule-based controllers: open gates, PI gating, greedy, excitation."""
 
 from typing import ClassVar
 
@@ -18,7 +18,7 @@ MAX_DIVERTED_SHARE = 0.6  # of the vehicles with a random next region; more lock
 
 
 class NoControl(Options):
-    """Open perimeter, u = u_max everywhere, without route guidance: the reference."""
+    """Open perimeter, u = u_max, without route guidance: the reference."""
 
     plans: ClassVar[bool] = False
 
@@ -27,7 +27,10 @@ class NoControl(Options):
 
 
 class RouteGuidance(Options):
-    """Open perimeter with nominal split ratios: guidance by travel times within regions."""
+    """Open perimeter with nominal split ratios.
+
+    In a city, drivers are guided by travel times within regions.
+    """
 
     plans: ClassVar[bool] = False
 
@@ -71,7 +74,7 @@ class SetPoint(Options):
 
 
 class PiGating(SetPoint):
-    """PI control of the accumulation of every protected region by the gates into it.
+    """PI control of protected regions by the gates into them.
 
     The equation is that of nmfd.controllers.rules.PiGate. The default gains are moderate ones: on
     the benchmark kp from 0 to 5 and ki from 0.01 to 0.1 differ by less than 2 % in total time
@@ -94,18 +97,17 @@ class PiGating(SetPoint):
     def make(self, planning: PlanningModel) -> "PiGate":
         """Return the controller. Raise InputError without a protected region."""
         if not planning.protected:
-            raise InputError(
-                f"{planning.where}: protected: pi-gating needs at least one protected region, got "
-                "none; add protected = [<region>, ...] with regions from 0 to "
-                f"{planning.network.regions - 1}"
-            )
+            last = planning.network.regions - 1
+            remedy = f"add protected = [<region>, ...] with regions from 0 to {last}"
+            problem = "pi-gating needs at least one protected region, got none"
+            raise InputError(f"{planning.where}: protected: {problem}; {remedy}")
         return PiGate(planning, self)
 
 
 class PiGate:
-    """Incremental PI control of the accumulation n_p of every protected region p.
+    """Incremental PI control of the accumulation of protected regions.
 
-    All entries h -> p have the same opening:
+    n_p is the accumulation of the protected region p. All entries h -> p have the same opening:
 
         u_hp(k) = clip(u_hp(k-1) + kp (n_p(k-1) - n_p(k)) / n_cr
                        + ki dt (n_set - n_p(k)) / n_cr,  u_min, u_max)
@@ -153,17 +155,17 @@ class PiGate:
 
 
 class Greedy(Options):
-    """Bang-bang control by the more congested of two regions (nmfd.controllers.rules.GreedyGate)."""
+    """Bang-bang control by the more congested of two regions (GreedyGate)."""
 
     def make(self, planning: PlanningModel) -> Controller:
         return GreedyGate(planning)
 
 
 class GreedyGate:
-    """Greedy controller of Geroliminis, Haddad and Ramezani (2013, table I), boundary by boundary.
+    """Greedy controller of Geroliminis, Haddad and Ramezani (2013, table I).
 
-    u_ih = u_min if h is congested, n_h > n_cr,h, and i is not, or less so, n_i / jam_i < n_h /
-    jam_h; else u_max.
+    u_ih = u_min if h is congested and i is not, or less so; else u_max. A region is congested if
+    n > n_cr, and less so if its n / jam is smaller.
     """
 
     name = "greedy"
@@ -187,7 +189,7 @@ class GreedyGate:
 
 
 class Probing(SetPoint):
-    """Random excitation for `cosim identify` (nmfd.controllers.rules.Excitation)."""
+    """Random excitation for `cosim identify` (Excitation)."""
 
     plans: ClassVar[bool] = False
 

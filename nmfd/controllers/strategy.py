@@ -87,7 +87,7 @@ def _named(name: str, text: str, options: type[Options], **fixed: Any) -> tuple[
 
 
 def _pair(name: str, text: str, options: type[Options], **fixed: Any) -> list[tuple[str, BuiltIn]]:
-    """Return a controller without ("pc" in its name) and with route guidance ("pcrg")."""
+    """Return a controller without ("pc") and with route guidance ("pcrg")."""
     alone = f"{text}, perimeter control"
     both = f"{alone} and route guidance"
     return [
@@ -162,12 +162,15 @@ class Strategy:
         return isinstance(self.controller, FromFile)
 
     def regional(self) -> "Strategy":
-        """Return the strategy itself. Raise InputError if it has labels, for a city in SUMO."""
+        """Return the strategy itself.
+
+        Raises: InputError if it has labels, which only a city in SUMO understands
+        """
         if self.labels:
-            remedy = (
-                f"needs a city in SUMO (cosim); on the regional model use {self.controller.name}"
-            )
-            raise InputError(f"strategy {self.name!r}: +{'+'.join(self.labels)} {remedy}")
+            labels = "+".join(self.labels)
+            remedy = f"on the regional model use {self.controller.name}"
+            problem = f"+{labels} needs a city in SUMO (cosim); {remedy}"
+            raise InputError(f"strategy {self.name!r}: {problem}")
         return self
 
     def table(self, scenario: Scenario) -> str:
@@ -195,9 +198,13 @@ class Strategy:
         return best[0] if best else name
 
     def options(self, scenario: Scenario) -> Options | None:
-        """Return the options for `scenario`, None for the user's own code. Raise InputError."""
-        kind = self.controller
-        return self._options(kind, scenario) if isinstance(kind, BuiltIn) else None
+        """Return the options for `scenario`; None for the user's own code.
+
+        Raises: InputError
+        """
+        if isinstance(self.controller, BuiltIn):
+            return self._options(self.controller, scenario)
+        return None
 
     def _options(self, kind: BuiltIn, scenario: Scenario) -> Options:
         if kind.given is not None:
@@ -206,9 +213,10 @@ class Strategy:
         return kind.of_table(self._own_table(scenario), scenario.where, prefix)
 
     def make(self, scenario: Scenario, policy: Path | None = None) -> Controller:
-        """Return a controller for `scenario`, which shares no array with it. Raise InputError.
+        """Return a controller for `scenario`, which shares no array with it.
 
         policy: file of a policy, plan or value function instead of the scenario's
+        Raises: InputError
         """
         kind = self.controller
         file = self.file(scenario, policy)
@@ -227,10 +235,11 @@ class Strategy:
         return options.load(file, planning, scenario)
 
     def planning(self, scenario: Scenario) -> PlanningModel:
-        """Return the planning model that predicts the runs of the strategy. Raise InputError.
+        """Return the planning model that predicts the runs of the strategy.
 
         It is that of the controller, or the city's model with guided drivers if nothing else guides
         routes.
+        Raises: InputError
         """
         planned = self.own_planning(scenario)
         guided = guided_model(scenario.network)
@@ -240,7 +249,10 @@ class Strategy:
         return planned
 
     def own_planning(self, scenario: Scenario) -> PlanningModel:
-        """Return the planning model of the controller, with its options. Raise InputError."""
+        """Return the planning model of the controller, with its options.
+
+        Raises: InputError
+        """
         table = self.table(scenario)
         own = self._own_table(scenario)
         network = self._network(scenario, own.pop("model", None), table)
@@ -253,7 +265,10 @@ class Strategy:
         return planning_model(replace(scenario, controller_options=tables), network)
 
     def _own_table(self, scenario: Scenario) -> dict[str, Any]:
-        """Return the options as they were given or written: the strategy's over the controller's."""
+        """Return the options as they were given or written.
+
+        Those of the strategy's table replace those of the controller's.
+        """
         kind = self.controller
         if isinstance(kind, BuiltIn) and kind.given is not None:
             return kind.given.model_dump(exclude_unset=True, exclude=set(kind.fixed))
@@ -263,10 +278,11 @@ class Strategy:
         return {**tables.get(kind.name, {}), **tables.get(self.table(scenario), {})}
 
     def _network(self, scenario: Scenario, model: Any, table: str) -> RegionalModel | None:
-        """Return the regional model to plan with, None for the scenario's. Raise InputError.
+        """Return the regional model to plan with; None for the scenario's.
 
         model: the option of that name. Without it, controllers that guide routes by a model plan
             with that of guided drivers, if the city has one
+        Raises: InputError
         """
         kind = self.controller
         if isinstance(kind, BuiltIn) and kind.given is not None and model is not None:
@@ -283,9 +299,10 @@ class Strategy:
         return None
 
     def file(self, scenario: Scenario, policy: Path | None = None) -> Path | None:
-        """Return the file that `make` reads, None without. Raise InputError if it is missing.
+        """Return the file that `make` reads; None if it reads none.
 
         policy: the file, instead of the one that the options name or the scenario's
+        Raises: InputError if it is missing
         """
         kind = self.controller
         reads = kind.default.reads if isinstance(kind, BuiltIn) else None
@@ -309,8 +326,9 @@ class Strategy:
         return path
 
     def fingerprint(self, scenario: Scenario, policy: Path | None = None) -> dict[str, Any]:
-        """Return what its runs depend on besides city and demand: options, files and model.
+        """Return what its runs depend on besides city and demand.
 
+        These are options, files and model.
         Raises: InputError
         """
         kind = self.controller
@@ -335,7 +353,10 @@ class Strategy:
         return result
 
     def outside_training(self, scenario: Scenario, level: float, policy: Path | None = None) -> str:
-        """Return a sentence if `level` times the demand is outside the training range, else ""."""
+        """Return a sentence if the demand is outside the training range.
+
+        level: factor of the scenario's demand
+        """
         kind = self.controller
         if not isinstance(kind, BuiltIn) or kind.options is not Dpc:
             return ""
@@ -348,8 +369,9 @@ ControllerLike: TypeAlias = str | Options | Controller | Strategy
 
 
 def parse(controller: ControllerLike) -> Strategy:
-    """Return the strategy of a name, of options, or of an object with `reset` and `act`.
+    """Return the strategy of a controller.
 
+    controller: a name, options, or an object with `reset` and `act`
     Raises: InputError for an unknown controller or options that are wrong
 
     >>> strategy = parse("pi-gating+max-pressure")
@@ -383,7 +405,9 @@ def split(name: str) -> tuple[str, tuple[str, ...]]:
 
 
 def named(options: Options) -> BuiltIn:
-    """Return a built-in controller with given options, which its name contains.
+    """Return a built-in controller with given options.
+
+    Its name contains them.
 
     >>> named(PiGating(kp=2.0)).name
     'pi-gating(kp=2.0)'
@@ -407,7 +431,10 @@ def named(options: Options) -> BuiltIn:
 
 
 def _kind(name: str, first: str) -> BuiltIn | FromFile:
-    """Return the controller of the name `first` in `name`. Raise InputError if it is unknown."""
+    """Return the controller of the name `first` in `name`.
+
+    Raises: InputError if it is unknown
+    """
     if custom.FILE_AND_CLASS.fullmatch(first):
         return FromFile(name=first)
     if first in CONTROLLERS:
@@ -477,10 +504,11 @@ def parse_many(
 
 def _check_same(one: Strategy, other: Strategy) -> None:
     """Raise InputError if two controller objects have the same name."""
-    if isinstance(one.controller, Given) and isinstance(other.controller, Given):
-        if one.controller.controller is not other.controller.controller:
-            remedy = "give each object an attribute `name` of its own"
-            raise InputError(f"controllers: two have the name {one.name!r}; {remedy}")
+    if not isinstance(one.controller, Given) or not isinstance(other.controller, Given):
+        return
+    if one.controller.controller is not other.controller.controller:
+        remedy = "give each object an attribute `name` of its own"
+        raise InputError(f"controllers: two have the name {one.name!r}; {remedy}")
 
 
 def _is_pattern(name: str) -> bool:
@@ -489,7 +517,10 @@ def _is_pattern(name: str) -> bool:
 
 
 def _matching(pattern: str, scenario: Scenario, parse: Callable[[Any], S]) -> list[S]:
-    """Return the `ready` strategies whose names match. Raise InputError if none does."""
+    """Return the `ready` strategies whose names match.
+
+    Raises: InputError if none does
+    """
     known = ready(scenario, parse)
     matching = [one for one in known if fnmatchcase(one.name, pattern)]
     if not matching:
@@ -520,7 +551,10 @@ def ready(scenario: Scenario, parse: Callable[[Any], S]) -> list[S]:
 
 
 def check_tables(scenario: Scenario) -> None:
-    """Raise InputError for a wrong option in any table of [controllers], used or not."""
+    """Check the options in all tables of [controllers], used or not.
+
+    Raises: InputError
+    """
     planning = planning_model(scenario)
     for table, content in scenario.controller_options.items():
         if table == OWN:

@@ -202,7 +202,8 @@ def train(
             keeper.save(run.state())
         if progress:
             unit = "" if task.own else " veh s"
-            progress(run.done, setup.steps, f"best {run.best:.4g}{unit}")
+            best = f"best {run.best:.4g}{unit}" if math.isfinite(run.best) else "no validation yet"
+            progress(run.done, setup.steps, best)
     if run.best == run.bar:
         print(
             f"nmfd: no policy gained {WORTH:.0%} on the model: its gates stay open", file=sys.stderr

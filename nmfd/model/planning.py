@@ -1,7 +1,7 @@
-"""Planning model of a controller: its belief about the city, which may differ from the simulated
-city.
+"""Planning model of a controller.
 
-It shares no array with the scenario, so that a controller cannot change the plant.
+It may differ from the simulated city. It shares no array with the scenario, so that a controller
+cannot change the plant.
 """
 
 import copy
@@ -21,7 +21,9 @@ GUIDED = "guided"  # subfolder of a network with the model of the same city with
 
 @dataclass(frozen=True, kw_only=True)
 class PlanningModel(Horizon):
-    """Model of a controller or filter before a run; the city may follow another network, or none.
+    """Model that a controller or filter plans with.
+
+    The city may follow another network, or none.
 
     forecast: demand from i to j in interval k (veh/s, (T, R, R) [k, i, j])
     """
@@ -32,7 +34,9 @@ class PlanningModel(Horizon):
     def destinations(self) -> Bool[np.ndarray, " R"]:
         """Regions that are the destination of any trip, (R,)."""
         vehicles = self.forecast.sum(axis=(0, 1))
-        return (vehicles if self.initial is None else vehicles + self.initial.sum(axis=0)) > 0
+        if self.initial is not None:
+            vehicles = vehicles + self.initial.sum(axis=0)
+        return vehicles > 0
 
 
 def planning_model(scenario: Scenario, network: RegionalModel | None = None) -> PlanningModel:
@@ -40,15 +44,17 @@ def planning_model(scenario: Scenario, network: RegionalModel | None = None) -> 
 
     network: its regional model, the scenario's if None
     """
-    names = [part.name for part in fields(Horizon) if part.name != "network"]
-    shared = {name: copy.deepcopy(getattr(scenario, name)) for name in names}
-    model = copy.deepcopy(network or scenario.network)
-    return PlanningModel(**shared, network=model, forecast=scenario.demand.copy())
+    shared = {part.name: getattr(scenario, part.name) for part in fields(Horizon)}
+    shared["network"] = network or scenario.network
+    return PlanningModel(**copy.deepcopy(shared), forecast=scenario.demand.copy())
 
 
 def other_model(scenario: Scenario, folder: Path, where: str = "") -> RegionalModel:
-    """Return the regional model in `folder`. Raise InputError, which names `where`, if it is of
-    another city."""
+    """Return the regional model in `folder`.
+
+    where: names it in errors; its file if ""
+    Raises: InputError if it is of another city
+    """
     model = load_network(folder)
     if not np.array_equal(model.adjacency, scenario.network.adjacency):
         what = f"network {model.name} has other regions or boundaries than {scenario.network.name}"
@@ -59,6 +65,8 @@ def other_model(scenario: Scenario, folder: Path, where: str = "") -> RegionalMo
 
 
 def guided_model(network: RegionalModel) -> Path | None:
-    """Return the folder of the city's model with guided drivers, if there is one."""
-    folder = None if network.folder is None else network.folder / GUIDED
-    return folder if folder is not None and (folder / "network.toml").is_file() else None
+    """Return the folder of the model with guided drivers, None without."""
+    if network.folder is None:
+        return None
+    folder = network.folder / GUIDED
+    return folder if (folder / "network.toml").is_file() else None

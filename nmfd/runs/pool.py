@@ -66,7 +66,10 @@ else:
 
 
 def attempt(job: Job) -> Any:
-    """Return the outcome of a job, or the reason why there is none, with file and line."""
+    """Return the outcome of a job, or the reason why there is none.
+
+    The reason of an unexpected error names file and line.
+    """
     try:
         return job()
     except InputError as error:
@@ -106,7 +109,10 @@ def in_processes(
 
 
 def in_subprocess(job: Job, folder: str) -> Any:
-    """Return the outcome of a job in a new process, from a worker of Dask, which may not fork."""
+    """Return the outcome of a job in a new process.
+
+    For workers of Dask, which may not fork.
+    """
     command = [sys.executable, "-c", "from nmfd.runs.pool import answer; answer()"]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "PYTHONSAFEPATH": "1"}
     done = subprocess.run(
@@ -152,7 +158,10 @@ def _start(job: Job, limit: float | None, folder: str) -> Future:
 
 
 def _start_server() -> None:
-    """Start the server that processes are forked from, unless it runs; Ctrl-C does not reach it."""
+    """Start the server that processes are forked from, unless it runs.
+
+    Ctrl-C does not reach it.
+    """
     resource_tracker.ensure_running()  # first, as it lets Ctrl-C through
     blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -174,9 +183,11 @@ def _environment(changes: Mapping[str, str]) -> Iterator[None]:
 
 
 class Watchdog:
-    """Context of a decision that ends a process of a run if it lasts longer than `limit` (s).
+    """Time limit of a decision, as a context around it.
 
-    Elsewhere it does nothing: in a user's own process there is Ctrl-C.
+    It ends the process of a run. In a user's own process it does nothing: there is Ctrl-C.
+
+    limit: longest decision (s)
     """
 
     def __init__(self, limit: float):
@@ -198,7 +209,10 @@ class Watchdog:
 
 
 def work(job: bytes, folder: str, environment: Mapping[str, str]) -> Any:
-    """Return the outcome of a pickled job in `folder`; end if the parent process ends."""
+    """Return the outcome of a pickled job in `folder`.
+
+    The process ends if its parent ends.
+    """
     threading.Thread(target=_end_with_parent, daemon=True).start()
     os.environ.clear()
     os.environ.update(environment)

@@ -1,5 +1,6 @@
-"""The benchmark: controllers x seeds on a regional plant, with a table and the paper's figures; its
-robustness.
+"""Benchmark of controllers x seeds on a regional plant, and robustness.
+
+The benchmark has a table and the paper's figures.
 
 For robustness every controller is made for the nominal scenario (MPC has its forecast, the policies
 their training) and meets another demand, or other MFDs (nmfd.model.scenario.perturbed); its
@@ -29,6 +30,8 @@ from nmfd.types import Plant, Result
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from nmfd.runs.frame import Table
 
 PLANTS: dict[str, Callable[[Scenario], Plant]] = {"nmfd": NmfdPlant, "acyclic": AcyclicPlant}
 REFERENCE = "no-control"
@@ -64,8 +67,10 @@ ROBUSTNESS_CAPTION = (
 
 
 def compared_with(controllers: Iterable[str]) -> str:
-    """Return the controller that others are compared with: no control, or the first if that is not
-    among them."""
+    """Return the controller that others are compared with.
+
+    It is no control, or the first controller if no control is not among them.
+    """
     names = list(controllers)
     return REFERENCE if REFERENCE in names else names[0]
 
@@ -92,8 +97,10 @@ def closed_loop_of(
 
 
 def workers_for(strategies: Sequence[Strategy], workers: int) -> int:
-    """Return `workers` for `run_many`: 0, this process, for one, unless the user's own controllers
-    may crash."""
+    """Return `workers` for `run_many`.
+
+    A single worker is this process (0), unless controllers of the user's own may crash it.
+    """
     own = any(strategy.own for strategy in strategies)
     return workers if own or workers > 1 else 0
 
@@ -101,7 +108,9 @@ def workers_for(strategies: Sequence[Strategy], workers: int) -> int:
 def key_of(
     scenario: Scenario, strategies: Sequence[Strategy], plant: str, policies: Mapping[str, Path]
 ) -> Callable[[str], dict]:
-    """Return the function that gives everything the runs of a controller depend on.
+    """Return the function of a controller's name that returns its key.
+
+    The key holds everything that its runs depend on.
 
     Raises: InputError if a controller cannot be made, or the regional model has no such fault
     """
@@ -146,10 +155,10 @@ def lower_bound(scenario: Scenario, strategy: Strategy, plant: str) -> float:
         return math.nan
 
 
-def with_bounds(
-    rows: "pd.DataFrame", lower: Mapping[tuple[str, float], float], level: float
-) -> "pd.DataFrame":
-    """Return the rows with columns `lower_bound_veh_s`, and `impossible` of a row below it.
+def with_bounds(rows: "Table", lower: Mapping[tuple[str, float], float], level: float) -> "Table":
+    """Return the rows with columns `lower_bound_veh_s` and `impossible`.
+
+    A row is impossible if it falls below the bound.
 
     lower: (controller, factor of the demand) -> lower bound (veh s)
     level: factor of rows that do not say theirs
@@ -160,13 +169,14 @@ def with_bounds(
         if math.isnan(factor):
             factor = level
         bounds.append(lower.get((row["controller"], factor), math.nan))
-    rows = rows.assign(lower_bound_veh_s=bounds)
+    rows["lower_bound_veh_s"] = bounds
     spent = rows.get("total_time_spent_veh_s", math.nan)
-    return rows.assign(impossible=spent < rows["lower_bound_veh_s"] * (1.0 - BOUND_TOLERANCE))
+    rows["impossible"] = spent < rows["lower_bound_veh_s"] * (1.0 - BOUND_TOLERANCE)
+    return rows
 
 
 def draw(folder: Path, scenarios: Mapping[float, Scenario], rows: "pd.DataFrame") -> None:
-    """Draw the finished runs of a benchmark, and its scenario, in its folder."""
+    """Draw the finished runs of a benchmark, and its scenario."""
     done = rows[rows["failure"] == ""]
     if done.empty:
         return
@@ -184,7 +194,7 @@ def draw(folder: Path, scenarios: Mapping[float, Scenario], rows: "pd.DataFrame"
 
 
 def summary_table(rows: "pd.DataFrame") -> str:
-    """Return one line per controller as text, and a table per factor of the demand.
+    """Return a table with a line per controller, for every demand level.
 
     Total time spent (TTS) is the mean over seeds with its 95 % interval. Controllers with an
     impossible run come last, without a rank.
@@ -267,9 +277,11 @@ def draw_accumulations(
     title: str | None = None,
     prefix: str = "",
 ) -> None:
-    """Draw total and regional accumulation over time, as png files in `folder`.
+    """Draw total and regional accumulation over time as png files.
 
-    seed: shown instead of the mean over seeds; title: above both pictures; prefix: of their names
+    seed: shown instead of the mean over seeds
+    title: text above both pictures
+    prefix: begins the names of the files
     """
     network = scenario.network
     drawing = plots.figure(8.0, 4.6)
@@ -286,7 +298,7 @@ def draw_accumulations(
 
 
 def draw_scenario(folder: Path, scenario: Scenario) -> list[Path]:
-    """Draw spawn matrix, region map and MFDs of `scenario`; return the png files in `folder`."""
+    """Draw spawn matrix, region map and MFDs; return the png files."""
     demand = plots.figure(11.0, 4.8)
     left, right = demand.subplots(1, 2)
     plots.spawn_matrix(left, scenario)
@@ -302,35 +314,38 @@ def draw_scenario(folder: Path, scenario: Scenario) -> list[Path]:
 
 
 def interval(values: Sequence[float]) -> float:
-    """Half of the 95 % interval of the mean of `values` (Student's t); NaN of a single one, or
-    where one is NaN."""
-    if len(values) < 2 or any(map(math.isnan, values)):
+    """Return half of the 95 % interval of a mean (Student's t).
+
+    It is NaN of a single value, or if a value is NaN.
+    """
+    count = len(values)
+    if count < 2 or any(map(math.isnan, values)):
         return math.nan
-    return (
-        float(stdtrit(len(values) - 1, 0.975)) * statistics.stdev(values) / math.sqrt(len(values))
-    )
+    return float(stdtrit(count - 1, 0.975)) * statistics.stdev(values) / math.sqrt(count)
 
 
 def run_perturbed(
     strategy: Strategy, seed: int, *, scenario: Scenario, sigma: float, kind: str
 ) -> Result:
-    """Run one closed loop in a perturbed scenario; return its figures, without arrays.
+    """Run one closed loop in a perturbed scenario; return its figures.
 
-    seed: number of the draw of the perturbation and of the noise on measurements; sigma, kind: see
-        `perturbed`
+    seed: number of the draw of the perturbation and of the noise on measurements
+    sigma, kind: see `perturbed`
     """
     import xarray
 
     actual = perturbed(scenario, sigma, seed, kind)
-    row = summary(
-        closed_loop_of(strategy, seed, scenario=scenario, plant=PERTURBED_PLANT, actual=actual)
-    )
+    result = closed_loop_of(strategy, seed, scenario=scenario, plant=PERTURBED_PLANT, actual=actual)
+    row = summary(result)
     facts = {"kind": kind, "sigma": sigma, "trips_veh": scenario.step * float(actual.demand.sum())}
     return Result(xarray.Dataset(attrs=facts | {column: row[column] for column in KEPT}))
 
 
 def improvements(rows: "pd.DataFrame", controller: str) -> dict[float, tuple[float, float]]:
-    """Return sigma -> mean and 95 % half interval of the improvement over no control (%)."""
+    """Return sigma -> mean and half interval of the improvement (%).
+
+    The improvement is over no control, the interval one of 95 %.
+    """
     totals = _finished(rows).pivot_table("total_time_spent_veh_s", ["sigma", "seed"], "controller")
     pairs = totals.reindex(columns=[controller, REFERENCE]).dropna()
     gains: dict[float, list[float]] = {}
@@ -355,7 +370,7 @@ def draw_robustness(folder: Path, rows: "pd.DataFrame") -> None:
 
 
 def improvement_table(rows: "pd.DataFrame") -> str:
-    """Return the improvements as text: one line per controller, one column per sigma."""
+    """Return the improvements: a line per controller, a column per sigma."""
     done = _finished(rows)
     if done.empty:
         return "no run is finished"
@@ -374,15 +389,13 @@ def improvement_table(rows: "pd.DataFrame") -> str:
 
 
 def _meaning(kind: str) -> str:
-    return (
-        "noise on the demand [veh/s]"
-        if kind.startswith("demand")
-        else "spread of the logarithm [-]"
-    )
+    if kind.startswith("demand"):
+        return "noise on the demand [veh/s]"
+    return "spread of the logarithm [-]"
 
 
 def _finished(rows: "pd.DataFrame") -> "pd.DataFrame":
-    """Return the finished runs of the kind that was run last, whose rows come first."""
+    """Return the finished runs of the last kind, whose rows come first."""
     done = rows[rows["failure"] == ""]
     return done[done["kind"] == done["kind"].iloc[0]] if len(done) else done
 
