@@ -11,17 +11,18 @@ a boundary, or for j = i ended their trip. So the rates are ratios of sums over 
     k_ij   = sum E_ij / sum q_i x_ij s_ij   over the flowing intervals.
 
 The largest flow of a boundary is that of its signals, or less where its crossings show a limit.
-`identification.fit` is for cities where congestion follows at once, and nothing can be counted.
+Only the storage of regions that locked cannot be counted: it is the one that predicts best.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from nmfd.arrays import PerPair, PerRegion
 from nmfd.metrics import largest_accumulation
-from nmfd.model.identification import Observed
+from nmfd.model.identification import HORIZON, Observed, prediction_errors
 from nmfd.model.mfd import JAM_DENSITY, PiecewiseLinear, guess_beyond
 from nmfd.model.regional_model import LEAST_ROOM, RegionalModel, passing_share
 
@@ -32,9 +33,11 @@ FEW_VEHICLES = 10.0  # that leave as the average vehicle does, added to the coun
 FLOWING = 0.6  # of the largest outflow: a fuller region with less is locked
 PLATEAU = 0.95  # of the largest outflow, where the plateau begins
 SEEN_BEYOND = 1.3  # times the critical accumulation, which must be seen to know it
-RISE = (0.35, 0.7, 1.0)  # of the critical accumulation: points of the rising branch
+RISE = (0.2, 0.4, 0.6, 0.8, 1.0)  # of the critical accumulation, points of the rising branch
 FALLS = (0.95, 0.5, 0.1, 0.01)  # of the largest outflow: points of the branch of locked states
 LIMITS = np.geomspace(1.0, 0.02, 60)  # of the capacity of a boundary, of which one is chosen
+LOCKED = 0.5  # of the largest outflow: with less at the end of its data, a region has locked
+STORAGES = (1.0, 0.8, 0.7, 0.6)  # of the largest accumulation of a region that locked
 TELLING = 0.98  # of the squared error: a limit that lowers it to less is believed
 
 
@@ -78,33 +81,67 @@ def counted(
     network: RegionalModel,
     runs: Sequence[Observed],
     *,
-    step: float,
-    fastest: float,
+    scheme: Mapping[str, Any],
+    fastest: PerRegion,
     saturation: PerPair,
     lane_km: PerRegion,
 ) -> RegionalModel:
     """Return `network` with counted rates, capacities and MFDs.
 
-    step: control interval (s)
-    fastest: largest rate of any vehicle (1/s)
+    scheme: step [s], substeps and integrator of predictions
+    fastest: largest rate of any vehicle (1/s, (R,))
     saturation: largest flow over each boundary that its signals allow (veh/s, (R, R))
     lane_km: lane-kilometres (km, (R,))
     """
-    counts = Counts.of(runs, step)
+    counts = Counts.of(runs, scheme["step"])
     most = largest_accumulation(run.accumulation for run in runs)
-    storage = np.maximum(JAM_DENSITY * lane_km, most)
-    model = replace(
+    start = replace(
         network,
         exit_rates=np.ones(network.adjacency.shape),
         capacity=np.where(network.adjacency, saturation, 0.0),
-        storage=storage,
+        storage=np.maximum(JAM_DENSITY * lane_km, most),
+        critical_above={},
     )
+    model = _counted(start, counts, fastest, lane_km)
+    locked = [_locked(model, region, most[region]) for region in range(model.regions)]
+    if not any(locked):
+        return model
+    found = [model]
+    for share in STORAGES:
+        storage = np.where(locked, share * most, start.storage)
+        found.append(_counted(replace(start, storage=storage), counts, fastest, lane_km))
+    errors = []
+    for model in found:
+        off = prediction_errors(model, runs, _horizon(runs), **scheme)
+        errors.append((off**2).mean())
+    return found[int(np.argmin(errors))]
+
+
+def _horizon(runs: Sequence[Observed]) -> int:
+    """Return the control intervals of the predictions that judge a storage."""
+    return min(HORIZON, max(len(run.demand) for run in runs))
+
+
+def _counted(
+    start: RegionalModel, counts: Counts, fastest: PerRegion, lane_km: PerRegion
+) -> RegionalModel:
+    """Return the counted model with the storage of `start`, whose capacities are the largest."""
+    assert start.capacity is not None
+    model = start
     for _ in range(ROUNDS):
         passed = _passed(model, counts)
         model, flowing = _with_mfds(model, counts, passed, lane_km)
         model = _with_rates(model, counts, passed, flowing, fastest)
-        model = _with_capacities(model, counts, flowing, saturation)
+        model = _with_capacities(model, counts, flowing, start.capacity)
     return model
+
+
+def _locked(model: RegionalModel, region: int, most: float) -> bool:
+    """Return True if the outflow of a region has fallen at `most` vehicles."""
+    if region in model.critical_above:
+        return False
+    curve = model.mfds[region]
+    return bool(curve.outflow(most) < LOCKED * curve.capacity)
 
 
 def _rates(model: RegionalModel, counts: Counts) -> np.ndarray:
@@ -246,17 +283,30 @@ def _pooled(n: np.ndarray, exits: np.ndarray, ready: np.ndarray) -> tuple[np.nda
 
 
 def _with_rates(
-    model: RegionalModel, counts: Counts, passed: np.ndarray, flowing: np.ndarray, fastest: float
+    model: RegionalModel,
+    counts: Counts,
+    passed: np.ndarray,
+    flowing: np.ndarray,
+    fastest: PerRegion,
 ) -> RegionalModel:
-    """Return `model` with exit rates of the counts, 1 on the average of a region's vehicles."""
+    """Return `model` with exit rates of the counts, 1 on the average of a region's vehicles.
+
+    The MFDs take the rest, so that as many vehicles leave as were counted.
+    """
     usual = _rates(model, counts)[..., None] * counts.inside * passed
     left = (counts.exits * flowing[..., None]).sum(axis=0) * counts.step
     expected = (usual * flowing[..., None]).sum(axis=0) * counts.step
     rates = (left + FEW_VEHICLES) / (expected + FEW_VEHICLES)
     vehicles = counts.inside.sum(axis=0) + 1e-9
-    rates /= ((rates * vehicles).sum(axis=1) / vehicles.sum(axis=1))[:, None]
-    free = np.array([mfd.rate_up_to_jam(0.0) for mfd in model.mfds])
-    return replace(model, exit_rates=np.minimum(rates, fastest / free[:, None]))
+    mean = (rates * vehicles).sum(axis=1) / vehicles.sum(axis=1)
+    mfds = []
+    for curve, level in zip(model.mfds, mean, strict=True):
+        if isinstance(curve, PiecewiseLinear):
+            curve = replace(curve, outflows=tuple(float(level * g) for g in curve.outflows))
+        mfds.append(curve)
+    free = np.array([curve.rate_up_to_jam(0.0) for curve in mfds])
+    rates = np.minimum(rates / mean[:, None], (fastest / free)[:, None])
+    return replace(model, mfds=tuple(mfds), exit_rates=rates)
 
 
 def _with_capacities(

@@ -8,6 +8,9 @@ state, under observed demand and controls (Ljung, System Identification, 1999, c
 Steps of `fit`: `windows` cuts the runs into pieces, `_Model` holds the free numbers, `_rollout`
 predicts a piece, `_misfit` weighs the errors by region and by destination, and `_network` makes a
 RegionalModel of the result. `prediction_errors` tests a model on runs that the fit did not use.
+
+`nmfd.model.counting` comes first: a fit is for cities in which counting does not separate MFDs and
+rates, because congestion follows at once.
 """
 
 import math
