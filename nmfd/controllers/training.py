@@ -71,11 +71,12 @@ def settings(scenario: Scenario, strategy: Strategy, steps: int | None = None) -
 def check(scenario: Scenario, strategy: Strategy) -> None:
     """Check that a training is worth its time.
 
-    Raises: InputError without gateways, or for placeholder MFDs of the model to train on
+    Raises: InputError without gateways, for placeholder MFDs of the model to train on, or if it
+        predicts worse than "as now"
     """
     city = scenario.network
     believed = strategy.planning(scenario).network
-    still = "nmfd.train(..., anyway=True) trains all the same"
+    still = "nmfd train --anyway trains all the same (nmfd.train: anyway=True)"
     if city.controllable is not None and not city.controllable.any():
         problem = f"controllable: is 0 at every boundary: {NO_GATEWAY}"
         raise InputError(f"{_file(city)}: {problem}; {still}")
@@ -83,6 +84,9 @@ def check(scenario: Scenario, strategy: Strategy) -> None:
         problem = "placeholder: is true: its MFDs are guesses from lanes and speed limits"
         remedy = f"run 'cosim identify {city.folder}' or put in your own"
         raise InputError(f"{_file(believed)}: {problem}; {remedy}; {still}")
+    if believed.misleads:
+        remedy = "identify it from more runs, or choose rules"
+        raise InputError(f"{_file(believed)}: held_out: {believed.misleads}; {remedy}; {still}")
 
 
 def _file(network: RegionalModel) -> Path | str:
