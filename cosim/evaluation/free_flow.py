@@ -39,7 +39,10 @@ def _edge_times(city: City) -> np.ndarray:
 
 
 def _street_times(city: City) -> csr_array:
-    """Return [a, b]: free-flow time over the junction and edge b after edge a (s, (E, E))."""
+    """Return the free-flow time from the end of edge a to that of edge b.
+
+    Its unit is s, its shape (E, E); only successors have an entry.
+    """
     edge_times = _edge_times(city)
     rows = []
     columns = []

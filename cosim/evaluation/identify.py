@@ -128,19 +128,19 @@ class Task:
         return fit_quality.with_guesses(model, samples, lane_km, states, fastest=fastest)
 
     def fastest(self, network: RegionalModel) -> PerRegion:
-        """Return the largest rate of vehicles (1/s, (R,)): a region crossing in free flow."""
+        """Return one region crossing in free flow as a rate (1/s, (R,))."""
         scenario = self.scenario
         crossing = np.maximum(crossing_times(city_of(network)), scenario.step / scenario.substeps)
         return 1.0 / crossing
 
     def held_out(self, runs: Sequence[Result]) -> list[Result]:
-        """Return the runs to test a model on: those of the last seed, or the last run."""
+        """Return the runs of the last seed, or the last run, to test a model."""
         if len(self.seeds) == 1:
             return list(runs[-1:])
         return [run for run in runs if run.seed == self.seeds[-1]]
 
     def trial(self, method: str, static: RegionalModel, runs: Sequence[Result]) -> "Trial":
-        """Return a model of all runs, and the errors of one of all runs but the held-out ones."""
+        """Return a model of all runs, and the errors of one without some."""
         model = self.model(method, static, runs)
         unseen = self.held_out(runs)
         without = self.model(method, static, [run for run in runs if run not in unseen])
@@ -150,7 +150,7 @@ class Task:
         return Trial(method=method, model=model, errors=errors)
 
     def best(self, static: RegionalModel, runs: Sequence[Result]) -> "Trial":
-        """Return the counted model, or the fitted one if counting falls short of it."""
+        """Return the counted model, or a fitted one if that is better."""
         counted = self.trial(COUNTED, static, runs)
         if counted.good:
             return counted
@@ -166,7 +166,7 @@ class Task:
 
 
 class Trial(NamedTuple):
-    """A model, and the errors of one that was made in the same way of fewer runs.
+    """A model, and the errors of one made in the same way of fewer runs.
 
     method: COUNTED or FITTED
     errors: `fit_quality.predictions` of the held-out runs
@@ -490,7 +490,7 @@ def lane_kilometres(network: RegionalModel) -> PerRegion:
 
 
 def saturation_flows(network: RegionalModel, runs: Sequence[Result]) -> PerPair:
-    """Return the largest flow over each boundary that its signals allow (veh/s, (R, R)).
+    """Return the largest flow of boundaries (veh/s, (R, R)).
 
     It is that of the gateways' lanes during the mean green of the runs without gates; lanes
     without a signal are always green.

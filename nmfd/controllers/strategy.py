@@ -353,7 +353,7 @@ class Strategy:
         return result
 
     def model_warning(self, scenario: Scenario) -> str:
-        """Return where the controller's model predicts worse than "as now", else "".
+        """Return where the planning model is worse than "as now", else "".
 
         Rules of a few numbers do not predict.
         """

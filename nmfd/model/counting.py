@@ -1,6 +1,6 @@
-"""Regional model counted from runs: exit rates by destination, and MFDs with a plateau.
+"""Regional model counted from runs.
 
-In an interval with accumulations x_ij the regional model lets
+It has exit rates by destination, and MFDs with a plateau. In an interval with accumulations x_ij the regional model lets
 
     k_ij q_i x_ij s_ij,    s_ij: share that boundaries let pass,
 
@@ -125,7 +125,10 @@ def _horizon(runs: Sequence[Observed]) -> int:
 def _counted(
     start: RegionalModel, counts: Counts, fastest: PerRegion, lane_km: PerRegion
 ) -> RegionalModel:
-    """Return the counted model with the storage of `start`, whose capacities are the largest."""
+    """Return the counted model with the storage of `start`.
+
+    start: its capacities are the largest ones
+    """
     assert start.capacity is not None
     model = start
     for _ in range(ROUNDS):
@@ -151,12 +154,12 @@ def _rates(model: RegionalModel, counts: Counts) -> np.ndarray:
 
 
 def _wishes(model: RegionalModel, counts: Counts) -> np.ndarray:
-    """Return k_ij q_i x_ij, what would leave without boundaries (veh/s, (N, R, R))."""
+    """Return k_ij q_i x_ij, the outflow without boundaries (veh/s, (N, R, R))."""
     return model.exit_rates * _rates(model, counts)[..., None] * counts.inside
 
 
 def _boundary_shares(model: RegionalModel, counts: Counts, wish: np.ndarray) -> np.ndarray:
-    """Return the share of the desired flow that passes each boundary (-, (N, R, R))."""
+    """Return the share of the desired flow that passes (-, (N, R, R))."""
     room = np.maximum(1.0 - counts.inside.sum(axis=2) / model.storage, LEAST_ROOM)
     limit = counts.perimeter * model.open_capacity * room[:, None, :]
     return passing_share(wish, limit)
@@ -169,7 +172,7 @@ def _desired_flows(model: RegionalModel, counts: Counts) -> np.ndarray:
 
 
 def _passed(model: RegionalModel, counts: Counts) -> np.ndarray:
-    """Return s_ij, the share of vehicles that boundaries let pass (-, (N, R, R))."""
+    """Return s_ij, which boundaries let pass (-, (N, R, R))."""
     shares = _boundary_shares(model, counts, _desired_flows(model, counts))
     passed = np.einsum("nihj,nih->nij", counts.splits, shares)
     own = np.arange(model.regions)
@@ -180,7 +183,7 @@ def _passed(model: RegionalModel, counts: Counts) -> np.ndarray:
 def _with_mfds(
     model: RegionalModel, counts: Counts, passed: np.ndarray, lane_km: PerRegion
 ) -> tuple[RegionalModel, np.ndarray]:
-    """Return `model` with MFDs of the counts, and the flowing intervals (bool, (N, R))."""
+    """Return `model` with counted MFDs, and the flowing intervals (N, R)."""
     n = counts.inside.sum(axis=2)
     exits = counts.exits.sum(axis=2)
     ready = (model.exit_rates * counts.inside * passed).sum(axis=2)
@@ -202,7 +205,7 @@ def _with_mfds(
 def mfd_of(
     n: np.ndarray, exits: np.ndarray, ready: np.ndarray, jam: float
 ) -> tuple[PiecewiseLinear, np.ndarray, bool]:
-    """Return the MFD of a region, its flowing intervals, and True if a plateau was seen.
+    """Return an MFD, its flowing intervals, and True if a plateau was seen.
 
     The outflow rises to a plateau, which ends with the largest accumulation that flowed. Beyond,
     it is that of locked intervals, or if there are none the same. If no plateau was seen, a guess
@@ -244,9 +247,9 @@ def mfd_of(
 def _fall(
     n: np.ndarray, outflow: np.ndarray, capacity: float, jam: float
 ) -> tuple[list[float], list[float]]:
-    """Return points beyond the plateau (veh), (veh/s): where the outflow falls to each of FALLS.
+    """Return points beyond the plateau (veh), (veh/s).
 
-    Where it was not seen to fall so far, it stays.
+    There the outflow falls to each of FALLS. Where it was not seen to fall so far, it stays.
 
     n, outflow: of the runs, from the critical accumulation; the outflow does not rise (veh, veh/s)
     jam: beyond all (veh)
@@ -289,7 +292,7 @@ def _with_rates(
     flowing: np.ndarray,
     fastest: PerRegion,
 ) -> RegionalModel:
-    """Return `model` with exit rates of the counts, 1 on the average of a region's vehicles.
+    """Return `model` with counted exit rates, 1 for the average vehicle.
 
     The MFDs take the rest, so that as many vehicles leave as were counted.
     """
@@ -312,9 +315,9 @@ def _with_rates(
 def _with_capacities(
     model: RegionalModel, counts: Counts, flowing: np.ndarray, saturation: PerPair
 ) -> RegionalModel:
-    """Return `model` with capacities: of the signals, or less where crossings show a limit.
+    """Return `model` with the capacities that crossings show.
 
-    A limit and a lower exit rate explain the same number of crossings. So each limit is judged
+    They are those of the signals, or less. A limit and a lower exit rate explain the same number of crossings. So each limit is judged
     with the desired flows that give this number under it.
     """
     both = flowing[:, :, None] & flowing[:, None, :]

@@ -188,12 +188,12 @@ class RegionalModel:
 
     @property
     def misleads(self) -> str:
-        """Sentence about predictions that are worse than "as now", "" if none are known."""
+        """Where the model predicts worse than "as now", "" if unknown."""
         return "" if self.held_out is None else self.held_out.problem
 
     @property
     def known_critical(self) -> PerRegion:
-        """Critical accumulations (R,) [veh], the largest seen ones where they were not seen."""
+        """Critical accumulations (R,) [veh], else the largest that were seen."""
         critical = self.critical
         for region, largest in self.critical_above.items():
             critical[region] = largest
@@ -282,7 +282,10 @@ class MfdTable(Settings):
 
 
 class PiecewiseTable(Settings):
-    """Outflow MFD along straight lines from (0, 0) through points, constant beyond the last one."""
+    """Outflow MFD along straight lines from (0, 0) through points.
+
+    It is constant beyond the last one.
+    """
 
     accumulations: config.PositiveNumbers = setting(
         "rising; the last one is the jam accumulation", unit="veh"
@@ -310,7 +313,10 @@ ErrorPair = Annotated[
 
 
 class HeldOutTable(Settings):
-    """Errors in runs that the model has not seen: of the model, and of "as now" (RMSE)."""
+    """Errors in runs that the model has not seen.
+
+    They are RMSE of the model, and of "as now", the prediction that nothing changes.
+    """
 
     ahead: float = setting("time from a state to the prediction", unit="s", gt=0.0)
     flowing: ErrorPair | None = setting(

@@ -319,7 +319,7 @@ def held_out(errors: pd.DataFrame) -> HeldOut:
 
 
 def ahead_table(errors: pd.DataFrame, titles: Sequence[str]) -> str:
-    """Return the errors of `predictions` by region as text, with those of all regions."""
+    """Return the errors of `predictions` by region as text."""
     rows = []
     for title, (_, error) in zip(titles, errors.iterrows(), strict=True):
         row = {"region": title}
@@ -345,7 +345,7 @@ def _vehicles(error: float) -> str:
 
 
 def _rmse(errors: np.ndarray) -> PerRegion:
-    """Return the root mean square of errors (n, R) of each region, NaN without any."""
+    """Return the root mean square of errors (n, R), NaN without any."""
     if not len(errors):
         return np.full(errors.shape[1], np.nan)
     return np.sqrt((errors**2).mean(axis=0))
