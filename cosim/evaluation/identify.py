@@ -220,14 +220,13 @@ class Identified:
 
     def fit_text(self) -> str:
         """Return the quality of the fit, and the errors in the held-out runs."""
-        unseen = ", ".join(
-            f"{run.controller} seed {run.seed}" for run in self.task.held_out(self.runs)
-        )
+        runs = [f"{run.controller} {run.seed}" for run in self.task.held_out(self.runs)]
+        unseen = ", ".join(dict.fromkeys(runs))
         lines = [
             fit_quality.fit_table(self.model, self.fits),
             *wrapped(fit_quality.prediction_text(self.held_out, self.task.scenario.step)),
             fit_quality.ahead_table(self.held_out, self.model.titles),
-            *wrapped(f"Rates and MFDs are {self.method}. Held out: {unseen}."),
+            *wrapped(f"Rates and MFDs are {self.method}. Held out: the runs {unseen}."),
         ]
         return "\n".join(lines)
 
@@ -266,7 +265,8 @@ class Identified:
         times = ", ".join(f"{level:g}" for level in self.task.levels)
         return (
             f"Written by cosim identify from {len(self.runs)} runs of {name} under {controllers};\n"
-            f"# rates and MFDs are {self.method}; loading runs: demand times {times}, seeds {min(seeds)} to {max(seeds)}."
+            f"# rates and MFDs are {self.method}; loading runs: demand times {times}, "
+            f"seeds {min(seeds)} to {max(seeds)}."
         )
 
 

@@ -1,6 +1,7 @@
 """Regional model counted from runs.
 
-It has exit rates by destination, and MFDs with a plateau. In an interval with accumulations x_ij the regional model lets
+It has exit rates by destination, and MFDs with a plateau. In an interval with accumulations x_ij
+the regional model lets
 
     k_ij q_i x_ij s_ij,    s_ij: share that boundaries let pass,
 
@@ -317,8 +318,8 @@ def _with_capacities(
 ) -> RegionalModel:
     """Return `model` with the capacities that crossings show.
 
-    They are those of the signals, or less. A limit and a lower exit rate explain the same number of crossings. So each limit is judged
-    with the desired flows that give this number under it.
+    They are those of the signals, or less. A limit and a lower exit rate explain the same number of
+    crossings. So each limit is judged with the desired flows that give this number under it.
     """
     both = flowing[:, :, None] & flowing[:, None, :]
     wish = _desired_flows(model, counts) * both

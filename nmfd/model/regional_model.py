@@ -188,7 +188,7 @@ class RegionalModel:
 
     @property
     def misleads(self) -> str:
-        """Where the model predicts worse than "as now", "" if unknown."""
+        """Text that says where "as now" predicts better, "" if unknown."""
         return "" if self.held_out is None else self.held_out.problem
 
     @property

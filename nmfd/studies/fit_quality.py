@@ -334,6 +334,9 @@ def ahead_table(errors: pd.DataFrame, titles: Sequence[str]) -> str:
         row[name] = _vehicles(model)
         row[f"{name}, as now"] = _vehicles(as_now)
     table = text_table([*rows, row], f"{everywhere.ahead:g} s ahead. {AHEAD_CAPTION}")
+    share = errors["flowing_total_share"].iloc[0]
+    if not np.isnan(share):
+        table += f"\nPredicted over observed vehicles in flowing traffic: {share:.2f}"
     if everywhere.problem:
         table += f"\nWARNING: the model does not know: {everywhere.problem}"
     return table
