@@ -5,16 +5,19 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import tiny
 import torch
 
+from cosim.evaluation import identify
 from cosim.evaluation.free_flow import crossing_times
+from cosim.evaluation.identify import Trial
 from cosim.sumo.net import city_of
 from nmfd.api import load_scenario
 from nmfd.controllers.mpc.controller import EconomicMpc
 from nmfd.controllers.strategy import parse
-from nmfd.controllers.training import check
+from nmfd.controllers.training import check, train
 from nmfd.errors import InputError
 from nmfd.model import dynamics
 from nmfd.model.counting import counted, mfd_of
@@ -179,6 +182,41 @@ def test_a_model_worse_than_as_now_is_refused(tmp_path):
     assert parse("pi-gating").model_warning(poor) == ""
     assert parse("mpc-pc").model_warning(scenario) == ""
     assert isinstance(EconomicMpc().misfit(parse("no-control").own_planning(poor)), Problem)
+    file = train(poor, parse("dpc-pc"), seed=0, out=tmp_path / "p.pt", steps=1, anyway=True)
+    known = torch.load(file, weights_only=True)["configuration"]
+    assert "beyond critical its error is 7 veh" in known["model_warning"]
+
+
+def trial(method, flowing, congested):
+    """Return a trial whose errors are 10 veh for "as now", in one region."""
+    errors = {"ahead_s": 900.0}
+    for name, error in (("flowing", flowing), ("congested", congested)):
+        errors[f"{name}_states"] = 5
+        errors[f"{name}_rmse_veh"] = error
+        errors[f"{name}_persistence_rmse_veh"] = 10.0
+    return Trial(method=method, model=None, errors=pd.DataFrame([errors]))
+
+
+@pytest.mark.parametrize(
+    ("counted_errors", "fitted_errors", "chosen"),
+    [
+        ((4.9, 9.9), (1.0, 1.0), "counted"),  # good: no fit is made
+        ((5.1, 9.9), (4.0, 9.0), "fitted"),
+        ((4.0, 10.1), (9.0, 9.0), "counted"),  # the fit is worse in all states together
+    ],
+)
+def test_a_fit_is_made_only_if_counting_falls_short(counted_errors, fitted_errors, chosen):
+    errors = {"counted": counted_errors, "fitted": fitted_errors}
+    made = []
+
+    class Task:
+        def trial(self, method, static, runs):
+            made.append(method)
+            return trial(method, *errors[method])
+
+    assert identify.Task.best(Task(), None, []).method == chosen
+    needed = not trial("counted", *counted_errors).good
+    assert made == (["counted", "fitted"] if needed else ["counted"])
 
 
 def test_crossing_times_are_those_of_the_streets():

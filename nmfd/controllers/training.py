@@ -184,15 +184,7 @@ def train(
     keeper: Keeper
     if module is None:
         assert out is not None
-        configuration = {
-            "controller": strategy.name,
-            "scenario": planning.name,
-            "seed": seed,
-            "compiled": compiled,
-            **setup.model_dump(exclude={"policy"}),
-        }
-        if task.own:
-            configuration["task"] = task.own
+        configuration = _configuration(strategy, planning, setup, task, seed, compiled)
         policy = first_policy(setup, planning, guidance=setup.guides)
         keeper = FileKeeper(policy, planning.network, configuration, out)
     else:
@@ -222,6 +214,24 @@ def train(
             "lower the learning rate"
         )
     return keeper.finish()
+
+
+def _configuration(
+    strategy: Strategy, planning: PlanningModel, setup: Dpc, task: Task, seed: int, compiled: bool
+) -> State:
+    """Return what a policy file says about its training."""
+    configuration = {
+        "controller": strategy.name,
+        "scenario": planning.name,
+        "seed": seed,
+        "compiled": compiled,
+        **setup.model_dump(exclude={"policy"}),
+    }
+    if task.own:
+        configuration["task"] = task.own
+    if planning.network.misleads:
+        configuration["model_warning"] = planning.network.misleads
+    return configuration
 
 
 def _check_module(module: nn.Module, scenario: Scenario) -> None:
