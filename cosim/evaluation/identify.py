@@ -291,7 +291,7 @@ def identify(
     workers: int = 1,
     out: Path | None = None,
 ) -> str:
-    """Identify the regional model of a SUMO city from loading runs, and write it.
+    """Identify the regional model of a SUMO city, and write it.
 
     It returns a report. The same call continues after an interruption.
 
