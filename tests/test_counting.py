@@ -10,6 +10,7 @@ import pytest
 import tiny
 import torch
 
+import nmfd
 from cosim.evaluation import identify
 from cosim.evaluation.free_flow import crossing_times
 from cosim.evaluation.identify import Trial
@@ -22,7 +23,7 @@ from nmfd.errors import InputError
 from nmfd.model import dynamics
 from nmfd.model.counting import counted, mfd_of
 from nmfd.model.identification import Observed, prediction_errors
-from nmfd.model.mfd import PiecewiseLinear, trapezoid
+from nmfd.model.mfd import RoundedLinear, trapezoid
 from nmfd.model.regional_model import Errors, HeldOut, load_network, network_toml
 from nmfd.runs.config import Problem
 
@@ -155,7 +156,7 @@ def test_a_counted_model_comes_back_from_its_file(truth, runs, tmp_path):
     again = load_network(tmp_path)
     assert again.held_out == WORSE
     for here, there in zip(found.mfds, again.mfds, strict=True):
-        assert isinstance(there, PiecewiseLinear)
+        assert isinstance(there, RoundedLinear)
         np.testing.assert_allclose(there.accumulations, here.accumulations, rtol=1e-5)
         np.testing.assert_allclose(there.outflows, here.outflows, rtol=1e-5)
     text = (tmp_path / "network.toml").read_text()
@@ -164,6 +165,14 @@ def test_a_counted_model_comes_back_from_its_file(truth, runs, tmp_path):
     (tmp_path / "network.toml").write_text(both)
     with pytest.raises(InputError, match="there is piecewise_mfd, too; remove one"):
         load_network(tmp_path)
+
+
+def test_mpc_solves_its_plans_on_a_counted_model(truth, runs):
+    """Kinks are rounded: at sharp ones the solver of MPC stops."""
+    scenario = load_scenario(ROOT / "scenarios" / "economic_mpc")
+    city = replace(scenario, network=count(truth, runs), measurement_std=0.0)
+    result = nmfd.run(city, "mpc-pc", steps=40, progress=False)
+    assert (result["status"] == 0).all()
 
 
 def test_a_model_worse_than_as_now_is_refused(tmp_path):

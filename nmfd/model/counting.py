@@ -24,7 +24,7 @@ import numpy as np
 from nmfd.arrays import PerPair, PerRegion
 from nmfd.metrics import largest_accumulation
 from nmfd.model.identification import HORIZON, Observed, prediction_errors
-from nmfd.model.mfd import JAM_DENSITY, PiecewiseLinear, guess_beyond
+from nmfd.model.mfd import JAM_DENSITY, RoundedLinear, guess_beyond
 from nmfd.model.regional_model import LEAST_ROOM, RegionalModel, passing_share
 
 ROUNDS = 6  # of MFD, rates and capacities after each other
@@ -205,7 +205,7 @@ def _with_mfds(
 
 def mfd_of(
     n: np.ndarray, exits: np.ndarray, ready: np.ndarray, jam: float
-) -> tuple[PiecewiseLinear, np.ndarray, bool]:
+) -> tuple[RoundedLinear, np.ndarray, bool]:
     """Return an MFD, its flowing intervals, and True if a plateau was seen.
 
     The outflow rises to a plateau, which ends with the largest accumulation that flowed. Beyond,
@@ -233,11 +233,11 @@ def mfd_of(
     if seen:
         beyond, further = _fall(middle[top:], falling, capacity, max(jam, 1.1 * end))
     else:
-        known = PiecewiseLinear(accumulations=tuple(rise), outflows=tuple(outflows))
+        known = RoundedLinear(accumulations=tuple(rise), outflows=tuple(outflows))
         guessed = guess_beyond(known, jam, end)
         beyond = np.linspace(guessed.critical, guessed.jam, len(FALLS))
         further = guessed.outflow(beyond)
-    curve = PiecewiseLinear(
+    curve = RoundedLinear(
         accumulations=tuple(map(float, [*rise, *beyond])),
         outflows=tuple(map(float, [*outflows, *further])),
     )
@@ -305,7 +305,7 @@ def _with_rates(
     mean = (rates * vehicles).sum(axis=1) / vehicles.sum(axis=1)
     mfds = []
     for curve, level in zip(model.mfds, mean, strict=True):
-        if isinstance(curve, PiecewiseLinear):
+        if isinstance(curve, RoundedLinear):
             curve = replace(curve, outflows=tuple(float(level * g) for g in curve.outflows))
         mfds.append(curve)
     free = np.array([curve.rate_up_to_jam(0.0) for curve in mfds])

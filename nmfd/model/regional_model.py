@@ -14,7 +14,7 @@ from scipy.sparse import csgraph, csr_array
 
 from nmfd.arrays import Adjacency, Hops, PerPair, PerRegion, PerTurn, Positions, TurnMask
 from nmfd.errors import InputError
-from nmfd.model.mfd import Cubic, Mfd, PiecewiseLinear
+from nmfd.model.mfd import Cubic, Mfd, RoundedLinear
 from nmfd.runs import config, shipped
 from nmfd.runs.config import Problem, Regions, Rows, Settings, Share, filled, got, setting
 
@@ -301,10 +301,8 @@ class PiecewiseTable(Settings):
         return self
 
     @property
-    def mfd(self) -> PiecewiseLinear:
-        return PiecewiseLinear(
-            accumulations=tuple(self.accumulations), outflows=tuple(self.outflows)
-        )
+    def mfd(self) -> RoundedLinear:
+        return RoundedLinear(accumulations=tuple(self.accumulations), outflows=tuple(self.outflows))
 
 
 ErrorPair = Annotated[
