@@ -416,7 +416,8 @@ def train(
     steps: Adam steps; those of scenario.toml, else 400, if None
     device: "cpu", which gives the same weights every time, "cuda" or "auto"
     resume: continue an interrupted training
-    anyway: train even on placeholder MFDs or if no gateway can be controlled
+    anyway: train even on placeholder MFDs, on a model that predicts worse than "as now", or if no
+        gateway can be controlled
     progress: see `benchmark`
     """
     scenario = loaded(scenario)

@@ -428,6 +428,9 @@ def robustness(scenario: Path, settings: dict, out: Path | None, **options: Any)
     "--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True
 )
 @click.option("--resume", is_flag=True, help="Continue an interrupted training.")
+@click.option(
+    "--anyway", is_flag=True, help="Train even if model or gateways make it pointless; see errors."
+)
 @click.option("--out", type=FILE, metavar="FILE", help="Policy file. [default: SCENARIO/NAME.pt]")
 def train(scenario: Path, settings: dict, controller: str, **options: Any) -> None:
     """Train a DPC policy on a scenario.

@@ -97,6 +97,7 @@ def result(scenario, strategy, *, seed, demand, city) -> Result:
         "demand": demand,
         "trips": 600,
         "outside_training": "",
+        "model_warning": "",
         "teleports": 3 * (strategy.name == "pi-gating"),
         "final_backlog_veh": 20,
         "signal_violations": 0,

@@ -11,10 +11,12 @@ import tiny
 from cosim.evaluation import model_validation
 from nmfd.model.identification import Observed
 from nmfd.model.mfd import Cubic
-from nmfd.model.regional_model import load_network
+from nmfd.model.regional_model import Errors, HeldOut, load_network
 from nmfd.studies.fit_quality import (
     MEANINGS,
+    ahead_table,
     fit_table,
+    held_out,
     prediction_text,
     predictions,
     region_fits,
@@ -114,6 +116,44 @@ def test_every_table_of_predictions_has_persistence():
     rows = rows.assign(
         ahead_rmse_share=0.1, ahead_persistence_rmse_share=0.1, whole_run_rmse_share=0.5
     )
+    rows = rows.assign(flowing_rmse_veh=[3.0, 4.0], flowing_persistence_rmse_veh=8.0)
+    rows = rows.assign(congested_rmse_veh=np.nan, congested_persistence_rmse_veh=np.nan)
     line = model_validation.prediction_table(rows).splitlines()
     assert line[0].count("if nothing changed") == 2
     assert line[1].count("25.0 %") == 2
+    assert line[0].split("  ")[-1].strip() == "congested (as now)"
+    assert "4 (8) veh" in line[1]  # root of the mean of 9 and 16
+    assert line[1].rstrip().endswith("-")
+
+
+def test_errors_are_told_apart_by_congestion(network):
+    """Region 0 gains 10 vehicles in every interval, beyond its critical accumulation at last."""
+    state = np.zeros((9, 3, 3))
+    state[:, 0, 0] = 10.0 * np.arange(9)
+    scheme = {"step": 450.0, "substeps": 16, "integrator": "euler"}  # 900 s are two intervals
+    runs = [observed(network, state)]
+    errors = predictions(network, runs, scheme, critical=np.array([55.0, 1.0, 1.0]))
+    assert errors["flowing_states"].tolist() == [4] * 3  # up to 50 vehicles after 900 s
+    assert errors["congested_states"].tolist() == [3] * 3
+    assert errors["flowing_persistence_rmse_veh"].tolist() == [20.0, 0.0, 0.0]
+    summary = held_out(errors)
+    assert summary.ahead == 900.0
+    assert summary.congested.as_now == pytest.approx(20.0 / np.sqrt(3.0))
+    predicted = (errors["flowing_rmse_veh"] ** 2).mean() ** 0.5
+    assert summary.flowing.model == pytest.approx(predicted)
+    alone = held_out(predictions(network, runs, scheme, critical=np.full(3, 1e3)))
+    assert alone.congested is None
+
+
+def test_a_model_worse_than_as_now_is_said_to_know_nothing(network):
+    state = np.zeros((9, 3, 3))
+    state[:, 0, 0] = 10.0 * np.arange(9)
+    scheme = {"step": 225.0, "substeps": 8, "integrator": "euler"}
+    errors = predictions(network, [observed(network, state)], scheme)
+    good = errors.assign(flowing_rmse_veh=1.0)
+    assert "WARNING" not in ahead_table(good, network.titles)
+    bad = errors.assign(flowing_rmse_veh=100.0)
+    table = ahead_table(bad, network.titles)
+    assert "the model does not know" in table
+    assert "its error is 100 veh, of 23" in table
+    assert HeldOut(ahead=900.0, flowing=None, congested=Errors(2.0, 3.0)).problem == ""

@@ -66,6 +66,7 @@ def in_city(
     )
     facts = dict.fromkeys(FACTS, 0) | {
         "outside_training": "",
+        "model_warning": "",
         "trips": trips,
         "scenario": scenario.name,
         "scenario_folder": str(scenario.folder),

@@ -1,8 +1,11 @@
 """Identification of the regional model of a SUMO city: `cosim identify`.
 
 First the city is loaded without perimeter control, and every region's MFD is fitted to its outflow
-samples. Then it is loaded under a probing controller, whose set points come from these MFDs, and
-the whole model, with the split ratios, is fitted to all runs by prediction error.
+samples. Then it is loaded under a probing controller, whose set points come from these MFDs.
+
+The whole model, with the split ratios, is counted from all runs (nmfd.model.counting). If a model
+counted from fewer runs does not predict the ones held out, a model is also fitted by prediction
+error (nmfd.model.identification), and the better of the two is written.
 """
 
 import os
@@ -11,19 +14,21 @@ import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
+from cosim.evaluation.free_flow import crossing_times
 from cosim.evaluation.model_validation import observed, outflow_samples
 from cosim.evaluation.runs import runs_of
 from cosim.plant.strategy import parse
 from cosim.sumo.net import city_of, network_folder
 from nmfd.api import load_scenario
+from nmfd.arrays import PerPair, PerRegion
 from nmfd.errors import InputError
 from nmfd.metrics import largest_accumulation
-from nmfd.model import authority, identification, mfd
+from nmfd.model import authority, counting, identification, mfd
 from nmfd.model.planning import GUIDED
 from nmfd.model.regional_model import RegionalModel, network_toml
 from nmfd.model.scenario import Scenario
@@ -37,6 +42,12 @@ from nmfd.types import Result
 PATHS = ("net", "regions")  # keys of [sumo] in network.toml
 UNGUIDED_STAGES = ("no-control", "probing-pc")
 GUIDED_STAGES = ("route-guidance", "probing-pcrg")
+LEAST_FLOW = 1e-3  # veh/s, of a boundary whose signals are never green
+SATURATION = 0.5  # vehicles a second and lane that pass a green signal
+COUNTED, FITTED = "counted", "fitted"
+# Held-out errors of a counted model that needs no fit, as shares of those of "as now".
+GOOD_FLOWING = 0.5
+GOOD_CONGESTED = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,37 +90,72 @@ class Task:
         raise_failures(run_many(runs, self.out, workers=self.workers, progress=show))
         return [Result.read(self.out / run.file) for run in runs]
 
-    def fit(
-        self, static: RegionalModel, runs: Sequence[Result], samples: Sequence[dict]
-    ) -> RegionalModel:
-        """Return the model that predicts the runs best.
+    def model(self, method: str, static: RegionalModel, runs: Sequence[Result]) -> RegionalModel:
+        """Return the model of runs.
 
+        method: COUNTED or FITTED
         static: result of `static_model`, which nearly empty regions keep
         """
+        samples = outflow_samples(static, runs)
+        empty = fit_quality.nearly_empty(samples)
+        states = [run["accumulation"] for run in runs]
         seen = [observed(run) for run in runs]
-        show = self._progress("fitting, ")
+        lane_km = lane_kilometres(static)
+        fastest = self.fastest(static)
+        if method == COUNTED:
+            model = counting.counted(
+                static,
+                seen,
+                scheme=self.scenario.scheme,
+                fastest=fastest,
+                saturation=saturation_flows(static, runs),
+                lane_km=lane_km,
+            )
+            above = dict(model.critical_above)
+            most = largest_accumulation(states)
+            for region in empty:
+                above[region] = float(most[region])
+            return replace(as_it_was(static, model, empty), critical_above=above)
         model = identification.fit(
-            static, seen, iterations=self.iterations, progress=show, **self.scenario.scheme
+            static,
+            seen,
+            iterations=self.iterations,
+            fastest=fastest,
+            progress=self._progress("fitting, "),
+            **self.scenario.scheme,
         )
-        return as_it_was(static, model, fit_quality.nearly_empty(samples))
+        model = as_it_was(static, model, empty)
+        return fit_quality.with_guesses(model, samples, lane_km, states, fastest=fastest)
 
-    def held_out(
-        self, static: RegionalModel, runs: Sequence[Result], model: RegionalModel
-    ) -> pd.DataFrame | None:
-        """Return errors of predictions of the last seed by a fit without it.
+    def fastest(self, network: RegionalModel) -> PerRegion:
+        """Return one region crossing in free flow as a rate (1/s, (R,))."""
+        scenario = self.scenario
+        crossing = np.maximum(crossing_times(city_of(network)), scenario.step / scenario.substeps)
+        return 1.0 / crossing
 
-        They are None if there is one seed only.
-
-        model: fitted to all runs; it knows which critical accumulations were seen
-        """
+    def held_out(self, runs: Sequence[Result]) -> list[Result]:
+        """Return the runs of the last seed, or the last run, to test a model."""
         if len(self.seeds) == 1:
-            return None
-        last = self.seeds[-1]
-        kept = [run for run in runs if run.seed != last]
-        unseen = [observed(run) for run in runs if run.seed == last]
-        without = self.fit(static, kept, outflow_samples(static, kept))
-        without = replace(without, critical_above=model.critical_above)
-        return fit_quality.predictions(without, unseen, self.scenario.scheme)
+            return list(runs[-1:])
+        return [run for run in runs if run.seed == self.seeds[-1]]
+
+    def trial(self, method: str, static: RegionalModel, runs: Sequence[Result]) -> "Trial":
+        """Return a model of all runs, and the errors of one without some."""
+        model = self.model(method, static, runs)
+        unseen = self.held_out(runs)
+        without = self.model(method, static, [run for run in runs if run not in unseen])
+        errors = fit_quality.predictions(
+            without, list(map(observed, unseen)), self.scenario.scheme, model.known_critical
+        )
+        return Trial(method=method, model=model, errors=errors)
+
+    def best(self, static: RegionalModel, runs: Sequence[Result]) -> "Trial":
+        """Return the counted model, or a fitted one if that is better."""
+        counted = self.trial(COUNTED, static, runs)
+        if counted.good:
+            return counted
+        fitted = self.trial(FITTED, static, runs)
+        return min(counted, fitted, key=lambda trial: trial.error)
 
     def _progress(self, stage: str) -> Callable[..., None] | None:
         """Return a progress function whose notes begin with the stage."""
@@ -119,14 +165,47 @@ class Task:
         return lambda done, total, note="": show(done, total, stage + note)
 
 
+class Trial(NamedTuple):
+    """A model, and the errors of one made in the same way of fewer runs.
+
+    method: COUNTED or FITTED
+    errors: `fit_quality.predictions` of the held-out runs
+    """
+
+    method: str
+    model: RegionalModel
+    errors: pd.DataFrame
+
+    @property
+    def good(self) -> bool:
+        """Return True if no other model is needed."""
+        found = fit_quality.held_out(self.errors)
+        limits = ((found.flowing, GOOD_FLOWING), (found.congested, GOOD_CONGESTED))
+        for errors, share in limits:
+            if errors is not None and errors.model > share * errors.as_now:
+                return False
+        return True
+
+    @property
+    def error(self) -> float:
+        """Return the RMSE over all states (veh)."""
+        squares = 0.0
+        for name in fit_quality.SITUATIONS:
+            count = self.errors[f"{name}_states"].iloc[0]
+            if count:
+                squares += count * (self.errors[f"{name}_rmse_veh"] ** 2).mean()
+        return float(np.sqrt(squares))
+
+
 @dataclass(frozen=True, kw_only=True)
 class Identified:
-    """A regional model that was fitted to loading runs.
+    """A regional model of loading runs.
 
     runs: of both stages
     samples: of the MFD of each region
     fits: quality of the fit, a row per region
-    held_out: errors of predictions of the last seed by a fit without it; None for one seed
+    method: COUNTED or FITTED
+    held_out: errors of predictions of the held-out runs by a model without them
     verdict: whether perimeter control can help
     """
 
@@ -135,15 +214,20 @@ class Identified:
     runs: Sequence[Result]
     samples: Sequence[dict]
     fits: pd.DataFrame
-    held_out: pd.DataFrame | None
+    method: str
+    held_out: pd.DataFrame
     verdict: authority.Verdict
 
     def fit_text(self) -> str:
-        """Return the quality of the fit, and the errors of the seed held out."""
-        lines = [fit_quality.fit_table(self.model, self.fits)]
-        if self.held_out is not None:
-            step = self.task.scenario.step
-            lines += wrapped(fit_quality.prediction_text(self.held_out, step))
+        """Return the quality of the fit, and the errors in the held-out runs."""
+        runs = [f"{run.controller} {run.seed}" for run in self.task.held_out(self.runs)]
+        unseen = ", ".join(dict.fromkeys(runs))
+        lines = [
+            fit_quality.fit_table(self.model, self.fits),
+            *wrapped(fit_quality.prediction_text(self.held_out, self.task.scenario.step)),
+            fit_quality.ahead_table(self.held_out, self.model.titles),
+            *wrapped(f"Rates and MFDs are {self.method}. Held out: the runs {unseen}."),
+        ]
         return "\n".join(lines)
 
     def write(self, out: Path, target: Path) -> None:
@@ -181,7 +265,8 @@ class Identified:
         times = ", ".join(f"{level:g}" for level in self.task.levels)
         return (
             f"Written by cosim identify from {len(self.runs)} runs of {name} under {controllers};\n"
-            f"# loading runs: demand times {times}, seeds {min(seeds)} to {max(seeds)}."
+            f"# rates and MFDs are {self.method}; loading runs: demand times {times}, "
+            f"seeds {min(seeds)} to {max(seeds)}."
         )
 
 
@@ -206,7 +291,7 @@ def identify(
     workers: int = 1,
     out: Path | None = None,
 ) -> str:
-    """Fit the regional model of a SUMO city to loading runs, and write it.
+    """Identify the regional model of a SUMO city, and write it.
 
     It returns a report. The same call continues after an interruption.
 
@@ -218,7 +303,7 @@ def identify(
     network: folder of the model; if None the scenario's network or, of guided drivers alone, its
         folder GUIDED
     protect: write the regions to protect into the scenario, those of the first model
-    iterations: of the fit
+    iterations: of a fit, if counting is not enough
     out: folder of samples, figures and loading runs, runs/SCENARIO-identify if None
     Raises: InputError for a network without a folder or one that must not be written, RunFailed if
         a run failed
@@ -312,15 +397,21 @@ def identified(task: Task) -> Identified:
     set_point = tuple(static.mfds[region].critical for region in scenario.protected)
     runs = first + task.loading_runs(1, set_point=set_point)
     samples = outflow_samples(static, runs)
-    model = task.fit(static, runs, samples)
-
+    trial = task.best(static, runs)
     states = [run["accumulation"] for run in runs]
-    city = city_of(static)
-    lane_km = np.bincount(city.edge_region, city.lane_metres, city.regions) / 1000.0
-    fastest = scenario.substeps / scenario.step
-    model = fit_quality.with_guesses(model, samples, lane_km, states, fastest=fastest)
-    fits = fit_quality.region_fits(model, samples, states, seeds=len(task.seeds), lane_km=lane_km)
-    model = replace(model, placeholder=False, doubts=tuple(fits["doubts"]))
+    fits = fit_quality.region_fits(
+        trial.model,
+        samples,
+        states,
+        seeds=len(task.seeds),
+        lane_km=lane_kilometres(static),
+    )
+    model = replace(
+        trial.model,
+        placeholder=False,
+        doubts=tuple(fits["doubts"]),
+        held_out=fit_quality.held_out(trial.errors),
+    )
     verdict = run_verdict(scenario, model, first)
     return Identified(
         task=task,
@@ -328,7 +419,8 @@ def identified(task: Task) -> Identified:
         runs=runs,
         samples=samples,
         fits=fits,
-        held_out=task.held_out(static, runs, model),
+        method=trial.method,
+        held_out=trial.errors,
         verdict=verdict,
     )
 
@@ -364,7 +456,12 @@ def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool)
     Raises: InputError for empty runs
     """
     network = replace(
-        scenario.network, exit_rates=None, capacity=None, storage=None, critical_above={}
+        scenario.network,
+        exit_rates=None,
+        capacity=None,
+        storage=None,
+        critical_above={},
+        held_out=None,
     )
     samples = outflow_samples(network, results)
     empty = fit_quality.nearly_empty(samples)
@@ -384,6 +481,29 @@ def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool)
     crossings = sum(result["crossings"].sum(axis=0) for result in results)
     ratios = identification.observed_split_ratios(network, crossings)
     return replace(network, observed_split_ratios=ratios)
+
+
+def lane_kilometres(network: RegionalModel) -> PerRegion:
+    """Return the lane-kilometres of each region (km, (R,))."""
+    city = city_of(network)
+    return np.bincount(city.edge_region, city.lane_metres, city.regions) / 1000.0
+
+
+def saturation_flows(network: RegionalModel, runs: Sequence[Result]) -> PerPair:
+    """Return the largest flow of boundaries (veh/s, (R, R)).
+
+    It is that of the gateways' lanes during the mean green of the runs without gates; lanes
+    without a signal are always green.
+    """
+    city = city_of(network)
+    greens = np.concatenate([run["gateway_original_green"] / run.step for run in runs])
+    flows = np.zeros((network.regions, network.regions))
+    for gateway, green in zip(city.gateways, greens.T, strict=True):
+        signalled = green[np.isfinite(green)]
+        share = float(signalled.mean()) if signalled.size else 1.0
+        lanes = max(len(gateway.lanes), 1)
+        flows[gateway.source, gateway.target] += SATURATION * lanes * share
+    return np.maximum(flows, LEAST_FLOW)
 
 
 def as_it_was(

@@ -25,7 +25,7 @@ from nmfd.model.scenario import Scenario
 from nmfd.runs import files
 from nmfd.runs.tables import text_table
 from nmfd.studies.benchmark import draw_accumulations
-from nmfd.studies.fit_quality import SPILLBACK, predictions
+from nmfd.studies.fit_quality import SITUATIONS, SPILLBACK, predictions
 from nmfd.types import Result
 
 COLLAPSED_SHARE = 0.7  # of the largest outflow so far, below which a denser region is collapsed
@@ -33,7 +33,8 @@ FEWEST_VEHICLES = 5.0  # in a region during an interval that counts as a sample
 CAPTION = (
     "RMSE of the accumulation predicted from the start of a run, and from every recorded state, "
     "and most: largest accumulation of any region, as shares of the critical accumulation (where "
-    "it was not seen, of the largest one that was); RMSE: mean of the regions"
+    "it was not seen, of the largest one that was); RMSE: mean of the regions. Flowing, congested: "
+    "later errors while no region is beyond its critical accumulation, and else"
 )
 
 
@@ -42,13 +43,32 @@ def observed(result: Result) -> Observed:
 
     Its demand is the departures.
     """
+    crossings = net_crossings(result)
+    exits = crossings.sum(axis=2)
+    own = np.arange(exits.shape[1])
+    exits[:, own, own] = result["arrivals"]
     return Observed(
         accumulation=result["accumulation"],
         demand=result["departures"] / result.step,
         perimeter=result["perimeter"],
         splits=result["splits"],
-        crossings=result["crossings"].sum(axis=3),
+        crossings=crossings.sum(axis=3),
+        exits=exits,
     )
+
+
+def net_crossings(result: Result) -> np.ndarray:
+    """Return crossings [i, h, j] from i to h, bound for j (veh, (T, R, R, R)).
+
+    In the model no vehicle leaves the region of its destination. Those that do, and come back
+    later, are taken off the vehicles that come.
+    """
+    crossings = result["crossings"].astype(float)
+    own = np.arange(crossings.shape[1])
+    leaving = crossings[:, own, :, own]  # [i, t, h] from i to h, bound for i
+    crossings[:, own, :, own] = 0.0
+    crossings[:, :, own, own] -= np.moveaxis(leaving, (0, 1, 2), (2, 0, 1))
+    return crossings
 
 
 def predict(scenario: Scenario, result: Result) -> Result:
@@ -142,6 +162,11 @@ def prediction_table(rows: pd.DataFrame) -> str:
             "later": f"{mean['ahead_rmse_share']} ({first['ahead_s']:g} s)",
             "if nothing changed ": mean["ahead_persistence_rmse_share"],
         }
+        for name in SITUATIONS:
+            errors = group[[f"{name}_rmse_veh", f"{name}_persistence_rmse_veh"]]
+            model, as_now = np.sqrt((errors**2).mean())
+            both = "-" if np.isnan(model) else f"{model:.0f} ({as_now:.0f}) veh"
+            line[f"{name} (as now)"] = both
         lines.append(line)
     return text_table(lines, CAPTION)
 

@@ -132,6 +132,7 @@ def _with_facts(
         "longest_queue_veh": int(result["queue_max"].max()),
         "notes": metrics.notes(result),
         "outside_training": job.strategy.outside_training(scenario, job.demand, job.policy),
+        "model_warning": job.strategy.model_warning(scenario),
         "leaking_share": leaking_share(result, plant.city, leaks),
         **estimation_errors(result, scenario.network.critical),
         "overhead_share": 1.0 - plant_facts["sumo_time_s"] / result.wall_time,

@@ -352,6 +352,16 @@ class Strategy:
             result["object"] = custom.object_fingerprint(kind.controller)
         return result
 
+    def model_warning(self, scenario: Scenario) -> str:
+        """Return where the planning model is worse than "as now", else "".
+
+        Rules of a few numbers do not predict.
+        """
+        kind = self.controller
+        if isinstance(kind, BuiltIn) and kind.options not in (Dpc, EconomicMpc):
+            return ""
+        return self.own_planning(scenario).network.misleads
+
     def outside_training(self, scenario: Scenario, level: float, policy: Path | None = None) -> str:
         """Return a sentence if the demand is outside the training range.
 

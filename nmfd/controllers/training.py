@@ -75,11 +75,12 @@ def settings(scenario: Scenario, strategy: Strategy, steps: int | None = None) -
 def check(scenario: Scenario, strategy: Strategy) -> None:
     """Check that a training is worth its time.
 
-    Raises: InputError without gateways, or for placeholder MFDs of the model to train on
+    Raises: InputError without gateways, for placeholder MFDs of the model to train on, or if it
+        predicts worse than "as now"
     """
     city = scenario.network
     believed = strategy.planning(scenario).network
-    still = "nmfd.train(..., anyway=True) trains all the same"
+    still = "nmfd train --anyway trains all the same (nmfd.train: anyway=True)"
     if city.controllable is not None and not city.controllable.any():
         problem = f"controllable: is 0 at every boundary: {NO_GATEWAY}"
         raise InputError(f"{_file(city)}: {problem}; {still}")
@@ -87,6 +88,9 @@ def check(scenario: Scenario, strategy: Strategy) -> None:
         problem = "placeholder: is true: its MFDs are guesses from lanes and speed limits"
         remedy = f"run 'cosim identify {city.folder}' or put in your own"
         raise InputError(f"{_file(believed)}: {problem}; {remedy}; {still}")
+    if believed.misleads:
+        remedy = "identify it from more runs, or choose rules"
+        raise InputError(f"{_file(believed)}: held_out: {believed.misleads}; {remedy}; {still}")
 
 
 def _file(network: RegionalModel) -> Path | str:
@@ -180,15 +184,7 @@ def train(
     keeper: Keeper
     if module is None:
         assert out is not None
-        configuration = {
-            "controller": strategy.name,
-            "scenario": planning.name,
-            "seed": seed,
-            "compiled": compiled,
-            **setup.model_dump(exclude={"policy"}),
-        }
-        if task.own:
-            configuration["task"] = task.own
+        configuration = _configuration(strategy, planning, setup, task, seed, compiled)
         policy = first_policy(setup, planning, guidance=setup.guides)
         keeper = FileKeeper(policy, planning.network, configuration, out)
     else:
@@ -218,6 +214,24 @@ def train(
             "lower the learning rate"
         )
     return keeper.finish()
+
+
+def _configuration(
+    strategy: Strategy, planning: PlanningModel, setup: Dpc, task: Task, seed: int, compiled: bool
+) -> State:
+    """Return what a policy file says about its training."""
+    configuration = {
+        "controller": strategy.name,
+        "scenario": planning.name,
+        "seed": seed,
+        "compiled": compiled,
+        **setup.model_dump(exclude={"policy"}),
+    }
+    if task.own:
+        configuration["task"] = task.own
+    if planning.network.misleads:
+        configuration["model_warning"] = planning.network.misleads
+    return configuration
 
 
 def _check_module(module: nn.Module, scenario: Scenario) -> None:

@@ -8,6 +8,9 @@ state, under observed demand and controls (Ljung, System Identification, 1999, c
 Steps of `fit`: `windows` cuts the runs into pieces, `_Model` holds the free numbers, `_rollout`
 predicts a piece, `_misfit` weighs the errors by region and by destination, and `_network` makes a
 RegionalModel of the result. `prediction_errors` tests a model on runs that the fit did not use.
+
+`nmfd.model.counting` comes first: a fit is for cities in which counting does not separate MFDs and
+rates, because congestion follows at once.
 """
 
 import math
@@ -51,6 +54,7 @@ class Observed:
     perimeter: (-, (T, R, R))
     splits: (-, (T, R, R, R))
     crossings: [i, h] from i to h (veh, (T, R, R))
+    exits: [i, j] vehicles bound for j that left i, or for j = i ended their trip (veh, (T, R, R))
     """
 
     accumulation: StatesOverTime
@@ -58,6 +62,7 @@ class Observed:
     perimeter: PairsOverTime
     splits: TurnsOverTime
     crossings: Real[np.ndarray, "T R R"]
+    exits: PairsOverTime | None = None
 
 
 class Windows(NamedTuple):
@@ -84,19 +89,26 @@ class _Model(torch.nn.Module):
 
     All numbers give a valid network.
 
-    fastest: largest rate of any vehicle, the inverse of the integration step (1/s)
+    fastest: largest rate of any vehicle (1/s, (R,) or one number)
     """
 
     def __init__(
-        self, network: RegionalModel, runs: Sequence[Observed], step: float, fastest: float
+        self,
+        network: RegionalModel,
+        runs: Sequence[Observed],
+        step: float,
+        fastest: PerRegion | float,
     ):
         super().__init__()
-        self._fastest = fastest
+        limits = np.broadcast_to(fastest, network.regions)
+        self._fastest = torch.tensor(limits, dtype=torch.float32)
         self._u_max = network.u_max
         self.adjacency = torch.tensor(network.adjacency, dtype=torch.float32)
         largest = largest_accumulation(run.accumulation for run in runs)
         flow = np.max([run.crossings.max(axis=0) for run in runs], axis=0) / step
-        free_rates = [min(mfd.rate_up_to_jam(0.0), 0.5 * fastest) for mfd in network.mfds]
+        free_rates = []
+        for mfd, limit in zip(network.mfds, limits, strict=True):
+            free_rates.append(min(mfd.rate_up_to_jam(0.0), 0.5 * limit))
         capacity = np.log(np.maximum(1.2 * flow, 0.05))
         self._first_capacity = torch.tensor(capacity, dtype=torch.float32)
         # Shape of the rate q: its value at 0, how far it falls up to the jam, and how it bends.
@@ -121,7 +133,7 @@ class _Model(torch.nn.Module):
         """Return the parameters that the free numbers stand for."""
         c, first, second, jam = self.shape()
         rates = EXIT_RATES ** torch.tanh(self.exit_rates)
-        rates = torch.minimum(rates, 0.999 * self._fastest / c.unsqueeze(-1))
+        rates = torch.minimum(rates, (0.999 * self._fastest / c).unsqueeze(-1))
         return dynamics.Parameters(
             mfd=of_numbers(Cubic, a=-c * second / jam**2, b=-c * first / jam, c=c, jam=jam),
             adjacency=self.adjacency,
@@ -167,6 +179,7 @@ def fit(
     step: float,
     substeps: int = 1,
     integrator: str = "euler",
+    fastest: PerRegion | None = None,
     iterations: int = ITERATIONS,
     seed: int = 0,
     progress: Callable[[int, int, str], None] | None = None,
@@ -179,12 +192,14 @@ def fit(
     network: its MFDs are the initial guess, their critical accumulations the scale of the errors
     step: control interval (s)
     substeps, integrator: of the integration (nmfd.model.dynamics.integrated)
+    fastest: largest rate of any vehicle (1/s, (R,)); that of the integration if None
     seed: of the batches
     progress: takes iterations done, all, and a note
     """
     with one_thread():  # the same order of sums everywhere
         generator = torch.Generator().manual_seed(seed)
-        model = _Model(network, runs, step, fastest=substeps / step)
+        limit = substeps / step if fastest is None else fastest
+        model = _Model(network, runs, step, limit)
         horizon = min(HORIZON, max(len(run.demand) for run in runs))
         data = windows(runs, horizon)
         count = len(data.states)

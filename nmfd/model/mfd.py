@@ -18,6 +18,7 @@ Samples = Real[np.ndarray, " N"]
 # Shape of the published curve, for guesses: g = c (ALPHA y^2 + BETA y + 1) x with y = x / jam.
 ALPHA = 0.98405
 BETA = -1.97190
+KINK_ROUNDING = 0.005  # of the jam accumulation: width of rounded kinks
 JAM_DENSITY = 80.0  # veh per lane-km: 60 % of the lanes full of standing vehicles
 
 
@@ -185,8 +186,12 @@ class PiecewiseLinear(Mfd):
         q = first_slope + 0.0 * accumulation
         # Beyond a kink n_k the outflow changes by (n - n_k) times the change of slope.
         for kink, change in kinks:
-            q = q + change * (1.0 - kink / xp.maximum(accumulation, kink))
+            q = q + change * (1.0 - kink / self._larger(accumulation, kink, xp))
         return q
+
+    def _larger(self, accumulation: Any, kink: Any, xp: Any) -> Any:
+        """Return the larger one of accumulation and kink [veh]."""
+        return xp.maximum(accumulation, kink)
 
     def _kinks(self) -> Iterator[tuple[Any, Any]]:
         """Yield accumulations from 0, and the change of slope there [1/s]."""
@@ -199,6 +204,29 @@ class PiecewiseLinear(Mfd):
             left = right
             low = high
             before = slope
+
+
+@dataclass(frozen=True, kw_only=True)
+class RoundedLinear(PiecewiseLinear):
+    """`PiecewiseLinear` with rounded kinks.
+
+    Solvers of MPC stop at sharp ones.
+
+    >>> curve = RoundedLinear(accumulations=(100.0, 300.0), outflows=(1.0, 1.0))
+    >>> curve.critical, round(float(curve.outflow(100.0)), 3)
+    (100.0, 0.993)
+    """
+
+    @property
+    def critical(self) -> float:
+        """First point with the largest outflow [veh]."""
+        if np.ndim(self.jam):
+            raise AttributeError("critical: only the curve of one region has it")
+        return float(self.accumulations[int(np.argmax(self.outflows))])
+
+    def _larger(self, accumulation: Any, kink: Any, xp: Any) -> Any:
+        width = KINK_ROUNDING * self.jam
+        return 0.5 * (accumulation + kink + ((accumulation - kink) ** 2 + width**2) ** 0.5)
 
 
 def trapezoid(

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -14,7 +14,7 @@ from scipy.sparse import csgraph, csr_array
 
 from nmfd.arrays import Adjacency, Hops, PerPair, PerRegion, PerTurn, Positions, TurnMask
 from nmfd.errors import InputError
-from nmfd.model.mfd import Cubic, Mfd
+from nmfd.model.mfd import Cubic, Mfd, RoundedLinear
 from nmfd.runs import config, shipped
 from nmfd.runs.config import Problem, Regions, Rows, Settings, Share, filled, got, setting
 
@@ -36,6 +36,42 @@ def passing_share(wish: Any, limit: Any) -> Any:
     wish, limit: desired flow and limit of the boundary, arrays of any library (veh/s)
     """
     return (1.0 + (wish / (limit + LEAST_LIMIT)) ** SHARPNESS) ** (-1.0 / SHARPNESS)
+
+
+class Errors(NamedTuple):
+    """RMSE of predicted accumulations, over regions and states [veh].
+
+    model: of the regional model
+    as_now: of the prediction that nothing changes
+    """
+
+    model: float
+    as_now: float
+
+
+class HeldOut(NamedTuple):
+    """Errors in runs that the model has not seen.
+
+    ahead: time from a state to the prediction (s)
+    flowing, congested: while no region is beyond its critical accumulation, and else; None if there
+        are no such states
+    """
+
+    ahead: float
+    flowing: Errors | None
+    congested: Errors | None
+
+    @property
+    def problem(self) -> str:
+        """Say where the model is worse than "as now", "" if it is nowhere."""
+        places = {"while traffic flows": self.flowing, "beyond critical": self.congested}
+        worse = []
+        for place, errors in places.items():
+            if errors is not None and errors.model > errors.as_now:
+                worse.append(f"{place} its error is {errors.model:.0f} veh, of {errors.as_now:.0f}")
+        if not worse:
+            return ""
+        return f'it predicts worse than "as now" {self.ahead:g} s ahead: {", ".join(worse)}'
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +98,7 @@ class RegionalModel:
     dispersion: of the logit by which guided drivers answer prices, see nmfd.model.answer (s)
     placeholder: the MFDs are guesses that no run has measured
     doubts: warnings about the fit of each region; () if unknown
+    held_out: errors in runs that the model has not seen; None if unknown
     folder: of network.toml, or None
     """
 
@@ -83,6 +120,7 @@ class RegionalModel:
     dispersion: float = DISPERSION_S
     placeholder: bool = False
     doubts: tuple[tuple[str, ...], ...] = ()
+    held_out: HeldOut | None = None
     folder: Path | None = None
 
     @property
@@ -147,6 +185,19 @@ class RegionalModel:
         sums = theta.sum(axis=1, keepdims=True)
         theta /= np.where(sums > 0, sums, 1.0)  # in place: large for hundreds of regions
         return theta
+
+    @property
+    def misleads(self) -> str:
+        """Text that says where "as now" predicts better, "" if unknown."""
+        return "" if self.held_out is None else self.held_out.problem
+
+    @property
+    def known_critical(self) -> PerRegion:
+        """Critical accumulations (R,) [veh], else the largest that were seen."""
+        critical = self.critical
+        for region, largest in self.critical_above.items():
+            critical[region] = largest
+        return critical
 
     @property
     def open_perimeter(self) -> PerPair:
@@ -230,6 +281,54 @@ class MfdTable(Settings):
         return Cubic(**vars(self))
 
 
+class PiecewiseTable(Settings):
+    """Outflow MFD along straight lines from (0, 0) through points.
+
+    It is constant beyond the last one.
+    """
+
+    accumulations: config.PositiveNumbers = setting(
+        "rising; the last one is the jam accumulation", unit="veh"
+    )
+    outflows: config.PositiveNumbers = setting("as many", unit="veh/s")
+
+    @model_validator(mode="after")
+    def _valid(self) -> "PiecewiseTable":
+        try:
+            _ = self.mfd
+        except InputError as error:
+            raise Problem("accumulations", str(error)) from None
+        return self
+
+    @property
+    def mfd(self) -> RoundedLinear:
+        return RoundedLinear(accumulations=tuple(self.accumulations), outflows=tuple(self.outflows))
+
+
+ErrorPair = Annotated[
+    tuple[Annotated[float, Field(ge=0.0)], Annotated[float, Field(ge=0.0)]], Field(strict=False)
+]
+
+
+class HeldOutTable(Settings):
+    """Errors in runs that the model has not seen.
+
+    They are RMSE of the model, and of "as now", the prediction that nothing changes.
+    """
+
+    ahead: float = setting("time from a state to the prediction", unit="s", gt=0.0)
+    flowing: ErrorPair | None = setting(
+        "while no region is beyond its critical accumulation", None, unit="veh"
+    )
+    congested: ErrorPair | None = setting("in all other states", None, unit="veh")
+
+    @property
+    def held_out(self) -> HeldOut:
+        flowing = None if self.flowing is None else Errors(*self.flowing)
+        congested = None if self.congested is None else Errors(*self.congested)
+        return HeldOut(ahead=self.ahead, flowing=flowing, congested=congested)
+
+
 class RegionTable(Settings):
     """Region; regions are numbered from 0 in the order of the file."""
 
@@ -239,6 +338,7 @@ class RegionTable(Settings):
     )
     adjacent: Regions = setting("regions into which roads lead from here")
     mfd: MfdTable | None = setting("own MFD instead of [mfd]", None)
+    piecewise_mfd: PiecewiseTable | None = setting("own MFD along straight lines", None)
     exit_rates: config.PositiveNumbers | None = setting(
         "rate at which vehicles leave, relative to the MFD, per destination; for all regions or "
         "none",
@@ -294,6 +394,11 @@ class NetworkTable(Settings):
         le=1e4,
     )
     mfd: MfdTable | None = setting("MFD of every region without one of its own", None)
+    held_out: HeldOutTable | None = setting(
+        "errors in runs that the model has not seen, by cosim identify; nmfd train and MPC refuse "
+        'a model that is worse than "as now"',
+        None,
+    )
     regions: Rows[RegionTable] = setting("one table per region", min_length=1)
     sumo: dict[str, Any] = setting("simulated city, for cosim", {})
 
@@ -314,9 +419,11 @@ class NetworkTable(Settings):
             allowed = f"a list of distinct whole numbers from 0 to {count - 1}"
             allowed += f" without {i}, the region itself"
             raise Problem(f"{where}.adjacent", got(allowed, list(row.adjacent)))
-        if row.mfd is None and self.mfd is None:
+        if row.mfd is None and row.piecewise_mfd is None and self.mfd is None:
             remedy = "missing; add a table [regions.mfd], or [mfd] for all regions"
             raise Problem(f"{where}.mfd", remedy)
+        if row.mfd is not None and row.piecewise_mfd is not None:
+            raise Problem(f"{where}.mfd", "there is piecewise_mfd, too; remove one of them")
         if (row.storage is None) != (row.capacity is None):
             remedy = "capacity and storage belong together; add or remove one"
             raise Problem(f"{where}.capacity", remedy)
@@ -380,7 +487,7 @@ def _network(table: NetworkTable, folder: Path) -> RegionalModel:
             ratios[i, int(j)] = {int(h): share for h, share in shares.items()}
         if row.critical_above is not None:
             critical_above[i] = row.critical_above
-    curves = [row.mfd or table.mfd for row in rows]
+    curves = [row.piecewise_mfd or row.mfd or table.mfd for row in rows]
     doubts = tuple(row.doubts for row in rows)
     if not any(doubts):
         doubts = ()
@@ -401,6 +508,7 @@ def _network(table: NetworkTable, folder: Path) -> RegionalModel:
         dispersion=table.dispersion,
         placeholder=table.placeholder,
         doubts=doubts,
+        held_out=None if table.held_out is None else table.held_out.held_out,
         folder=folder,
     )
 

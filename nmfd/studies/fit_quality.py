@@ -11,7 +11,7 @@ from nmfd.arrays import PerRegion, Points, StatesOverTime
 from nmfd.metrics import largest_accumulation
 from nmfd.model import identification, mfd
 from nmfd.model.identification import Observed
-from nmfd.model.regional_model import RegionalModel
+from nmfd.model.regional_model import Errors, HeldOut, RegionalModel
 from nmfd.runs import files
 from nmfd.runs.tables import text_table, wrapped
 
@@ -42,11 +42,16 @@ MEANINGS = {  # beginning of a doubt -> meaning and remedy
     "lanes; give a higher demand (cosim: --levels)",
     ODD: f"outside {CRITICAL_DENSITIES[0]:g} to {CRITICAL_DENSITIES[1]:g} veh per lane-km, as no "
     "city has it; check regions, lanes and data",
-    ALONE: "there is no held-out error; give --seeds 2 or more",
+    ALONE: "the held-out run has the trips of the others; give --seeds 2 or more",
 }
 HELD_OUT = (
     "RMSE of accumulations, in percent of critical ones (where these were not seen, of the "
-    "largest), in runs of the last seed, by a fit without them: "
+    "largest), in runs that the model has not seen: "
+)
+SITUATIONS = ("flowing", "congested")  # no region beyond its critical accumulation, and else
+AHEAD_CAPTION = (
+    'RMSE in vehicles, and "as now": that of the prediction that nothing changes. Flowing: no '
+    "region is beyond its critical accumulation (where that was not seen, the largest one)"
 )
 
 
@@ -56,7 +61,7 @@ def with_guesses(
     lane_km: PerRegion,
     accumulations: States = (),
     *,
-    fastest: float = np.inf,
+    fastest: PerRegion | float = np.inf,
 ) -> RegionalModel:
     """Return `model` with guesses where the data show no falling branch.
 
@@ -64,8 +69,9 @@ def with_guesses(
 
     lane_km: lane-kilometres (km, (R,))
     accumulations: of each run (veh, (T+1, R, R)); without them the samples have the largest ones
-    fastest: largest rate of any vehicle (1/s)
+    fastest: largest rate of any vehicle (1/s, (R,))
     """
+    fastest = np.broadcast_to(fastest, model.regions)
     empty = nearly_empty(samples)
     most = _largest(samples, accumulations)
     above = {}
@@ -76,9 +82,9 @@ def with_guesses(
         above[n] = float(most[n])
         if n in empty:
             continue
-        rate = fastest
+        rate = fastest[n]
         if model.exit_rates is not None:
-            rate = fastest / model.exit_rates[n].max()
+            rate = fastest[n] / model.exit_rates[n].max()
         jam = mfd.JAM_DENSITY * lane_km[n]
         mfds[n] = mfd.guess_beyond(curve, jam, above[n], max_rate=rate)
     storage = model.storage
@@ -254,44 +260,104 @@ def fit_table(
     return "\n".join([text_table(rows), *wrapped("\n".join(lines))])
 
 
-def predictions(network: RegionalModel, runs: Sequence[Observed], scheme: dict) -> pd.DataFrame:
+def predictions(
+    network: RegionalModel,
+    runs: Sequence[Observed],
+    scheme: dict,
+    critical: PerRegion | None = None,
+) -> pd.DataFrame:
     """Return the RMSE of predicted accumulations, a row per region.
 
-    They are shares of the critical accumulation, or where that was not seen, of the largest [-].
-
     scheme: step [s], substeps and integrator
+    critical: critical accumulations (veh, (R,)); those of the network, or where they were not seen
+        the largest ones, if None
 
     Columns:
 
         next_interval_rmse_share, ahead_rmse_share: errors of the regional model, one control
-            interval and ahead_s [s] ahead
+            interval and ahead_s [s] ahead, as shares of `critical`
         next_interval_persistence_rmse_share, ahead_persistence_rmse_share: errors of the
             prediction that nothing changes
+        flowing_rmse_veh, flowing_persistence_rmse_veh: errors `ahead_s` ahead, of states in which
+            no region is beyond its critical accumulation up to then (veh); NaN without any
+        congested_rmse_veh, congested_persistence_rmse_veh: of all other states (veh)
+        flowing_states, congested_states: their number
+        flowing_total_share: predicted over observed vehicles in the flowing states (-)
     """
-    largest = network.critical
-    for region, above in network.critical_above.items():
-        largest[region] = above
+    if critical is None:
+        critical = network.known_critical
     longest = max(len(run.demand) for run in runs)
     ahead = min(max(1, round(AHEAD_S / scheme["step"])), longest)
-    columns = {}
+    columns: dict[str, object] = {}
     for when, intervals in (("next_interval", 1), ("ahead", ahead)):
         errors = identification.prediction_errors(network, runs, intervals, **scheme)
-        states = [run.accumulation.sum(axis=2) for run in runs]
-        unchanged = np.concatenate([state[:-intervals] - state[intervals:] for state in states])
-        columns[f"{when}_rmse_share"] = _rmse(errors) / largest
-        columns[f"{when}_persistence_rmse_share"] = _rmse(unchanged) / largest
+        states = identification.windows(runs, intervals).states.sum(-1).numpy()
+        unchanged = states[:, 0] - states[:, -1]
+        columns[f"{when}_rmse_share"] = _rmse(errors) / critical
+        columns[f"{when}_persistence_rmse_share"] = _rmse(unchanged) / critical
+    flowing = (states <= critical).all(axis=(1, 2))
+    for name, chosen in zip(SITUATIONS, (flowing, ~flowing), strict=True):
+        columns[f"{name}_states"] = int(chosen.sum())
+        columns[f"{name}_rmse_veh"] = _rmse(errors[chosen])
+        columns[f"{name}_persistence_rmse_veh"] = _rmse(unchanged[chosen])
+    there = states[flowing, -1].sum()
+    predicted = there + errors[flowing].sum()
+    columns["flowing_total_share"] = predicted / there if there else np.nan
     return pd.DataFrame({**columns, "ahead_s": ahead * scheme["step"]})
 
 
+def held_out(errors: pd.DataFrame) -> HeldOut:
+    """Return the means over regions of `predictions`."""
+    found: dict[str, Errors | None] = {}
+    for name in SITUATIONS:
+        found[name] = None
+        if errors[f"{name}_states"].iloc[0]:
+            model = _rmse(errors[f"{name}_rmse_veh"].to_numpy())
+            as_now = _rmse(errors[f"{name}_persistence_rmse_veh"].to_numpy())
+            found[name] = Errors(float(model), float(as_now))
+    return HeldOut(ahead=float(errors["ahead_s"].iloc[0]), **found)
+
+
+def ahead_table(errors: pd.DataFrame, titles: Sequence[str]) -> str:
+    """Return the errors of `predictions` by region as text."""
+    rows = []
+    for title, (_, error) in zip(titles, errors.iterrows(), strict=True):
+        row = {"region": title}
+        for name in SITUATIONS:
+            row[name] = _vehicles(error[f"{name}_rmse_veh"])
+            row[f"{name}, as now"] = _vehicles(error[f"{name}_persistence_rmse_veh"])
+        rows.append(row)
+    everywhere = held_out(errors)
+    row = {"region": "all"}
+    for name in SITUATIONS:
+        model, as_now = getattr(everywhere, name) or (np.nan, np.nan)
+        row[name] = _vehicles(model)
+        row[f"{name}, as now"] = _vehicles(as_now)
+    table = text_table([*rows, row], f"{everywhere.ahead:g} s ahead. {AHEAD_CAPTION}")
+    share = errors["flowing_total_share"].iloc[0]
+    if not np.isnan(share):
+        table += f"\nPredicted over observed vehicles in flowing traffic: {share:.2f}"
+    if everywhere.problem:
+        table += f"\nWARNING: the model does not know: {everywhere.problem}"
+    return table
+
+
+def _vehicles(error: float) -> str:
+    """Return an error [veh] as text, "-" for NaN."""
+    return "-" if np.isnan(error) else f"{error:.1f}"
+
+
 def _rmse(errors: np.ndarray) -> PerRegion:
-    """Return the root mean square of errors (n, R) of each region."""
+    """Return the root mean square of errors (n, R), NaN without any."""
+    if not len(errors):
+        return np.full(errors.shape[1], np.nan)
     return np.sqrt((errors**2).mean(axis=0))
 
 
 def prediction_text(errors: pd.DataFrame, step: float) -> str:
     """Return the means of `predictions` as text.
 
-    errors: in runs that the fit did not use
+    errors: in runs that the model has not seen
     step: control interval (s)
     """
     texts = []
@@ -305,7 +371,7 @@ def prediction_text(errors: pd.DataFrame, step: float) -> str:
 def write_fits(path: Path, fits: pd.DataFrame, held_out: pd.DataFrame | None = None) -> None:
     """Write fit.csv, a row per region.
 
-    held_out: `predictions` in runs that the fit did not use
+    held_out: `predictions` in runs that the model has not seen
     """
     table = fits.assign(doubts=fits["doubts"].map("; ".join))
     if held_out is not None:

@@ -76,6 +76,7 @@ class EconomicMpc(Options):
         "ipopt: the published formulation, as a reference, a hundred times slower",
         "projected-gradient",
     )
+    anyway: bool = setting('plan with a model that predicts worse than "as now", too', False)
 
     @model_validator(mode="after")
     def _fits_together(self) -> "EconomicMpc":
@@ -95,6 +96,14 @@ class EconomicMpc(Options):
     @property
     def reads(self) -> FileKind | None:
         return VALUE if self.terminal else None
+
+    def misfit(self, planning: PlanningModel) -> Problem | None:
+        """Return a model that is not worth planning with as a problem."""
+        misleads = planning.network.misleads
+        if not misleads or self.anyway:
+            return None
+        name = planning.network.name
+        return Problem("anyway", f"the model {name}: {misleads}; set anyway = true to plan with it")
 
     def make(self, planning: PlanningModel) -> "MpcController":
         return MpcController(planning, self)
