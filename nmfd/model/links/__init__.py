@@ -1,0 +1,1 @@
+"""A plant of streets: a link transmission model with signals, gates, metering and drivers."""
