@@ -13,6 +13,7 @@ tuple assignment: `a, b = x, y`
 """
 
 import ast
+import importlib
 import io
 import re
 import subprocess
@@ -21,7 +22,6 @@ import tokenize
 import tomllib
 from collections import Counter, defaultdict
 from collections.abc import Iterator
-from itertools import chain
 from pathlib import Path
 
 import grimp
@@ -66,7 +66,8 @@ def main() -> None:
             problems.append(f"{name}: {value:,.6g} is more than {limit:,.6g}")
     problems += odd_docstrings()
     problems += long_pages()
-    if not PICTURE.is_file() or edges_in(PICTURE.read_text(encoding="utf-8")) != arrows():
+    picture = PICTURE.read_text(encoding="utf-8") if PICTURE.is_file() else ""
+    if edges_in(picture) != arrows():
         problems.append(f"{PICTURE.name}: is out of date; run python .ci/house.py --draw")
     sys.exit("\n".join(problems) or None)
 
@@ -137,16 +138,23 @@ def shown_commands() -> list:
 
 
 def settings() -> list[type[BaseModel]]:
-    """Return every pydantic model of the house once; a field that a subclass inherits counts there
-    only."""
+    """Return every pydantic model of the house that has no subclass.
+
+    A field that a subclass inherits counts there only.
+    """
     graph = grimp.build_graph("nmfd", "cosim", cache_dir=None)
     for module in graph.modules:
-        __import__(module) if not module.endswith("__main__") else None
-    kinds, queue = [], [BaseModel]
+        if not module.endswith("__main__"):
+            importlib.import_module(module)
+    found = set()
+    queue = [BaseModel]
     while queue:
-        queue += (below := queue.pop().__subclasses__())
-        kinds += [kind for kind in below if kind.__module__.split(".")[0] in ("nmfd", "cosim")]
-    return [kind for kind in dict.fromkeys(kinds) if not kind.__subclasses__()]
+        kind = queue.pop()
+        below = kind.__subclasses__()
+        queue += below
+        if not below and kind.__module__.partition(".")[0] in ("nmfd", "cosim"):
+            found.add(kind)
+    return list(found)
 
 
 def odd_docstrings() -> list[str]:
@@ -154,13 +162,16 @@ def odd_docstrings() -> list[str]:
     problems = []
     for file in sources("nmfd", "cosim"):
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-            text = ast.get_docstring(node) if isinstance(node, DOCUMENTED) else None
+            if not isinstance(node, DOCUMENTED):
+                continue
+            text = ast.get_docstring(node)
             if not text:
                 continue
             where = f"{file.relative_to(ROOT)}:{getattr(node, 'lineno', 1)}"
             first = text.splitlines()[0]
-            if ODD.match(first):
-                problems.append(f"{where}: begins with {ODD.match(first)[0]!r}")
+            odd = ODD.match(first)
+            if odd:
+                problems.append(f"{where}: begins with {odd[0]!r}")
             if len(first) > DOCSTRING_LINE:
                 problems.append(f"{where}: first line of {len(first)} characters")
     return problems
@@ -182,40 +193,47 @@ def room(module: str) -> str:
 
 
 def arrows() -> set[tuple[str, str]]:
-    """Return the imports between rooms, without those that a longer way implies (the transitive
-    reduction)."""
+    """Return the imports between rooms, as their transitive reduction.
+
+    Imports that a longer way implies are left out.
+    """
     graph = grimp.build_graph("nmfd", "cosim", exclude_type_checking_imports=True, cache_dir=None)
-    inside, below = floors(), defaultdict(set)
-    for one in graph.modules:
-        for other in graph.find_modules_directly_imported_by(one):
-            if room(one) != room(other) and room(one) in inside and room(other) in inside:
-                below[room(one)].add(room(other))
+    inside = floors()
+    below = defaultdict(set)
+    for module in graph.modules:
+        for imported in graph.find_modules_directly_imported_by(module):
+            one = room(module)
+            other = room(imported)
+            if one != other and one in inside and other in inside:
+                below[one].add(other)
 
     def reached(start: str) -> set[str]:
         return {start}.union(*(reached(other) for other in below[start]))
 
-    return {
-        (one, other)
-        for one in list(below)
-        for other in below[one]
-        if not any(other in reached(third) for third in below[one] if third != other)
-    }
+    result = set()
+    for one in list(below):
+        for other in below[one]:
+            ways = [reached(third) for third in below[one] if third != other]
+            if not any(other in way for way in ways):
+                result.add((one, other))
+    return result
 
 
 def floors() -> dict[str, int]:
-    """Return the floor of every room in the layers of pyproject.toml, the lowest is 0."""
+    """Return the floor of every room; the lowest is 0.
+
+    The floors are the layers of pyproject.toml, cosim's above those of nmfd.
+    """
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-    contracts = project["tool"]["importlinter"]["contracts"]
-    layers = [contract["layers"] for contract in contracts if contract["type"] == "layers"]
-    ordered = [
-        re.split(r"\s*[|:]\s*", layer)
-        for layer in chain.from_iterable(reversed(layers[::-1][::-1]))
-    ]
-    cosim = [layer for layer in ordered if layer[0].startswith("cosim")]
-    nmfd = [layer for layer in ordered if layer[0].startswith("nmfd")]
-    return {
-        name: floor for floor, layer in enumerate([*nmfd[::-1], *cosim[::-1]]) for name in layer
-    }
+    layers = []
+    for contract in project["tool"]["importlinter"]["contracts"]:
+        if contract["type"] == "layers":
+            layers += reversed(contract["layers"])
+    result = {}
+    for floor, layer in enumerate(layers):
+        for name in re.split(r"\s*[|:]\s*", layer):
+            result[name] = floor
+    return result
 
 
 def edges_in(picture: str) -> set[tuple[str, str]]:
@@ -250,9 +268,7 @@ def drawn() -> str:
     axes.set(xlim=(0, 1), ylim=(-0.7, max(place.values()) + 0.7))
     axes.axis("off")
     plt.rcParams.update({"svg.hashsalt": "house", "svg.fonttype": "none"})
-    from io import StringIO
-
-    out = StringIO()
+    out = io.StringIO()
     figure.savefig(out, format="svg", bbox_inches="tight", metadata={"Date": None})
     return out.getvalue()
 

@@ -1,9 +1,9 @@
-"""The reference of the Python interface as HTML: python .ci/reference.py [FOLDER] (default:
-runs/reference).
+"""Reference of the Python interface as HTML.
 
-Of the public names of nmfd and cosim, the environments of nmfd.rl, and a controller as it is
-written; by pdoc, for which the names that are imported when they are first used are imported first.
-What pdoc warns of is an error. Needs the extras test and rl.
+    python .ci/reference.py [FOLDER]      default: runs/reference
+
+It has the public names of nmfd and cosim, the environments of nmfd.rl, and a controller as it is
+written. What pdoc warns of is an error. It needs the extras test and rl.
 """
 
 import importlib
@@ -23,23 +23,21 @@ def build(folder: Path) -> None:
     """Write the pages to `folder`; its index.html is where to begin."""
     for name in MODULES:
         module = importlib.import_module(name)
-        vars(module).update(
-            {public: getattr(module, public) for public in getattr(module, "__all__", ())}
-        )
+        # pdoc sees only names that are there, and many are imported when they are first used.
+        for public in getattr(module, "__all__", ()):
+            vars(module)[public] = getattr(module, public)
     env.filters["to_markdown"] = _with_lists(env.filters["to_markdown"])
     with warnings.catch_warnings(action="error", category=UserWarning):
         pdoc.pdoc(*MODULES, output_directory=folder)
 
 
 def _with_lists(to_markdown):
-    """The same filter, but lines such as "seed: of the noise", of which docstrings are made, become
-    a list."""
+    """Return the filter, with lines such as "seed: of the noise" as a list."""
 
     @jinja2.pass_context
     def filtered(context: jinja2.runtime.Context, text: str) -> str:
-        return to_markdown(
-            context, re.sub(r"^(\w+(?:, \w+)*): ", r"* **\1**: ", text, flags=re.MULTILINE)
-        )
+        listed = re.sub(r"^(\w+(?:, \w+)*): ", r"* **\1**: ", text, flags=re.MULTILINE)
+        return to_markdown(context, listed)
 
     return filtered
 

@@ -1,313 +1,450 @@
-"""Python interface of `cosim`: a function for every command, and single runs.
+"""Python interface of `cosim`: functions for commands and single runs.
 
-Bokeh and Optuna are imported in the functions that need them: they take a second.
+Studies return tables; the command line prints them. Bokeh and Optuna are imported in the functions
+that need them: they take a second.
 """
 
 import os
 import sys
 import webbrowser
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cosim.evaluation import evaluate as evaluation
-from cosim.evaluation import model_validation, results, statistics
+from cosim.evaluation import model_validation, results
 from cosim.evaluation.identify import identify as identify
 from cosim.evaluation.runs import runs_of
 from cosim.evaluation.signal_proof import sheets
 from cosim.evaluation.simulate import Simulation, simulate
 from cosim.importing import get as cities
 from cosim.importing.importer import import_city as import_city
+from cosim.plant import strategy as strategies_of
+from cosim.plant.settings import Settings
+from cosim.plant.strategy import Strategy, parse
 from cosim.report import figures
-from nmfd.api import check_policies, load_scenario
-from nmfd.controllers.strategy import Strategy, parse, parse_many
-from nmfd.errors import InputError, RunFailed
+from nmfd.api import (
+    Controllers,
+    ScenarioLike,
+    check_policies,
+    levels_of,
+    loaded,
+    seeds_of,
+)
+from nmfd.api import catalogue as regional_catalogue
+from nmfd.controllers.strategy import BuiltIn, ControllerLike, parse_many
+from nmfd.errors import RunFailed
 from nmfd.metrics import summary
-from nmfd.model.scenario import Scenario, with_demand
+from nmfd.model.scenario import Scenario
 from nmfd.runs.files import default_folder, file_name, write_table
+from nmfd.runs.frame import Table
 from nmfd.runs.progress import Progress, watched
-from nmfd.runs.run_many import locked, raise_failures, run_many
+from nmfd.runs.run_many import Run, locked, raise_failures, run_many
 from nmfd.studies.benchmark import REFERENCE, draw_accumulations
-from nmfd.types import Controller, Result
+from nmfd.types import Result
+
+if TYPE_CHECKING:
+    from nmfd.controllers.base import Options
 
 DEMO = "demo"  # a shipped scenario
+FIRST_SEED = 2000  # of evaluations; those below are for development
+TUNING_SEED = 1000
 
 
 def run(
-    scenario: Scenario | Path | str,
-    controller: str | Controller,
+    scenario: ScenarioLike,
+    controller: ControllerLike,
     *,
+    city: Settings | str | None = None,
     seed: int = 0,
-    steps: int | None = None,
     demand: float = 1.0,
+    steps: int | None = None,
     policy: Path | str | None = None,
-    city: str = "",
     tripinfo: Path | str | None = None,
     progress: Progress = None,
 ) -> Result:
     """Run one closed loop in SUMO, in this process and without a run folder.
 
     scenario: shipped name, folder of a scenario.toml, or result of nmfd.load_scenario
-    controller: strategy by name, or an object with `reset` and `act` (nmfd.Controller)
-    seed: of trips, drivers and guidance; the same seed gives the same result, but for wall times
+    controller: strategy by name, options such as nmfd.PiGating(kp=2.0), or an object with `reset`
+        and `act` (nmfd.Controller)
+    city: what else the city does: cosim.Settings whose given fields replace the scenario's, or
+        words such as "max-pressure+rerouting-30"
+    seed: seed of trips, drivers and guidance; the same seed gives the same result, but for wall
+        times
+    demand: factor of the scenario's demand
     steps: control intervals; the scenario's if None
-    demand: multiple of the scenario's demand
     policy: policy file, if not SCENARIO/NAME.pt
-    city: words of the strategy for a controller object, such as "max-pressure+rerouting-30"
     tripinfo: file for SUMO's own output of trips; all others are options of SUMO in [sumo.options]
     progress: None for a bar, False for none, or a function of done and total control intervals
 
-    The result has the arrays of cosim.plant.record.RECORD, and the facts of
-    cosim.evaluation.simulate as attributes.
+    The result has the arrays of cosim.plant.record.RECORD and the facts of
+    cosim.evaluation.simulate.
     Raises: InputError for a wrong name, file or value, RuntimeError if another simulation is open
-    in this process
+        in this process
 
-        >>> result = cosim.run("grid7_peak", "pi-gating+rerouting-30", seed=3, steps=2)
+        >>> city = cosim.Settings(rerouting=0.3)
+        >>> result = cosim.run("grid7_peak", nmfd.PiGating(), city=city, seed=3, steps=2)
         >>> result.accumulation.shape, result.crossings.shape
         ((3, 7, 7), (2, 7, 7, 7))
     """
     strategy = parse(controller, city)
-    scenario = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
-    if not 0.0 < demand <= 10.0:
-        raise InputError(f"demand: expected a number above 0 up to 10, got {demand:g} instead")
-    policy, tripinfo = (None if file is None else Path(file) for file in (policy, tripinfo))
+    shortened = loaded(scenario, steps=steps)
+    loaded(shortened, demand=demand)  # checks the factor
+    policy_file = None if policy is None else Path(policy)
+    trip_file = None if tripinfo is None else Path(tripinfo)
     with watched(strategy.name, progress) as show:
-        job = Simulation(
-            with_demand(scenario, steps=steps), strategy, seed, demand, policy, tripinfo
-        )
+        job = Simulation(shortened, strategy, seed, demand, policy_file, trip_file)
         return simulate(job, progress=show)
 
 
 def run_controllers(
-    scenario: Path | str,
-    controllers: Sequence[str],
+    scenario: ScenarioLike,
+    controllers: Controllers,
     *,
-    settings: Mapping[str, Any] | None = None,
+    city: Settings | str | None = None,
     seed: int = 0,
-    steps: int | None = None,
     demand: float = 1.0,
-    policy: Path | None = None,
-    out: Path | None = None,
-) -> str:
-    """Run strategies on the same trips with a run folder, two at a time; return a report.
+    steps: int | None = None,
+    policies: Mapping[str, Path | str] | None = None,
+    out: Path | str | None = None,
+    workers: int = 2,
+    time_limit: float | None = None,
+    overwrite: bool = False,
+    progress: Progress = None,
+) -> Table:
+    """Run strategies on the same trips in a folder; return a row per run.
 
-    settings: see nmfd.load_scenario; other arguments as in `run`
-    policy: policy file of the first controller, if not SCENARIO/NAME.pt
-    out: run folder, runs/SCENARIO-TIME if None
+    policies: files by controller, if not SCENARIO/NAME.pt
+    out: run folder, runs/SCENARIO-TIME if None; it is `table.attrs["folder"]`
+    others: as in `run` and `evaluate`
     Raises: InputError, and RunFailed if a run failed
     """
-    loaded = with_demand(load_scenario(scenario, settings), steps=steps)
-    strategies = _reference_first(controllers)
-    policies = {} if policy is None else {parse(controllers[0]).name: policy}
-    out = default_folder(loaded.name) if out is None else out
-    runs = runs_of(loaded, strategies, [seed], demand=demand, policies=policies)
+    loaded_one = loaded(scenario, steps=steps)
+    strategies = _reference_first(parse_many(controllers, loaded_one, lambda one: parse(one, city)))
+    files = {name: Path(file) for name, file in (policies or {}).items()}
+    check_policies(files, strategies)
+    out = default_folder(loaded_one.name) if out is None else Path(out)
+    runs = runs_of(loaded_one, strategies, [seed], demand=demand, policies=files)
     with locked(out):
-        raise_failures(run_many(runs, out, workers=2))
+        rows = run_many(
+            runs,
+            out,
+            workers=workers,
+            time_limit=time_limit,
+            overwrite=overwrite,
+            progress=progress,
+        )
+        raise_failures(rows)
         finished = results.read(out)
-        there = [run for level in finished.levels for run in level.results()]
-        draw_accumulations(out, loaded, there)
+        there = [one for level in finished.levels for one in level.results()]
+        draw_accumulations(out, loaded_one, there)
         write_table(out / "signals.csv", sheets(there), float_format="%g")
-    wrong = [
-        f"{run.controller}: signals break their rules {run.signal_violations} times, see {out / 'signals.csv'}"
-        for run in there
-        if run.signal_violations
-    ]
-    return "\n".join(
-        [
-            statistics.text(finished.rows),
-            *wrong,
-            f"Written to {out}; a page about it: cosim report {out}",
-        ]
-    )
+    table = Table(finished.rows)
+    table.attrs["folder"] = str(out)
+    return table
 
 
-def demo(out: Path, *, seed: int = 1000) -> str:
-    """Run the demo city with and without gates, write a page and open it; return a report."""
+def demo(out: Path | str = "runs/demo", *, seed: int = 1000) -> Table:
+    """Run the demo city with and without gates, and open a page about both.
+
+    The page is `table.attrs["page"]`.
+    """
     from cosim.report import html
 
-    scenario, strategies = load_scenario(DEMO), [parse("no-control"), parse("pi-gating")]
+    out = Path(out)
+    scenario = loaded(DEMO)
+    strategies = [parse("no-control"), parse("pi-gating")]
     with locked(out):
-        rows = run_many(runs_of(scenario, strategies, [seed]), out, workers=2)
+        rows = run_many(runs_of(scenario, strategies, [seed]), out, workers=2, overwrite=True)
         raise_failures(rows)
-        lines = [
-            f"{row['controller'] + ':':12} {row['completed_veh']:,.0f} of {row['trips']:,.0f} trips completed, "
-            f"{row['mean_trip_time_s'] / 60:.1f} minutes per trip"
-            for row in rows[rows["seed"] == seed].to_dict("records")
-        ]
         page = html.write_page(out / "report.html", [results.read(out)], seed=seed).resolve()
     if _has_screen():
         webbrowser.open(page.as_uri())
-    return "\n".join(
-        [*lines, f"Both side by side: {page}; next: cosim watch {DEMO} --controller pi-gating"]
-    )
+    table = Table(rows[rows["seed"] == seed])
+    table.attrs["page"] = str(page)
+    return table
 
 
 def watch(
-    scenario: Path | str,
-    controllers: Sequence[str],
+    scenario: ScenarioLike,
+    controllers: Controllers,
     *,
-    settings: Mapping[str, Any] | None = None,
+    city: Settings | str | None = None,
     seed: int = 0,
     demand: float = 1.0,
     port: int = 0,
     gui: bool = False,
-) -> str:
-    """Show runs on a live page, or one run in sumo-gui, until they end and the page is closed;
-    return their outcomes.
+) -> dict[str, dict]:
+    """Show runs on a live page; return their figures by name.
 
-    port: of the page, any that is free if 0; the other arguments as in `run_controllers`
+    It returns when the runs have ended and the page is closed.
+
+    port: port of the page, any that is free if 0
+    gui: show the first run in sumo-gui instead; nothing is returned if its window is closed early
+    others: as in `run`
     """
     from cosim.view import live
 
-    loaded = load_scenario(scenario, settings)
-    jobs = [
-        Simulation(loaded, strategy, seed, demand) for strategy in _reference_first(controllers)
-    ]
+    loaded_one = loaded(scenario)
+    loaded(loaded_one, demand=demand)  # checks the factor
+    strategies = _reference_first(parse_many(controllers, loaded_one, lambda one: parse(one, city)))
+    jobs = [Simulation(loaded_one, strategy, seed, demand) for strategy in strategies]
     if gui:
         try:
             with watched("watch", None) as show:
-                rows = {jobs[0].strategy.name: summary(simulate(jobs[0], progress=show, gui=True))}
+                return {jobs[0].strategy.name: summary(simulate(jobs[0], progress=show, gui=True))}
         except RunFailed:
-            return "The window was closed before the end."
-    else:
-        runs = live.watch(jobs, port=port, browse=_has_screen())
-        rows = {run.name: run.row for run in runs if run.row is not None}
-    return "\n".join(
-        f"{name}, seed {seed}: total time spent {row['total_time_spent_veh_s']:.4g} veh s, "
-        f"{row['completed_veh']:,.0f} trips completed"
-        for name, row in rows.items()
-    )
+            return {}
+    rows = {}
+    for one in live.watch(jobs, port=port, browse=_has_screen()):
+        if one.row is not None:
+            rows[one.name] = one.row
+    return rows
 
 
 def evaluate(
-    scenario: Path | str,
-    controllers: Sequence[str],
+    scenario: ScenarioLike,
+    controllers: Controllers,
     *,
-    seeds: Sequence[int] | None = None,
-    settings: Mapping[str, Any] | None = None,
-    levels: Sequence[float] = (1.0,),
+    city: Settings | str | None = None,
+    seeds: int | Iterable[int] | None = None,
+    demand: float | Iterable[float] = 1.0,
     steps: int | None = None,
-    policies: Mapping[str, Path] | None = None,
+    settings: Mapping[str, Any] | None = None,
+    policies: Mapping[str, Path | str] | None = None,
+    out: Path | str | None = None,
     workers: int = 1,
     scheduler: str | None = None,
-    check: int | None = None,
-    out: Path | None = None,
-) -> str:
-    """Run controllers x seeds x demand levels in SUMO, write tables and figures, and return the
-    tables as text.
+    time_limit: float | None = None,
+    overwrite: bool = False,
+    progress: Progress = None,
+) -> Table:
+    """Run controllers x seeds x demand levels; return a row per run.
 
-    scenario: a scenario, or the file of a suite (cosim.evaluation.evaluate), which has its own
+    Tables and figures are written to the folder.
+
+    scenario: as in `run`, or the file of a suite (cosim.evaluation.evaluate), which has its own
         seeds and levels
-    controllers: strategies, or patterns such as "dpc-*"
-    seeds: 2000 to 2009 if None
+    controllers: one or several as in `run`, or patterns such as "dpc-*"
+    city: as in `run`, for all controllers
+    seeds: how many, from 2000, or which; ten if None
+    demand: factor or factors of the scenario's demand
     settings: see nmfd.load_scenario; of every scenario of a suite
-    levels: multiples of the scenario's demand
     policies: files by controller, if not SCENARIO/NAME.pt
+    out: folder, runs/SCENARIO-evaluate if None; it is `table.attrs["folder"]`
     workers: runs at a time on this machine
     scheduler: address of a Dask scheduler that does the runs instead
-    check: do only so many random runs of `out` again, and compare
-    out: folder, runs/SCENARIO-evaluate if None
-    Raises: InputError, and RunFailed if runs failed
+    time_limit: seconds after which a run is ended; see nmfd.runs.run_many
+    overwrite: do finished runs again whose settings have changed
+    progress: None for a bar, False for none, or a function called as progress(done, runs, name)
+
+    The column `failure` is "" of a finished run, else its reason. Raises InputError.
+
+        >>> table = cosim.evaluate("demo", ["no-control", nmfd.PiGating(kp=0.4)], seeds=3)
+        >>> table.groupby("controller")["total_time_spent_veh_s"].mean()
     """
-    if Path(scenario).suffix == ".toml":
-        chosen, seeds = evaluation.read_suite(Path(scenario), settings)
-    else:
-        chosen = [(load_scenario(scenario, settings), levels)]
-    chosen = [(with_demand(loaded, steps=steps), each) for loaded, each in chosen]
-    strategies = parse_many(controllers, chosen[0][0])
-    check_policies(policies or {}, strategies)
-    seeds = list(range(2000, 2010) if seeds is None else seeds)
-    name = Path(scenario).stem if len(chosen) > 1 else chosen[0][0].name
-    out = out or Path("runs") / f"{file_name(name)}-evaluate"
-    runs = evaluation.plan(chosen, strategies, seeds, policies)
-    if check is not None:
-        lines = evaluation.check(runs, out, check, workers=workers)
-        return (
-            "\n".join(lines) or f"{min(check, len(runs))} runs of {out} done again: no difference"
-        )
-    with locked(out):
-        rows = evaluation.evaluate(runs, out, workers=workers, scheduler=scheduler)
-        text = []
-        for each in dict.fromkeys(results.finished_rows(rows).get("scenario", ())):
-            finished = results.read(out, each)
-            figures.draw_all(finished)
-            text += [each] * (len(chosen) > 1) + [statistics.text(finished.rows)]
-    raise_failures(rows)
-    return "\n".join(
-        [*text, f"Written to {out}: see evaluate.md and the figures; a page: cosim report {out}"]
+    runs, out = planned(
+        scenario,
+        controllers,
+        city=city,
+        seeds=seeds,
+        demand=demand,
+        steps=steps,
+        settings=settings,
+        policies=policies,
+        out=out,
     )
+    with locked(out):
+        rows = evaluation.evaluate(
+            runs,
+            out,
+            workers=workers,
+            scheduler=scheduler,
+            time_limit=time_limit,
+            overwrite=overwrite,
+            progress=progress,
+        )
+        for name in dict.fromkeys(results.finished_rows(rows).get("scenario", ())):
+            figures.draw_all(results.read(out, name))
+    rows.attrs["folder"] = str(out)
+    return rows
 
 
-def compare(folder: Path) -> str:
-    """Compare finished runs with what the regional model predicts; write a table and figures beside
-    them."""
+def planned(
+    scenario: ScenarioLike,
+    controllers: Controllers,
+    *,
+    city: Settings | str | None = None,
+    seeds: int | Iterable[int] | None = None,
+    demand: float | Iterable[float] = 1.0,
+    steps: int | None = None,
+    settings: Mapping[str, Any] | None = None,
+    policies: Mapping[str, Path | str] | None = None,
+    out: Path | str | None = None,
+) -> tuple[list[Run], Path]:
+    """Return the runs of `evaluate` with these arguments, and their folder.
+
+    Raises: InputError
+    """
+    name = ""
+    suite: list[tuple[Scenario, Sequence[float]]]
+    if not isinstance(scenario, Scenario) and Path(scenario).suffix == ".toml":
+        name = Path(scenario).stem
+        suite, seeds = evaluation.read_suite(Path(scenario), settings)
+    else:
+        levels = levels_of(demand)
+        one = loaded(scenario, settings=settings)
+        for level in levels:
+            loaded(one, demand=level)  # checks the factor
+        suite = [(one, levels)]
+    suite = [(loaded(one, steps=steps), levels) for one, levels in suite]
+    first = suite[0][0]
+    strategies = parse_many(controllers, first, lambda one: parse(one, city))
+    files = {name: Path(file) for name, file in (policies or {}).items()}
+    check_policies(files, strategies)
+    chosen = seeds_of(10 if seeds is None else seeds, FIRST_SEED)
+    if out is None:
+        stem = file_name(name if len(suite) > 1 else first.name)
+        out = Path("runs") / f"{stem}-evaluate"
+    return evaluation.plan(suite, strategies, chosen, files), Path(out)
+
+
+def compare(folder: Path | str) -> Table:
+    """Compare finished runs with the regional model; return a row per run.
+
+    A table and figures are written beside the runs.
+    """
+    folder = Path(folder)
     finished = results.read(folder)
     with locked(folder):
-        rows = model_validation.compare(finished)
+        rows = Table(model_validation.compare(finished))
         write_table(folder / "foresight.csv", rows, float_format="%.6g")
-    where = f"Written to {folder}: see foresight.csv and the figures"
-    return f"{model_validation.prediction_table(rows)}\n{where}; large errors: cosim identify {finished.scenario.name}"
+    rows.attrs["scenario"] = finished.scenario.name
+    return rows
 
 
-def report(folders: Sequence[Path], *, seed: int | None = None, out: Path | None = None) -> Path:
-    """Write one HTML page about finished runs and return its path; seed: of the runs on the map."""
+def report(
+    folders: Path | str | Sequence[Path | str],
+    *,
+    seed: int | None = None,
+    out: Path | str | None = None,
+) -> Path:
+    """Write one HTML page about finished runs and return its path.
+
+    seed: seed of the runs on the map
+    """
     from cosim.report import html
 
-    runs = [results.read(folder) for folder in folders]
-    with locked(folders[0]) if out is None else nullcontext():
-        return html.write_page(out or folders[0] / "report.html", runs, seed=seed)
+    given = [folders] if isinstance(folders, str | Path) else folders
+    paths = [Path(folder) for folder in given]
+    runs = [results.read(path) for path in paths]
+    with locked(paths[0]) if out is None else nullcontext():
+        page = paths[0] / "report.html" if out is None else Path(out)
+        return html.write_page(page, runs, seed=seed)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tuned:
+    """Result of `tune`.
+
+    table: one row per candidate: options, score (veh s), total time spent of every run
+    best: the best options, to be used as a controller; None for the user's own code
+    text: the same as a table of scenario.toml
+    folder: where both were written
+    """
+
+    table: Table
+    best: "Options | None"
+    text: str
+    folder: Path
 
 
 def tune(
-    scenario: Path | str,
-    controller: str,
+    scenario: ScenarioLike,
+    controller: ControllerLike,
     *,
     options: Mapping[str, tuple[float, float]],
-    settings: Mapping[str, Any] | None = None,
-    seeds: int | Sequence[int] = 2,
+    city: Settings | str | None = None,
+    candidates: int = 40,
+    seeds: int | Iterable[int] = 2,
+    demand: float | Iterable[float] = 1.0,
     steps: int | None = None,
+    search_seed: int = 0,
+    out: Path | str | None = None,
     workers: int = 1,
-    out: Path | None = None,
-    **how: Any,
-) -> str:
-    """Search the options of a controller in SUMO by CMA-ES; return the best ones as text.
+    time_limit: float | None = None,
+    progress: Progress = None,
+) -> Tuned:
+    """Search the options of a controller in SUMO by CMA-ES, as `cosim tune`.
 
     options: KEY, or KEY[N] for one number of a list, -> (low, high)
+    candidates: how many; the first has the given or the scenario's values
     seeds: runs per candidate and demand level, from seed 1000, or the seeds
-    how: trials, levels and search_seed of cosim.evaluation.tuning.Tuning
+    demand: factor or factors of the scenario's demand
+    search_seed: seed of the search and of training
+    others: as in `evaluate`
     """
     from cosim.evaluation import tuning
 
-    loaded = with_demand(load_scenario(scenario, settings), steps=steps)
-    numbers = range(1000, 1000 + seeds) if isinstance(seeds, int) else list(seeds)
-    out = out or Path("runs") / f"{file_name(loaded.name)}-tune"
+    one = loaded(scenario, steps=steps)
+    strategy = parse(controller, city)
+    kind = strategy.controller
+    if isinstance(kind, BuiltIn) and kind.given is not None:
+        plain = BuiltIn(name=_base(kind), text=kind.text, options=kind.options, fixed=kind.fixed)
+        given = kind.given.model_dump(exclude_unset=True, exclude=set(kind.fixed))
+        tables = {**one.controller_options, plain.name: given}
+        one = replace(one, controller_options=tables)
+        strategy = replace(strategy, controller=plain)
     order = tuning.Tuning(
-        scenario=loaded, strategy=parse(controller), options=options, seeds=numbers, out=out, **how
+        scenario=one,
+        strategy=strategy,
+        options=options,
+        seeds=seeds_of(seeds, TUNING_SEED),
+        levels=levels_of(demand),
+        trials=candidates,
+        search_seed=search_seed,
+        out=Path("runs") / f"{file_name(one.name)}-tune" if out is None else Path(out),
     )
-    tuning.tune(order, workers=workers)
-    best = (out / "tune.toml").read_text(encoding="utf-8")
-    return f"{best}Written to {out}: see tune.csv; to use the options, copy tune.toml into the scenario.toml"
+    table = tuning.tune(order, workers=workers, time_limit=time_limit, progress=progress)
+    best = strategy.options(tuning.best_of(order, table))
+    text = (order.out / "tune.toml").read_text(encoding="utf-8")
+    return Tuned(table=Table(table), best=best, text=text, folder=order.out)
 
 
-def get(name: str | None, out: Path | None = None) -> str:
-    """Download a published city to a folder, cities/NAME if None; without a name list the
-    cities."""
-    return cities.listed() if name is None else cities.get(name, out or Path("cities") / name)
+def get(name: str | None, out: Path | str | None = None) -> str:
+    """Download a published city; without a name list them.
+
+    out: folder, cities/NAME if None
+    """
+    if name is None:
+        return cities.listed()
+    return cities.get(name, Path("cities", name) if out is None else Path(out))
 
 
-def _reference_first(controllers: Sequence[str]) -> list[Strategy]:
-    """Return the strategies, first no control, else the last one: the others are compared with
-    it."""
-    strategies = [parse(name) for name in reversed(dict.fromkeys(controllers))]
-    return sorted(strategies, key=lambda strategy: strategy.name != REFERENCE)
+def catalogue() -> dict[str, dict[str, str]]:
+    """Return what is shipped, controllers, and words, with a line each."""
+    words = strategies_of.vocabulary()
+    return regional_catalogue() | {"Words behind a controller, for a city": words}
+
+
+def _base(kind: BuiltIn) -> str:
+    return kind.name.partition("(")[0]
+
+
+def _reference_first(strategies: Sequence[Strategy]) -> list[Strategy]:
+    """Return the strategies, the one that others are compared with first.
+
+    It is no control, else the last one.
+    """
+    turned = list(reversed(strategies))
+    return sorted(turned, key=lambda strategy: strategy.name != REFERENCE)
 
 
 def _has_screen() -> bool:
-    """Return True if a browser may be opened: there is a screen and a terminal."""
-    screen = (
-        not sys.platform.startswith("linux")
-        or "DISPLAY" in os.environ
-        or "WAYLAND_DISPLAY" in os.environ
-    )
+    """Return True if there are a screen for a browser and a terminal."""
+    screen = not sys.platform.startswith("linux")
+    screen |= "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
     return screen and sys.stdout.isatty()

@@ -7,43 +7,47 @@ from typing import Any
 import click
 
 import cosim
+import nmfd
 import nmfd.cli
 from nmfd.cli import (
     CONTROLLERS,
     COUNT,
+    DEMAND,
     FILE,
     FOLDER,
+    LEVEL,
+    OVERWRITE,
     POLICIES,
     SCENARIO,
+    SCHEDULER,
     SEED,
+    STEPS,
+    TIME_LIMIT,
     VERSION,
     Commands,
     ControllerName,
-    Number,
+    combined,
     listed,
     out_option,
     parsed,
     seed_option,
+    seeds_option,
 )
 from nmfd.errors import InputError
 
-LEVEL = Number(0.0, 10.0, min_open=True)
 CONTROLLER = click.option(
     "--controller",
     type=ControllerName(),
     required=True,
     metavar="NAME[+...]",
-    help="Controller from `nmfd show` or FILE:Class, and options of the city, joined by +: actuated or max-pressure "
-    "(signals), rerouting-N and compliance-N (percent of drivers), guided, guidance-period-N (s), "
-    "metering, estimate.",
+    help="Controller from `nmfd show` or FILE:Class, and options of the city, joined by +: "
+    "actuated or max-pressure (signals), rerouting-N and compliance-N (percent of drivers), "
+    "guided, guidance-period-N (s), metering, estimate.",
 )
 AGAINST = click.option(
     "--against", metavar="NAME[+...]", help="Second controller, run on the same trips."
 )
-STEPS = click.option(
-    "--steps", type=COUNT, help="Number of control intervals. [default: as in the scenario]"
-)
-DEMAND = click.option(
+ONE_DEMAND = click.option(
     "--demand", type=LEVEL, default=1.0, help="Factor that multiplies the demand."
 )
 WORKERS = click.option(
@@ -53,9 +57,7 @@ WORKERS = click.option(
     show_default="one per core",
     help="Parallel runs.",
 )
-LEVELS = click.option(
-    "--demand", "levels", type=listed(LEVEL), default="1", help="Factors that multiply the demand."
-)
+RUNNING = combined(WORKERS, SCHEDULER, TIME_LIMIT, OVERWRITE)
 
 
 def span(text: str) -> tuple[float, float]:
@@ -80,6 +82,10 @@ def main() -> None:
     """Perimeter control in a SUMO city. Begin with `cosim demo`."""
 
 
+def _both(controller: str, against: str | None) -> list[str]:
+    return [controller] if against is None else [controller, against]
+
+
 @main.command()
 @click.option("--out", type=FOLDER, default="runs/demo", metavar="DIR", help="Run folder.")
 def demo(out: Path) -> None:
@@ -91,36 +97,14 @@ def demo(out: Path) -> None:
     Example:
       cosim demo
     """
-    click.echo(cosim.api.demo(out))
-
-
-@main.command()
-@SCENARIO
-@CONTROLLER
-@AGAINST
-@seed_option("Seed of trips, drivers and guidance.")
-@STEPS
-@DEMAND
-@click.option(
-    "--policy",
-    type=FILE,
-    metavar="FILE",
-    help="Policy file of --controller. [default: SCENARIO/NAME.pt]",
-)
-@out_option("runs/SCENARIO-TIME")
-def run(scenario: Path, controller: str, against: str | None, **options: Any) -> None:
-    """Run one controller, or two on the same trips.
-
-    SCENARIO is a name that `nmfd show` lists, or a folder with a scenario.toml; its network must
-    name a SUMO city. Prints a table and writes results, tables and figures.
-
-    \b
-    Examples:
-      cosim run grid7_peak --controller dpc-pcrg --against no-control
-      cosim run grid7_peak --controller pi-gating --set controllers.pi-gating.kp=2 --set sumo.chain_limit=0.4
-    """
+    rows = cosim.api.demo(out)
+    for row in rows.to_dict("records"):
+        completed = f"{row['completed_veh']:,.0f} of {row['trips']:,.0f} trips completed"
+        minutes = f"{row['mean_trip_time_s'] / 60:.1f} minutes per trip"
+        click.echo(f"{row['controller'] + ':':12} {completed}, {minutes}")
     click.echo(
-        cosim.api.run_controllers(scenario, list(filter(None, (controller, against))), **options)
+        f"Both side by side: {rows.attrs['page']}; "
+        f"next: cosim watch {cosim.api.DEMO} --controller pi-gating"
     )
 
 
@@ -129,12 +113,70 @@ def run(scenario: Path, controller: str, against: str | None, **options: Any) ->
 @CONTROLLER
 @AGAINST
 @seed_option("Seed of trips, drivers and guidance.")
-@DEMAND
+@STEPS
+@ONE_DEMAND
+@TIME_LIMIT
+@OVERWRITE
+@click.option(
+    "--policy",
+    type=FILE,
+    metavar="FILE",
+    help="Policy file of --controller. [default: SCENARIO/NAME.pt]",
+)
+@out_option("runs/SCENARIO-TIME")
+def run(
+    scenario: Path,
+    settings: dict,
+    controller: str,
+    against: str | None,
+    policy: Path | None,
+    **options: Any,
+) -> None:
+    """Run one controller, or two on the same trips.
+
+    SCENARIO is a name that `nmfd show` lists, or a folder with a scenario.toml; its network must
+    name a SUMO city. Prints a table and writes results, tables and figures.
+
+    \b
+    Examples:
+      cosim run grid7_peak --controller dpc-pcrg --against no-control
+      cosim run grid7_peak --controller pi-gating --set controllers.pi-gating.kp=2
+    """
+    from cosim.evaluation.statistics import text
+
+    loaded = nmfd.load_scenario(scenario, settings)
+    policies = {} if policy is None else {controller: policy}
+    rows = cosim.api.run_controllers(
+        loaded, _both(controller, against), policies=policies, **options
+    )
+    out = rows.attrs["folder"]
+    click.echo(text(rows))
+    for row in rows.to_dict("records"):
+        if row["signal_violations"]:
+            table = f"{out}/signals.csv"
+            times = f"{row['signal_violations']} times, see {table}"
+            click.echo(f"{row['controller']}: signals break their rules {times}")
+    click.echo(f"Written to {out}; a page about it: cosim report {out}")
+
+
+@main.command()
+@SCENARIO
+@CONTROLLER
+@AGAINST
+@seed_option("Seed of trips, drivers and guidance.")
+@ONE_DEMAND
 @click.option(
     "--port", type=click.IntRange(0, 65535), default=0, help="Port of the page; 0: any free port."
 )
 @click.option("--gui", is_flag=True, help="Open sumo-gui instead of a page, with one run.")
-def watch(scenario: Path, controller: str, against: str | None, gui: bool, **options: Any) -> None:
+def watch(
+    scenario: Path,
+    settings: dict,
+    controller: str,
+    against: str | None,
+    gui: bool,
+    **options: Any,
+) -> None:
     """Watch runs on a live page with map and curves.
 
     Buttons on the page pause the runs and set their speed. No files are written.
@@ -145,34 +187,42 @@ def watch(scenario: Path, controller: str, against: str | None, gui: bool, **opt
     """
     if gui and against:
         raise InputError("--gui: shows one run; omit --against")
-    click.echo(
-        cosim.api.watch(scenario, list(filter(None, (controller, against))), gui=gui, **options)
-    )
+    loaded = nmfd.load_scenario(scenario, settings)
+    rows = cosim.api.watch(loaded, _both(controller, against), gui=gui, **options)
+    for name, row in rows.items():
+        spent = f"total time spent {row['total_time_spent_veh_s']:.4g} veh s"
+        completed = f"{row['completed_veh']:,.0f} trips completed"
+        click.echo(f"{name}, seed {options['seed']}: {spent}, {completed}")
+    if gui and not rows:
+        click.echo("The window was closed before the end.")
 
 
 @main.command()
 @SCENARIO
 @CONTROLLERS
-@click.option("--seeds", type=COUNT, default=10, help="Runs per controller and demand level.")
+@seeds_option(10, "Runs per controller and demand level, or their seeds.")
 @click.option(
     "--first-seed",
     type=SEED,
     default=2000,
-    help="First seed; seeds below 2000 are for development.",
+    help="First seed of a number of seeds; those below 2000 are for development.",
 )
-@LEVELS
+@DEMAND
 @STEPS
 @POLICIES
-@WORKERS
-@click.option(
-    "--scheduler", metavar="ADDRESS", help="Dask scheduler for the runs, such as tls://host:8786."
-)
+@RUNNING
 @click.option(
     "--check", type=COUNT, metavar="N", help="Only repeat N random runs of --out, and compare."
 )
 @out_option("runs/SCENARIO-evaluate")
 def evaluate(
-    scenario: Path, controllers: tuple[str, ...], seeds: int, first_seed: int, **options: Any
+    scenario: Path,
+    settings: dict,
+    controllers: tuple[str, ...],
+    seeds: int | tuple[int, ...],
+    first_seed: int,
+    check: int | None,
+    **options: Any,
 ) -> None:
     """Compare controllers over seeds and demand levels.
 
@@ -184,13 +234,33 @@ def evaluate(
     \b
     Examples:
       cosim evaluate grid7_peak --controllers no-control,pi-gating,dpc-pc --workers 4
-      cosim evaluate grid7_peak --controllers no-control,dpc-pc --demand 0.8,1.0,1.3 --out runs/levels
+      cosim evaluate grid7_peak --controllers no-control,dpc-pc --demand 0.8,1,1.3 --out runs/x
     """
-    click.echo(
-        cosim.api.evaluate(
-            scenario, controllers, seeds=range(first_seed, first_seed + seeds), **options
-        )
-    )
+    from cosim.evaluation import results, statistics
+    from cosim.evaluation.evaluate import check as differences
+
+    options |= {"settings": settings, "seeds": seeds}
+    if isinstance(seeds, int):
+        options["seeds"] = range(first_seed, first_seed + seeds)
+    if check is not None:
+        running = {"workers": options.pop("workers")}
+        for name in ("scheduler", "time_limit", "overwrite"):
+            options.pop(name)
+        runs, out = cosim.api.planned(scenario, controllers, **options)
+        lines = differences(runs, out, check, **running)
+        same = f"{min(check, len(runs))} runs of {out} done again: no difference"
+        click.echo("\n".join(lines) or same)
+        return
+    rows = cosim.api.evaluate(scenario, controllers, **options)
+    out = rows.attrs["folder"]
+    done = results.finished_rows(rows)
+    names = list(dict.fromkeys(done.get("scenario", ())))
+    for name in names:
+        if len(names) > 1:
+            click.echo(name)
+        click.echo(statistics.text(done[done["scenario"] == name]))
+    nmfd.api.raise_failures(rows)
+    click.echo(f"Written to {out}: see evaluate.md and the figures; a page: cosim report {out}")
 
 
 @main.command()
@@ -206,7 +276,14 @@ def compare(folder: Path) -> None:
     Example:
       cosim compare runs/grid7_peak-evaluate
     """
-    click.echo(cosim.api.compare(folder))
+    from cosim.evaluation.model_validation import prediction_table
+
+    rows = cosim.api.compare(folder)
+    click.echo(prediction_table(rows))
+    click.echo(
+        f"Written to {folder}: see foresight.csv and the figures; large errors: "
+        f"cosim identify {rows.attrs['scenario']}"
+    )
 
 
 @main.command()
@@ -239,22 +316,22 @@ def report(folders: tuple[Path, ...], **options: Any) -> None:
     multiple=True,
     metavar="KEY=LOW:HIGH",
     callback=parsed("KEY=LOW:HIGH, such as kp=0.1:10", span),
-    help="Option of the controller and its range; KEY[0], KEY[1] for numbers of a list. May be repeated.",
+    help="Option of the controller and its range; KEY[0], KEY[1] for numbers of a list. "
+    "May be repeated.",
 )
 @click.option(
     "--candidates",
-    "trials",
     type=COUNT,
     default=40,
     help="Candidates; the first has the scenario's values.",
 )
-@click.option(
-    "--seeds", type=COUNT, default=2, help="Runs per candidate and level, from seed 1000."
-)
-@LEVELS
+@seeds_option(2, "Runs per candidate and level, from seed 1000, or their seeds.")
+@DEMAND
+@STEPS
 @WORKERS
+@TIME_LIMIT
 @out_option("runs/SCENARIO-tune")
-def tune(scenario: Path, controller: str, **how: Any) -> None:
+def tune(scenario: Path, settings: dict, controller: str, **how: Any) -> None:
     """Search the options of a controller by CMA-ES.
 
     Minimises the geometric mean of the total time spent over seeds and demand levels. Writes
@@ -265,7 +342,11 @@ def tune(scenario: Path, controller: str, **how: Any) -> None:
     Example:
       cosim tune grid7_peak --controller pi-gating --option kp=0.1:10 --option ki=0.001:0.1
     """
-    click.echo(cosim.api.tune(scenario, controller, **how))
+    found = cosim.api.tune(nmfd.load_scenario(scenario, settings), controller, **how)
+    click.echo(
+        f"{found.text}Written to {found.folder}: see tune.csv; to use the options, copy tune.toml "
+        "into the scenario.toml"
+    )
 
 
 @main.command()
@@ -342,7 +423,12 @@ def import_(source: Path | None, bbox: str | None, **options: Any) -> None:
 @main.command()
 @SCENARIO
 @click.option(
-    "--levels", type=listed(LEVEL), default="0.6,0.8,1", help="Factors that multiply the demand."
+    "--demand",
+    "--levels",
+    "levels",
+    type=listed(LEVEL),
+    default="0.6,0.8,1",
+    help="Factors that multiply the demand.",
 )
 @click.option("--seeds", type=COUNT, default=2, help="Loading runs per level, from seed 1000.")
 @click.option(

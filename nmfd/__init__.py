@@ -1,25 +1,39 @@
 """Regional (NMFD) traffic model, controllers on it, and the closed loop.
 
     >>> import nmfd
-    >>> scenario = nmfd.load_scenario("economic_mpc")
-    >>> result = nmfd.run(scenario, "dpc-pcrg", seed=1)
-    >>> print(f"{nmfd.summary(result)['total_time_spent_veh_s']:.3g} veh s")
-    5.52e+07 veh s
+    >>> result = nmfd.run("economic_mpc", nmfd.PiGating(kp=2.0), seed=1)
+    >>> print(f"{result.total_time_spent:.3g} veh s")
+    8.88e+07 veh s
 
-`run` is one closed loop, `benchmark` many with a run folder; `train` makes a DPC policy,
-`controller` a controller by name. Any object with `reset` and `act` is a controller (see
-`Controller`; `nmfd new-controller` writes a template). Names here are imported at their first use.
+`run` is one closed loop, `benchmark` many with a run folder; `train` makes a DPC policy. A
+controller is its options (`NoControl`, `PiGating`, `EconomicMpc`, `Dpc`, ...), a name, or any
+object with `reset` and `act` (see `Controller`; `nmfd new-controller` writes a template). Names
+here are imported at their first use.
 """
 
-import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from nmfd import api as api
-    from nmfd.api import benchmark, controller, identify, load_scenario, run, train
+    from nmfd.api import (
+        benchmark,
+        controller,
+        identify,
+        load_scenario,
+        options,
+        robustness,
+        run,
+        train,
+    )
+    from nmfd.controllers.base import Options
+    from nmfd.controllers.dpc.compact import GatingRule, PricingRule
+    from nmfd.controllers.dpc.options import Dpc
     from nmfd.controllers.dpc.policy import ModuleController, PerimeterLayer, SplitsLayer
     from nmfd.controllers.dpc.rollout import Trajectories
+    from nmfd.controllers.mpc.controller import EconomicMpc
+    from nmfd.controllers.open_loop import Bound
+    from nmfd.controllers.rules import Greedy, NoControl, PiGating, Probing, RouteGuidance
     from nmfd.errors import InputError
     from nmfd.metrics import summary, total_time_spent
     from nmfd.model.mfd import Cubic, Mfd, PiecewiseLinear, trapezoid
@@ -32,9 +46,24 @@ if TYPE_CHECKING:
 
 __version__ = "0.2.0"  # of the package perimeter-cosim, nmfd and cosim alike
 _MODULES = {
-    "api": ("benchmark", "controller", "identify", "load_scenario", "run", "train"),
+    "api": (
+        "benchmark",
+        "controller",
+        "identify",
+        "load_scenario",
+        "options",
+        "robustness",
+        "run",
+        "train",
+    ),
+    "controllers.base": ("Options",),
+    "controllers.dpc.compact": ("GatingRule", "PricingRule"),
+    "controllers.dpc.options": ("Dpc",),
     "controllers.dpc.policy": ("ModuleController", "PerimeterLayer", "SplitsLayer"),
     "controllers.dpc.rollout": ("Trajectories",),
+    "controllers.mpc.controller": ("EconomicMpc",),
+    "controllers.open_loop": ("Bound",),
+    "controllers.rules": ("Greedy", "NoControl", "PiGating", "Probing", "RouteGuidance"),
     "errors": ("InputError",),
     "metrics": ("summary", "total_time_spent"),
     "model.mfd": ("Cubic", "Mfd", "PiecewiseLinear", "trapezoid"),
@@ -59,26 +88,3 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
-
-
-def _register(gymnasium: Any) -> None:
-    for name, options in (("Scenario", {}), ("Hexagon7", {"scenario": "economic_mpc"})):
-        gymnasium.register(id=f"nmfd/{name}-v0", entry_point="nmfd.rl:RegionalEnv", kwargs=options)
-
-
-class _Finder:
-    """Import hook that registers the environments with gymnasium, which has no plug-ins since
-    1.0."""
-
-    @classmethod
-    def find_spec(cls, name: str, *rest: Any) -> Any:
-        others = [finder for finder in sys.meta_path if name == "gymnasium" and finder is not cls]
-        if spec := next(filter(None, (finder.find_spec(name, *rest) for finder in others)), None):
-            execute, loader = spec.loader.exec_module, spec.loader  # type: ignore[union-attr]
-            loader.exec_module = lambda module: (execute(module), _register(module))  # type: ignore
-        return spec
-
-
-if "gymnasium" in sys.modules:
-    _register(sys.modules["gymnasium"])
-sys.meta_path.insert(0, _Finder)

@@ -3,20 +3,21 @@
 import re
 import sys
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, overload
 
 from nmfd import closed_loop
 from nmfd.controllers import open_loop, training
+from nmfd.controllers.base import Options
 from nmfd.controllers.dpc import rollout
 from nmfd.controllers.strategy import (
     CONTROLLERS,
+    ControllerLike,
     Strategy,
     check_tables,
-    city_words,
     parse,
     parse_many,
 )
@@ -44,15 +45,23 @@ from nmfd.studies.measured import identify as identify
 from nmfd.types import Controller, Plant, Result
 
 if TYPE_CHECKING:
-    import pandas as pd
     import torch
     from torch import nn
 
     from nmfd.controllers.dpc.rollout import Trajectories
+    from nmfd.runs.frame import Table
+
+    Cost: TypeAlias = Callable[[Trajectories], torch.Tensor]
+    Sample: TypeAlias = Callable[[torch.Generator, int], tuple]
+    Module = TypeVar("Module", bound=nn.Module)
+
+ScenarioLike: TypeAlias = Scenario | Path | str
+Controllers: TypeAlias = ControllerLike | Sequence[ControllerLike]
+MOST_DEMAND = 10.0  # factor of a scenario's demand
 
 
 def load_scenario(folder: Path | str, settings: Mapping[str, Any] | None = None) -> Scenario:
-    """Read a scenario and its network, and check the options of its controllers.
+    """Read a scenario and its network, and check all its options.
 
         >>> nmfd.load_scenario("economic_mpc").network.region_names
         ('north-west', 'north-east', 'west', 'centre', 'east', 'south-west', 'south-east')
@@ -70,201 +79,320 @@ def load_scenario(folder: Path | str, settings: Mapping[str, Any] | None = None)
     return scenario
 
 
-def controller(
-    name: str, scenario: Scenario | Path | str, *, policy: Path | str | None = None
-) -> Controller:
-    """Return the controller `name` for `scenario`, with `reset` and `act`.
+def loaded(
+    scenario: ScenarioLike,
+    *,
+    steps: int | None = None,
+    demand: float = 1.0,
+    settings: Mapping[str, Any] | None = None,
+) -> Scenario:
+    """Return a scenario, shortened and with another demand.
 
-    name: as on the command line: "pi-gating", "dpc-pcrg", ..., or "path/to/file.py:Class"
+    scenario: a Scenario, or as in `load_scenario`
+    steps: control intervals; the scenario's if None
+    demand: factor of the scenario's demand
+    settings: as in `load_scenario`
+    Raises: InputError
+    """
+    if not isinstance(scenario, Scenario):
+        scenario = load_scenario(scenario, settings)
+    if not 0.0 < demand <= MOST_DEMAND:
+        allowed = f"expected a number above 0 up to {MOST_DEMAND:g}"
+        raise InputError(f"demand: {allowed}, got {demand:g} instead")
+    return with_demand(scenario, steps=steps, factor=demand)
+
+
+def levels_of(demand: float | Iterable[float]) -> list[float]:
+    """Return the factors of the demand of a study as a list."""
+    if isinstance(demand, int | float):
+        return [float(demand)]
+    return [float(one) for one in demand]
+
+
+def seeds_of(seeds: int | Iterable[int], first: int = 0) -> list[int]:
+    """Return the seeds of a study: so many from `first` on, or those given.
+
+    Raises: InputError if there is none
+    """
+    if isinstance(seeds, int):
+        seeds = range(first, first + seeds)
+    chosen = list(seeds)
+    if not chosen:
+        raise InputError("seeds: expected a number from 1 up or a sequence, got none")
+    return chosen
+
+
+def options(controller: str, scenario: ScenarioLike) -> Options:
+    """Return the options that a scenario gives a built-in controller.
+
+        >>> nmfd.options("pi-gating", "grid7_peak").changed(kp=2.0).kp
+        2.0
+
+    Raises: InputError for an unknown name or a wrong option
+    """
+    found = parse(controller).options(loaded(scenario))
+    if found is None:
+        raise InputError(f"controller {controller!r}: is your own and has no declared options")
+    return found
+
+
+def controller(
+    controller: ControllerLike, scenario: ScenarioLike, *, policy: Path | str | None = None
+) -> Controller:
+    """Return a controller for `scenario`, with `reset` and `act`.
+
+    controller: options such as nmfd.PiGating(kp=2.0), a name as on the command line, such as
+        "pi-gating", or "path/to/file.py:Class"
     policy: the file of a policy or plan, if not SCENARIO/NAME.pt or .npz
 
         >>> nmfd.controller("pi-gating", "economic_mpc").regions  # protected ones
         array([3])
 
     Raises: InputError for an unknown name, a wrong option, or a policy that is missing or made for
-    another network
+        another network
     """
-    return parse(name).make(_loaded(scenario), None if policy is None else Path(policy))
+    return parse(controller).make(loaded(scenario), _path(policy))
 
 
 def run(
-    scenario: Scenario | Path | str,
-    controller: str | Controller,
+    scenario: ScenarioLike,
+    controller: ControllerLike,
     *,
     seed: int = 0,
-    plant: str | Plant = "nmfd",
+    demand: float = 1.0,
     steps: int | None = None,
+    plant: str | Plant = "nmfd",
     policy: Path | str | None = None,
     progress: Progress = None,
 ) -> Result:
     """Run one closed loop on a regional model.
 
-        >>> result = nmfd.run("economic_mpc", "pi-gating", steps=20)
-        >>> result.accumulation.shape  # states, regions, destinations
-        (21, 7, 7)
+        >>> result = nmfd.run("economic_mpc", nmfd.PiGating(kp=2.0), steps=20)
+        >>> result.accumulation.dims, result.accumulation.shape
+        (('time', 'region', 'destination'), (21, 7, 7))
         >>> bool(result.observed[20].sum() == result.accumulation[20].sum())  # observed with noise
         False
 
     scenario: a name of `nmfd show`, the folder of a scenario.toml, or a Scenario
-    controller: a name as on the command line, or an object with `reset` and `act` (nmfd.Controller)
-    seed: of the measurement noise
-    plant: "nmfd", "acyclic", or an object with `reset`, `step` and `observe` as in nmfd.Plant
+    controller: options such as nmfd.PiGating(kp=2.0), a name as on the command line, or an object
+        with `reset` and `act` (nmfd.Controller)
+    seed: seed of the measurement noise
+    demand: factor of the scenario's demand
     steps: control intervals; the scenario's if None
+    plant: "nmfd", "acyclic", or an object with `reset`, `step` and `observe` as in nmfd.Plant
     policy: as in `nmfd.controller`
     progress: None for a bar on a terminal or in a notebook, False for none, or a function of the
         steps done and all steps
 
-    The same seed gives the same result but for wall times (Result.without_times). Raises
-    InputError.
+    The same seed gives the same result but for wall times (Result.without_times). Raises InputError
+    for a wrong argument, and for an inadmissible command before the plant sees it.
     """
-    strategy, scenario = parse(controller).regional(), with_demand(_loaded(scenario), steps=steps)
+    strategy = parse(controller).regional()
+    scenario = loaded(scenario, steps=steps, demand=demand)
     _check_plant(plant)
-    acting, name = (
-        strategy.make(scenario, None if policy is None else Path(policy)),
-        type(plant).__name__,
-    )
+    acting = strategy.make(scenario, _path(policy))
+    name = type(plant).__name__
     if isinstance(plant, str):
-        name, plant = plant, PLANTS[plant](scenario)
+        name = plant
+        plant = PLANTS[plant](scenario)
     with watched(strategy.name, progress) as show:
         result = closed_loop.run(plant, acting, scenario, seed=seed, progress=show)
-    return result.assign(controller=strategy.name, plant=name)
+    return result.assign(controller=strategy.name, plant=name, demand=float(demand))
 
 
 def benchmark(
-    scenario: Scenario | Path | str,
-    controllers: str | Sequence[str],
+    scenario: ScenarioLike,
+    controllers: Controllers,
     *,
-    seeds: int | Sequence[int] = 1,
+    seeds: int | Iterable[int] = 1,
+    demand: float | Iterable[float] = 1.0,
+    steps: int | None = None,
     plant: str = "nmfd",
-    out: Path | str | None = None,
     policies: Mapping[str, Path | str] | None = None,
+    out: Path | str | None = None,
     workers: int = 1,
+    scheduler: str | None = None,
+    time_limit: float | None = None,
+    overwrite: bool = False,
     progress: Progress = None,
-) -> "pd.DataFrame":
-    """Run controllers x seeds with a run folder, as `nmfd benchmark`; return one row per run.
+) -> "Table":
+    """Run controllers x seeds in a run folder, and return one row per run.
 
-        >>> rows = nmfd.benchmark("economic_mpc", ["no-control", "dpc-pc*"], out="runs/mine")
+        >>> rows = nmfd.benchmark("economic_mpc", ["no-control", nmfd.PiGating()], out="runs/mine")
         >>> rows.groupby("controller")["completed_veh"].mean().round(-2).to_dict()
-        {'dpc-pc': 31600.0, 'dpc-pcrg': 31700.0, 'no-control': 6200.0}
+        {'no-control': 6200.0, 'pi-gating': 31600.0}
 
-    controllers: a name, several, or patterns, which stand for the controllers that can be made for
-        this scenario
+    scenario: as in `nmfd.run`
+    controllers: one or several as in `nmfd.run`, or patterns, which stand for the controllers that
+        can be made for this scenario
     seeds: how many, from 0, or which
-    out: the run folder, runs/<scenario>-<time> if None; finished runs in it are kept
+    demand: factor or factors of the scenario's demand
+    steps: control intervals; the scenario's if None
+    plant: "nmfd" or "acyclic"
     policies: controller -> file, if not SCENARIO/NAME.pt
+    out: run folder, runs/SCENARIO-TIME if None; finished runs in it are kept
     workers: runs at a time
+    scheduler: address of a Dask scheduler that does the runs instead
+    time_limit: seconds after which a run is ended; see nmfd.runs.run_many
+    overwrite: do finished runs again whose settings have changed
     progress: as in `nmfd.run`; your own is called as progress(done, runs, name)
 
-    The column `failure` is "" of a finished run, else its reason; `lower_bound_veh_s` is that of
-    the total time spent with the same controls, where `nmfd bound` has found one. Raises
-    InputError.
+    The column `failure` is "" of a finished run, else its reason. `lower_bound_veh_s` bounds the
+    total time spent with the same controls, where `nmfd bound` has found one; `impossible` marks
+    rows below it. Raises InputError.
     """
-    scenario, files = (
-        _loaded(scenario),
-        {name: Path(file) for name, file in (policies or {}).items()},
-    )
+    levels = levels_of(demand)
+    scenarios = {level: loaded(scenario, steps=steps, demand=level) for level in levels}
+    first = scenarios[levels[0]]
+    files = {name: Path(file) for name, file in (policies or {}).items()}
     _check_plant(plant)
-    strategies = parse_many(controllers, scenario, regional=True)
+    strategies = parse_many(controllers, first, _regional)
     check_policies(files, strategies)
-    key = key_of(scenario, strategies, plant, files)
-    runs = [
-        Run(
-            run_name(strategy.name, seed),
-            key(strategy.name),
-            partial(
-                closed_loop_of,
-                strategy,
-                seed,
-                scenario=scenario,
-                plant=plant,
-                policy=files.get(strategy.name),
-            ),
-        )
-        for seed in (range(seeds) if isinstance(seeds, int) else seeds)
-        for strategy in strategies
-    ]
-    out = default_folder(scenario.name) if out is None else Path(out)
-    lower = {
-        strategy.name: benchmark_study.lower_bound(scenario, strategy, plant)
-        for strategy in strategies
-    }
+    runs = []
+    lower = {}
+    for level, one in scenarios.items():
+        key = key_of(one, strategies, plant, files)
+        folder = f"demand-{level:g}" if len(levels) > 1 else ""
+        for strategy in strategies:
+            lower[strategy.name, level] = benchmark_study.lower_bound(one, strategy, plant)
+        for seed in seeds_of(seeds):
+            for strategy in strategies:
+                policy = files.get(strategy.name)
+                job = partial(
+                    closed_loop_of,
+                    strategy,
+                    seed,
+                    scenario=one,
+                    plant=plant,
+                    policy=policy,
+                    demand=level,
+                )
+                name = run_name(strategy.name, seed)
+                runs.append(Run(name, key(strategy.name), job, folder))
+    out = default_folder(first.name) if out is None else Path(out)
     with locked(out):
-        rows = run_many(runs, out, workers=workers_for(strategies, workers), progress=progress)
-        rows["lower_bound_veh_s"] = rows["controller"].map(lower)
-        done = rows[rows["failure"] == ""]
-        names = [
-            run_name(name, seed)
-            for name, seed in zip(done["controller"], done["seed"], strict=True)
-        ]
-        if names:
-            benchmark_study.draw_accumulations(
-                out, scenario, [Result.read(out / f"{name}.nc") for name in names]
-            )
-            benchmark_study.draw_scenario(out, scenario)
+        rows = run_many(
+            runs,
+            out,
+            workers=workers_for(strategies, workers),
+            scheduler=scheduler,
+            time_limit=time_limit,
+            overwrite=overwrite,
+            progress=progress,
+        )
+        rows = benchmark_study.with_bounds(rows, lower, levels[0])
+        benchmark_study.draw(out, scenarios, rows)
     return rows
 
 
 def robustness(
-    scenario: Scenario | Path | str,
-    controllers: str | Sequence[str],
+    scenario: ScenarioLike,
+    controllers: Controllers,
     *,
     kind: str = "demand",
-    sigmas: Sequence[float] | None = None,
-    scenarios: int = 20,
+    sigmas: Iterable[float] | None = None,
+    seeds: int | Iterable[int] = 20,
+    demand: float = 1.0,
+    steps: int | None = None,
     out: Path | str | None = None,
     workers: int = 1,
+    scheduler: str | None = None,
+    time_limit: float | None = None,
+    overwrite: bool = False,
     progress: Progress = None,
-) -> "pd.DataFrame":
-    """Run controllers, and no control, in perturbed scenarios in a folder, draw the improvement;
-    return the runs.
+) -> "Table":
+    """Run controllers in perturbed scenarios, and return one row per run.
+
+    No control runs as well; a figure shows the gain over it.
 
     kind: "demand", "demand-total", "mfd-scale", "mfd-axis" or "trip-lengths"
         (nmfd.model.scenario.perturbed)
     sigmas: standard deviations of the demand noise (veh/s), or of the logarithms of MFDs or trip
         lengths (-)
-    scenarios: draws for every sigma
-    out, workers, progress: see `benchmark`
+    seeds: draws of the perturbation for every sigma
+    others: see `benchmark`
     """
-    scenario = _loaded(scenario)
-    others = [
-        one for one in parse_many(controllers, scenario, regional=True) if one.name != REFERENCE
-    ]
-    strategies = [parse(REFERENCE), *others]
+    scenario = loaded(scenario, steps=steps, demand=demand)
+    strategies: list[Strategy] = [parse(REFERENCE)]
+    for strategy in parse_many(controllers, scenario, _regional):
+        if strategy.name != REFERENCE:
+            strategies.append(strategy)
     key = key_of(scenario, strategies, benchmark_study.PERTURBED_PLANT, {})
-    runs = [
-        Run(
-            run_name(strategy.name, number),
-            {**key(strategy.name), "kind": kind, "sigma": sigma},
-            partial(
-                benchmark_study.run_perturbed,
-                strategy,
-                number,
-                scenario=scenario,
-                sigma=sigma,
-                kind=kind,
-            ),
-            folder=f"{kind}-{sigma:g}",
-        )
-        for sigma in sigmas or (SIGMAS_VEH_S if kind.startswith("demand") else SPREADS)
-        for number in range(scenarios)
-        for strategy in strategies
-    ]
+    if sigmas is None:
+        sigmas = SIGMAS_VEH_S if kind.startswith("demand") else SPREADS
+    runs = []
+    for sigma in sigmas:
+        for number in seeds_of(seeds):
+            for strategy in strategies:
+                job = partial(
+                    benchmark_study.run_perturbed,
+                    strategy,
+                    number,
+                    scenario=scenario,
+                    sigma=sigma,
+                    kind=kind,
+                )
+                own_key = {**key(strategy.name), "kind": kind, "sigma": sigma}
+                name = run_name(strategy.name, number)
+                runs.append(Run(name, own_key, job, folder=f"{kind}-{sigma:g}"))
     out = default_folder(scenario.name) if out is None else Path(out)
     with locked(out):
-        rows = run_many(runs, out, workers=workers_for(strategies, workers), progress=progress)
+        rows = run_many(
+            runs,
+            out,
+            workers=workers_for(strategies, workers),
+            scheduler=scheduler,
+            time_limit=time_limit,
+            overwrite=overwrite,
+            progress=progress,
+        )
         if (rows["failure"] == "").any():
             benchmark_study.draw_robustness(out, rows)
     return rows
 
 
+@overload
 def train(
-    scenario: Scenario | Path | str,
-    controller: str = "dpc-pcrg",
+    scenario: ScenarioLike,
+    controller: ControllerLike = ...,
+    *,
+    policy: None = ...,
+    cost: "Cost | None" = ...,
+    sample: "Sample | None" = ...,
+    constraints: "Sequence[tuple[Cost, float]]" = ...,
+    out: Path | str | None = ...,
+    seed: int = ...,
+    steps: int | None = ...,
+    device: str = ...,
+    resume: bool = ...,
+    anyway: bool = ...,
+    progress: Progress = ...,
+) -> Path: ...
+@overload
+def train(
+    scenario: ScenarioLike,
+    controller: ControllerLike = ...,
+    *,
+    policy: "Module",
+    cost: "Cost | None" = ...,
+    sample: "Sample | None" = ...,
+    constraints: "Sequence[tuple[Cost, float]]" = ...,
+    out: Path | str | None = ...,
+    seed: int = ...,
+    steps: int | None = ...,
+    device: str = ...,
+    resume: bool = ...,
+    anyway: bool = ...,
+    progress: Progress = ...,
+) -> "Module": ...
+def train(
+    scenario: ScenarioLike,
+    controller: ControllerLike = "dpc-pcrg",
     *,
     policy: "nn.Module | None" = None,
-    cost: "Callable[[Trajectories], torch.Tensor] | None" = None,
-    sample: "Callable[[torch.Generator, int], tuple] | None" = None,
-    constraints: "Sequence[tuple[Callable[[Trajectories], torch.Tensor], float]]" = (),
+    cost: "Cost | None" = None,
+    sample: "Sample | None" = None,
+    constraints: "Sequence[tuple[Cost, float]]" = (),
     out: Path | str | None = None,
     seed: int = 0,
     steps: int | None = None,
@@ -272,15 +400,16 @@ def train(
     resume: bool = False,
     anyway: bool = False,
     progress: Progress = None,
-) -> Any:
-    """Train a DPC policy and return its file; or a module of your own, which is returned.
+) -> "Path | nn.Module":
+    """Train a DPC policy and return its file, or your own module.
 
-    controller: its name; with `policy` the one whose settings and planning model are used
+    controller: its name or nmfd.Dpc(...); with `policy` the one whose settings and planning model
+        are used
     policy: module as in nmfd.ModuleController, admissible by nmfd.PerimeterLayer and
         nmfd.SplitsLayer; trained in place
     cost: differentiable function, nmfd.Trajectories -> (B,); by default the total time spent
-    sample: (torch.Generator, B) -> initial states (veh, (B, R, R)) and demand (veh/s, (T, B, R,
-        R)); by default random
+    sample: (torch.Generator, B) -> initial states (veh, (B, R, R)) and demand (veh/s,
+        (T, B, R, R)); by default random
     constraints: pairs of a function, nmfd.Trajectories -> penalty >= 0 (B,), and its weight; their
         means are added
     out: policy file, SCENARIO/NAME.pt if None
@@ -290,131 +419,144 @@ def train(
     anyway: train even on placeholder MFDs or if no gateway can be controlled
     progress: see `benchmark`
     """
-    scenario, strategy = _loaded(scenario), parse(controller)
+    scenario = loaded(scenario)
+    strategy = parse(controller)
     if policy is not None and (out or resume):
         raise InputError(
             "policy: a module is returned, not written; omit out and resume, keep its state_dict()"
         )
     task = training.Task(cost=cost, sample=sample, constraints=constraints)
-    options: dict[str, Any] = {
-        "seed": seed,
-        "steps": steps,
-        "device": training.available(device),
-        "resume": resume,
-    }
     chosen = training.settings(scenario, strategy, steps)
-    file = _file(scenario, f"{controller}.pt", out) if policy is None else None
+    device = training.available(device)
+    file = None if policy is not None else _file(scenario, f"{strategy.name}.pt", out)
     believed = strategy.planning(scenario).network
     for region, doubts in zip(believed.region_names, believed.doubts, strict=False):
         if doubts:
-            print(
-                f"nmfd: the model of region {region} is doubtful: {'; '.join(doubts)}",
-                file=sys.stderr,
-            )
+            problem = f"the model of region {region} is doubtful: {'; '.join(doubts)}"
+            print(f"nmfd: {problem}", file=sys.stderr)
     worth = policy is None and chosen.steps >= training.WORTH_COMPILING
-    options |= {"compiled": worth and rollout.can_compile(options["device"])}
-    options |= {"module": policy, "task": task, "anyway": anyway}
     try:
-        with watched(controller, progress) as show:
-            return training.train(scenario, strategy, out=file, progress=show, **options)
+        with watched(strategy.name, progress) as show:
+            return training.train(
+                scenario,
+                strategy,
+                seed=seed,
+                out=file,
+                module=policy,
+                task=task,
+                steps=steps,
+                device=device,
+                resume=resume,
+                compiled=worth and rollout.can_compile(device),
+                anyway=anyway,
+                progress=show,
+            )
     except KeyboardInterrupt:
         if file is None:
             raise
-        raise KeyboardInterrupt(
-            f"the best policy so far, if any, is {file}; add --resume to continue"
-        ) from None
+        kept = f"the best policy so far, if any, is {file}; add --resume to continue"
+        raise KeyboardInterrupt(kept) from None
 
 
 def bound(
-    scenario: Scenario | Path | str,
+    scenario: ScenarioLike,
     controller: str,
     *,
     out: Path | str | None = None,
     iterations: int = bound_study.ITERATIONS,
     progress: Progress = None,
-) -> str:
-    """Find the best plan "bound-pc" or "bound-pcrg" for known demand, and a lower bound; return a
-    report.
+) -> open_loop.Plan:
+    """Find the best plan for known demand, and a lower bound.
 
+    controller: "bound-pc" or, with route guidance, "bound-pcrg"
     out: plan file, SCENARIO/NAME.npz if None
     iterations: Adam steps
     """
-    scenario = _loaded(scenario)
+    scenario = loaded(scenario)
     file = _file(scenario, f"{controller}.npz", out)
     with watched(controller, progress) as show:
         plan = bound_study.compute(scenario, controller, iterations=iterations, progress=show)
     open_loop.write(plan, scenario, file)
+    return plan
+
+
+def bound_report(plan: open_loop.Plan) -> str:
+    """Return the totals of all starts of a plan, and the lower bound."""
     totals = sorted(plan.totals.items(), key=lambda item: item[1])
-    lines = [
-        f"from {name}: {total:.5g} veh s" + (" (kept)" if name == plan.start else "")
-        for name, total in totals
-    ]
-    lines += [f"lower bound: {plan.lower:.5g} veh s"]
+    lines = []
+    for name, total in totals:
+        kept = " (kept)" if name == plan.start else ""
+        lines.append(f"from {name}: {total:.5g} veh s{kept}")
+    lines.append(f"lower bound: {plan.lower:.5g} veh s")
     if plan.lower > 0:
         above = benchmark_study.percent_change(totals[0][1], plan.lower)
         lines[-1] += f"; the best plan is at most {above:.1f} % above the optimum"
-    return "\n".join([*lines, f"Written to {file}"])
+    return "\n".join(lines)
 
 
-def show(scenario: Scenario | Path | str, *, out: Path | str | None = None) -> str:
-    """Draw demand, region map and MFDs of a scenario; return a summary with the files."""
-    scenario = _loaded(scenario)
+def show(scenario: ScenarioLike, *, out: Path | str | None = None) -> list[Path]:
+    """Draw demand, region map and MFDs of a scenario; return the files.
+
+    out: folder, runs/SCENARIO-show if None
+    """
+    scenario = loaded(scenario)
     folder = Path("runs") / f"{file_name(scenario.name)}-show" if out is None else Path(out)
     folder.mkdir(parents=True, exist_ok=True)
-    files = benchmark_study.draw_scenario(folder, scenario)
-    total = scenario.step * scenario.demand.sum()
-    line = (
-        f"{scenario.name}: {scenario.network.regions} regions, {total:,.0f} trips between "
-        f"{int((scenario.demand.sum(axis=0) > 0).sum())} pairs, peak {scenario.demand.sum(axis=(1, 2)).max():.3g} "
-        f"veh/s, {scenario.steps} control intervals of {scenario.step:g} s"
+    return benchmark_study.draw_scenario(folder, scenario)
+
+
+def described(scenario: Scenario) -> str:
+    """Return a scenario in one line."""
+    demand = scenario.demand
+    pairs = int((demand.sum(axis=0) > 0).sum())
+    return (
+        f"{scenario.name}: {scenario.network.regions} regions, "
+        f"{scenario.step * demand.sum():,.0f} trips between {pairs} pairs, peak "
+        f"{demand.sum(axis=(1, 2)).max():.3g} veh/s, {scenario.steps} control intervals of "
+        f"{scenario.step:g} s"
     )
-    return "\n".join([line, *(f"Written to {file}" for file in files)])
 
 
-def catalogue() -> str:
-    """List the shipped scenarios, networks and policies, and all controllers, one line each."""
-    scenarios, networks = shipped.folders(shipped.SCENARIO), shipped.folders(shipped.NETWORK)
-    sections = {
-        "Scenarios": {
-            folder.name: _first_sentence(folder / "scenario.toml") for folder in scenarios
-        },
-        "Networks": {folder.name: _first_sentence(folder / "network.toml") for folder in networks},
-        "Policies": {
-            f"{folder.name}/{file.name}": ""
-            for folder in scenarios
-            for file in sorted(folder.glob("dpc-*.pt"))
-        },
+def catalogue() -> dict[str, dict[str, str]]:
+    """Return what is shipped, and all controllers, with a line each."""
+    scenarios = shipped.folders(shipped.SCENARIO)
+    networks = shipped.folders(shipped.NETWORK)
+    policies = {}
+    for folder in scenarios:
+        for file in sorted(folder.glob("dpc-*.pt")):
+            policies[f"{folder.name}/{file.name}"] = ""
+    return {
+        "Scenarios": {one.name: _first_sentence(one / "scenario.toml") for one in scenarios},
+        "Networks": {one.name: _first_sentence(one / "network.toml") for one in networks},
+        "Policies": policies,
         "Controllers": {kind.name: kind.text for kind in CONTROLLERS.values()},
-        "Words for a city in SUMO, behind a controller": dict(city_words()),
     }
-    return "\n\n".join(
-        "\n".join(
-            [
-                title,
-                *(
-                    f"  {name:{max(map(len, rows))}}  {text}".rstrip()
-                    for name, text in rows.items()
-                ),
-            ]
-        )
-        for title, rows in sections.items()
-    )
+
+
+def listing(sections: Mapping[str, Mapping[str, str]]) -> str:
+    """Return a catalogue as text."""
+    parts = []
+    for title, rows in sections.items():
+        width = max(map(len, rows))
+        lines = [f"  {name:{width}}  {text}".rstrip() for name, text in rows.items()]
+        parts.append("\n".join([title, *lines]))
+    return "\n\n".join(parts)
 
 
 def _first_sentence(file: Path) -> str:
     """Return the first sentence of the comment at the top of a TOML file."""
-    lines = takewhile(
-        lambda line: line.startswith("#"), file.read_text(encoding="utf-8").splitlines()
-    )
-    words = " ".join(line.lstrip("# ") for line in lines if not line.startswith("#:"))
-    return textwrap.shorten(
-        re.split(r"\.\s+(?=[A-Z\d])", words)[0].rstrip("."), 90, placeholder=" ..."
-    )
+    text = file.read_text(encoding="utf-8").splitlines()
+    comment = takewhile(lambda line: line.startswith("#"), text)
+    words = " ".join(line.lstrip("# ") for line in comment if not line.startswith("#:"))
+    sentence = re.split(r"\.\s+(?=[A-Z\d])", words)[0]
+    return textwrap.shorten(sentence.rstrip("."), 90, placeholder=" ...")
 
 
 def _file(scenario: Scenario, name: str, out: Path | str | None) -> Path:
-    """Return the file that `out` names, or `name` in the scenario's folder; check that its folder
-    exists."""
+    """Return the file that `out` names, or `name` in the scenario's folder.
+
+    Raises: InputError if its folder does not exist
+    """
     if out is not None:
         file = Path(out)
     elif scenario.folder is not None:
@@ -426,30 +568,34 @@ def _file(scenario: Scenario, name: str, out: Path | str | None) -> Path:
     return file
 
 
+def _path(file: Path | str | None) -> Path | None:
+    return None if file is None else Path(file)
+
+
+def _regional(controller: ControllerLike) -> Strategy:
+    return parse(controller).regional()
+
+
 def check_policies(policies: Mapping[str, Path], strategies: Sequence[Strategy]) -> None:
-    """Raise InputError for a policy file of a controller that is not among the strategies."""
+    """Check that every policy file is of one of the strategies.
+
+    Raises: InputError
+    """
     known = [strategy.name for strategy in strategies]
     for name in policies:
         if name not in known:
             near = did_you_mean(name, known)
-            raise InputError(
-                f"--policy: {name!r} is not among {', '.join(known)}{near}; add it there"
-            )
+            problem = f"{name!r} is not among {', '.join(known)}{near}; add it there"
+            raise InputError(f"--policy: {problem}")
 
 
 def _check_plant(plant: str | Plant) -> None:
-    lacking = [
-        method
-        for method in ("reset", "step", "observe")
-        if not callable(getattr(plant, method, None))
-    ]
-    if lacking and not isinstance(plant, str):
-        raise InputError(f"plant: {type(plant).__name__} has no {lacking[0]}; see nmfd.Plant")
-    if isinstance(plant, str) and plant not in PLANTS:
-        raise InputError(
-            f"plant {plant!r} is unknown{did_you_mean(plant, PLANTS)}; choose from {', '.join(PLANTS)}"
-        )
-
-
-def _loaded(scenario: Scenario | Path | str) -> Scenario:
-    return scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
+    if isinstance(plant, str):
+        if plant not in PLANTS:
+            near = did_you_mean(plant, PLANTS)
+            names = ", ".join(PLANTS)
+            raise InputError(f"plant {plant!r} is unknown{near}; choose from {names}")
+        return
+    for method in ("reset", "step", "observe"):
+        if not callable(getattr(plant, method, None)):
+            raise InputError(f"plant: {type(plant).__name__} has no {method}; see nmfd.Plant")

@@ -1,8 +1,9 @@
-"""Shapes of NumPy arrays for annotations; content and unit are documented at their use.
+"""Shapes of NumPy arrays for annotations.
 
-R regions, T control intervals, S = T + 1 states. One letter is one number within a call, or within
-one object. Tests check them (tests/conftest.py, jaxtyping and beartype); elsewhere they cost
-nothing. nmfd.tensors has those of torch.
+Content and unit are documented where they are used. R regions, T control intervals, S = T + 1
+states. One letter is one number within a call, or within one object. The tests check shapes
+(tests/conftest.py, jaxtyping and beartype); elsewhere they cost nothing. The shapes of torch's
+tensors are in nmfd.tensors.
 """
 
 import numpy as np
@@ -19,6 +20,5 @@ Adjacency = Bool[np.ndarray, "R R"]
 TurnMask = Bool[np.ndarray, "R R R"]
 Hops = Int[np.ndarray, "R R"]
 Intervals = Float[np.ndarray, " T"]
-Points = Float[
-    np.ndarray, "_ 2"
-]  # of a line on the map [m], or samples of accumulation and outflow
+# Places on a map [m], or pairs of accumulation and outflow.
+Points = Float[np.ndarray, "_ 2"]

@@ -1,6 +1,9 @@
-"""Command line `nmfd`: it parses options and calls nmfd.api; cosim.cli takes the shared options
-from here."""
+"""Command line `nmfd`: it parses options and calls nmfd.api.
 
+It also declares the options that cosim.cli shares.
+"""
+
+import math
 import os
 import shlex
 import signal
@@ -16,11 +19,38 @@ import click
 
 import nmfd
 from nmfd.errors import InputError, RunFailed
+from nmfd.runs.files import check_name, parts_of
 
 FOLDER = click.Path(path_type=Path, file_okay=False)
 FILE = click.Path(path_type=Path, dir_okay=False)
 COUNT = click.IntRange(1, 10**6)
 SEED = click.IntRange(0, 2**31 - 1)  # SUMO's seeds have 32 bits
+
+
+class Seeds(click.ParamType):
+    """Number of seeds, or the seeds A,B,... or FROM-TO."""
+
+    name = "N|A,B|FROM-TO"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> int | tuple[int, ...]:
+        if isinstance(value, int | tuple):
+            return value
+        try:
+            first, dash, last = value.partition("-")
+            if dash:
+                seeds = tuple(range(int(first), int(last) + 1))
+            elif "," in value:
+                seeds = tuple(int(word) for word in value.split(","))
+            else:
+                return COUNT.convert(value, param, ctx)
+            if not seeds or len(set(seeds)) < len(seeds):
+                raise ValueError
+        except ValueError:
+            form = "a number of seeds, seeds such as 3300,3301, or a range such as 3300-3309"
+            self.fail(f"expected {form}, got {value!r} instead", param, ctx)
+        return tuple(SEED.convert(seed, param, ctx) for seed in seeds)
 
 
 class Number(click.FloatRange):
@@ -30,12 +60,16 @@ class Number(click.FloatRange):
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float:
         number = super().convert(value, param, ctx)
-        return number if number == number else self.fail(f"{value!r} is not a number.", param, ctx)
+        if math.isnan(number):
+            self.fail(f"{value!r} is not a number.", param, ctx)
+        return number
 
 
 class Commands(click.Group):
-    """Command group with sections in its help that ends user errors and Ctrl-C in one line on
-    stderr."""
+    """Command group with sections in its help.
+
+    User errors and Ctrl-C end a command with one line on stderr.
+    """
 
     def __init__(
         self,
@@ -46,12 +80,14 @@ class Commands(click.Group):
     ):
         """elsewhere: a command of the other program -> its name"""
         super().__init__(*args, **options)
-        self.sections, self.elsewhere = sections, elsewhere
+        self.sections = sections
+        self.elsewhere = elsewhere
 
     def resolve_command(self, ctx: click.Context, args: list[str]) -> Any:
-        """Find the command; name the other program's one."""
-        if args[0] not in self.commands and (command := self.elsewhere.get(args[0])):
-            ctx.fail(f"No such command '{args[0]}': it is `{command}`.")
+        """Find the command; name the one of the other program."""
+        name = args[0]
+        if name not in self.commands and name in self.elsewhere:
+            ctx.fail(f"No such command '{name}': it is `{self.elsewhere[name]}`.")
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -59,15 +95,17 @@ class Commands(click.Group):
         width = max(map(len, self.commands))
         for title, names in self.sections.items():
             with formatter.section(title):
-                rows = [
-                    (f"{name:{width}}", self.commands[name].get_short_help_str(60))
-                    for name in names
-                ]
+                rows = []
+                for name in names:
+                    text = self.commands[name].get_short_help_str(60)
+                    rows.append((f"{name:{width}}", text))
                 formatter.write_dl(rows)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run a command; exit with 2 after a user error, 1 after failed runs, 130 after Ctrl-C or
-        SIGTERM."""
+        """Run a command.
+
+        Exit with 2 after a user error, 1 after failed runs, 130 after Ctrl-C or SIGTERM.
+        """
         stops = []
 
         def stop(*_: object) -> NoReturn:
@@ -80,26 +118,32 @@ class Commands(click.Group):
                 signal.signal(signal.SIGINT, stop)
         for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
             if getattr(sys, name) is None:  # closed: some other file would get its number
-                setattr(sys, name, open(os.devnull, mode))
-                os.set_inheritable(getattr(sys, name).fileno(), True)
+                stream = open(os.devnull, mode)  # noqa: SIM115 - open as long as the process
+                setattr(sys, name, stream)
+                os.set_inheritable(stream.fileno(), True)
         try:
             return super().invoke(ctx)
         except (KeyboardInterrupt, Exception) as error:
+            text = f"error: {error}"
+            status = 2
             if stops or isinstance(error, KeyboardInterrupt):
-                told = str(error) if isinstance(error, KeyboardInterrupt) else ""
-                text, status = ": ".join(filter(None, ["interrupted", told])), 130
-            elif isinstance(error, BrokenPipeError) or not isinstance(
-                error, (RunFailed, InputError, OSError)
-            ):
+                text = "interrupted"
+                status = 130
+                if isinstance(error, KeyboardInterrupt) and str(error):
+                    text += f": {error}"
+            elif isinstance(error, RunFailed):
+                status = 1
+            elif isinstance(error, BrokenPipeError) or not isinstance(error, (InputError, OSError)):
                 raise  # click ends without a word if nobody reads on
-            else:
-                text, status = f"error: {error}", 1 if isinstance(error, RunFailed) else 2
         click.echo(f"{self.name}: {' '.join(text.split())}", err=True)
-        ctx.exit(status)
+        raise click.exceptions.Exit(status)
 
 
 def combined(*decorators: Callable) -> Callable:
-    """Return one decorator that applies several, so that their options appear in this order."""
+    """Return one decorator that applies several.
+
+    Their options appear in this order.
+    """
 
     def decorate(command: Callable) -> Callable:
         for decorator in reversed(decorators):
@@ -123,7 +167,7 @@ def listed(kind: click.ParamType) -> Callable[[str], tuple]:
     """Return a parser of values of a kind that are separated by commas."""
 
     def parse(text: str) -> tuple:
-        values = tuple(kind.convert(word.strip(), None, None) for word in text.split(","))
+        values = tuple(kind.convert(word, None, None) for word in parts_of(text))
         if len(set(values)) < len(values):
             raise click.BadParameter(
                 f"expected distinct values separated by commas, got {text!r} instead"
@@ -135,12 +179,12 @@ def listed(kind: click.ParamType) -> Callable[[str], tuple]:
 
 
 def parsed(form: str, convert: Callable[[str], Any]) -> Callable:
-    """Return the callback of a repeated option KEY=VALUE, which gives a dict; `form` begins with
-    its metavar."""
+    """Return the callback of a repeated option KEY=VALUE, which gives a dict.
 
-    def parse(
-        _ctx: click.Context, _param: click.Parameter, values: Sequence[str]
-    ) -> dict[str, Any]:
+    form: what is expected; it begins with the metavar
+    """
+
+    def parse(_ctx: Any, _param: Any, values: Sequence[str]) -> dict[str, Any]:
         result = {}
         for text in values:
             key, _, value = text.partition("=")
@@ -179,7 +223,8 @@ SET = click.option(
     multiple=True,
     metavar="KEY=VALUE",
     callback=parsed("KEY=VALUE, such as steps=12", toml_or_text),
-    help="Change a setting of the scenario, such as steps=12 or controllers.pi-gating.kp=2. May be repeated.",
+    help="Change a setting of the scenario, such as steps=12 or controllers.pi-gating.kp=2. "
+    "May be repeated.",
 )
 SCENARIO = combined(click.argument("scenario", type=click.Path(path_type=Path)), SET)
 CONTROLLERS = click.option(
@@ -195,10 +240,44 @@ POLICIES = click.option(
     multiple=True,
     metavar="NAME=FILE",
     callback=parsed("NAME=FILE, such as dpc-pc=mine.pt", Path),
-    help="Policy or plan file of a controller. May be repeated. [default: SCENARIO/NAME.pt or .npz]",
+    help="Policy or plan file of a controller. May be repeated. "
+    "[default: SCENARIO/NAME.pt or .npz]",
 )
 WORKERS = click.option("--workers", type=COUNT, default=1, help="Number of parallel runs.")
 TRY = "; try it: nmfd benchmark {0} --controllers no-control,{1} --policy {1}={2}"
+
+
+SCHEDULER = click.option(
+    "--scheduler", metavar="ADDRESS", help="Dask scheduler for the runs, such as tls://host:8786."
+)
+TIME_LIMIT = click.option(
+    "--time-limit",
+    type=Number(0.0, min_open=True),
+    metavar="S",
+    help="Time after which a run in a process of its own is ended. [default: ten times the "
+    "expected one, at least 600]",
+)
+OVERWRITE = click.option(
+    "--overwrite", is_flag=True, help="Do finished runs again whose settings have changed."
+)
+RUNNING = combined(WORKERS, SCHEDULER, TIME_LIMIT, OVERWRITE)
+LEVEL = Number(0.0, 10.0, min_open=True)
+STEPS = click.option(
+    "--steps", type=COUNT, help="Number of control intervals. [default: as in the scenario]"
+)
+DEMAND = click.option(
+    "--demand",
+    "--levels",
+    "demand",
+    type=listed(LEVEL),
+    default="1",
+    help="Factors that multiply the demand.",
+)
+
+
+def seeds_option(default: int, text: str, *others: str) -> Callable:
+    """Return the option --seeds, and its older names."""
+    return click.option("--seeds", *others, "seeds", type=Seeds(), default=default, help=text)
 
 
 def seed_option(text: str = "Random seed.") -> Callable:
@@ -209,7 +288,10 @@ def seed_option(text: str = "Random seed.") -> Callable:
 def out_option(
     default: str, text: str = "Run folder; finished runs in it are not repeated."
 ) -> Callable:
-    """Return the option --out of a folder; `default` says where results go without it."""
+    """Return the option --out of a folder.
+
+    default: where results go without it
+    """
     return click.option("--out", type=FOLDER, metavar="DIR", help=f"{text} [default: {default}]")
 
 
@@ -230,7 +312,7 @@ def out_option(
 )
 @VERSION
 def main() -> None:
-    """Perimeter control and route guidance on the regional traffic model (NMFD).
+    """Perimeter control and route guidance on the regional model (NMFD).
 
     \b
     Begin with `nmfd show`, then
@@ -254,20 +336,26 @@ def show(scenario: Path | None, settings: dict, out: Path | None) -> None:
       nmfd show economic_mpc --out figures
     """
     if scenario is None:
-        click.echo(nmfd.api.catalogue())
-    else:
-        click.echo(nmfd.api.show(nmfd.load_scenario(scenario, settings), out=out))
+        click.echo(nmfd.api.listing(nmfd.api.catalogue()))
+        return
+    loaded = nmfd.load_scenario(scenario, settings)
+    files = nmfd.api.show(loaded, out=out)
+    click.echo(nmfd.api.described(loaded))
+    for file in files:
+        click.echo(f"Written to {file}")
 
 
 @main.command()
 @SCENARIO
 @CONTROLLERS
-@click.option("--seeds", type=COUNT, default=1, help="Runs with seeds 0 to N - 1.")
+@seeds_option(1, "Number of runs, with seeds from 0, or the seeds.")
+@DEMAND
+@STEPS
 @click.option(
     "--plant", type=click.Choice(["nmfd", "acyclic"]), default="nmfd", help="Plant model."
 )
 @POLICIES
-@WORKERS
+@RUNNING
 @out_option("runs/SCENARIO-TIME")
 def benchmark(scenario: Path, settings: dict, out: Path | None, **options: Any) -> None:
     """Run controllers on a regional model and compare them.
@@ -283,9 +371,8 @@ def benchmark(scenario: Path, settings: dict, out: Path | None, **options: Any) 
     loaded = nmfd.load_scenario(scenario, settings)
     out = out or nmfd.api.default_folder(loaded.name)
     rows = nmfd.api.benchmark(loaded, out=out, **options)
-    click.echo(
-        f"{nmfd.api.summary_table(rows)}\nWritten to {out}: see the figures; more seeds: --seeds N --out {out}"
-    )
+    click.echo(nmfd.api.summary_table(rows))
+    click.echo(f"Written to {out}: see the figures; more seeds: --seeds N --out {out}")
     nmfd.api.raise_failures(rows)
 
 
@@ -303,8 +390,9 @@ def benchmark(scenario: Path, settings: dict, out: Path | None, **options: Any) 
     type=listed(Number(0.0)),
     help="Noise (veh/s) or spread (-). [default: 0,...,5 or 0,...,0.4]",
 )
-@click.option("--scenarios", type=COUNT, default=20, help="Random scenarios per sigma.")
-@WORKERS
+@seeds_option(20, "Number of random scenarios per sigma, or their seeds.", "--scenarios")
+@STEPS
+@RUNNING
 @out_option("runs/SCENARIO-TIME")
 def robustness(scenario: Path, settings: dict, out: Path | None, **options: Any) -> None:
     """Run controllers under unexpected demand or MFDs.
@@ -320,9 +408,8 @@ def robustness(scenario: Path, settings: dict, out: Path | None, **options: Any)
     loaded = nmfd.load_scenario(scenario, settings)
     out = out or nmfd.api.default_folder(loaded.name)
     rows = nmfd.api.robustness(loaded, out=out, **options)
-    click.echo(
-        f"{nmfd.api.improvement_table(rows)}\nWritten to {out}: see runs.csv and robustness.png"
-    )
+    click.echo(nmfd.api.improvement_table(rows))
+    click.echo(f"Written to {out}: see runs.csv and robustness.png")
     nmfd.api.raise_failures(rows)
 
 
@@ -376,10 +463,10 @@ def bound(scenario: Path, settings: dict, controller: str, **options: Any) -> No
     Example:
       nmfd bound economic_mpc --controller bound-pcrg
     """
-    text = nmfd.api.bound(nmfd.load_scenario(scenario, settings), controller, **options)
-    click.echo(
-        text + TRY.format(scenario, controller, options["out"] or f"{scenario}/{controller}.npz")
-    )
+    plan = nmfd.api.bound(nmfd.load_scenario(scenario, settings), controller, **options)
+    file = options["out"] or f"{scenario}/{controller}.npz"
+    click.echo(nmfd.api.bound_report(plan))
+    click.echo(f"Written to {file}{TRY.format(scenario, controller, file)}")
 
 
 @main.command(name="new-controller")
@@ -394,18 +481,17 @@ def new_controller(file: Path) -> None:
       nmfd new-controller mine.py
       nmfd benchmark economic_mpc --controllers no-control,mine.py:MyController
     """
+    check_name(file)
     if file.suffix != ".py":
-        raise InputError(
-            f"{file}: expected a name that ends in .py, such as {file.with_suffix('.py')}"
-        )
+        better = file.with_suffix(".py")
+        raise InputError(f"{file}: expected a name that ends in .py, such as {better}")
     if file.exists():
         raise InputError(f"{file}: exists; choose another name")
     text = resources.files("nmfd.controllers").joinpath("template.py").read_text(encoding="utf-8")
     file.write_text(text.replace("FILE", str(file)), encoding="utf-8")
     own = f"{shlex.quote(str(file))}:MyController"
-    click.echo(
-        f"Written to {file}; try it: nmfd benchmark economic_mpc --controllers no-control,{own}"
-    )
+    command = f"nmfd benchmark economic_mpc --controllers no-control,{own}"
+    click.echo(f"Written to {file}; try it: {command}")
 
 
 @main.command()
@@ -455,9 +541,8 @@ def identify(counts: Path, out: Path, **options: Any) -> None:
 
     \b
     Example:
-      nmfd identify counts.csv --detectors detectors.csv --regions regions.csv --trip-length 1500 --out networks/mine
+      nmfd identify counts.csv --detectors detectors.csv --out networks/mine
     """
     click.echo(nmfd.api.identify(counts, out=out, **options).text)
-    click.echo(
-        f'Written to {out}: see mfd.png and identify.txt; next: a scenario.toml with network = "{out}"'
-    )
+    next_step = f'a scenario.toml with network = "{out}"'
+    click.echo(f"Written to {out}: see mfd.png and identify.txt; next: {next_step}")

@@ -1,17 +1,22 @@
 """The closed loop of any plant and any controller."""
 
 import copy
+import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from nmfd import faults
-from nmfd.errors import InputError
+from nmfd import __version__, faults
+from nmfd.model.commands import admissible
 from nmfd.model.scenario import Scenario
+from nmfd.runs.pool import Watchdog
 from nmfd.tensors import one_thread
 from nmfd.types import Controller, Controls, Observation, Plant, Result, State, Status
+
+PATIENCE = 10.0  # deadlines after which a decision ends the process of a run
+LEAST_PATIENCE_S = 10.0
 
 
 @one_thread()
@@ -31,72 +36,91 @@ def run(
     either. A decision is late after the control interval or the controller's own `deadline` (s).
 
     progress: is called with the intervals done and `scenario.steps` after every interval
-    Raises: InputError if a number of a command is not finite
+    Raises: InputError for a command of a wrong type, shape or value, before the plant sees it
     """
     network = scenario.network
+    name = str(getattr(controller, "name", type(controller).__name__))
     controller.reset(seed)
-    sensors, random = faults.Sensors(scenario.ordered_faults), noise_of(seed)
+    sensors = faults.Sensors(scenario.ordered_faults)
+    random = noise_of(seed)
 
     def observe() -> tuple[Observation, str]:
         return sensors.see(measurement(plant, states[-1], scenario.measurement_std, random))
 
-    states, controls, decision_time = [plant.reset(seed)], [], []
+    states = [plant.reset(seed)]
     observed, problem = observe()
     observations = [observed]
-    begin, deadline = time.perf_counter(), scenario.step
+    controls = []
+    decision_time = []
+    begin = time.perf_counter()
+    deadline = scenario.step
     own = getattr(controller, "deadline", None)
     if isinstance(own, int | float) and own > 0:
         deadline = min(own, deadline)
+    watchdog = Watchdog(max(PATIENCE * deadline, LEAST_PATIENCE_S))
     for k in range(scenario.steps):
         given = copy.deepcopy(observed)
-        before, processor = time.perf_counter(), time.process_time()
-        command = controller.act(given)
+        before = time.perf_counter()
+        processor = time.process_time()
+        with watchdog:
+            command = controller.act(given)
         decision_time.append(time.process_time() - processor)
         late = time.perf_counter() - before > deadline
-        command = _checked(command, f"{controller.name}: interval {k}")
+        command = admissible(command, network, f"{name}: interval {k}")
         if problem:
             command = _with_status(command, Status.SENSOR_FAULT, problem, command.note)
         if late:
-            command = _with_status(
-                command, Status.LATE, command.note, f"later than its deadline of {deadline:g} s"
-            )
+            reason = f"later than its deadline of {deadline:g} s"
+            command = _with_status(command, Status.LATE, command.note, reason)
         states.append(plant.step(command))
         fault = states[-1].problem
-        controls.append(
-            _with_status(command, Status.PLANT_FAULT, command.note, fault) if fault else command
-        )
+        if fault:
+            command = _with_status(command, Status.PLANT_FAULT, command.note, fault)
+        controls.append(command)
         observed, problem = observe()
         observations.append(observed)
         if progress:
             progress(k + 1, scenario.steps)
+    about = {
+        "controller": name,
+        "plant": type(plant).__name__,
+        "seed": seed,
+        "step": scenario.step,
+        "scenario": scenario.name,
+        "version": __version__,
+        "settings": json.dumps(scenario.settings),
+        "estimated": int(plant.observe() is not None),
+        "wall_time": time.perf_counter() - begin,
+    }
+    nothing = np.zeros((network.regions, network.regions))
     return Result.make(
-        {
-            "controller": controller.name,
-            "plant": type(plant).__name__,
-            "seed": seed,
-            "step": scenario.step,
-            "estimated": int(plant.observe() is not None),
-            "wall_time": time.perf_counter() - begin,
-        },
-        accumulation=np.stack([s.accumulation for s in states]),
-        backlog=np.stack([s.backlog for s in states]),
-        completed=np.array([s.completed for s in states]),
-        observed=np.stack([o.accumulation for o in observations]),
-        observed_backlog=np.stack([o.backlog for o in observations]),
-        perimeter=np.stack([c.perimeter for c in controls]),
-        splits=np.stack(
-            [network.nominal_splits if c.splits is None else c.splits for c in controls]
-        ),
+        about,
+        network.region_names,
+        accumulation=_column(states, "accumulation"),
+        backlog=_column(states, "backlog"),
+        completed=_column(states, "completed"),
+        removed=_column(states, "removed", nothing),
+        observed=_column(observations, "accumulation"),
+        observed_backlog=_column(observations, "backlog"),
+        perimeter=_column(controls, "perimeter"),
+        splits=_column(controls, "splits", network.nominal_splits),
+        prices=_column(controls, "prices", nothing[0]),
+        status=np.array([command.status.value for command in controls]),
+        note=_column(controls, "note"),
         decision_time=np.array(decision_time),
-        status=np.array([c.status.value for c in controls]),
-        note=np.array([c.note for c in controls]),
-        removed=np.stack(
-            [np.zeros_like(s.backlog) if s.removed is None else s.removed for s in states]
-        ),
-        prices=np.stack(
-            [np.zeros(network.regions) if c.prices is None else c.prices for c in controls]
-        ),
     )
+
+
+def _column(rows: Sequence[object], name: str, default: object = None) -> np.ndarray:
+    """Return a field of all rows as an array.
+
+    default: value of rows in which it is None
+    """
+    values = []
+    for row in rows:
+        value = getattr(row, name)
+        values.append(default if value is None else value)
+    return np.array(values)
 
 
 def noise_of(seed: int) -> np.random.Generator:
@@ -105,8 +129,10 @@ def noise_of(seed: int) -> np.random.Generator:
 
 
 def measurement(plant: Plant, state: State, std: float, random: np.random.Generator) -> Observation:
-    """Return the estimate of the plant's own instruments or, without any, the state with noise of
-    `std` [veh]."""
+    """Return the estimate of the plant's own instruments, or the state.
+
+    std: standard deviation of the noise on the state (veh), if the plant has no instruments
+    """
     noise = std * random.standard_normal(state.accumulation.shape)
     return plant.observe() or Observation(
         step=state.step,
@@ -115,19 +141,6 @@ def measurement(plant: Plant, state: State, std: float, random: np.random.Genera
         backlog=state.backlog,
         realised=state.realised,
     )
-
-
-def _checked(controls: Controls, where: str) -> Controls:
-    """Return controls with copied arrays, into which no controller writes; raise InputError if one
-    is not finite."""
-    arrays = {}
-    for name in ("perimeter", "splits", "prices", "metering"):
-        if (values := getattr(controls, name)) is not None:
-            arrays[name] = values = np.array(values)
-            if wrong := np.argwhere(~np.isfinite(values)).tolist():
-                got = f"expected a finite number, got {values[*wrong[0]]} instead"
-                raise InputError(f"{where}: {name}{wrong[0]}: {got}")
-    return replace(controls, **arrays)
 
 
 def _with_status(controls: Controls, status: Status, *notes: str) -> Controls:

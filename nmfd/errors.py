@@ -9,7 +9,7 @@ from importlib.util import find_spec
 
 
 class InputError(ValueError):
-    """A mistake in a file, key, value or command line.
+    """Mistake in a file, key, value or command line.
 
     The message is one line that names the file, the key, the value, what is allowed and the remedy;
     the command lines print it and exit with status 2.
@@ -17,42 +17,50 @@ class InputError(ValueError):
 
 
 class RunFailed(Exception):
-    """Some runs ended in an error. The message names them in one line."""
+    """Failure of some runs. The message names them in one line."""
 
 
 def did_you_mean(word: str, choices: Iterable[str]) -> str:
-    """Return "; did you mean ...?" with the most similar of `choices`; "" if none is similar."""
+    """Return "; did you mean ...?" with the most similar choice.
+
+    Return "" if none is similar.
+    """
     close = difflib.get_close_matches(word, list(choices), n=1)
-    return f"; did you mean {close[0]}?" if close else ""
+    if not close:
+        return ""
+    return f"; did you mean {close[0]}?"
 
 
 def need(what: str, extra: str, *modules: str) -> None:
-    """Check that the `modules` of an extra of pyproject.toml, which `what` needs, are installed.
-    Raises InputError."""
-    if missing := [module for module in modules if find_spec(module) is None]:
-        raise InputError(
-            f"{what}: needs {', '.join(missing)}; install the extra {extra} with: pip install -e '.[{extra}]'"
-        )
+    """Check that the modules of an optional dependency are installed.
+
+    what: the part of the program that needs them
+    extra: their group in pyproject.toml
+
+    Raises: InputError
+    """
+    missing = [module for module in modules if find_spec(module) is None]
+    if missing:
+        remedy = f"install the extra {extra} with: pip install -e '.[{extra}]'"
+        raise InputError(f"{what}: needs {', '.join(missing)}; {remedy}")
 
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Delay Ctrl-C and SIGTERM until the end of the block, for code that they would leave with a
-    lock held."""
+    """Delay Ctrl-C and SIGTERM until the end of the block.
+
+    It is for code that an interruption would leave with a lock held.
+    """
     held: list[int] = []
-    numbers = (
-        (signal.SIGINT, signal.SIGTERM)
-        if threading.current_thread() is threading.main_thread()
-        else ()
-    )
-    before = {
-        number: signal.signal(number, lambda received, _: held.append(received))
-        for number in numbers
-    }
+    before = {}
+    # Other threads receive no signals, and Python does not let them set handlers.
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            before[number] = signal.signal(number, lambda received, _: held.append(received))
     try:
         yield
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-        for received in held[:1]:
-            signal.raise_signal(received)
+        if held:
+            signal.raise_signal(held[0])

@@ -1,6 +1,6 @@
-"""Shapes of torch's tensors for annotations, as nmfd.arrays has them, and torch on one thread.
+"""Shapes of torch's tensors for annotations; one thread for torch.
 
-B: any batch, or none, that broadcasts.
+nmfd.arrays has those of NumPy. B: any batch, or none, that broadcasts.
 """
 
 from collections.abc import Iterator
@@ -17,10 +17,11 @@ PerTurn = Float[torch.Tensor, "*#B R R R"]
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Compute on one thread within the block, or, as a decorator, within the function.
+    """Let torch compute on one thread within the block.
 
-    The matrices here are small: on a busy machine more threads wait for one another twenty times
-    longer than they compute. Afterwards torch has its number of threads back.
+    As a decorator: within the function. The matrices here are small: on a busy machine, more
+    threads wait for one another twenty times longer than they compute. Afterwards torch has its
+    number of threads back.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(1)

@@ -1,7 +1,7 @@
-"""Types that plants, controllers and the closed loop exchange, and the result of a run."""
+"""Types that plants, controllers and the closed loop exchange."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Flag
 from pathlib import Path
@@ -17,7 +17,9 @@ if TYPE_CHECKING:
 
 
 class Status(Flag):
-    """Status of one decision: OK, or a combination of these. `Controls.note` gives the reason.
+    """Status of one decision: OK, or a combination of these.
+
+    `Controls.note` gives the reason.
 
     SOLVER_FAILURE: the solver failed, diverged or stopped short of its tolerance
     FALLBACK: the controls are those of a fallback, not of the controller
@@ -40,8 +42,9 @@ class Status(Flag):
 
 @dataclass(frozen=True, kw_only=True)
 class State:
-    """True state of a plant at the start of control interval `step`; controllers get an Observation
-    instead.
+    """True state of a plant at the start of control interval `step`.
+
+    Controllers get an Observation instead.
 
     step: k = 0, 1, ...
     time: since the start (s)
@@ -67,16 +70,21 @@ class State:
 
     @property
     def unfinished(self) -> PerPair:
-        """Return the vehicles (R, R) that spend time: running, waiting to enter, and removed
-        (nmfd.metrics)."""
+        """Return the vehicles that spend time (veh, (R, R)).
+
+        They run, wait to enter, or were removed (nmfd.metrics).
+        """
         spending = self.accumulation + self.backlog
-        return spending if self.removed is None else spending + self.removed
+        if self.removed is None:
+            return spending
+        return spending + self.removed
 
 
 @dataclass(frozen=True, kw_only=True)
 class Observation:
-    """Input of a controller at the start of control interval `step`: with noise, with faults, or an
-    estimate.
+    """Input of a controller at the start of control interval `step`.
+
+    It has noise and faults, or is an estimate.
 
     step, time: those of the State
     accumulation: (R, R) [veh], [i, j] = in region i bound for j
@@ -95,21 +103,24 @@ class Observation:
 class Controls:
     """Command of a controller for one control interval.
 
-    perimeter: (R, R) [-], [i, h] = u_ih, share of the desired transfer flow from i to h that may
-        pass; ignored where h is not adjacent to i
-    splits: (R, R, R) [-], [i, h, j] = theta_ihj, share of the vehicles in i bound for j that head
-        for h; None without route guidance: drivers keep their routes (in the regional model the
-        nominal splits)
-    prices: (R,) [-], added share of the travel time through region i that guided drivers bound for
-        other regions see: 1 for twice as long. In a city, guidance by these travel times replaces
-        `splits`; the regional model takes `splits`. None: no prices
-    metering: (R,) [veh/s], largest rate of trips that may begin in region i; further trips wait
+    `Controls(perimeter=u)` is enough.
+
+    perimeter: u_ih, share of the desired transfer flow from i to h that may pass
+        (-, (R, R) [i, h]); ignored where h is not adjacent to i
+    splits: theta_ihj, share of the vehicles in i bound for j that head for h (-, (R, R, R)
+        [i, h, j]); None without route guidance: drivers keep their routes (in the regional model
+        the nominal splits)
+    status: OK, or the reasons why these are other controls
+    note: the status in words, "" if OK
+    prices: added share of the travel time through region i that guided drivers bound for other
+        regions see (-, (R,)), such as 1 for twice as long. In a city, guidance by these travel
+        times replaces `splits`; the regional model takes `splits`. None: no prices
+    metering: largest rate of trips that may begin in region i (veh/s, (R,)); further trips wait
         outside, in the backlog. Only cities with `+metering` obey it. None: no limit
-    status: OK, or the reasons why these are other controls; note: the same in words, "" if OK
     """
 
     perimeter: PerPair
-    splits: PerTurn | None
+    splits: PerTurn | None = None
     status: Status = Status.OK
     note: str = ""
     prices: PerRegion | None = None
@@ -118,8 +129,10 @@ class Controls:
 
 @runtime_checkable
 class Plant(Protocol):
-    """City, regional or microscopic. `step` is one control interval. A method `close` releases what
-    it holds."""
+    """City, regional or microscopic.
+
+    `step` is one control interval. A method `close` releases what the plant holds.
+    """
 
     def reset(self, seed: int) -> State:
         """Start again from the beginning."""
@@ -128,8 +141,10 @@ class Plant(Protocol):
         """Apply `controls` for one control interval; return the state at its end."""
 
     def observe(self) -> Observation | None:
-        """Return the estimate of the plant's own instruments; None without any: the state is
-        measured with noise."""
+        """Return the estimate of the plant's own instruments.
+
+        It is None without any; the state is then measured with noise.
+        """
 
 
 @runtime_checkable
@@ -139,11 +154,13 @@ class Controller(Protocol):
     name: str
 
     def reset(self, seed: int = 0) -> None:
-        """Start a new run; all random draws of the controller follow from `seed`."""
+        """Start a new run; all random draws follow from `seed`."""
 
     def act(self, observation: Observation) -> Controls:
-        """Return the controls of the interval that begins now; `observation` is the controller's
-        own copy."""
+        """Return the controls of the interval that begins now.
+
+        observation: the controller's own copy
+        """
 
 
 class Quantity(NamedTuple):
@@ -154,16 +171,14 @@ class Quantity(NamedTuple):
     text: str
 
     def variable(self, values: Any) -> tuple:
-        """Return `values` as xarray.Dataset takes them: dimensions, array and attributes."""
+        """Return dimensions, array and attributes, as xarray.Dataset takes them."""
         array = np.asarray(values)
-        array = (
-            array.astype(object) if array.dtype.kind == "U" else array
-        )  # as netCDF returns texts
-        return (
-            self.dimensions,
-            array,
-            {"long_name": self.text} | ({"units": self.unit} if self.unit else {}),
-        )
+        if array.dtype.kind == "U":
+            array = array.astype(object)  # as netCDF returns texts
+        attributes = {"long_name": self.text}
+        if self.unit:
+            attributes["units"] = self.unit
+        return self.dimensions, array, attributes
 
 
 _PAIRS = ("time", "region", "destination")
@@ -192,13 +207,10 @@ VARIABLES: dict[str, Quantity] = {
         ("interval",), "s", "processor time of Controller.act, of all threads of the process"
     ),
 }
-HOST_TIMES = (
-    "decision_time",
-    "wall_time",
-    "sumo_time_s",
-    "setup_time_s",
-    "overhead_share",
-)  # differ between two runs
+SHOWN_FACTS = 30  # in the representation of a result
+SHOWN_CHARACTERS = 60  # of a fact
+# These differ between two runs of the same seed.
+HOST_TIMES = ("decision_time", "wall_time", "sumo_time_s", "setup_time_s", "overhead_share")
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,28 +219,107 @@ class Result:
 
     data: variables over time (T+1 states), interval (T decisions), region, next_region and
         destination; in SUMO over gateway and edge, too. Attributes: controller, plant, seed, step
-        (s), estimated (0 or 1), wall_time (s), and all scalar facts of the run
+        (s), estimated (0 or 1), wall_time (s), scenario, version, settings (JSON), and all scalar
+        facts of the run
 
-    `result.accumulation` is the array of that variable, `result.controller` the attribute of that
-    name; a variable comes before an attribute of the same name.
+    `result.accumulation` is the labelled array of that variable, `result["accumulation"]` its
+    values, `result.seed` the attribute of that name; `dir(result)` lists them.
     """
 
     data: "xarray.Dataset"
 
+    @property
+    def accumulation(self) -> "xarray.DataArray":
+        """Vehicles inside (veh, (T+1, R, R))."""
+        return self.data["accumulation"]
+
+    @property
+    def backlog(self) -> "xarray.DataArray":
+        """Vehicles waiting to enter (veh, (T+1, R, R))."""
+        return self.data["backlog"]
+
+    @property
+    def completed(self) -> "xarray.DataArray":
+        """Completed trips since the start (veh, (T+1,))."""
+        return self.data["completed"]
+
+    @property
+    def observed(self) -> "xarray.DataArray":
+        """Vehicles inside as the controller observed them (veh, (T+1, R, R))."""
+        return self.data["observed"]
+
+    @property
+    def perimeter(self) -> "xarray.DataArray":
+        """Commanded shares of the transfer flows (-, (T, R, R))."""
+        return self.data["perimeter"]
+
+    @property
+    def splits(self) -> "xarray.DataArray":
+        """Commanded split ratios, nominal without guidance (-, (T, R, R, R))."""
+        return self.data["splits"]
+
+    @property
+    def status(self) -> "xarray.DataArray":
+        """Status of every decision, 0 if OK (nmfd.Status, (T,))."""
+        return self.data["status"]
+
+    @property
+    def controller(self) -> str:
+        """Name of the controller."""
+        return self.data.attrs["controller"]
+
+    @property
+    def seed(self) -> int:
+        """Seed of the run."""
+        return self.data.attrs["seed"]
+
+    @property
+    def step(self) -> float:
+        """Control interval (s)."""
+        return self.data.attrs["step"]
+
+    @property
+    def sizes(self) -> Mapping[str, int]:
+        """Length of every dimension."""
+        return {str(name): size for name, size in self.data.sizes.items()}
+
+    @property
+    def total_time_spent(self) -> float:
+        """Total time spent (veh s); see nmfd.metrics.total_time_spent."""
+        if "time_spent" in self:
+            return float(self["time_spent"].sum())
+        vehicles = self["accumulation"][:-1].sum() + self["backlog"][:-1].sum()
+        return float(self.step * (vehicles + self["removed"][:-1].sum()))
+
+    @property
+    def completed_trips(self) -> float:
+        """Trips that reached their end (veh)."""
+        return float(self.data.attrs.get("completed_veh", self["completed"][-1]))
+
     @classmethod
-    def make(cls, attrs: Mapping[str, Any], **arrays: Any) -> "Result":
-        """Return the result of a closed loop with these `attrs` and the arrays of VARIABLES."""
+    def make(
+        cls, attrs: Mapping[str, Any], region_names: Sequence[str] = (), **arrays: Any
+    ) -> "Result":
+        """Return the result of a closed loop.
+
+        attrs: facts of the run
+        arrays: those of VARIABLES
+        """
         import xarray  # half a second, which few commands need
 
         times = attrs["step"] * np.arange(len(arrays["accumulation"]))
-        coordinates = {
-            "time": ("time", times, {"long_name": "time since the start", "units": "s"}),
-            "interval": (
-                "interval",
-                times[:-1],
-                {"long_name": "beginning of the interval", "units": "s"},
+        coordinates: dict[str, tuple] = {
+            "time": Quantity(("time",), "s", "time since the start").variable(times),
+            "interval": Quantity(("interval",), "s", "beginning of the interval").variable(
+                times[:-1]
             ),
         }
+        for name in ("region", "next_region", "destination"):
+            numbers = np.arange(arrays["accumulation"].shape[1])
+            coordinates[name] = Quantity((name,), "1", "number of the region").variable(numbers)
+        if len(region_names):
+            names = Quantity(("region",), "", "name of the region").variable(region_names)
+            coordinates["region_name"] = names
         variables = {name: about.variable(arrays[name]) for name, about in VARIABLES.items()}
         return cls(xarray.Dataset(variables, coordinates, dict(attrs)))
 
@@ -250,26 +341,23 @@ class Result:
         except Exception as error:
             reason = str(error).partition("\n")[0]
             raise InputError(f"{path}: is no run ({reason}); delete it and run again") from None
-        data.attrs = {
-            name: v.item() if isinstance(v, np.generic) else v for name, v in data.attrs.items()
-        }
+        for name, value in data.attrs.items():
+            if isinstance(value, np.generic):
+                data.attrs[name] = value.item()
         return cls(data)
 
     def write(self, path: Path | str) -> None:
         """Write the Dataset to the netCDF file `path`, whole or not at all."""
         data = self.data.copy()
-        data.attrs = {
-            name: int(value) if isinstance(value, bool) else value
-            for name, value in data.attrs.items()
-        }
+        for name, value in data.attrs.items():
+            if isinstance(value, bool):  # netCDF has no such type
+                data.attrs[name] = int(value)
+        encoding = {}
         for name, variable in data.variables.items():
-            if variable.dtype == np.float16:  # netCDF has no such type
+            if variable.dtype == np.float16:  # nor this one
                 data[name] = variable.astype(np.float32)
-        encoding = {
-            name: {"zlib": True, "_FillValue": None}
-            for name, variable in data.variables.items()
-            if variable.dtype.kind in "fiu"
-        }
+            if variable.dtype.kind in "fiu":
+                encoding[name] = {"zlib": True, "_FillValue": None}
         path = Path(path)
         temporary = path.with_name(f".{path.stem}-{os.getpid()}.tmp")
         try:
@@ -285,10 +373,31 @@ class Result:
         if name.startswith("__") or name == "data":
             raise AttributeError(name)
         if name in self.data.variables:
-            return self[name]
+            return self.data[name]
         if name in self.data.attrs:
             return self.data.attrs[name]
         raise AttributeError(f"result without variable or attribute {name!r}")
+
+    def __dir__(self) -> list[str]:
+        names = {*super().__dir__(), *map(str, self.data.variables), *map(str, self.data.attrs)}
+        return sorted(names)
+
+    def __repr__(self) -> str:
+        lengths = ", ".join(f"{name} {size}" for name, size in self.sizes.items())
+        facts = "\n".join(f"    {name}: {value}" for name, value in self._shown().items())
+        return f"Result of {self.data.attrs.get('controller', '?')} over {lengths}\n{facts}"
+
+    def _shown(self) -> dict[str, str]:
+        """Return facts for a screen: total time spent, and short attributes."""
+        shown = {}
+        if "accumulation" in self:
+            shown["total_time_spent"] = f"{self.total_time_spent:.6g} veh s"
+            shown["completed_trips"] = f"{self.completed_trips:,.0f}"
+        for name, value in self.data.attrs.items():
+            if len(shown) < SHOWN_FACTS and len(str(value)) <= SHOWN_CHARACTERS:
+                text = f"{value:g}" if isinstance(value, float) else str(value)
+                shown.setdefault(str(name), text)
+        return shown
 
     def __getitem__(self, name: str) -> np.ndarray:
         return self.data.variables[name].values
@@ -297,7 +406,7 @@ class Result:
         return name in self.data.variables
 
     def assign(self, **values: Any) -> "Result":
-        """Return the result with other arrays of its variables, or other attributes."""
+        """Return the result with other arrays or other attributes."""
         data = self.data.copy()
         for name, value in values.items():
             if name in data.variables:
@@ -309,22 +418,35 @@ class Result:
     def add(
         self, attrs: Mapping[str, Any], about: Mapping[str, Quantity] = {}, **arrays: np.ndarray
     ) -> "Result":
-        """Return the result with more attributes, and the `arrays` that are described in
-        `about`."""
-        variables = {
-            name: quantity.variable(arrays[name])
-            for name, quantity in about.items()
-            if name in arrays
-        }
+        """Return the result with more attributes and arrays.
+
+        about: name of an array -> its axes, unit and meaning
+        """
+        variables = {}
+        for name, quantity in about.items():
+            if name in arrays:
+                variables[name] = quantity.variable(arrays[name])
         return Result(self.data.assign(variables).assign_attrs(attrs))
 
+    def label(self, **names: Sequence[str]) -> "Result":
+        """Return the result with names of the entries of some dimensions.
+
+        names: `gateway` or `edge` -> names
+        """
+        coordinates = {}
+        for dimension, values in names.items():
+            about = Quantity((dimension,), "", f"name of the {dimension}")
+            coordinates[dimension] = about.variable(values)
+        return Result(self.data.assign_coords(coordinates))
+
     def without_times(self) -> "xarray.Dataset":
-        """Return the Dataset without wall times and key: the same for every run of the same
-        seed."""
+        """Return the Dataset without wall times and key.
+
+        It is the same for every run of the same seed.
+        """
         data = self.data.drop_vars(HOST_TIMES, errors="ignore")
-        data.attrs = {
-            name: value for name, value in data.attrs.items() if name not in (*HOST_TIMES, "key")
-        }
+        for name in (*HOST_TIMES, "key"):
+            data.attrs.pop(name, None)
         return data
 
     def _repr_html_(self) -> str:

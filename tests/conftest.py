@@ -49,8 +49,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--annotations",
         choices=("on", "off"),
         default="on",
-        help="whether types and shapes are checked at every call of nmfd, which costs half as much time again where "
-        "arrays are all there is",
+        help="whether types and shapes are checked at every call of nmfd, which costs half as much "
+        "time again where arrays are all there is",
     )
 
 

@@ -11,9 +11,9 @@ import trajectories
 
 from cosim.evaluation import evaluate, statistics
 from cosim.evaluation.simulate import FACTS
+from cosim.plant.strategy import parse
 from cosim.sumo.net import city_of
 from nmfd.api import load_scenario
-from nmfd.controllers.strategy import parse
 from nmfd.metrics import COUNTED
 from nmfd.model.scenario import with_demand
 from nmfd.runs import run_many

@@ -18,11 +18,15 @@ def programme(phases, position=0.0):
     )
 
 
-def gateway_signal(phases, movements, position=0.0):
+def gateway_signal(phases, movements, position=0.0, step=1.0):
     """A fixed-time signal, and the states that it will show."""
     shown = []
     signal = GatewaySignal(
-        programme(phases, position), movements, start=0.0, show=lambda _, state: shown.append(state)
+        programme(phases, position),
+        movements,
+        start=0.0,
+        step=step,
+        show=lambda _, state: shown.append(state),
     )
     return signal, shown
 
@@ -94,11 +98,12 @@ def test_a_link_that_is_never_red_is_held_once_per_cycle(position):
     assert {state[3] for state in states[: round(90 - position)]} == {"g"}
 
 
-def test_a_time_just_before_the_end_of_the_cycle_is_in_its_last_phase():
-    """Sums of simulation steps are off by some rounding."""
+@pytest.mark.parametrize("rounding", [-1e-7, 0.0, 1e-7])
+def test_the_end_of_the_cycle_may_be_off_by_some_rounding(rounding):
+    """Sums of simulation steps are."""
     signal, shown = gateway_signal(SINGLE, {0: 0})
-    signal.play(90.0 - 1e-7)
-    signal.play(90.0)
+    signal.play(89.0 + rounding)
+    signal.play(90.0 + rounding)
     assert shown == ["ry", "Gr"]
 
 
@@ -108,13 +113,42 @@ def test_every_window_of_a_link_keeps_its_minimum_green():
     assert held == 5 * "G" + 3 * "y" + 15 * "r" + 5 * "G" + 3 * "y" + 59 * "r"
 
 
+HALVES = [("Gr", 42.5), ("yr", 3.5), ("rG", 41.5), ("ry", 3.0)]
+SHORT = [("rG", 20.25), ("ry", 3.0), ("Gr", 0.25), ("gr", 20.0), ("yr", 3.25)]
+
+
+@pytest.mark.parametrize("phases", [HALVES, SHORT])
+@pytest.mark.parametrize("step", [0.5, 1.0])
+@pytest.mark.parametrize("share, cut", [(1.0, None), (0.0, 5.0)])
+def test_a_change_is_in_the_step_that_contains_its_time(phases, step, share, cut):
+    """SUMO's rule, for the phases of the programme and for the end of a limited green."""
+    signal, shown = gateway_signal(phases, {0: 0}, step=step)
+    signal.command(np.full(1, share))
+    cycle = sum(seconds for _, seconds in phases)
+    ends = np.cumsum([seconds for _, seconds in phases])
+    begin = next(
+        end - seconds for (state, seconds), end in zip(phases, ends, strict=True) if state[0] == "G"
+    )
+    for now in np.arange(0.0, 3 * cycle, step):
+        signal.play(now)
+        last = now + step - 0.01  # before the end of the step
+        expected = phases[int(np.searchsorted(ends, last % cycle, side="right"))][0][0]
+        if cut and last > (begin or cycle) and (last - begin) % cycle >= cut:
+            expected = "y" if (last - begin) % cycle < cut + yellow_time_of(phases) else "r"
+        assert shown[-1][0] == expected, now
+
+
+def yellow_time_of(phases):
+    return yellow_time(programme(phases).phases, 0)
+
+
 def test_u_max_is_the_original_programme_to_the_fraction_of_a_second():
     phases = [("Gr", 42.4), ("yr", 3), ("rG", 41.6), ("ry", 3)]
-    signal, _ = gateway_signal(phases, {0: 0})
+    signal, _ = gateway_signal(phases, {0: 0}, step=0.1)
     signal.command(np.ones(1))
-    while signal.next_change < 270.0:
-        signal.play(signal.next_change)
-    assert signal.green_time()["s"][0] == pytest.approx(3 * 42.4)
+    for now in np.arange(0.0, 271.0, 0.1):
+        signal.play(now)
+    assert signal.green_time()["s"][0].shown == pytest.approx(3 * 42.4)
 
 
 @pytest.mark.parametrize(
@@ -185,5 +219,7 @@ def test_a_ration_of_green_is_spent_in_every_cycle(lights, share, full, expected
         shown += last
         assert ration.opened(second) == (last == "G" and shown[-2:-1] != "G")
     assert shown == expected
-    assert ration.green_time(float(len(lights))) == shown.count("G")
+    green = ration.green_time(float(len(lights)))
+    assert green.shown == shown.count("G")
+    assert green.ungated == lights.count("G")
     assert ration.limited == (share < 1.0)

@@ -56,7 +56,8 @@ def test_examples_in_docstrings(name, tmp_path, monkeypatch):
     if name == "nmfd.rl.env":
         given["gymnasium"] = pytest.importorskip("gymnasium", reason="no extra rl")
     found = doctest.testmod(importlib.import_module(name), extraglobs=given)
-    assert found.attempted and not found.failed, "see the output above"
+    assert found.attempted
+    assert not found.failed, "see the output above"
     assert "+SKIP" not in FILES[name]
 
 

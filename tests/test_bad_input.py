@@ -3,9 +3,11 @@ nothing left behind."""
 
 import gzip
 import io
+import os
 import pickle
 import re
 import shutil
+import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -219,11 +221,10 @@ def test_demand_files(tmp_path, content):
 
 @pytest.fixture(scope="module")
 def city(tmp_path_factory):
-    """Return the folder of an imported network and its scenario."""
-    config, project = (
-        tiny_city.city(tmp_path_factory.mktemp("city")),
-        tmp_path_factory.mktemp("project"),
-    )
+    """Return the folder of a city, a controller, and the network and scenario imported from it."""
+    project = tmp_path_factory.mktemp("project")
+    config = tiny_city.city(project)
+    good(nmfd("new-controller", project / "mine.py"))
     good(cosim("import", config, "--regions", 3, "--out", project / "networks" / "tiny"))
     return project
 
@@ -285,6 +286,38 @@ def test_files_of_a_city(city, tmp_path, file, name):
     line = error_line(cosim(*command, "--out", out))
     assert path.name in line or "nowhere" in line or "has no region" in line
     assert not out.exists()
+
+
+NOT_UTF_8 = os.fsdecode(b"b\xe4d")  # as Windows of old wrote "bäd"
+REPLACED = "a${HOME}b"  # SUMO puts the variable's value there
+IN_ODD_FOLDERS = [
+    "import {odd}/city.sumocfg --regions 3 --out {good}/networks/new",
+    "import {good}/city.sumocfg --regions 3 --out {odd}/networks/new",
+    "run {odd}/scenarios/tiny --controller no-control --out {good}/out",
+    "evaluate {odd}/scenarios/tiny --controllers no-control --out {good}/out",
+    "watch {odd}/scenarios/tiny --controller no-control",
+    "identify {odd}/scenarios/tiny --out {good}/out",
+]
+IN_WRONG_FOLDERS = [
+    "run {good}/scenarios/tiny --controller no-control --out {odd}/out",
+    "run {good}/scenarios/tiny --controller {odd}/mine.py:MyController --out {good}/out",
+    "tune {good}/scenarios/tiny --controller pi-gating --option kp=0.1:1 --out {odd}/out",
+]
+
+
+@pytest.mark.skipif(sys.platform == "darwin", reason="file names are UTF-8")
+@pytest.mark.parametrize(
+    "command, name, expected",
+    [(command, NOT_UTF_8, "the name is not UTF-8") for command in IN_ODD_FOLDERS + IN_WRONG_FOLDERS]
+    + [(command, REPLACED, "SUMO puts variables") for command in IN_ODD_FOLDERS],
+)
+def test_folders_that_sumo_cannot_open(city, tmp_path, command, name, expected):
+    for folder in (tmp_path / "good", tmp_path / name):
+        shutil.copytree(city, folder)
+    before = sorted(tmp_path.rglob("*"))
+    words = [word.format(odd=tmp_path / name, good=tmp_path / "good") for word in command.split()]
+    assert expected in error_line(cosim(*words))
+    assert sorted(tmp_path.rglob("*")) == before
 
 
 def test_unsorted_routes_are_sorted(city, tmp_path):

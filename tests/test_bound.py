@@ -12,11 +12,9 @@ from commands import good, nmfd
 from nmfd import api, closed_loop
 from nmfd.api import load_scenario
 from nmfd.controllers import open_loop
-from nmfd.controllers.rules import NoControl, PiGating
 from nmfd.errors import InputError
 from nmfd.metrics import total_time_spent
 from nmfd.model import dynamics
-from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
 from nmfd.model.scenario import with_demand
 from nmfd.studies import bound
@@ -34,7 +32,7 @@ def test_where_nothing_congests_the_bound_is_an_open_perimeter(scenario):
     assert (
         plan.perimeter[:8, 0, 1].min() > 0.85
     )  # later intervals move vehicles that the horizon does not count
-    uncontrolled = closed(free, NoControl(planning_model(free)))
+    uncontrolled = closed(free, api.controller("no-control", free))
     assert closed(free, plan) == pytest.approx(uncontrolled, rel=1e-3)
 
 
@@ -64,7 +62,7 @@ def test_the_bound_is_not_above_the_closed_loop_it_started_from(scenario):
     plan = bound.compute(crowded, "bound-pc", iterations=200)
     # A sigmoid never quite reaches the bounds of u.
     assert plan.totals[plan.start] <= (1.0 + 1e-4) * closed(
-        crowded, PiGating(planning_model(crowded))
+        crowded, api.controller("pi-gating", crowded)
     )
 
 
@@ -80,7 +78,7 @@ def test_an_interrupted_descent_keeps_the_best_so_far(scenario):
 
 
 def test_a_plan_that_benchmark_replays(folder, tmp_path):
-    text = api.bound(folder, "bound-pcrg", iterations=20)
+    text = api.bound_report(api.bound(folder, "bound-pcrg", iterations=20))
     assert "(kept)" in text
     assert "from pi-gating:" in text
     assert "the best plan is at most" in text
@@ -102,10 +100,8 @@ def test_wrong_names(scenario):
 
 
 def test_files_that_do_not_fit(scenario, tmp_path):
-    path, start = (
-        tmp_path / "p.npz",
-        bound.neutral_starts(scenario.network, scenario.steps, guidance=False),
-    )
+    path = tmp_path / "p.npz"
+    start = bound.neutral_starts(scenario.network, scenario.steps, guidance=False)
     open_loop.write(bound.solve(scenario, start, guidance=False, iterations=1), scenario, path)
     assert (
         open_loop.read(path, replace(scenario, measurement_std=9.0), guidance=False).start in start
@@ -175,10 +171,8 @@ def test_every_trajectory_meets_the_relaxation(variant, guidance):
         network = replace(network, capacity=1.5 * network.adjacency, storage=np.full(7, 9000.0))
     changes = {"substeps": {"substeps": 3}, "rk4": {"integrator": "rk4"}}.get(variant, {})
     scenario = replace(scenario, network=network, **changes)
-    lp, bounded = (
-        bound.relaxation(scenario, guidance=guidance),
-        bound.lower_bound(scenario, guidance=guidance),
-    )
+    lp = bound.relaxation(scenario, guidance=guidance)
+    bounded = bound.lower_bound(scenario, guidance=guidance)
     runs = list(bound.neutral_starts(network, 12, guidance=guidance).values())
     runs += [random_controls(network, 12, random, guidance=guidance) for _ in range(5)]
     for controls in runs:

@@ -12,7 +12,7 @@ from commands import MAINS, call, error_line, good, nmfd, runs, same
 
 from nmfd import closed_loop
 from nmfd.controllers import training
-from nmfd.controllers.rules import PiGating
+from nmfd.controllers.rules import PiGate
 from nmfd.runs.run_many import run_many
 from nmfd.types import Result
 
@@ -51,7 +51,8 @@ def test_help_is_quick_fits_a_screen_and_shows_examples(package):
     )
     for name in main.commands:
         text = good(call(package, name, "--help"))
-        assert "Example" in text and f"{package} {name}" in text, name
+        assert "Example" in text, name
+        assert f"{package} {name}" in text, name
     assert time.process_time() - begin < 2.0
     alone = {
         name: value for name, value in os.environ.items() if not name.startswith("COV")
@@ -111,7 +112,7 @@ def test_settings(folder, tmp_path):
 def test_a_failing_controller_names_itself_and_the_others_are_kept(
     both, tmp_path, monkeypatch, in_process
 ):
-    monkeypatch.setattr(PiGating, "act", lambda self, measurement: 1 / 0)
+    monkeypatch.setattr(PiGate, "act", lambda self, measurement: 1 / 0)
     result = nmfd(*both)
     assert result.exit_code == 1
     assert result.stderr.count("\n") == 1

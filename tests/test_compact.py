@@ -11,6 +11,7 @@ from commands import good, nmfd
 
 from nmfd.api import load_scenario
 from nmfd.controllers import training
+from nmfd.controllers.base import from_table
 from nmfd.controllers.dpc.compact import FILL_TIME_S, CompactPolicy, Numbers
 from nmfd.controllers.dpc.policy import Architecture, DpcController
 from nmfd.controllers.dpc.policy_file import load_policy
@@ -113,7 +114,7 @@ def test_with_an_integral_it_contains_the_pi_gate_and_relief_comes_on_top(networ
         protected=(CENTRE,),
         controller_options={"pi-gating": {"set_point": [0.8 * critical], "kp": 1.2, "ki": ki}},
     )
-    gate = PiGating(planning)
+    gate = from_table(PiGating, planning, "pi-gating").make(planning)
     numbers = Numbers(set_point=0.8, gain=1.2 / span, integral=ki * planning.step / span)
     alone, relieved = (
         DpcController(policy(network, numbers._replace(relief=relief), guidance=False))
@@ -196,7 +197,7 @@ def test_it_is_trained_and_kept_in_a_file(tmp_path):
     assert trained.numbers[1] == rule.policy.numbers[1]  # kept
     setup = training.settings(loaded, parse("dpc-pcrg"))
     untrained = training.validate(
-        rule.policy, Rollout(planning_model(loaded, "dpc-pcrg")), 0, setup
+        rule.policy, Rollout(parse("dpc-pcrg").own_planning(loaded)), 0, setup
     )
     assert content["configuration"]["validation_veh_s"] < untrained
     good(
@@ -213,9 +214,12 @@ def test_it_is_trained_and_kept_in_a_file(tmp_path):
 
 @pytest.mark.parametrize(
     "numbers, protected, problem",
-    [([-1.0] * 8, (3,), "numbers: expected 8 to 11 numbers >= 0"), ([1.0] * 7, (3,), "numbers: should have at least 8"),
-     ([1.0] * 8, (), "numbers: expected a scenario with protected regions")],
-)  # fmt: skip
+    [
+        ([-1.0] * 8, (3,), "numbers: expected 8 to 11 numbers >= 0"),
+        ([1.0] * 7, (3,), "numbers: should have at least 8"),
+        ([1.0] * 8, (), "numbers: expected a scenario with protected regions"),
+    ],
+)
 def test_wrong_numbers_of_a_rule(numbers, protected, problem):
     options = {"pricing-rule": {"numbers": numbers}}
     scenario = replace(

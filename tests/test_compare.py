@@ -3,6 +3,7 @@ itself."""
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,10 +11,11 @@ import tiny
 import torch
 import trajectories
 
-from cosim.evaluation.identify import _protected, as_it_was, static_model
+from cosim.evaluation import identify, model_validation
+from cosim.evaluation.identify import as_it_was, static_model
 from cosim.evaluation.model_validation import held_up, observed, outflow_samples, predict
+from cosim.plant.strategy import parse
 from nmfd.api import load_scenario
-from nmfd.controllers.strategy import parse
 from nmfd.model import dynamics, mfd
 from nmfd.model.identification import observed_split_ratios
 from nmfd.model.regional_model import load_network, network_toml
@@ -69,7 +71,7 @@ def result(scenario):
 
 
 def test_a_perfect_model_has_no_error(scenario, result):
-    assert np.abs(predict(scenario, result).accumulation - result.accumulation).max() < 1e-6
+    assert np.abs(predict(scenario, result).accumulation - result["accumulation"]).max() < 1e-6
     rows = predictions(scenario.network, [observed(result)], scenario.scheme)
     assert rows[["next_interval_rmse_share", "ahead_rmse_share"]].to_numpy().max() < 1e-4
 
@@ -77,12 +79,35 @@ def test_a_perfect_model_has_no_error(scenario, result):
 def test_a_model_that_discharges_too_slowly_holds_too_many(scenario, result):
     slow = tuple(replace(m, a=0.9 * m.a, b=0.9 * m.b, c=0.9 * m.c) for m in scenario.network.mfds)
     wrong = replace(scenario, network=replace(scenario.network, mfds=slow))
-    off = predict(wrong, result).accumulation.sum(axis=2) - result.accumulation.sum(axis=2)
+    off = predict(wrong, result).accumulation.sum(axis=2) - result["accumulation"].sum(axis=2)
     assert off.sum(axis=1).mean() > 100
     rows = predictions(wrong.network, [observed(result)], wrong.scheme)
     whole = np.sqrt((off**2).mean(axis=0)) / wrong.network.critical
     assert (rows["next_interval_rmse_share"] < rows["ahead_rmse_share"]).all()
     assert rows["next_interval_rmse_share"].mean() < whole.mean()
+
+
+def test_errors_where_the_critical_accumulation_was_not_seen(scenario, result):
+    """Shares are of the largest accumulation that was seen, if anybody drove there."""
+    network = scenario.network
+    critical = network.critical
+    unseen = replace(scenario, network=replace(network, critical_above={0: 50.0, 1: 0.0}))
+    late = result.assign(accumulation=result["accumulation"] + 1.0)
+    errors = model_validation._errors(unseen, [result], [late])
+    errors.insert(0, "demand", 1.0)
+    errors.insert(1, "controller", "no-control")
+    base = [50.0, np.nan, *critical[2:]]
+    np.testing.assert_allclose(errors["share_of_veh"], base)
+    np.testing.assert_allclose(errors["whole_run_rmse_share"], 7.0 / np.array(base))
+    most = result["accumulation"].sum(axis=2).max(axis=0)
+    np.testing.assert_allclose(errors["most_share"], most / np.array(base))
+    assert errors["critical_veh"].isna().tolist() == [True, True, *[False] * 5]
+    table = model_validation.prediction_table(errors)
+    assert "nan" not in table
+    assert "inf" not in table
+    assert "(where it was not seen, of the largest one that was)" in " ".join(table.split())
+    alone = model_validation.prediction_table(errors[errors["region"] == 1])
+    assert alone.splitlines()[1].split()[:7] == ["1", "no-control", "1", "hexagon7", "-", "-", "-"]
 
 
 def test_the_model_of_those_who_drive():
@@ -233,13 +258,43 @@ def test_an_empty_region_keeps_its_model_in_identification(scenario, result):
 def test_the_regions_to_protect_are_proposed_and_written(tmp_path):
     loaded = load_scenario(tiny.write(tmp_path, network=tiny.row_network(3)))
     file = loaded.folder / "scenario.toml"
-    assert _protected(loaded, (), write=True) == _protected(loaded, (1,), write=True) == []
     before = file.read_text()
-    (line,) = _protected(loaded, (0, 2), write=False)
+    assert identify._proposal(loaded, (), written=True) == []
+    assert identify._proposal(loaded, (1,), written=True) == []
+    (line,) = identify._proposal(loaded, (0, 2), written=False)
     assert "protected = [0, 2] instead of [1] in" in line
     assert file.read_text() == before
-    _protected(loaded, (0, 2), write=True)
+    identify._write_protected(loaded, (0, 2))
     assert file.read_text() == before.replace("protected = [1]", "protected = [0, 2]")
     file.write_text(before.replace("protected = [1]\n", ""))
-    _protected(loaded, (2,), write=True)
+    identify._write_protected(loaded, (2,))
     assert load_scenario(loaded.folder).protected == (2,)
+
+
+def test_the_same_command_goes_on_after_ctrl_c_in_the_second_model(tmp_path, monkeypatch):
+    """Until its end the command changes nothing that its loading runs depend on."""
+    folder = tiny.write(tmp_path, network=tiny.row_network(3))
+    before = (folder / "scenario.toml").read_text()
+    verdict = SimpleNamespace(protect=(0, 2), sentences=("Yes.",))
+    found = SimpleNamespace(verdict=verdict, write=lambda out, target: None, fit_text=lambda: "")
+    tasks, stopped = [], [True]
+
+    def identified(task):
+        tasks.append(task)
+        if task.guided and stopped:
+            raise KeyboardInterrupt("finished runs are in a/b; the same command with --out a/b")
+        return found
+
+    monkeypatch.setattr(identify, "identified", identified)
+    out = tmp_path / "out"
+    with pytest.raises(KeyboardInterrupt) as interrupted:
+        identify.identify(folder, protect=True, out=out)
+    assert str(interrupted.value) == f"finished runs are in {out}; the same command goes on"
+    assert (folder / "scenario.toml").read_text() == before
+    stopped.clear()
+    said = identify.identify(folder, protect=True, out=out)
+    assert said.count("protected = [0, 2] instead of [1]") == 1
+    assert "was written there" in said
+    assert [task.scenario.protected for task in tasks] == [(1,), (0, 2)] * 2
+    assert [task.out for task in tasks] == [out, out / "guided"] * 2
+    assert load_scenario(folder).protected == (0, 2)

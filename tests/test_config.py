@@ -71,7 +71,8 @@ class Table(Settings):
         ),
         (
             {"quux": 3},
-            "quux: unknown key; allowed here: share, count, flag, name, names, numbers, gains, rows, table",
+            "quux: unknown key; allowed here: share, count, flag, name, names, numbers, gains, "
+            "rows, table",
         ),
         ({"count": 7}, "a.b: takes both; omit one"),
     ],

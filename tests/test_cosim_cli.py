@@ -15,10 +15,10 @@ from commands import cosim, error_line, good
 
 from cosim import api
 from cosim.evaluation.model_validation import predict
+from cosim.plant.strategy import parse
 from nmfd.api import load_scenario
 from nmfd.controllers.dpc.policy import Architecture, Policy
 from nmfd.controllers.dpc.policy_file import checkpoint
-from nmfd.model.planning import planning_model
 from nmfd.model.regional_model import load_network
 from nmfd.types import Result
 
@@ -39,7 +39,7 @@ def small(tmp_path_factory):
     scenario = load_scenario(folder / "scenarios" / "small")
     for name, guidance in (("dpc-pc", False), ("dpc-pcrg", True)):
         torch.manual_seed(0)
-        network = planning_model(scenario, name).network
+        network = parse(name).own_planning(scenario).network
         policy = Policy(network, Architecture(width=8, guidance=guidance))
         torch.save(checkpoint(policy, network, {}), scenario.folder / f"{name}.pt")
     return scenario.folder
@@ -61,8 +61,8 @@ def test_every_controller_runs(small, tmp_path, controller):
     assert controller in text
     assert result.controller == controller
     assert result.plant == "sumo"
-    assert len(result.accumulation) == 4
-    assert result.accumulation[-1].sum() > 0
+    assert len(result["accumulation"]) == 4
+    assert result["accumulation"][-1].sum() > 0
     assert (out / "total_accumulation.png").stat().st_size > 10_000
 
 
@@ -150,7 +150,7 @@ def test_outputs_of_sumo_agree_with_ours(small, tmp_path):
     trips = ElementTree.parse(tmp_path / "trips.xml").getroot()
     assert sum(float(trip.get("depart")) >= 0 for trip in trips) == result.departed_veh > 0
     last = ElementTree.parse(tmp_path / "summary.xml").getroot()[-1]
-    assert int(last.get("running")) == result.accumulation[-1].sum()
+    assert int(last.get("running")) == result["accumulation"][-1].sum()
 
 
 RUN = ("run", "{small}", "--controller", "no-control", "--out", "{tmp}/out")

@@ -13,12 +13,11 @@ from cosim.evaluation.simulate import Simulation, estimation_errors, simulate
 from cosim.plant.detectors import instruments, lay_out, probes
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import Settings, settings
+from cosim.plant.strategy import parse
 from cosim.sumo.net import city_of
-from nmfd import closed_loop
+from nmfd import api, closed_loop
 from nmfd.api import controller as make_controller
 from nmfd.api import load_scenario
-from nmfd.controllers.rules import PiGating
-from nmfd.controllers.strategy import parse
 from nmfd.model.planning import planning_model
 from nmfd.types import Controls
 
@@ -42,7 +41,7 @@ def drive(scenario, controller=None, planning=None, settings=None, **overrides):
     plant = SumoPlant(scenario, settings=settings or Settings(**overrides), planning=planning)
     with closing(plant):
         return closed_loop.run(
-            plant, controller or PiGating(planning_model(scenario)), scenario, seed=3
+            plant, controller or api.controller("pi-gating", scenario), scenario, seed=3
         )
 
 
@@ -103,7 +102,7 @@ def test_all_links_and_all_probes_see_everything(scenario):
     )
     seen = []
     with closing(plant):
-        state, controller = plant.reset(3), PiGating(planning_model(scenario))
+        state, controller = plant.reset(3), api.controller("pi-gating", scenario)
         readings = plant._estimation.readings
         plant._estimation.readings = lambda: (seen.append(readings()), seen[-1])[1]
         for _ in range(scenario.steps):
@@ -145,7 +144,7 @@ def test_estimating_changes_nothing_but_what_is_seen(scenario, run):
     exact = drive(scenario, again)
     assert not exact.estimated
     assert run.estimated
-    assert (exact.accumulation == run.accumulation).all()
+    assert (exact["accumulation"] == run.accumulation).all()
 
 
 def test_states_are_estimated_with_the_model_of_those_who_drive():

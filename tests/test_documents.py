@@ -11,40 +11,41 @@ import pytest
 from commands import MAINS
 from documents import FILES, ROOT, kind, read
 
-from nmfd.controllers.strategy import parse
+from cosim.plant.strategy import parse
 from nmfd.runs import shipped
 
 # What a reader replaces, and files and folders that are not kept here: a path that begins so need
 # not exist.
-PLACEHOLDERS = tuple(
-    [
-        "runs",
-        "networks/mycity",
-        "scenarios/mycity",
-        "mycity",
-        "city.",
-        "mine",
-        "scenarios/mine",
-        "networks/mine",
-        "counts.csv",
-        "detectors.csv",
-        "regions.csv",
-        "about.csv",
-        "dpc-pcrg.onnx",
-        "bologna/",
-        "ingolstadt21/",
-        "cologne8/",
-        "luxembourg/",
-        "networks/ingolstadt",
-        "networks/cologne",
-        "FILE",
-        "NAME",
-        "build/",
-        "SCENARIO",
-        "DIR",
-    ]
+PLACEHOLDERS = (
+    "runs",
+    "networks/mycity",
+    "scenarios/mycity",
+    "mycity",
+    "city.",
+    "mine",
+    "scenarios/mine",
+    "networks/mine",
+    "counts.csv",
+    "detectors.csv",
+    "regions.csv",
+    "about.csv",
+    "dpc-pcrg.onnx",
+    "bologna/",
+    "ingolstadt21/",
+    "cologne8/",
+    "luxembourg/",
+    "networks/ingolstadt",
+    "networks/cologne",
+    "FILE",
+    "NAME",
+    "build/",
+    "SCENARIO",
+    "DIR",
 )
-SUFFIXES = r"py|md|toml|csv|png|txt|json|nc|npz|pt|onnx|xml|gz|parquet|css|js|j2|ipynb|html|mp4|log|tmp|lock"
+SUFFIXES = (
+    "py|md|toml|csv|png|txt|json|nc|npz|pt|onnx|xml|gz|parquet|css|js|j2|ipynb|html|mp4|log|"
+    "tmp|lock"
+)
 PATH = re.compile(rf"(?:\.?[\w+=-]+/)*\.?[\w.+-]*\w\.(?:{SUFFIXES})|(?:\.?[\w+-]+/)+[\w+-]*")
 PYTHON = re.compile(r"(?:nmfd|cosim)(?:\.\w+)+")
 OPTION = re.compile(r"--[a-z][\w-]*")

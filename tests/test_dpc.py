@@ -10,11 +10,13 @@ import tiny
 import torch
 
 import nmfd
+from nmfd import api
 from nmfd.api import load_scenario
 from nmfd.controllers import training
+from nmfd.controllers.dpc import first_policy
+from nmfd.controllers.dpc.options import Dpc
 from nmfd.controllers.dpc.policy import FILL_TIME_S, MOST_PRICE, Architecture, DpcController, Policy
 from nmfd.controllers.dpc.policy_file import checkpoint, load, load_policy
-from nmfd.controllers.rules import PiGating
 from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
 from nmfd.model import dynamics
@@ -159,10 +161,8 @@ def test_training_lowers_the_total_time_spent(tmp_path, scenario):
     rollout = training.Rollout(planning_model(scenario))
     torch.manual_seed(0)
     fresh = Policy(scenario.network, Architecture())
-    after = training.validate(
-        load_policy(trained, scenario.network)[0], rollout, 0, training.Training()
-    )
-    assert after < training.validate(fresh, rollout, 0, training.Training())
+    after = training.validate(load_policy(trained, scenario.network)[0], rollout, 0, Dpc())
+    assert after < training.validate(fresh, rollout, 0, Dpc())
 
 
 def test_resume_needs_something_to_resume_and_the_same_settings(tmp_path, scenario, monkeypatch):
@@ -178,6 +178,59 @@ def test_resume_needs_something_to_resume_and_the_same_settings(tmp_path, scenar
         training.train(scenario, parse("dpc-pc"), seed=0, out=out, steps=4, progress=interrupt)
     with pytest.raises(InputError, match="seed: was 0, now 1"):
         training.train(scenario, parse("dpc-pc"), seed=1, out=out, steps=4, resume=True)
+
+
+@pytest.mark.parametrize("content", [{}, {"configuration": 1}, [1.0]], ids=str)
+def test_what_is_no_state_of_a_training_cannot_be_resumed(tmp_path, scenario, content):
+    out = tmp_path / "p.pt"
+    torch.save(content, tmp_path / "p.pt.resume")
+    with pytest.raises(InputError, match="is no state of a training; train without") as caught:
+        training.train(scenario, parse("dpc-pc"), seed=0, out=out, steps=4, resume=True)
+    one_line(caught, tmp_path / "p.pt.resume")
+
+
+def test_a_policy_cannot_be_resumed(tmp_path, scenario):
+    """Nor the state of another architecture, though the settings are the same."""
+    out = tmp_path / "p.pt"
+    training.train(scenario, parse("dpc-pc"), seed=0, out=out, steps=1)
+    trained = torch.load(out, weights_only=True)
+    for wrong in ({}, {"policy": {}}, {"policy": trained["weights"], "optimizer": {}}):
+        torch.save({**trained, **wrong}, tmp_path / "p.pt.resume")
+        with pytest.raises(InputError, match="is no state of a training"):
+            training.train(scenario, parse("dpc-pc"), seed=0, out=out, steps=1, resume=True)
+
+
+@pytest.fixture
+def default_dtype():
+    yield torch.set_default_dtype
+    torch.set_default_dtype(torch.float32)
+
+
+@pytest.mark.parametrize(
+    "controller, table",
+    [
+        ("dpc-pc", {"noise": 0.1, "demand_high": 2.0}),
+        ("dpc-pcrg", {"prices": True, "metering": True}),
+        ("dpc-pcrg", {"compact": True}),
+        ("dpc-pcrg", {"preset": "published"}),
+        ("dpc-pc", {"from_gating": True}),
+    ],
+)
+def test_torch_s_default_dtype_changes_nothing(
+    tmp_path, scenario, default_dtype, monkeypatch, controller, table
+):
+    """float64 is a usual first line of scripts: the same weights, and the same run."""
+    monkeypatch.setattr(first_policy, "GATE_STEPS", 3)
+    chosen = replace(scenario, controller_options={controller: table})
+    files, runs = [], []
+    for dtype in (torch.float32, torch.float64):
+        default_dtype(dtype)
+        out = tmp_path / f"{dtype}.pt"
+        files.append(training.train(chosen, parse(controller), seed=0, out=out, steps=2))
+        runs.append(nmfd.run(chosen, controller, policy=out, progress=False))
+    assert files[0].read_bytes() == files[1].read_bytes()
+    np.testing.assert_array_equal(runs[0].perimeter, runs[1].perimeter)
+    np.testing.assert_array_equal(runs[0].accumulation, runs[1].accumulation)
 
 
 @pytest.mark.parametrize("controller", ["dpc-pc", "dpc-pcrg"])
@@ -353,14 +406,14 @@ def test_a_policy_begins_as_a_gate(scenario):
     generator = torch.Generator().manual_seed(0)
     torch.manual_seed(0)
     made = Policy(network, Architecture(width=32, guidance=False))
-    training.begin_as_gate(made, rollout, generator)
+    first_policy.begin_as_gate(made, rollout, generator)
     x, _ = rollout.random_start(50, 0.0, 1.0, generator)
     x = torch.where(x[:, 1:].sum((1, 2), keepdim=True) > 1.0, x, torch.full_like(x, 50.0))
     shares = []
     for full in (0.7, 1.0, 1.4):
         filled = x.clone()
         filled[:, 1] *= (
-            full * PiGating(planning_model(scenario)).set_point[0] / x[:, 1].sum(-1)
+            full * api.controller("pi-gating", scenario).set_point[0] / x[:, 1].sum(-1)
         ).unsqueeze(-1)
         with torch.no_grad():
             shares.append((made(filled)[0] - network.u_min) / (network.u_max - network.u_min))
@@ -374,7 +427,7 @@ PEAK = load_scenario(Path(__file__).parents[1] / "scenarios" / "grid7_peak")
 PEAK = replace(PEAK, steps=12, demand=PEAK.demand[20:32], measurement_std=0.0)
 
 
-class Gated:
+class Gated(torch.nn.Module):
     """Policy with gates and metering that depend on the state; a third of the nominal split ratios
     are exchanged."""
 
@@ -384,7 +437,7 @@ class Gated:
         torch.from_numpy(PEAK.network.adjacency),
     )
 
-    def __call__(self, x):
+    def forward(self, x):
         perimeter = self.gates * (0.2 + 0.5 * torch.exp(-x.sum(-1, keepdim=True) / 50.0))
         return perimeter, self.usual.lerp(self.usual.roll(1, -1), 1.0 / 3.0)
 

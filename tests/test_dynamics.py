@@ -71,7 +71,8 @@ def test_who_is_where_he_wants_to_be_is_not_sent_on(network):
 
 
 def test_one_region_with_a_linear_mfd_decays_exponentially():
-    mfds, adjacency = (Cubic(a=0.0, b=0.0, c=0.0042, jam=10_000.0),), np.zeros((1, 1), dtype=bool)
+    mfds = (Cubic(a=0.0, b=0.0, c=0.0042, jam=10_000.0),)
+    adjacency = np.zeros((1, 1), dtype=bool)
     p = dynamics.parameters(
         replace(NETWORK, region_names=("only",), adjacency=adjacency, mfds=mfds)
     )
@@ -140,17 +141,13 @@ def test_gradients_against_finite_differences(integrator, filling, network):
 def test_torch_and_casadi_agree(integrator, substeps, network):
     """Over a rollout into the jam and beyond, with new controls in every interval."""
     random = np.random.default_rng(6)
-    p, x, twin, most = (
-        ipopt.parameters(network),
-        torch.zeros(7, 7, dtype=torch.float64),
-        ca.DM(7, 7),
-        0.0,
-    )
+    p = ipopt.parameters(network)
+    x = torch.zeros(7, 7, dtype=torch.float64)
+    twin = ca.DM(7, 7)
+    most = 0.0
     for _ in range(120):
-        demand, (perimeter, splits) = (
-            random.uniform(0.0, 2.0, (7, 7)),
-            random_controls(random, NETWORK),
-        )
+        demand = random.uniform(0.0, 2.0, (7, 7))
+        perimeter, splits = random_controls(random, NETWORK)
         scheme = {"step": STEP, "integrator": integrator, "substeps": substeps}
         inputs = (torch.from_numpy(array) for array in (demand, perimeter, splits))
         x = dynamics.advance(dynamics.parameters(network), x, *inputs, **scheme)
@@ -196,3 +193,28 @@ def test_exit_rates_scale_what_leaves():
     )
     torch.testing.assert_close(scaled[0], plain[0] * torch.from_numpy(rates.diagonal().copy()))
     torch.testing.assert_close(scaled[1], plain[1] * torch.from_numpy(rates)[:, None, :])
+
+
+@pytest.mark.parametrize("integrator", dynamics.SCHEMES)
+def test_an_interval_that_counts_is_the_same_interval(integrator):
+    """And what it counts is what is missing at its end."""
+    x, demand, perimeter, splits = random_tensors(9, filling=6000.0)
+    options = {"integrator": integrator, "substeps": 2}
+    plain = dynamics.advance(PARAMETERS, x, demand, perimeter, splits, STEP, **options)
+    after, ended = dynamics.advance_counted(
+        PARAMETERS, x, demand, perimeter, splits, STEP, **options
+    )
+    torch.testing.assert_close(after, plain, rtol=1e-12, atol=0.0)
+    torch.testing.assert_close(ended, (x + STEP * demand - after).sum(), rtol=1e-9, atol=0.0)
+
+
+def test_metering_admits_in_proportion_and_keeps_the_rest_waiting():
+    """Two regions: 30 vehicles wait and 1 veh/s comes, in the first, where 1 veh/s may depart."""
+    backlog = torch.tensor([[10.0, 20.0], [0.0, 0.0]])
+    demand = torch.tensor([[0.0, 1.0], [0.2, 0.0]])
+    admitted, waiting = dynamics.admitted(backlog, demand, torch.tensor([1.0, 1.0]), 20.0)
+    torch.testing.assert_close(admitted, torch.tensor([[0.2, 0.8], [0.2, 0.0]]))
+    torch.testing.assert_close(waiting, torch.tensor([[6.0, 24.0], [0.0, 0.0]]))
+    admitted, waiting = dynamics.admitted(backlog, demand, None, 20.0)
+    torch.testing.assert_close(admitted, torch.tensor([[0.5, 2.0], [0.2, 0.0]]))
+    assert not waiting.any()

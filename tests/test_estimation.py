@@ -71,11 +71,9 @@ class Crowd:
             size=(REGIONS,) * 3
         )
         each = np.clip(each, 0.0, 3.0)
-        mean, crossings, departures = (
-            np.zeros(REGIONS),
-            np.zeros((REGIONS, REGIONS)),
-            np.zeros((REGIONS, REGIONS)),
-        )
+        mean = np.zeros(REGIONS)
+        crossings = np.zeros((REGIONS, REGIONS))
+        departures = np.zeros((REGIONS, REGIONS))
         shares = np.array([self._known.probe_share, 1.0 - self._known.probe_share])
         for _ in range(SCENARIO.substeps):
             x = self.accumulation
@@ -125,11 +123,9 @@ class Crowd:
 
 def watch(seed, known, *, steps=40, changed=lambda observation: observation, wrong=1.0):
     """Truth and estimate (steps, R, R), and what the detectors said (steps, R)."""
-    crowd, estimator, rows = (
-        Crowd(seed, known, wrong=wrong),
-        Estimator(planning_model(SCENARIO), known),
-        [],
-    )
+    crowd = Crowd(seed, known, wrong=wrong)
+    estimator = Estimator(planning_model(SCENARIO), known)
+    rows = []
     for k in range(steps):
         observation = crowd.step(k)
         estimate = estimator.step(OPEN, changed(observation))
@@ -294,9 +290,10 @@ def readings(known, *, mean=40.0, expansion=0.1, crossings=9.0, x=25.0, probes=1
         probes=np.full((REGIONS, REGIONS), 3.0),
         probe_departures=np.full((REGIONS, REGIONS), 4.0),
     )
-    columns = model._readings(
-        z, np.full(REGIONS**2, leaving), observation, observation.accumulation
+    prediction = estimation._Prediction(
+        z, covariance=torch.zeros(0), leaving=np.full(REGIONS**2, leaving)
     )
+    columns = model._compared(prediction, observation, observation.accumulation)
     ends = np.cumsum([REGIONS, len(model._boundaries), REGIONS**2, REGIONS**2])
     kinds = [np.split(column, ends) for column in columns]
     assert all(np.ptp(part) == 0 for kind in kinds for part in kind)
@@ -369,13 +366,14 @@ def test_the_noise_of_one_flow_by_hand():
     moves = torch.zeros(len(model._turns) + REGIONS + REGIONS**2, dtype=torch.float64)
     here, onward, bound = (int(n) for n in model._turns[0])
     crossing = int(np.flatnonzero((model._boundaries == [here, onward]).all(axis=1))[0])
-    moves[0], left, before = 9.0, REGIONS * here + bound, REGIONS**2 + here
-    came, after, passed = (
-        REGIONS * onward + bound,
-        REGIONS**2 + onward,
-        REGIONS**2 + REGIONS + crossing,
-    )
-    probe, kept = REGIONS**2 + REGIONS + len(model._boundaries), np.exp(-SCENARIO.step / 900.0)
+    moves[0] = 9.0
+    left = REGIONS * here + bound
+    came = REGIONS * onward + bound
+    before = REGIONS**2 + here
+    after = REGIONS**2 + onward
+    passed = REGIONS**2 + REGIONS + crossing
+    probe = REGIONS**2 + REGIONS + len(model._boundaries)
+    kept = np.exp(-SCENARIO.step / 900.0)
     for leaving in (0.0, 50.0):  # turns stray by a share of what leaves the cell
         out = torch.zeros(REGIONS**2, dtype=torch.float64).index_fill(
             0, torch.tensor([left]), leaving

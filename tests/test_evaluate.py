@@ -14,8 +14,8 @@ from commands import cosim, error_line, good
 from filelock import FileLock, Timeout
 
 from cosim.evaluation import evaluate, results
+from cosim.plant.strategy import parse
 from nmfd.api import load_scenario
-from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
 from nmfd.model.scenario import with_demand
 
@@ -52,12 +52,18 @@ def ran(monkeypatch):
 
 
 def evaluated(
-    city, tmp_path, *, controllers=("no-control", "pi-gating"), seeds=(2000, 2001), levels=(1.0,)
+    city,
+    tmp_path,
+    *,
+    controllers=("no-control", "pi-gating"),
+    seeds=(2000, 2001),
+    levels=(1.0,),
+    overwrite=False,
 ):
     scenario = with_demand(load_scenario(city), steps=STEPS)
     strategies = [parse(name) for name in controllers]
     runs = evaluate.plan([(scenario, levels)], strategies, seeds)
-    return evaluate.evaluate(runs, tmp_path / "out", progress=False)
+    return evaluate.evaluate(runs, tmp_path / "out", overwrite=overwrite, progress=False)
 
 
 @pytest.mark.parametrize(
@@ -124,7 +130,9 @@ def test_only_runs_that_a_change_concerns_are_done_again(
     evaluated(city, tmp_path)
     ran.clear()
     change(city / file, old, new)
-    evaluated(city, tmp_path)
+    with pytest.raises(InputError, match="is a run with other settings"):
+        evaluated(city, tmp_path)
+    evaluated(city, tmp_path, overwrite=True)
     assert {name for name, _, _ in ran} == again
 
 

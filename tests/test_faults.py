@@ -19,9 +19,8 @@ from cosim.sumo.net import city_of
 from nmfd import faults
 from nmfd.api import load_scenario
 from nmfd.closed_loop import run
-from nmfd.controllers.rules import NoControl
+from nmfd.controllers.rules import Constant
 from nmfd.errors import InputError
-from nmfd.model.planning import planning_model
 from nmfd.model.plant import AcyclicPlant, NmfdPlant
 from nmfd.types import Controls
 
@@ -37,11 +36,11 @@ def scenario(tmp_path_factory):
     return load_scenario(tiny.write(tmp_path_factory.mktemp("tiny"), scenario=text))
 
 
-class Diary(NoControl):
+class Diary(Constant):
     """No control that keeps its observations."""
 
     def __init__(self, scenario):
-        super().__init__(planning_model(scenario))
+        super().__init__("diary", Controls(perimeter=scenario.network.open_perimeter))
         self.seen = []
 
     def act(self, measurement):
@@ -54,7 +53,11 @@ def driven(scenario, *ordered):
     diary = Diary(scenario)
     result = run(NmfdPlant(scenario), diary, replace(scenario, faults=ordered), seed=0)
     assert [m.step for m in diary.seen] == list(range(scenario.steps))
-    return result.accumulation[:-1], np.stack([m.accumulation for m in diary.seen]), result.note
+    return (
+        result["accumulation"][:-1],
+        np.stack([m.accumulation for m in diary.seen]),
+        result["note"],
+    )
 
 
 def check_notes(notes, begin, end, text):
@@ -85,16 +88,18 @@ def test_a_region_without_measurements(scenario):
     check_notes(notes, 4, 10, "measurement 2 of 4 entries missing, last ones used")
 
 
-class Mad(NoControl):
+class Mad(Constant):
     """A controller of which one number is not finite in interval 3."""
 
     def act(self, measurement):
         shapes = {"perimeter": (2, 2), "splits": (2, 2, 2), "prices": (2,), "metering": (2,)}
         arrays = {
-            "perimeter": np.ones((2, 2)),
+            "perimeter": np.full((2, 2), 0.5),
             "splits": None,
-            self.wrong: np.ones(shapes[self.wrong]),
         }
+        arrays[self.wrong] = np.full(shapes[self.wrong], 0.5)
+        if self.wrong == "splits":
+            arrays["splits"] = self.splits.copy()
         if measurement.step == 3:
             arrays[self.wrong][self.at] = self.value
         return Controls(**arrays)
@@ -107,8 +112,9 @@ class Mad(NoControl):
 )
 @pytest.mark.parametrize("value", [np.nan, -np.inf])
 def test_a_number_that_is_not_finite_is_named(scenario, plant, wrong, at, value):
-    controller = Mad(planning_model(scenario))
+    controller = Mad("no-control", Controls(perimeter=scenario.network.open_perimeter))
     controller.wrong, controller.at, controller.value = wrong, at, value
+    controller.splits = scenario.network.nominal_splits
     expected = (
         f"no-control: interval 3: {wrong}{list(at)}: expected a finite number, got {value} instead"
     )

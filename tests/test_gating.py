@@ -6,12 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from nmfd import api
 from nmfd.api import load_scenario
 from nmfd.closed_loop import run
-from nmfd.controllers.rules import PiGating, Probing
 from nmfd.errors import InputError
 from nmfd.metrics import summary
-from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
 from nmfd.types import Observation, Status
 
@@ -41,15 +40,15 @@ def with_options(**options):
 
 
 def test_benchmark_row():
-    trajectory = run(NmfdPlant(SCENARIO), PiGating(planning_model(SCENARIO)), SCENARIO, seed=0)
+    trajectory = run(NmfdPlant(SCENARIO), api.controller("pi-gating", SCENARIO), SCENARIO, seed=0)
     row = summary(trajectory)
     assert row["total_time_spent_veh_s"] == pytest.approx(8.9e7, rel=0.02)
     assert row["final_accumulation_veh"] < 500.0
-    assert trajectory.accumulation[:, CENTRE].sum(axis=1).max() < 1.25 * CRITICAL
+    assert trajectory["accumulation"][:, CENTRE].sum(axis=1).max() < 1.25 * CRITICAL
 
 
 def test_only_the_entries_are_metered_and_within_bounds():
-    controller, random = PiGating(planning_model(SCENARIO)), np.random.default_rng(0)
+    controller, random = api.controller("pi-gating", SCENARIO), np.random.default_rng(0)
     others = NETWORK.adjacency.copy()
     others[:, CENTRE] = False
     for step in range(100):
@@ -66,7 +65,7 @@ def test_the_integral_does_not_wind_up(long, then, limit):
     """After hours at one bound, the gate leaves it as fast as after ten minutes."""
     gates = []
     for intervals in (20, 1000):
-        controller = PiGating(planning_model(SCENARIO))
+        controller = api.controller("pi-gating", SCENARIO)
         for step in range(intervals):
             controls = controller.act(seen(long * CRITICAL, step))
         assert gate(controls) == getattr(NETWORK, limit)
@@ -76,14 +75,14 @@ def test_the_integral_does_not_wind_up(long, then, limit):
 
 
 def test_one_step_by_hand():
-    controller = PiGating(planning_model(with_options(set_point=[3000.0], kp=0.5, ki=0.001)))
+    controller = api.controller("pi-gating", with_options(set_point=[3000.0], kp=0.5, ki=0.001))
     controller.act(seen(3000.0))
     by_hand = 0.9 + (0.5 * (3000.0 - 3600.0) + 0.001 * 30.0 * (3000.0 - 3600.0)) / CRITICAL
     assert gate(controller.act(seen(3600.0, 1))) == pytest.approx(by_hand, rel=1e-12)
 
 
 def test_reset_forgets():
-    controller = PiGating(planning_model(SCENARIO))
+    controller = api.controller("pi-gating", SCENARIO)
     for step in range(5):
         controller.act(seen(2.0 * CRITICAL, step))
     controller.reset()
@@ -102,7 +101,7 @@ def test_reset_forgets():
 )
 def test_wrong_options(options, problem):
     with pytest.raises(InputError, match=f"controllers.pi-gating.{problem}") as caught:
-        PiGating(planning_model(with_options(**options)))
+        api.controller("pi-gating", with_options(**options))
     assert "\n" not in str(caught.value)
 
 
@@ -111,7 +110,7 @@ def test_every_protected_region_is_held_at_its_set_point():
     direction."""
     options = {"set_point": [1000.0, 3000.0], "kp": 0.0, "ki": 0.001}
     assert NETWORK.adjacency[5, 3]
-    controller = PiGating(planning_model(replace(with_options(**options), protected=(5, 3))))
+    controller = api.controller("pi-gating", replace(with_options(**options), protected=(5, 3)))
     accumulation = np.zeros((7, 7))
     accumulation[5, 0], accumulation[3, 1] = 1200.0, 3300.0
     controls = controller.act(
@@ -130,23 +129,23 @@ def test_something_must_be_protected():
     with pytest.raises(
         InputError, match="protected: pi-gating needs at least one protected region, got none"
     ):
-        PiGating(planning_model(replace(SCENARIO, protected=())))
+        api.controller("pi-gating", replace(SCENARIO, protected=()))
 
 
 def test_the_set_point_by_a_share_of_the_maximum_outflow():
     mfd = NETWORK.mfds[3]
     for share in (0.5, 0.95, 1.0):
-        (point,) = PiGating(planning_model(with_options(outflow_share=share))).set_point
+        (point,) = api.controller("pi-gating", with_options(outflow_share=share)).set_point
         assert point <= mfd.critical
         assert mfd.outflow(point) == pytest.approx(share * mfd.capacity, rel=1e-3)
-    assert PiGating(
-        planning_model(with_options(outflow_share=0.5, set_point=[3000.0]))
+    assert api.controller(
+        "pi-gating", with_options(outflow_share=0.5, set_point=[3000.0])
     ).set_point == [3000.0]
 
 
 def test_probing_moves_around_the_set_point_that_identification_gives():
     options = {"probing-pc": {"set_point": [2000.0]}}
-    probing = Probing(planning_model(replace(SCENARIO, controller_options=options)), guidance=False)
+    probing = api.controller("probing-pc", replace(SCENARIO, controller_options=options))
     probing.reset(1)
     gates = [probing.act(seen(2000.0, k)).perimeter for k in range(20)]
     assert len({u.tobytes() for u in gates}) > 1

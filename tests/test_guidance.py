@@ -1,6 +1,6 @@
 """The searches of route guidance against all ways there are, in a small random city."""
 
-from itertools import product
+from itertools import pairwise, product
 from unittest.mock import Mock
 
 import libsumo
@@ -14,7 +14,7 @@ from streets import seen
 from cosim.plant import guidance
 from cosim.plant.guidance import Guide
 from cosim.plant.meter import Event
-from cosim.plant.routes import MOST_NODES, Moves, Searches, Trees, Ways
+from cosim.plant.routes import MOST_NODES, Exits, Moves, Searches, Trees, Ways
 
 EDGES, REGION = 40, np.repeat([0, 1, 2, 3], 10)
 
@@ -52,16 +52,10 @@ def ways(city, request):
     )
     return (
         Ways(
-            gate,
-            entry,
-            following,
-            inside=inside,
-            outside=back,
+            Exits(np.array([gate, entry, move, following]).T, inside=inside, outside=back),
             time=time,
             turns=turn,
             crossing=turn[move],
-            leading=inside.leading_to(inside.number[gate]),
-            reached=back.leading_to(back.number[entry]),
             ahead=back.ahead(back.number[entry], 0.8 * time, 0.7 * turn),
             searches=searches,
             everywhere=(everywhere, turn[move], back_to(gate, entry, city)),
@@ -88,7 +82,7 @@ def least(city, allowed):
 def takes(way, city):
     """The time [s] from the end of the first edge of a way to that of its last."""
     turns = {(int(a), int(b)): extra for a, b, extra in zip(*city[:3], strict=True)}
-    return sum(turns[move] + city[3][move[1]] for move in zip(way[:-1], way[1:], strict=True))
+    return sum(turns[move] + city[3][move[1]] for move in pairwise(way))
 
 
 def back_to(gate, entry, city):
@@ -211,7 +205,7 @@ def test_a_main_road_that_leaves_the_region_and_comes_back_is_open_to_all(route)
         assert guided(tuple(route), ways_return=False, side=side) == ("ast", 2)
 
 
-def test_ways_that_return_are_taken_where_they_are_faster_and_no_command_for_the_next_region_closes_them():
+def test_ways_that_return_are_taken_where_they_are_faster_and_no_command_closes_them():
     assert guided(tuple("ast"), ways_return=True, side=12.0) == ("ast", 2)
     assert guided(tuple("ambt"), ways_return=True, side=2.0) == ("ast", 2)
     for to_region_1 in (
@@ -303,7 +297,7 @@ def test_drivers_are_asked_again_where_they_are():
             assert guide.realised.sum() == guide.realised[0, 2, 2] == 1
         # Of the region that he was told before nothing is left, although a control interval has
         # passed.
-        assert guide._assigned[0, 2, 2] == pytest.approx(1.0 if asked < 9 else 0.9)
+        assert guide._shares._given[0, 2, 2] == pytest.approx(1.0 if asked < 9 else 0.9)
 
 
 def test_on_a_junction_it_is_too_late_and_who_arrived_is_not_asked():

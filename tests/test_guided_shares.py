@@ -11,11 +11,11 @@ import tiny
 from streets import seen
 
 from cosim.evaluation.simulate import Simulation, simulate
-from cosim.plant import guidance
+from cosim.plant import guidance, shares
 from cosim.plant.guidance import Guide
 from cosim.plant.meter import Event
+from cosim.plant.strategy import parse
 from nmfd.api import load_scenario
-from nmfd.controllers.strategy import parse
 from nmfd.types import Controls
 
 # s and z are in region 0, a and b in 1 and 2; all lead to t in 3, where t2 follows, and z by a
@@ -66,9 +66,9 @@ class Town:
             inside={":a_1": 9.0, ":s_1": 9.0},
         )
         self.routes, self.takes_it, self.shares = {}, True, np.zeros((2, 4, 4, 4))
-        for shares, to_a in zip(self.shares, (own, theta), strict=True):
-            shares[0, 1, 3], shares[0, 2, 3] = to_a, 1.0 - to_a
-            shares[1, 3, 3] = shares[2, 3, 3] = 1.0
+        for splits, to_a in zip(self.shares, (own, theta), strict=True):
+            splits[0, 1, 3], splits[0, 2, 3] = to_a, 1.0 - to_a
+            splits[1, 3, 3] = splits[2, 3, 3] = 1.0
         self.guide = Guide(
             streets.session(self.routes, set_route=self._set_route),
             city,
@@ -123,7 +123,7 @@ def test_a_longer_way_is_taken_as_soon_as_its_region_is_far_enough_behind(
     """Half of them shall go by b, which takes 125 s more. After n drivers by a, the lead of a's
     price is 125 - bonus ((n + 1) / 2 - ((n + 1) / 2 - n)) = 125 - bonus n: b it is from n = 125 /
     bonus on."""
-    monkeypatch.setattr(guidance, "SHARE_PENALTY_S", bonus)
+    monkeypatch.setattr(shares, "SHARE_PENALTY_S", bonus)
     town = Town(through_a=30.0, through_b=155.0, theta=0.25)
     ways = town.drive(first + 1)
     assert ways.index("b") == first

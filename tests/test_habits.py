@@ -14,6 +14,7 @@ from commands import nmfd as command
 
 import cosim
 import nmfd
+from cosim.plant.strategy import parse
 from nmfd.controllers import strategy
 from nmfd.runs import progress
 
@@ -23,11 +24,9 @@ NAMES = ("no-control", "dpc-pc", "dpc-pcrg", "pi-gating")
 @pytest.fixture
 def listed(tmp_path, monkeypatch):
     """Names of the strategies in a list, where those of NAMES can be made."""
-    monkeypatch.setattr(
-        strategy, "ready", lambda scenario: [strategy.parse(name) for name in NAMES]
-    )
+    monkeypatch.setattr(strategy, "ready", lambda scenario, parse: [parse(name) for name in NAMES])
     scenario = nmfd.load_scenario(tiny.write(tmp_path))
-    return lambda given: [one.name for one in strategy.parse_many(given, scenario)]
+    return lambda given: [one.name for one in strategy.parse_many(given, scenario, strategy.parse)]
 
 
 @pytest.mark.parametrize(
@@ -51,7 +50,7 @@ def test_a_pattern_stands_for_what_has_a_policy(tmp_path, monkeypatch):
     monkeypatch.setattr("nmfd.studies.plots.save", lambda *given: None)
     folder = tiny.write(tmp_path)
     scenario = nmfd.load_scenario(folder)
-    names = [one.name for one in strategy.ready(scenario)]
+    names = [one.name for one in strategy.ready(scenario, strategy.parse)]
     assert "mpc-pc" in names
     assert not any(name.startswith("dpc") for name in names)
     table = good(
@@ -66,7 +65,7 @@ def test_a_pattern_stands_for_what_has_a_policy(tmp_path, monkeypatch):
     )
     for name in ("dpc-pc.pt", "dpc-pc+max-pressure.pt", "dpc-pc+nonsense.pt"):
         (folder / name).touch()
-    names = [one.name for one in strategy.ready(nmfd.load_scenario(folder))]
+    names = [one.name for one in strategy.ready(nmfd.load_scenario(folder), parse)]
     assert {"dpc-pc", "dpc-pc+max-pressure"} <= set(names)
     assert not {"dpc-pcrg", "dpc-pc+nonsense"} & set(names)
 

@@ -9,13 +9,11 @@ import pytest
 import tiny
 import torch
 
-from nmfd import closed_loop
+from nmfd import api, closed_loop
 from nmfd.api import load_scenario
-from nmfd.controllers.rules import Probing
 from nmfd.model import dynamics, identification
-from nmfd.model.identification import Observed
+from nmfd.model.identification import Observed, Windows
 from nmfd.model.mfd import Cubic
-from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
 
 ROOT = Path(__file__).parents[1]
@@ -28,7 +26,7 @@ def scenario():
     return replace(
         loaded,
         network=tiny.limited(loaded.network),
-        demand=0.4 * loaded.demand,
+        demand=0.4 * loaded.demand[:120],
         steps=120,
         protected=(3,),
         controller_options={},
@@ -38,13 +36,13 @@ def scenario():
 
 def observe(scenario, seed, factor):
     demanded = replace(scenario, demand=factor * scenario.demand)
-    controller = Probing(planning_model(demanded), guidance=False)
+    controller = api.controller("probing-pc", demanded)
     trajectory = closed_loop.run(NmfdPlant(demanded), controller, demanded, seed=seed)
     return Observed(
-        accumulation=trajectory.accumulation,
+        accumulation=trajectory["accumulation"],
         demand=demanded.demand[: demanded.steps],
-        perimeter=trajectory.perimeter,
-        splits=trajectory.splits,
+        perimeter=trajectory["perimeter"],
+        splits=trajectory["splits"],
         crossings=np.full((demanded.steps, 7, 7), 60.0),
     )
 
@@ -90,20 +88,42 @@ def test_windows_are_the_intervals_in_order(runs):
 
 def test_probing_moves_every_gate_and_repeats_itself(scenario):
     def trajectory(seed, guidance=True):
-        controller = Probing(planning_model(scenario), guidance=guidance)
+        controller = api.controller("probing-pcrg" if guidance else "probing-pc", scenario)
         return closed_loop.run(NmfdPlant(scenario), controller, scenario, seed=seed)
 
     first, again, other = trajectory(0), trajectory(0), trajectory(1)
-    np.testing.assert_array_equal(first.perimeter, again.perimeter)
-    assert (first.perimeter != other.perimeter).any()
-    gates = first.perimeter[:, scenario.network.adjacency]
+    np.testing.assert_array_equal(first["perimeter"], again["perimeter"])
+    assert (first["perimeter"] != other["perimeter"]).any()
+    gates = first["perimeter"][:, scenario.network.adjacency]
     assert (np.ptp(gates, axis=0) > 0.2).all()
     assert gates.min() >= scenario.network.u_min
     assert gates.max() <= scenario.network.u_max
-    sums = first.splits.sum(axis=2)
+    sums = first["splits"].sum(axis=2)
     assert np.isclose(sums, 1.0).sum() == np.isclose(sums, 0.0).sum() * 6  # all but j = i
-    assert not first.splits[:, ~scenario.network.split_mask].any()
+    assert not first["splits"][:, ~scenario.network.split_mask].any()
     assert (trajectory(0, guidance=False).splits == scenario.network.nominal_splits).all()
+
+
+def test_a_fit_begins_at_the_largest_accumulations_and_flows(scenario, runs):
+    made = identification._Model(scenario.network, runs, 30.0, 1.0 / 30.0)
+    largest = np.max([run.accumulation.sum(axis=2).max(axis=0) for run in runs], axis=0)
+    with torch.no_grad():
+        p = made.regional()
+        assert made.penalty().item() == 0.0
+    u_max, adjacency = scenario.network.u_max, scenario.network.adjacency
+    np.testing.assert_allclose(p.mfd.jam, 0.7 * largest, rtol=1e-5)
+    np.testing.assert_allclose(p.storage, 2.0 * largest, rtol=1e-5)
+    np.testing.assert_allclose(u_max * p.capacity, 1.2 * 60.0 / 30.0 * adjacency, rtol=1e-5)
+    assert (p.exit_rates == 1.0).all()
+
+
+def test_a_fit_reports_its_progress(scenario, runs):
+    notes = []
+    identification.fit(
+        scenario.network, runs[:1], step=30.0, iterations=2, progress=lambda *n: notes.append(n)
+    )
+    assert [note[:2] for note in notes] == [(1, 2), (2, 2)]
+    assert all(note[2].startswith("misfit 0.") for note in notes)
 
 
 @pytest.fixture
@@ -118,7 +138,7 @@ def model(scenario, runs):
 
 
 def test_any_free_numbers_are_a_valid_model(model):
-    """q = c (1 - first y - second y^2) with y = x / jam, falling from c to a hundredth of it at the least."""
+    """q = c (1 - first y - second y^2) falls from c, to a hundredth at the least; y = x / jam."""
     p = model.regional()
     c, first, second, jam = model.shape()
     assert (first >= 0).all()
@@ -154,12 +174,14 @@ def test_what_a_fit_makes_small(scenario, runs, by_origin):
     """Errors that cancel out in their regions count by destination only; far ones linearly."""
     p, scheme = dynamics.parameters(scenario.network, dtype=torch.float32), {"step": 30.0}
     observed, *rest = identification.windows(runs[:1], 2)
-    missed, scale = torch.zeros(7, 7), torch.full((7,), 50.0)
-    missed[1, 3], missed[(1, 5) if by_origin else (5, 3)] = 100.0, -100.0
+    scale = torch.full((7,), 50.0)
+    missed = torch.zeros(7, 7)
+    missed[1, 3] = 100.0
+    missed[(1, 5) if by_origin else (5, 3)] = -100.0
     wrong = observed.clone()
     wrong[:, 1:] += missed
     far = (2.0 - 0.5 * identification.OUTLIER) * 2.0  # two errors of twice the scale
-    found = identification._misfit(p, [wrong, *rest], scale, scheme)
+    found = identification._misfit(p, Windows(wrong, *rest), scale, scheme)
     assert found == pytest.approx(
         identification.BY_DESTINATION * far / 49 + (0.0 if by_origin else far / 7), rel=1e-3
     )
@@ -170,3 +192,22 @@ def test_a_run_shorter_than_the_horizon_is_left_out(runs):
     assert len(identification.windows([short, runs[0]], 5)[0]) == len(
         identification.windows(runs[:1], 5)[0]
     )
+
+
+def test_the_learning_rate_falls_from_first_to_last():
+    rates = [identification._learning_rate(k, 100) for k in range(101)]
+    assert (np.diff(rates) < 0.0).all()
+    assert rates[::50] == pytest.approx([0.03, 0.03 * 0.525, 0.03 * 0.05])
+
+
+def test_split_ratios_are_the_shares_of_crossings(scenario):
+    """Of turns that are allowed; rare ones count as none, and few vehicles give no ratio."""
+    crossings = np.zeros((7, 7, 7))
+    crossings[0, [1, 3, 2, 5], 2] = 60.0, 39.6, 0.4, 900.0  # 5 is not beside 0
+    crossings[0, 1, 6] = 29.0
+    crossings[0, 3, 5] = 30.0
+    ratios = identification.observed_split_ratios(scenario.network, crossings)
+    assert ratios == {
+        (0, 2): {1: pytest.approx(0.6024, abs=1e-4), 3: pytest.approx(0.3976, abs=1e-4)},
+        (0, 5): {3: 1.0},
+    }

@@ -6,7 +6,6 @@ import gzip
 import re
 import shutil
 import xml.etree.ElementTree as ElementTree
-from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -20,12 +19,13 @@ from cosim.importing.demand import read_traffic
 from cosim.importing.streets import graph, read_streets
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
+from cosim.plant.strategy import parse
 from cosim.sumo.net import load_city
 from cosim.sumo.recorded_trips import own_flows, read_recorded_trips, read_routes
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
-from nmfd.model.planning import planning_model
 from nmfd.model.regional_model import load_network
+from nmfd.model.scenario import with_demand
 
 
 @pytest.fixture(scope="module")
@@ -278,7 +278,7 @@ def test_options_and_includes_of_the_user_count(config, tmp_path):
 def test_signal_plans_know_the_city_s_own_vehicles(imported):
     """Turning flows are those of its routes, and of fastest ways; every signal plan runs on its
     signals."""
-    scenario = replace(load_scenario(imported[0] / "scenarios" / "tiny"), steps=2)
+    scenario = with_demand(load_scenario(imported[0] / "scenarios" / "tiny"), steps=2)
     own, additional = (
         [scenario.folder / name for name in names]
         for names in (settings(scenario).routes, settings(scenario).additional)
@@ -390,7 +390,7 @@ def test_identification_gives_both_models_and_the_import_takes_the_second_away(
     assert f"Written to {network / 'guided' / 'network.toml'}" in text
     assert (tmp_path / "loading" / "guided" / "level-2" / "probing-pcrg-1000.nc").is_file()
     loaded = load_scenario(scenario)
-    guided = planning_model(loaded, "dpc-pcrg").network
+    guided = parse("dpc-pcrg").own_planning(loaded).network
     assert guided.hash != loaded.network.hash
     assert guided.observed_split_ratios == loaded.network.observed_split_ratios
     assert "PLACEHOLDERS" not in (network / "network.toml").read_text()
@@ -403,7 +403,7 @@ def test_identification_gives_both_models_and_the_import_takes_the_second_away(
     shutil.rmtree(network)
     shutil.rmtree(scenario)
     tiny_city.imported(tmp_path, 2, config)
-    assert planning_model(load_scenario(scenario), "dpc-pcrg").network.regions == 2
+    assert parse("dpc-pcrg").own_planning(load_scenario(scenario)).network.regions == 2
 
 
 @pytest.mark.slow

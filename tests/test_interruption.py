@@ -58,7 +58,9 @@ def test_ctrl_c_at_any_moment_is_one_line(tmp_path, after, wait):
         returned, said = stopped(
             "nmfd", *command, out=tmp_path / "out", by=signal.SIGINT, after=after, wait=wait
         )
-    assert returned == 130 and said.startswith("nmfd: interrupted") and said.count("\n") == 1, said
+    assert returned == 130, said
+    assert said.startswith("nmfd: interrupted")
+    assert said.count("\n") == 1, said
 
 
 @pytest.mark.slow
@@ -101,7 +103,8 @@ def test_a_stopped_benchmark_continues(tmp_path, by, status):
         2,
     )
     returned, said = stopped("nmfd", *command, out=tmp_path / "out", by=by)
-    assert returned == status and "Traceback" not in said, said
+    assert returned == status, said
+    assert "Traceback" not in said
     if status == 130:
         assert said.splitlines()[-1].startswith("nmfd: interrupted: finished runs are in"), said
     first = runs(tmp_path / "out")

@@ -14,7 +14,8 @@ from cosim.plant.meter import Event
 from cosim.plant.stuck import LEADER_M, LEADER_PATIENCE_S, QUEUE_END_M, Lanes
 from cosim.sumo.session import Session
 
-NODES = """<nodes><node id="a" x="0" y="0"/><node id="b" x="300" y="0"/><node id="l" x="600" y="200"/>
+NODES = """<nodes><node id="a" x="0" y="0"/><node id="b" x="300" y="0"/>
+<node id="l" x="600" y="200"/>
 <node id="r" x="600" y="-200"/><node id="e" x="900" y="0"/></nodes>"""
 EDGES = """<edges><edge id="ab" from="a" to="b" numLanes="2"/>
 <edge id="bl" from="b" to="l"/><edge id="br" from="b" to="r"/>

@@ -29,20 +29,19 @@ from nmfd.ledger import LedgerError
 from nmfd.model.regional_model import load_network
 
 COUNT_EVERY, STEPS = 25, 250
-REGION = {
-    "A": 0,
-    "B": 0,
-    "C": 1,
-    "D": 2,
-}  # by the junction that an edge leads to: 0 and 2 do not touch
+# By the junction that an edge leads to: 0 and 2 do not touch.
+REGION = {"A": 0, "B": 0, "C": 1, "D": 2}
 CALIBRATOR = (
-    '<calibrator id="c{0}" edge="{0}" pos="{1}" freq="10" jamThreshold="0.99"><flow begin="0" end="900" {2}/>'
-    "</calibrator>"
+    '<calibrator id="c{0}" edge="{0}" pos="{1}" freq="10" jamThreshold="0.99">'
+    '<flow begin="0" end="900" {2}/></calibrator>'
 )
-REROUTER = '<rerouter id="r" edges="A1B1 B1C1 B2C2 C2B2 C1B1 B1B2 C1C2"><interval begin="0" end="900">{}</interval></rerouter>'
+REROUTER = (
+    '<rerouter id="r" edges="A1B1 B1C1 B2C2 C2B2 C1B1 B1B2 C1C2">'
+    '<interval begin="0" end="900">{}</interval></rerouter>'
+)
 RECKLESS = (
-    'jmIgnoreFoeProb="1" jmIgnoreFoeSpeed="99" jmIgnoreJunctionFoeProb="1" jmDriveAfterRedTime="999" '
-    'collisionMinGapFactor="0"'
+    'jmIgnoreFoeProb="1" jmIgnoreFoeSpeed="99" jmIgnoreJunctionFoeProb="1" '
+    'jmDriveAfterRedTime="999" collisionMinGapFactor="0"'
 )
 
 
@@ -165,7 +164,8 @@ CASES = {
     "taken-back": Case(script=forget, expects=("given_up",)),
     "destination-rerouter": Case(
         additional=REROUTER.format(
-            '<destProbReroute id="C3D3" probability="0.5"/><destProbReroute id="B2A2" probability="0.5"/>'
+            '<destProbReroute id="C3D3" probability="0.5"/>'
+            '<destProbReroute id="B2A2" probability="0.5"/>'
         ),
         expects=("arrivals", "redirected"),
     ),
@@ -183,7 +183,8 @@ CASES = {
     ),
     "persons-cars": Case(
         vehicles="".join(
-            f'<trip id="own{n}" depart="triggered" from="A1B1" to="C1D1"/><person id="p{n}" depart="{3 * n}">'
+            f'<trip id="own{n}" depart="triggered" from="A1B1" to="C1D1"/>'
+            f'<person id="p{n}" depart="{3 * n}">'
             f'<ride from="A1B1" to="C1D1" lines="own{n}"/></person>'
             for n in range(30)
         ),

@@ -22,10 +22,8 @@ def tables(*, days: int = 3, most: float = 900.0) -> tuple[pd.DataFrame, pd.Data
     """(counts, detectors) of two regions with ten links each, all of which follow CURVE exactly."""
     random, rows = np.random.default_rng(0), []
     links = [(f"{region}{n}", f"{region}-{n}", region) for region in REGIONS for n in range(10)]
-    detectors, (r, n) = (
-        pd.DataFrame(links, columns=["detid", "linkid", "region"]),
-        np.indices((2, 10)).reshape(2, -1),
-    )
+    detectors = pd.DataFrame(links, columns=["detid", "linkid", "region"])
+    r, n = np.indices((2, 10)).reshape(2, -1)
     detectors = detectors.assign(length=(0.25 + 0.05 * n) * LANE_KM / 2.0 / 4.75, lanes=2, pos=0.1)
     detectors = detectors.assign(long=8.5 + 0.01 * (n % 5), lat=47.4 - 0.03 * r - 0.01 * (n // 5))
     for day in range(days):
@@ -126,17 +124,15 @@ def test_doubts_of_few_days_free_flow_and_loops_at_stop_lines(tmp_path):
     text = " ".join(found.fits["doubts"][0])
     loops = "loops at stop lines (100 %)"
     for doubt in ("no falling branch", "coverage unknown", loops, "trip length assumed", "days: 1"):
-        assert doubt in text and f"WARNING, {doubt.split(' (')[0].split(':')[0]}" in found.text, (
-            doubt
-        )
+        assert doubt in text
+        assert f"WARNING, {doubt.split(' (')[0].split(':')[0]}" in found.text
     n = found.network.critical_above[0]
     assert n == found.intervals["accumulation_veh"].max() < 210.0
     assert np.isnan(found.fits["critical_veh"]).all()
     assert f"above {n:.0f} " in found.text
     assert f"critical_above = {n:.6g}" in (tmp_path / "city/network.toml").read_text()
-    for (
-        curve
-    ) in found.network.mfds:  # measured up to n, beyond a guess from lanes: 27 veh per lane-km
+    # Measured up to n, beyond a guess from lanes: 27 veh per lane-km.
+    for curve in found.network.mfds:
         assert curve.outflow(n) == pytest.approx(CURVE.outflow(n), rel=0.03)
         assert curve.jam == 80.0 * LANE_KM
         assert curve.critical == pytest.approx(27.2 * LANE_KM, rel=0.01)
@@ -299,7 +295,8 @@ def test_bad_rows_and_silent_detectors_are_left_out_and_counted(tmp_path, made):
         "out": tmp_path / "city",
     }
     found = nmfd.identify(**options)
-    left = f"2 rows marked as errors, 2 rows with a missing or impossible number, {len(hour)} rows doubled"
+    left = "2 rows marked as errors, 2 rows with a missing or impossible number, "
+    left += f"{len(hour)} rows doubled"
     assert left in " ".join(found.text.split())
     assert found.fits["critical_veh"][0] == pytest.approx(CURVE.critical, rel=0.03)
     frame = found.intervals

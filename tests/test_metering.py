@@ -17,6 +17,7 @@ from cosim.sumo.xml_files import read_xml
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.model.plant import AcyclicPlant, NmfdPlant
+from nmfd.model.scenario import with_demand
 from nmfd.types import Controls
 
 CRITICAL = np.array([100.0, 50.0])
@@ -70,7 +71,7 @@ def test_with_a_queue_trips_begin_at_the_commanded_rate(rate, step):
 
 
 def test_without_a_command_regions_are_held_at_their_level():
-    meters, session, _ = metering([], [])
+    meters, _, _ = metering([], [])
     most, rates = CRITICAL / FILLING_S, []
     for full in (0.5, 1.5, 1.5, 1.3):
         meters.command(None, full * CRITICAL)
@@ -87,7 +88,7 @@ def test_without_a_command_regions_are_held_at_their_level():
 
 @pytest.mark.parametrize("kind", [NmfdPlant, AcyclicPlant])
 def test_in_the_regional_model_who_may_not_enter_waits_and_enters_later(kind):
-    scenario = replace(load_scenario("economic_mpc"), steps=12)
+    scenario = with_demand(load_scenario("economic_mpc"), steps=12)
     network, plant = scenario.network, kind(scenario)
     opened = Controls(perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=None)
     due = scenario.demand.sum(axis=(1, 2)) * scenario.step
@@ -118,7 +119,7 @@ def ran(scenario, seed=5, **changes):
 
 def test_in_a_city_the_books_hold_and_waiting_counts():
     """grid7 with hardly anybody let in: the same trips, due at the same times, wait."""
-    scenario = replace(load_scenario("grid7_peak"), steps=3)
+    scenario = with_demand(load_scenario("grid7_peak"), steps=3)
     rate = np.full(7, 0.02)
     (free, trips), (held, metered) = (
         ran(scenario, rate=rate, metering=level) for level in (0.0, 1.2)
@@ -146,7 +147,7 @@ def own(tmp_path):
 
 
 def test_a_citys_own_vehicles_wait_as_well(own):
-    scenario = replace(load_scenario(own), steps=6)
+    scenario = with_demand(load_scenario(own), steps=6)
     regions, step = scenario.network.regions, scenario.step
     (free, due), *metered = (
         ran(scenario),

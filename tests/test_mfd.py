@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nmfd.errors import InputError
-from nmfd.model.mfd import Cubic, fit, trapezoid
+from nmfd.model.mfd import Cubic, fit, guess, guess_beyond, trapezoid
 
 # The published curve with a tenth of its jam accumulation: the coefficients span nine orders of
 # magnitude.
@@ -22,7 +22,7 @@ def same(curve, expected, rel=1e-3):
 
 
 def test_a_parabola_in_closed_form():
-    """g = c x (1 - x / 2 n) has its most, c n / 2, at n; three quarters of it at n / 2, and it ends at 2 n."""
+    """g = c x (1 - x/2n) has its most, c n / 2, at n; three quarters at n / 2; the end at 2 n."""
     curve = Cubic(a=0.0, b=-0.004 / 1000.0, c=0.004, jam=2000.0)
     assert curve.critical == pytest.approx(500.0, abs=0.1)
     assert curve.capacity == pytest.approx(1.0)
@@ -143,10 +143,20 @@ def test_the_most_that_is_allowed_binds():
 
 def test_the_largest_samples_share_a_bin():
     """Of three in the last one the median counts: the largest of all is no bin of its own."""
-    x, g = (
-        np.append(X[:-1], [980.0, 990.0, 1000.0]),
-        TRUTH.outflow(np.append(X[:-1], [990.0, 990.0, 990.0])),
-    )
+    x = np.append(X[:-1], [980.0, 990.0, 1000.0])
+    g = TRUTH.outflow(np.append(X[:-1], [990.0, 990.0, 990.0]))
     g[-1] *= 9.0
     curve = fit(x, g)
     np.testing.assert_allclose(curve.outflow(X[:-1]), TRUTH.outflow(X[:-1]), rtol=2e-3)
+
+
+def test_a_guess_beyond_the_data_goes_on_where_they_end():
+    """It has the jam accumulation of the lanes, unless the data go beyond its critical one."""
+    free = Cubic(a=0.0, b=0.0, c=0.004, jam=500.0)
+    near = guess_beyond(free, 1000.0, 200.0)
+    assert near.jam == 1000.0
+    assert near.outflow(200.0) == pytest.approx(0.8)
+    far = guess_beyond(free, 1000.0, 500.0)
+    assert far.critical == pytest.approx(500.0, rel=1e-3)
+    assert far.critical > 500.0
+    assert guess_beyond(free, 1000.0, 200.0, max_rate=0.003) == guess(0.003, 1000.0)

@@ -11,18 +11,19 @@ import tiny
 import torch
 from tiny import random_controls
 
+from nmfd import api
 from nmfd.api import load_scenario
 from nmfd.closed_loop import run
 from nmfd.controllers.mpc import controller as mpc
 from nmfd.controllers.mpc import edge_model
-from nmfd.controllers.mpc.controller import TOLERANCE, EconomicMpc
-from nmfd.controllers.rules import NoControl
+from nmfd.controllers.mpc.controller import TOLERANCE
+from nmfd.controllers.rules import Constant
 from nmfd.errors import InputError
 from nmfd.metrics import summary
 from nmfd.model import dynamics
-from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
-from nmfd.types import Observation, Status
+from nmfd.model.scenario import with_demand
+from nmfd.types import Controls, Observation, Status
 
 SCENARIO = load_scenario(Path(__file__).parents[1] / "scenarios" / "economic_mpc")
 NETWORK = SCENARIO.network
@@ -35,13 +36,13 @@ def states():
     centre."""
     trajectory = run(
         NmfdPlant(SCENARIO),
-        NoControl(planning_model(SCENARIO)),
-        replace(SCENARIO, steps=50),
+        api.controller("no-control", SCENARIO),
+        with_demand(SCENARIO, steps=50),
         seed=0,
     )
     return [
         Observation(step=k, time=30.0 * k, accumulation=x, backlog=np.zeros((7, 7)))
-        for k, x in enumerate(trajectory.accumulation)
+        for k, x in enumerate(trajectory["accumulation"])
     ]
 
 
@@ -69,7 +70,7 @@ def assert_admissible(controls, guidance):
 
 @BOTH
 def test_controls_are_admissible_and_solved(states, guidance):
-    controller = EconomicMpc(planning_model(SCENARIO), guidance=guidance)
+    controller = api.controller("mpc-pcrg" if guidance else "mpc-pc", SCENARIO)
     for k in range(0, 50, 6):
         controls = controller.act(states[k])
         assert controls.status == Status.OK
@@ -80,7 +81,7 @@ def test_controls_are_admissible_and_solved(states, guidance):
 @pytest.mark.parametrize("k", [10, 30])
 def test_no_random_plan_nearby_or_far_is_better(states, guidance, k):
     controller, random = (
-        EconomicMpc(planning_model(SCENARIO), guidance=guidance),
+        api.controller("mpc-pcrg" if guidance else "mpc-pc", SCENARIO),
         np.random.default_rng(k),
     )
     assert controller.act(states[k]).status == Status.OK
@@ -105,7 +106,7 @@ def test_two_decisions_against_brute_force(tmp_path):
     """A jammed region behind a gate: the best of all pairs of u on a grid."""
     network = tiny.row_network(2).replace("jam = 1000.0", "jam = 700.0")
     scenario = load_scenario(tiny.write(tmp_path, network=network))
-    controller = EconomicMpc(planning_model(with_options(scenario, horizon=6)), guidance=False)
+    controller = api.controller("mpc-pc", with_options(scenario, horizon=6))
     accumulation = np.array([[0.0, 900.0], [0.0, 330.0]])
     measurement = Observation(step=0, time=0.0, accumulation=accumulation, backlog=np.zeros((2, 2)))
     assert controller.act(measurement).status == Status.OK
@@ -126,7 +127,7 @@ def test_the_plan_costs_what_the_regional_model_says(states, guidance):
         replace(SCENARIO, step=90.0, substeps=3),
         replace(SCENARIO, integrator="rk4"),
     ):
-        controller = EconomicMpc(planning_model(scenario), guidance=guidance)
+        controller = api.controller("mpc-pcrg" if guidance else "mpc-pc", scenario)
         start, demand = controller.forecast(states[20])
         random, admissible = np.random.default_rng(7), controller.admissible
         rows = [
@@ -147,7 +148,7 @@ def test_the_plan_costs_what_the_regional_model_says(states, guidance):
 
 
 def test_the_backlog_is_demand_and_noise_is_not_negative(states):
-    controller = EconomicMpc(planning_model(SCENARIO), guidance=False)
+    controller = api.controller("mpc-pc", SCENARIO)
     backlog = np.zeros((7, 7))
     backlog[0, 6] = 60.0
     start, demand = controller.forecast(
@@ -160,7 +161,7 @@ def test_the_backlog_is_demand_and_noise_is_not_negative(states):
 
 
 def test_nothing_is_demanded_after_the_end(states):
-    controller = EconomicMpc(planning_model(SCENARIO), guidance=False)
+    controller = api.controller("mpc-pc", SCENARIO)
     for step in (SCENARIO.steps - 2, SCENARIO.steps, SCENARIO.steps + 50):
         controls = controller.act(replace(states[5], step=step))
         assert controls.status == Status.OK
@@ -169,9 +170,11 @@ def test_nothing_is_demanded_after_the_end(states):
 @BOTH
 def test_a_solver_without_iterations_says_so_and_does_not_act(states, guidance, monkeypatch):
     monkeypatch.setattr(mpc, "MAX_ITERATIONS", 0)
-    controls = EconomicMpc(planning_model(SCENARIO), guidance=guidance).act(states[30])
+    controls = api.controller("mpc-pcrg" if guidance else "mpc-pc", SCENARIO).act(states[30])
     assert controls.note == "iteration limit: pi-gating in control"
-    controller = EconomicMpc(planning_model(replace(SCENARIO, protected=())), guidance=guidance)
+    controller = api.controller(
+        "mpc-pcrg" if guidance else "mpc-pc", replace(SCENARIO, protected=())
+    )
     controls = controller.act(states[30])
     assert controls.note == "iteration limit: perimeter opened, nominal splits"
     assert (controls.perimeter[NETWORK.adjacency] == NETWORK.u_max).all()
@@ -180,7 +183,7 @@ def test_a_solver_without_iterations_says_so_and_does_not_act(states, guidance, 
 
 
 def test_a_time_limit_is_a_recorded_failure(states):
-    controller = EconomicMpc(planning_model(SCENARIO), guidance=True)
+    controller = api.controller("mpc-pcrg", SCENARIO)
     controller.deadline = 1e-6
     controls = controller.act(states[30])
     assert controls.note == "time limit: pi-gating in control"
@@ -192,7 +195,7 @@ def test_more_iterations_never_make_the_plan_worse(states, guidance, monkeypatch
     costs = []
     for most in (0, 1, 2, 4, 8, 100):
         monkeypatch.setattr(mpc, "MAX_ITERATIONS", most)
-        controller = EconomicMpc(planning_model(SCENARIO), guidance=guidance)
+        controller = api.controller("mpc-pcrg" if guidance else "mpc-pc", SCENARIO)
         assert_admissible(controller.act(states[30]), guidance)
         costs.append(cost(controller, *controller.forecast(states[30]), controller._plan))
     assert costs == sorted(costs, reverse=True)
@@ -200,7 +203,7 @@ def test_more_iterations_never_make_the_plan_worse(states, guidance, monkeypatch
 
 
 def test_without_a_measurement_the_last_plan_is_used_until_it_ends(states):
-    controller = EconomicMpc(planning_model(SCENARIO), guidance=True)
+    controller = api.controller("mpc-pcrg", SCENARIO)
     nothing = np.full((7, 7), np.nan)
     assert controller.act(states[20]).status == Status.OK
     plan = controller._plan
@@ -217,7 +220,7 @@ def test_without_a_measurement_the_last_plan_is_used_until_it_ends(states):
 
 
 def test_reset_forgets_the_plan(states):
-    controller = EconomicMpc(planning_model(SCENARIO), guidance=False)
+    controller = api.controller("mpc-pc", SCENARIO)
     first = controller.act(states[25]).perimeter
     controller.act(states[26])
     controller.reset()
@@ -238,7 +241,7 @@ def test_reset_forgets_the_plan(states):
 )
 def test_wrong_options(options, problem):
     with pytest.raises(InputError, match=f"controllers.mpc-pc.{problem}") as caught:
-        EconomicMpc(planning_model(with_options(**options)), guidance=False)
+        api.controller("mpc-pc", with_options(**options))
     assert "\n" not in str(caught.value)
 
 
@@ -249,7 +252,7 @@ def test_benchmark_row(guidance, most):
     row = summary(
         run(
             NmfdPlant(SCENARIO),
-            EconomicMpc(planning_model(SCENARIO), guidance=guidance),
+            api.controller("mpc-pcrg" if guidance else "mpc-pc", SCENARIO),
             SCENARIO,
             seed=0,
         )
@@ -262,8 +265,8 @@ def test_benchmark_row(guidance, most):
 def test_ipopt_is_the_reference_solver(states, guidance):
     """The published formulation, in the place of our solver: as good a plan from the same state, to
     a thousandth."""
-    ours = EconomicMpc(planning_model(SCENARIO), guidance=guidance)
-    reference = EconomicMpc(planning_model(with_options(solver="ipopt")), guidance=guidance)
+    ours = api.controller("mpc-pcrg" if guidance else "mpc-pc", SCENARIO)
+    reference = api.controller("mpc-pcrg" if guidance else "mpc-pc", with_options(solver="ipopt"))
     costs = []
     for controller in (ours, reference):
         assert controller.act(states[20]).status == Status.OK
@@ -285,7 +288,7 @@ def test_the_clock_is_looked_at_wherever_a_decision_takes_time(states, monkeypat
         return slow(*arguments, **more)
 
     monkeypatch.setattr(edge_model, "advance", advance)
-    controller = EconomicMpc(planning_model(SCENARIO), guidance=True)
+    controller = api.controller("mpc-pcrg", SCENARIO)
     controller.deadline = limit
     for k in (29, 30):
         begin = time.perf_counter()
@@ -296,23 +299,23 @@ def test_the_clock_is_looked_at_wherever_a_decision_takes_time(states, monkeypat
 
 
 def test_a_decision_that_came_late_is_late_in_the_books(tmp_path):
-    class Slow(NoControl):
+    class Slow(Constant):
         deadline = 0.2
 
         def act(self, observation):
             time.sleep(0.25 * (observation.step == 1))
             return super().act(observation)
 
-    scenario = replace(load_scenario(tiny.write(tmp_path)), steps=3)
+    scenario = with_demand(load_scenario(tiny.write(tmp_path)), steps=3)
     for controller, kinds, note in (
         (
-            Slow(planning_model(scenario)),
+            Slow("slow", Controls(perimeter=scenario.network.open_perimeter)),
             [Status.OK, Status.LATE, Status.OK],
             "later than its deadline of 0.2 s",
         ),
-        (NoControl(planning_model(scenario)), [Status.OK] * 3, ""),
+        (api.controller("no-control", scenario), [Status.OK] * 3, ""),
     ):
         trajectory = run(NmfdPlant(scenario), controller, scenario, seed=0)
-        assert list(trajectory.status) == [kind.value for kind in kinds]
-        assert trajectory.note[1] == note
+        assert list(trajectory["status"]) == [kind.value for kind in kinds]
+        assert trajectory["note"][1] == note
         assert summary(trajectory)["late_decisions"] == kinds.count(Status.LATE)

@@ -61,11 +61,9 @@ class TripBased:
         self.scenario = scenario
 
     def reset(self, seed):
-        self.k, self.ended, self.groups = (
-            0,
-            0.0,
-            [],
-        )  # i, j, share of the trip length that is left, vehicles
+        self.k = 0
+        self.ended = 0.0
+        self.groups = []  # i, j, share of the trip length that is left, vehicles
         return self.state()
 
     def step(self, controls):
@@ -86,10 +84,8 @@ class TripBased:
             else:
                 moved.append((i, j, left, vehicles))
         demand = s.step * s.demand[self.k]
-        self.k, self.groups = (
-            self.k + 1,
-            moved + [(i, j, 1.0, demand[i, j]) for i, j in np.argwhere(demand > 0)],
-        )
+        self.k += 1
+        self.groups = moved + [(i, j, 1.0, demand[i, j]) for i, j in np.argwhere(demand > 0)]
         return self.state()
 
     def state(self):
@@ -127,12 +123,12 @@ def days(generator, batch):
 def test_a_network_and_mfd_serve_plants_rules_and_mpc(controller):
     for plant in ("nmfd", "acyclic", TripBased(ring())):
         result = nmfd.run(ring(), controller, plant=plant, progress=False)
-        assert result.completed[-1] + result.accumulation[-1].sum() == pytest.approx(
+        assert result["completed"][-1] + result["accumulation"][-1].sum() == pytest.approx(
             30.0 * ring().demand.sum()
         )
-        assert result.completed[-1] > 50
-        assert (result.status == 0).all()
-    assert not result.completed[:10].any()  # no trip ends before its length is driven
+        assert result["completed"][-1] > 50
+        assert (result["status"] == 0).all()
+    assert not result["completed"][:10].any()  # no trip ends before its length is driven
 
 
 def test_a_policy_cost_constraint_and_days():
@@ -145,23 +141,21 @@ def test_a_policy_cost_constraint_and_days():
         own = {"cost": burnt, "sample": days, "constraints": [(crowded, weight)]}
         trained = nmfd.train(scenario, policy=policy, **own, steps=40, progress=False)
         after = nmfd.run(scenario, nmfd.ModuleController(trained, scenario), progress=False)
-        most[weight] = after.accumulation[:, 1].sum(-1).max()
+        most[weight] = after["accumulation"][:, 1].sum(-1).max()
         assert trained is policy
         assert nmfd.total_time_spent(after) < nmfd.total_time_spent(before)
     assert most[1e4] < 0.6 * most[0.0]
 
 
 def test_rollouts_are_the_closed_loop():
-    policy, rollout = (
-        Linear(ring().network).double(),
-        Rollout(planning_model(ring()), dtype=torch.float64),
-    )
+    policy = Linear(ring().network).double()
+    rollout = Rollout(planning_model(ring()), dtype=torch.float64)
     run = rollout.trajectories(
         policy, rollout.start[None], rollout.demand[:, None], torch.Generator()
     )
     result = nmfd.run(ring(), nmfd.ModuleController(policy, ring()), progress=False)
-    np.testing.assert_allclose(run.states[:, 0].detach(), result.accumulation[:-1], atol=1e-9)
-    np.testing.assert_allclose(run.perimeter[:, 0].detach(), result.perimeter, atol=1e-9)
+    np.testing.assert_allclose(run.states[:, 0].detach(), result["accumulation"][:-1], atol=1e-9)
+    np.testing.assert_allclose(run.perimeter[:, 0].detach(), result["perimeter"], atol=1e-9)
     assert run.backlog.max() > 1.0
     assert run.total_time_spent.item() == pytest.approx(nmfd.total_time_spent(result))
 

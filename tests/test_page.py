@@ -91,6 +91,13 @@ def test_every_number_of_the_tables_is_there(content, evaluation):
         )
 
 
+def test_doubtful_rows_are_flagged_on_the_card_and_below_the_tables(content):
+    words = Page(content).words
+    assert words.count("WARNING: vehicles were removed, ") == 1 + 2  # card, and two demand levels
+    assert content.index('class="warning"') < content.index('class="card"')
+    assert any(cell.endswith(" !") for cell in Page(content).cells)
+
+
 def test_the_card_has_the_figures_of_the_best_strategy(evaluation):
     rows = (
         results.read(evaluation).level(1.0).rows.assign(mean_trip_time_s=0.0, co2_kg=float("nan"))

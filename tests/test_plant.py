@@ -2,6 +2,7 @@
 simulations of grid7."""
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,6 +14,7 @@ from cosim.plant.guidance import Guide
 from cosim.plant.sampling import StreetSampler
 from cosim.sumo.session import Session
 from nmfd.api import load_scenario
+from nmfd.model.scenario import with_demand
 from nmfd.types import Controls
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
@@ -70,7 +72,7 @@ def test_open_gateways_leave_sumo_alone(scenario, plant_of):
 @pytest.mark.parametrize("guidance", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_ledger_and_crossings_balance(scenario, plant_of, guidance):
     measurements, record = drive(plant_of(), scenario, guidance=guidance)
-    for k, (before, after) in enumerate(zip(measurements[:-1], measurements[1:], strict=True)):
+    for k, (before, after) in enumerate(pairwise(measurements)):
         crossings = record.crossings[k]
         expected = before.accumulation + record.departures[k] - crossings.sum(1) + crossings.sum(0)
         expected -= np.diag(record.arrivals[k])
@@ -166,7 +168,7 @@ def sent_round(scenario, plant):
 
 def test_guided_vehicles_are_asked_again(scenario, plant_of):
     """The ledger is checked at every step; who was told something else counts for the last only."""
-    plant, scenario = plant_of(), replace(scenario, steps=2)
+    plant, scenario = plant_of(), with_demand(scenario, steps=2)
     _, once = drive(plant, scenario, guidance=True)
     plant.close()
     asked = plant_of(guidance_period=5.0)

@@ -9,12 +9,11 @@ import pytest
 import tiny
 from tiny import random_controls
 
+from nmfd import api
 from nmfd.api import load_scenario
 from nmfd.closed_loop import run
-from nmfd.controllers.rules import NoControl
 from nmfd.metrics import total_time_spent
 from nmfd.model import acyclic
-from nmfd.model.planning import planning_model
 from nmfd.model.plant import AcyclicPlant, NmfdPlant
 from nmfd.types import Controls
 
@@ -79,7 +78,7 @@ def test_non_negative_with_other_integrators(make, integrator, substeps):
 def test_without_control_both_plants_are_the_same(network):
     """Shortest ways never turn back."""
     scenario = replace(SCENARIO, network=network)
-    controller = NoControl(planning_model(scenario))
+    controller = api.controller("no-control", scenario)
     nmfd, anmfd = (
         run(make(scenario), controller, scenario, seed=0) for make in (NmfdPlant, AcyclicPlant)
     )
@@ -89,7 +88,7 @@ def test_without_control_both_plants_are_the_same(network):
 
 def test_no_control_forces_no_move():
     plant = AcyclicPlant(SCENARIO)
-    run(plant, NoControl(planning_model(SCENARIO)), SCENARIO, seed=0)
+    run(plant, api.controller("no-control", SCENARIO), SCENARIO, seed=0)
     assert plant.forced_moves == 0.0
 
 
@@ -105,10 +104,8 @@ def test_no_way_leads_back_to_the_origin_or_the_previous_region():
 
 
 def test_shares_sum_to_one_and_are_theta_renormalised():
-    model, (_, splits) = (
-        acyclic.build(SCENARIO.network),
-        random_controls(np.random.default_rng(5), SCENARIO.network),
-    )
+    model = acyclic.build(SCENARIO.network)
+    _, splits = random_controls(np.random.default_rng(5), SCENARIO.network)
     theta, forced = acyclic.shares(model, splits)
     sums = np.bincount(model.move_from, theta, minlength=len(model.region))
     np.testing.assert_allclose(sums, model.region != model.destination, atol=1e-12)

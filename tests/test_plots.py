@@ -5,13 +5,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from tiny import made
 
 from nmfd.api import load_scenario
 from nmfd.controllers.strategy import CONTROLLERS
-from nmfd.studies import plots
+from nmfd.studies import benchmark, plots
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "economic_mpc"
+DOLLARS = "ü <b>$x^$</b> & $$y"  # no mathematics: a syntax error
 
 
 @pytest.fixture(scope="module")
@@ -115,3 +118,38 @@ def test_the_legend_fits_the_figure(scenario, width):
         drawing.legends[0].get_window_extent(drawing.canvas.get_renderer()).width
         <= drawing.bbox.width
     )
+
+
+def test_names_with_dollars_are_text_in_every_figure(scenario, tmp_path):
+    network = replace(scenario.network, region_names=(DOLLARS,) * 7)
+    named = replace(scenario, name=DOLLARS, network=network)
+    runs = runs_of(named, plants=("nmfd", DOLLARS), controllers=(DOLLARS, "no-control"))
+    benchmark.draw_accumulations(tmp_path, named, runs, title=DOLLARS)
+    benchmark.draw_scenario(tmp_path, named)
+    plots.draw_mfds(tmp_path / "samples.png", network, [{DOLLARS: np.ones((3, 2))}] * 7)
+    drawing = plots.figure(5, 4)
+    ax = plots.with_intervals(drawing.subplots(), {DOLLARS: {1.0: (2.0, 0.1)}})
+    ax.set_ylabel(f"time of {DOLLARS}")
+    plots.legend_below(drawing, [ax])
+    plots.save(drawing, tmp_path / "intervals.png")
+    assert len(list(tmp_path.glob("*.png"))) == 7
+
+
+def pixels(drawing, name):
+    """The picture of a logarithmic axis with a name in every place that takes one."""
+    ax = drawing.subplots()
+    ax.loglog([1.0, 1000.0], [1.0, 10.0], label=name)
+    ax.set(title=name, xlabel=name, ylabel="veh")
+    ax.text(10.0, 5.0, name)
+    drawing.suptitle(name)
+    ax.legend()
+    canvas = FigureCanvasAgg(drawing)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())
+
+
+def test_names_look_as_matplotlib_draws_escaped_ones():
+    """The powers of ten at the ticks of a logarithmic axis stay mathematics."""
+    usual = Figure(figsize=(5, 4), layout="constrained")
+    expected = pixels(usual, DOLLARS.replace("$", r"\$"))
+    np.testing.assert_array_equal(pixels(plots.figure(5, 4), DOLLARS), expected)

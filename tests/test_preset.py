@@ -51,8 +51,8 @@ def test_the_published_preset_trains_loads_and_drives(tmp_path, monkeypatch):
     assert weights["backbone.1.a"] != 0.0
     assert weights["perimeter_decoder.1.a"] != 0.0
     result = nmfd.run(scenario, "dpc-pcrg", policy=file, progress=False)
-    assert (result.perimeter[:, 0, 1] >= 0.1).all()
-    assert np.isfinite(result.accumulation).all()
+    assert (result["perimeter"][:, 0, 1] >= 0.1).all()
+    assert np.isfinite(result["accumulation"]).all()
 
 
 def test_one_part_at_a_time_and_what_does_not_fit(tmp_path):

@@ -8,19 +8,18 @@ import tiny
 import torch
 from commands import good, nmfd
 
+from cosim.plant.strategy import parse
 from nmfd import closed_loop
 from nmfd.api import load_scenario, run
 from nmfd.controllers.dpc.policy import Architecture, Policy
 from nmfd.controllers.dpc.rollout import Rollout
-from nmfd.controllers.strategy import parse
-from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
 from nmfd.studies.benchmark import lower_bound
 from nmfd.types import Observation
 
 
 def test_every_decoder_descends_the_total_time_spent():
-    planning = planning_model(load_scenario("grid7_peak"), "dpc-pcrg", "dpc-pcrg+max-pressure")
+    planning = parse("dpc-pcrg+max-pressure").own_planning(load_scenario("grid7_peak"))
     rollout = Rollout(planning, dtype=torch.float64)
     torch.manual_seed(0)
     made = Policy(
@@ -55,11 +54,11 @@ def test_a_trained_network_closes_the_loop_and_its_trips_wait(tmp_path):
     controller = parse("dpc-pcrg").make(scenario)
     run = closed_loop.run(NmfdPlant(scenario), controller, scenario, seed=0)
     expected = (
-        controller.policy.prices(torch.from_numpy(run.observed[:-1]).float()).detach().numpy()
+        controller.policy.prices(torch.from_numpy(run["observed"][:-1]).float()).detach().numpy()
     )
-    np.testing.assert_allclose(run.prices, expected, rtol=1e-4)
-    assert run.prices.max() < 1.0
-    assert run.backlog.max() > 1.0
+    np.testing.assert_allclose(run["prices"], expected, rtol=1e-4)
+    assert run["prices"].max() < 1.0
+    assert run["backlog"].max() > 1.0
 
 
 def test_the_lower_bound_without_metering_is_not_that_of_a_policy_that_meters():
@@ -72,11 +71,11 @@ def test_the_lower_bound_without_metering_is_not_that_of_a_policy_that_meters():
 def test_mpc_of_grid7_has_the_outputs_of_the_policy():
     """The script decides within its bounds, prices the filling centre most, and lets fewest trips
     begin there."""
-    scenario = replace(load_scenario("grid7_peak", {"demand_factor": 2.0}), steps=12)
+    scenario = load_scenario("grid7_peak", {"demand_factor": 2.0})
     strategy = parse(
         f"{scenario.folder}/price_mpc.py:PriceMpc+max-pressure+guidance-period-60+metering"
     )
-    x = run(scenario, "no-control").accumulation[12]
+    x = run(scenario, "no-control", steps=12)["accumulation"][12]
     controls = strategy.make(scenario).act(
         Observation(step=12, time=1080.0, accumulation=x, backlog=0.0 * x)
     )

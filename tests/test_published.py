@@ -21,6 +21,7 @@ from nmfd.model import dynamics
 from nmfd.model.planning import planning_model
 from nmfd.model.plant import AcyclicPlant, NmfdPlant
 from nmfd.model.regional_model import load_network
+from nmfd.model.scenario import with_demand
 from nmfd.studies import bound
 from nmfd.types import Observation
 
@@ -43,7 +44,9 @@ def begun(tmp_path):
 def test_the_noise_of_the_benchmark_is_a_standard_deviation_of_the_measurement_or_of_the_state(
     plant,
 ):
-    scenario = replace(load_scenario("economic_mpc"), steps=30, initial=np.full((7, 7), 100.0))
+    scenario = replace(
+        with_demand(load_scenario("economic_mpc"), steps=30), initial=np.full((7, 7), 100.0)
+    )
     assert (scenario.measurement_std, scenario.process_std) == (0.25, 0.0)
     moved = replace(scenario, measurement_std=0.0, process_std=0.25)
     quiet, first, again, noisy = (
@@ -53,7 +56,7 @@ def test_the_noise_of_the_benchmark_is_a_standard_deviation_of_the_measurement_o
     assert (quiet.observed - quiet.accumulation).std() == pytest.approx(0.25, rel=0.05)
     assert (first.observed == first.accumulation).all()
     assert (first.accumulation == again.accumulation).all()
-    assert (first.accumulation != noisy.accumulation).any()
+    assert (first.accumulation != noisy["accumulation"]).any()
     assert first.accumulation.min() >= 0.0
     assert (first.accumulation - quiet.accumulation)[1].std() == pytest.approx(0.25, rel=0.3)
     assert scenario.hash != moved.hash != replace(moved, process_std=0.0).hash
@@ -129,8 +132,8 @@ def test_greedy_does_what_the_paper_has_it_do(two_regions):
     trajectory = run(
         NmfdPlant(two_regions), make_controller("greedy", two_regions), two_regions, seed=0
     )
-    assert trajectory.completed[-1] == pytest.approx(17070.0, rel=0.01)
-    n1, n2 = trajectory.accumulation.sum(axis=2).T
+    assert trajectory["completed"][-1] == pytest.approx(17070.0, rel=0.01)
+    n1, n2 = trajectory["accumulation"].sum(axis=2).T
     assert (n1[0], n2[0]) == (5400.0, 4000.0)
     met = int(np.argmax(n1 <= n2))
     assert 60.0 * met == pytest.approx(590.0, abs=90.0)
@@ -198,11 +201,13 @@ def test_a_control_horizon_of_one_holds_the_best_constant_controls(two_regions):
 @pytest.mark.parametrize("plant", [NmfdPlant, AcyclicPlant])
 def test_a_city_that_does_not_begin_empty(begun, plant):
     """Everybody who was inside at first is there, and reaches the end of the trip."""
-    quiet = replace(begun, demand=0.0 * begun.demand, steps=20)
+    quiet = with_demand(begun, steps=20, factor=0.0)
     trajectory = run(plant(quiet), make_controller("no-control", quiet), quiet, seed=0)
-    np.testing.assert_array_equal(trajectory.accumulation[0], [[0.0, 100.0], [0.0, 50.0]])
-    assert trajectory.accumulation[-1].sum() + trajectory.completed[-1] == pytest.approx(150.0)
-    assert trajectory.completed[-1] > 50.0
+    np.testing.assert_array_equal(trajectory["accumulation"][0], [[0.0, 100.0], [0.0, 50.0]])
+    assert trajectory["accumulation"][-1].sum() + trajectory["completed"][-1] == pytest.approx(
+        150.0
+    )
+    assert trajectory["completed"][-1] > 50.0
     assert (quiet.start == begun.initial).all()
     assert quiet.hash != replace(quiet, initial=None).hash
 

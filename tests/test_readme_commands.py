@@ -10,7 +10,8 @@ from commands import MAINS, call, good
 from documents import FILES, NOTEBOOKS, ROOT, read
 
 STEPS = ["--steps", 2]
-REDUCED = {  # what is added; of an option that is there already the last counts. The city is tiny_city
+# What is added; of an option that is there already the last counts. The city is tiny_city.
+REDUCED = {
     "nmfd benchmark": ["--seeds", 1],
     "nmfd train": ["--steps", 1],
     "nmfd new-controller": [],

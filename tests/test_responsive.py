@@ -13,13 +13,16 @@ import tiny_city
 from commands import cosim
 from signal_rules import MIN_GREEN, watched
 
+from cosim.plant.gates import DEFAULT_YELLOW_S
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
 from nmfd.api import load_scenario
+from nmfd.model.scenario import with_demand
 from nmfd.types import Controls
 
 CONFIG = """<configuration>
-  <input><net-file value="city.net.xml"/><route-files value="cars.rou.xml"/></input><time><end value="450"/></time>
+  <input><net-file value="city.net.xml"/><route-files value="cars.rou.xml"/></input>
+  <time><end value="450"/></time>
 </configuration>"""
 CARS = """<routes>
   <flow id="east" begin="0" end="450" period="3" from="A1B1" to="C1D1"/>
@@ -67,7 +70,7 @@ def opened(town):
 def drive(folder, gates, faults=(), **overrides):
     """A run under u = gates[k] in interval k: what every signal shows second by second, and
     more."""
-    scenario = replace(load_scenario(folder), steps=len(gates), faults=tuple(faults))
+    scenario = replace(with_demand(load_scenario(folder), steps=len(gates)), faults=tuple(faults))
     plant = SumoPlant(
         scenario, settings=settings(scenario).changed(**({"chain_limit": 0.0} | overrides))
     )
@@ -127,6 +130,18 @@ def test_open_gates_leave_sumo_s_own_signals_to_the_byte(town, opened):
     assert not np.isnan(opened.record.gateway_green).all()
 
 
+@pytest.mark.parametrize("signals", ["fixed", "max-pressure"])
+def test_the_share_of_ungated_green(town, signals):
+    """An open gate shows all green that SUMO or max-pressure gives it, however little that is."""
+    for gates, least, most in ((0.9, 1.0, 1.0), (0.1, 0.0, 0.5)):
+        record = drive(town[1], [gates] * 3, signals=signals).record
+        shown, ungated = record.gateway_green[1:], record.gateway_original_green[1:]
+        given = ungated > 0.0
+        assert given.any()
+        assert (shown[given] <= ungated[given]).all()
+        assert least <= shown[given].sum() / ungated[given].sum() <= most
+
+
 def test_rationed_under_max_pressure(town, opened):
     """Max-pressure runs their stages, and closed gateways let less through."""
     run = drive(town[1], [0.1] * 3, signals="max-pressure")
@@ -142,10 +157,16 @@ def test_a_deaf_signal_runs_its_own_programme_and_can_be_held_again(town):
         for before, after in pairwise(run.shown["B2"])
         for a, b in zip(before, after, strict=True)
     )
-    green = run.record.gateway_green[:, [n for n, g in enumerate(run.gateways) if g.signal == "B2"]]
-    held = ~np.isnan(green[0])
-    assert (green[[0, 2]][:, held] <= MIN_GREEN + 1.0).all()
-    assert (green[1, held] > 2 * MIN_GREEN).all()
+    own = [n for n, gateway in enumerate(run.gateways) if gateway.signal == "B2"]
+    green = run.record.gateway_green[:, own]
+    assert (green[[0, 2]] <= MIN_GREEN + 1.0).all()
+    assert (green[1] >= 2 * MIN_GREEN).all()
+    interval = len(run.shown["B2"]) // 3
+    deaf = run.shown["B2"][interval : 2 * interval]
+    for n, seconds in zip(own, green[1], strict=True):
+        lights = [state[run.gateways[n].links[0]] for state in deaf]
+        shown = sum(light in "Gg" for light in lights)
+        assert seconds == pytest.approx(shown, abs=DEFAULT_YELLOW_S)  # of the change
 
 
 @pytest.fixture(scope="module")
@@ -182,7 +203,8 @@ def test_what_cannot_run_here_is_refused_before_the_first_run(
         else ("--controllers", f"no-control,{name}")
     )
     done = cosim(command, places[city], *names, "--steps", 1, "--out", "out")
-    assert done.exit_code != 0 and len(done.stderr.strip().splitlines()) == 1, done.stderr
+    assert done.exit_code != 0
+    assert len(done.stderr.strip().splitlines()) == 1, done.stderr
     assert f"controller {name} cannot run here: " in done.stderr
     assert said in done.stderr
     assert not (tmp_path / "out").exists()

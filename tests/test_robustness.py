@@ -15,7 +15,8 @@ from nmfd.studies import benchmark as study
 
 
 def test_noise_has_the_declared_size_and_place(scenario):
-    long = replace(scenario, demand=np.tile(10.0 * np.sign(scenario.demand), (200, 1, 1)))
+    many = np.tile(10.0 * np.sign(scenario.demand), (200, 1, 1))
+    long = replace(scenario, steps=len(many), demand=many)
     noisy = perturbed(long, 1.0, 0)
     change, pairs = noisy.demand - long.demand, pairs_with_demand(long.demand)
     assert (change[:, ~pairs] == 0.0).all()
@@ -79,7 +80,7 @@ def test_trip_lengths_stay_within_the_integration_step_and_a_wrong_kind_is_one_l
 
 
 def test_rows_and_picture_of_a_comparison(folder, tmp_path):
-    out, options = tmp_path / "out", {"sigmas": [0.0, 1.0], "scenarios": 2}
+    out, options = tmp_path / "out", {"sigmas": [0.0, 1.0], "seeds": 2}
     rows = robustness(folder, ["pi-gating"], out=out, **options)
     assert {path.name for path in out.iterdir()} >= {
         "runs.csv",
@@ -98,12 +99,10 @@ def test_rows_and_picture_of_a_comparison(folder, tmp_path):
     table = study.improvement_table(rows)
     assert "pi-gating" in table
     assert "±" in table
-    more = robustness(folder, ["greedy"], out=out, sigmas=[1.0], scenarios=1)
+    more = robustness(folder, ["greedy"], out=out, sigmas=[1.0], seeds=1)
     assert len(more) == 9
     assert set(more["failure"]) == {""}
-    other = robustness(
-        folder, ["pi-gating"], kind="trip-lengths", out=out, sigmas=[0.1], scenarios=1
-    )
+    other = robustness(folder, ["pi-gating"], kind="trip-lengths", out=out, sigmas=[0.1], seeds=1)
     table = study.improvement_table(other)
     assert "360" in table
     assert "sigma of trip-lengths: spread" in table

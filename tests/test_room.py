@@ -14,9 +14,9 @@ from cosim.plant.room import Room, shared, upstream
 from cosim.plant.settings import settings
 from cosim.plant.supervisor import Supervisor
 from cosim.sumo.net import Gateway
+from nmfd import api
 from nmfd.api import load_scenario
-from nmfd.controllers.rules import PiGating
-from nmfd.model.planning import planning_model
+from nmfd.model.scenario import with_demand
 from nmfd.types import Controls, Observation
 
 # Streets a and b lead to the gateways a -> x and b -> y; c, which has a signal at its end, d and e
@@ -108,7 +108,7 @@ def town(tmp_path_factory):
 
 @pytest.mark.parametrize("limit, held", [(0.6, True), (0.0, False)])
 def test_no_command_fills_the_street_before_a_gateway(town, limit, held):
-    scenario = replace(load_scenario(town), steps=4)
+    scenario = with_demand(load_scenario(town), steps=4)
     with closing(
         SumoPlant(scenario, settings=settings(scenario).changed(chain_limit=limit))
     ) as plant:
@@ -132,7 +132,7 @@ def test_no_command_fills_the_street_before_a_gateway(town, limit, held):
 def test_the_integral_goes_on_from_what_was_realised():
     """At the set point the next command is the mean of what the entries realised."""
     scenario = load_scenario("economic_mpc")
-    network, controller = scenario.network, PiGating(planning_model(scenario))
+    network, controller = scenario.network, api.controller("pi-gating", scenario)
     accumulation = np.zeros((7, 7))
     accumulation[3, 0] = controller.set_point[0]
     entries = network.adjacency[:, 3]
@@ -144,8 +144,16 @@ def test_the_integral_goes_on_from_what_was_realised():
     assert controller.act(seen).perimeter[entries, 3] == pytest.approx(0.5)
 
 
-@pytest.mark.parametrize("change, full, share, opens", [(1, 1.5, 0.2, True), (0, 1.5, 0.2, True), (-1, 1.5, 0.2, False),
-                                                        (1, 0.5, 0.2, False), (1, 1.5, 0.9, False)])  # fmt: skip
+@pytest.mark.parametrize(
+    "change, full, share, opens",
+    [
+        (1, 1.5, 0.2, True),
+        (0, 1.5, 0.2, True),
+        (-1, 1.5, 0.2, False),
+        (1, 0.5, 0.2, False),
+        (1, 1.5, 0.9, False),
+    ],
+)
 def test_gates_that_do_not_empty_their_region_open_for_a_while(change, full, share, opens):
     network = load_scenario("economic_mpc").network
     supervisor, command = Supervisor(network, 90.0), np.where(network.adjacency, 1.0, 0.0)

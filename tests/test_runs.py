@@ -43,8 +43,8 @@ def test_a_result_is_read_as_it_was_written(tmp_path):
     xr.testing.assert_identical(back.data, original.data)
     assert (back.controller, back.plant, back.seed, back.step) == ("no-control", "nmfd", 0, 30.0)
     assert back.co2_kg == 3.25
-    assert back.gateway_flow.shape == (4, 3)
-    assert list(back.note) == ["", "", "", "no"]
+    assert back["gateway_flow"].shape == (4, 3)
+    assert list(back["note"]) == ["", "", "", "no"]
     assert list(tmp_path.iterdir()) == [tmp_path / "a.nc"]
     assert pickle.loads(pickle.dumps(back)).seed == 0
     with pytest.raises(AttributeError, match="nothing"):
@@ -70,7 +70,8 @@ def test_xarray_opens_a_run_with_names_and_units(tmp_path):
         assert data.attrs["estimated"] == 1
         assert set(data.data_vars) == {*VARIABLES, *RECORD}
         for name, values in data.variables.items():
-            assert values.attrs["long_name"] and ("units" in values.attrs or name == "note"), name
+            assert values.attrs["long_name"], name
+            assert "units" in values.attrs or name == "note", name
         assert list(data["status"].values) == [0, 0, 0, 3]  # a solver failure and a fallback
         assert list(data["time"].values) == [0.0, 30.0, 60.0, 90.0, 120.0]
         assert data["time"].attrs["units"] == "s"
@@ -195,7 +196,7 @@ def test_runs_are_done_once_and_come_in_the_order_asked_for(tmp_path):
     assert list(again["controller"]) == ["c", "a", "b"]
     assert len(calls) == 3
     pd.testing.assert_frame_equal(
-        pd.read_csv(out / "runs.csv", keep_default_na=False), again, check_dtype=False
+        again, pd.read_csv(out / "runs.csv", keep_default_na=False), check_dtype=False
     )
     manifest = read_manifest(out)
     assert [session["seeds"] for session in manifest["sessions"]] == [[0, 1], [0]]
@@ -207,19 +208,80 @@ def test_runs_are_done_once_and_come_in_the_order_asked_for(tmp_path):
     assert re.fullmatch(r"None|[0-9a-f]{40}", str(manifest["sessions"][0]["commit"]))
 
 
-def test_another_key_does_a_run_again(tmp_path, capsys):
-    calls = []
-    run_many([run_of("a", calls=calls), run_of("b", calls=calls)], tmp_path / "out", workers=0)
-    run_many(
-        [run_of("a", calls=calls, policy="q"), run_of("b", calls=calls)],
-        tmp_path / "out",
-        workers=0,
-    )
+def test_a_run_with_another_key_is_replaced_only_if_that_is_said(tmp_path, capsys):
+    calls, out = [], tmp_path / "out"
+    run_many([run_of("a", calls=calls), run_of("b", calls=calls)], out, workers=0)
+    changed = [run_of("a", calls=calls, policy="q"), run_of("b", calls=calls)]
+    with pytest.raises(InputError, match=r"a-0.nc: is a run with other settings \(controller ch"):
+        run_many(changed, out, workers=0)
+    assert len(calls) == 2
+    run_many(changed, out, workers=0, overwrite=True)
     assert calls == [("a", 0), ("b", 0), ("a", 0)]
     assert "a-0.nc: out of date, controller changed" in capsys.readouterr().err
-    rows = run_many([run_of("a", calls=calls, scenario="other")], tmp_path / "out", workers=0)
+    other = [run_of("a", calls=calls, scenario="other")]
+    with pytest.raises(InputError, match="scenario_hash changed.*or add --overwrite"):
+        run_many(other, out, workers=0)
+    rows = run_many(other, out, workers=0, overwrite=True)
     assert len(calls) == 4
     assert list(rows["controller"]) == ["a"]
+
+
+def test_files_that_are_no_runs_are_left_alone(tmp_path, capsys):
+    calls, out = [], tmp_path / "out"
+    runs = [run_of("a", calls=calls)]
+    first = run_many(runs, out, workers=0)
+    (out / "a-before.nc").write_bytes((out / "a-0.nc").read_bytes())
+    (out / "a-7.nc").write_bytes((out / "a-0.nc").read_bytes())
+    os.mkfifo(out / "a-8.nc")
+    again = run_many(runs, out, workers=0)
+    pd.testing.assert_frame_equal(first, again)
+    assert "a-7.nc: is the run of a with seed 0, not that of its name" in capsys.readouterr().err
+    rows = run_many([run_of("a", 7, calls=calls), run_of("a", 8, calls=calls)], out, workers=0)
+    assert set(rows["seed"]) == {0, 7, 8}
+    assert calls == [("a", 0), ("a", 7), ("a", 8)]
+
+
+@pytest.mark.parametrize(
+    "content", ["[]", "{", '{"folders": {"": {}}, "sessions": [{}]}', '{"folders": {}}']
+)
+def test_a_damaged_manifest_is_one_line(tmp_path, content):
+    run_many([run_of()], tmp_path / "out", workers=0)
+    (tmp_path / "out" / "manifest.json").write_text(content)
+    with pytest.raises(InputError, match="manifest.json: is no manifest of runs, or damaged") as e:
+        run_many([run_of()], tmp_path / "out", workers=0)
+    assert "\n" not in str(e.value)
+
+
+def test_a_name_that_no_file_can_have_is_refused_before_the_runs(tmp_path):
+    calls = []
+    with pytest.raises(InputError, match="its name is longer than the 200 bytes"):
+        run_many([run_of("a" * 250, calls=calls)], tmp_path / "out", workers=0)
+    assert calls == []
+
+
+def test_a_run_that_lasts_too_long_is_ended_and_the_others_go_on(tmp_path):
+    runs = [run_of("a", work=partial(time.sleep, 600)), run_of("b")]
+    rows = run_many(runs, tmp_path / "out", time_limit=3.0).set_index("controller")["failure"]
+    assert rows["a"] == "its time limit of 3 s is over"
+    assert rows["b"] == ""
+
+
+def test_folders_of_killed_processes_are_swept(tmp_path):
+    code = (
+        "import os, pathlib, signal; from nmfd.runs.files import temporary_folder\n"
+        f"with temporary_folder(where=pathlib.Path({str(tmp_path)!r})) as folder:\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=False)
+    assert len(list(tmp_path.iterdir())) == 1
+    with files.temporary_folder(where=tmp_path) as folder:
+        assert len(list(tmp_path.iterdir())) == 2  # it may be new, without its lock
+        past = time.time() - 10.0
+        for held in tmp_path.glob("*/.held"):
+            os.utime(held, (past, past))
+        files.sweep(tmp_path, "cosim-")
+        assert list(tmp_path.iterdir()) == [folder]
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_run_that_is_cut_off_is_done_again(tmp_path):
@@ -339,7 +401,7 @@ def test_progress_counts_runs(tmp_path):
         workers=0,
         progress=lambda *what: shown.append(what),
     )
-    assert shown == [(0, 2), (1, 2, "a-0"), (2, 2, "b-0")]
+    assert shown == [(0, 2, ""), (1, 2, "a-0"), (2, 2, "b-0")]
 
 
 @pytest.mark.slow

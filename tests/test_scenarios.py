@@ -11,7 +11,6 @@ from nmfd.api import load_scenario
 from nmfd.controllers import training
 from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
-from nmfd.model.planning import planning_model
 from nmfd.model.regional_model import load_network, network_toml
 from nmfd.model.scenario import read_scenario
 
@@ -176,10 +175,10 @@ def test_a_controller_plans_with_the_model_that_it_names(base, tmp_path):
         'name = "x"\nbase = "../scenario"\n[controllers.mpc-pc]\nmodel = "../model"\nhorizon = 4\n',
     )
     scenario = load_scenario(folder)
-    planned = planning_model(scenario, "mpc-pc")
+    planned = parse("mpc-pc").own_planning(scenario)
     assert planned.network.mfds[0].jam == 800.0
     assert planned.controller_options["mpc-pc"] == {"horizon": 4}
-    assert planning_model(scenario, "mpc-pcrg").network.mfds[0].jam == 1000.0
+    assert parse("mpc-pcrg").own_planning(scenario).network.mfds[0].jam == 1000.0
     assert make_controller("mpc-pc", scenario).options.horizon == 4
 
 
@@ -190,17 +189,18 @@ def test_guiding_controllers_find_the_model_of_guided_drivers(base, tmp_path):
     scenario = load_scenario(
         beside(
             base,
-            'name = "x"\nbase = "../scenario"\n[controllers."dpc-pcrg+max-pressure"]\nmodel = "../model"\n',
+            'name = "x"\nbase = "../scenario"\n[controllers."dpc-pcrg+max-pressure"]\n'
+            'model = "../model"\n',
         )
     )
     jam = {
-        name: planning_model(scenario, name).network.mfds[0].jam
+        name: parse(name).own_planning(scenario).network.mfds[0].jam
         for name in ("dpc-pcrg", "mpc-pcrg", "dpc-pc", "bound-pcrg", "dpc-pcrg+max-pressure")
     }
     assert list(jam.values()) == [800.0, 800.0, 1000.0, 1000.0, 700.0]
     (network / "guided" / "network.toml").write_text(tiny.row_network(3))
     with pytest.raises(InputError, match="guided/network.toml: network .* has other regions"):
-        planning_model(scenario, "dpc-pcrg")
+        parse("dpc-pcrg").own_planning(scenario)
 
 
 def test_an_inherited_model_lies_where_the_base_says(base, tmp_path):
@@ -211,7 +211,7 @@ def test_an_inherited_model_lies_where_the_base_says(base, tmp_path):
     far = tmp_path / "far" / "away"
     far.mkdir(parents=True)
     (far / "scenario.toml").write_text(f'name = "y"\nbase = "../../{first.name}"\n')
-    assert planning_model(load_scenario(far), "mpc-pc").network.mfds[0].jam == 800.0
+    assert parse("mpc-pc").own_planning(load_scenario(far)).network.mfds[0].jam == 800.0
 
 
 def test_a_variant_has_options_model_and_policy_of_its_own(base, tmp_path):

@@ -1,7 +1,6 @@
 """The proof sheet of signals: violations by hand, SUMO's own record, and random commands under
 every signal control."""
 
-from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -12,13 +11,14 @@ from signal_rules import CROSS, WALK, rules
 from test_responsive import CARS, CONFIG
 
 from cosim.api import run_controllers
-from cosim.evaluation.signal_proof import SHEET, VIOLATIONS, proof_sheet
+from cosim.evaluation.signal_proof import VIOLATIONS, proof_sheet
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import own_files, settings
+from cosim.plant.strategy import parse
 from cosim.sumo.net import city_of
 from cosim.sumo.xml_files import read_xml
 from nmfd.api import load_scenario
-from nmfd.controllers.strategy import parse
+from nmfd.model.scenario import with_demand
 from nmfd.types import Controls
 
 CONTROLS = ("", "max-pressure", "actuated", "webster", "metering")
@@ -28,8 +28,7 @@ def judge(phases, shown, crossings=()):
     """The row of a signal with such phases, which shows (state, seconds)."""
     begins = np.cumsum([0.0, *(seconds for _, seconds in shown)]).tolist()
     states = [(begin, state) for begin, (state, _) in zip(begins, shown, strict=False)]
-    row = rules(phases, crossings).judge(states, begins[-1])
-    return dict(zip(tuple(SHEET)[1:], row, strict=True))
+    return rules(phases, crossings).judge(states, begins[-1])
 
 
 @pytest.mark.parametrize(
@@ -48,7 +47,8 @@ def judge(phases, shown, crossings=()):
         ),
         ([("Gg", 9), ("yr", 3), ("rG", 9), ("ry", 3)], [("GG", 9), ("gG", 9)], {"conflicts": 1}),
         (WALK, [*WALK, ("GrG", 19), *WALK[1:]], {"short_greens": 1}),  # a crossing keeps its 20 s
-        (WALK, [*WALK, WALK[0], *WALK[2:5]], {"short_intergreens": 1}),  # and is cleared for 9 s
+        (WALK, [*WALK, WALK[0], *WALK[2:5]], {"short_clearances": 1}),  # and is cleared for 9 s
+        (WALK, [*WALK, *WALK[:3], *WALK[4:5]], {"short_intergreens": 1, "short_clearances": 1}),
         (WALK, [*WALK, *WALK[:4], ("rGr", 2), ("ryr", 2)], {"short_greens": 1}),  # 3 s originally
     ],
 )
@@ -62,12 +62,24 @@ def test_figures_of_a_sheet():
     assert (row["shortest_green"], row["shortest_yellow"], row["longest_red"]) == (7.0, 3.0, 36.0)
 
 
+def test_clearance_of_a_crossing():
+    """From the end of its green to that of the cars across it, not to that of the cars beside."""
+    row = judge(WALK, [*WALK, *WALK[:2], ("yrr", 5), *WALK[3:5]], crossings=(2,))
+    assert row["shortest_clearance"] == 9.0
+    assert np.isnan(judge(CROSS, 3 * CROSS)["shortest_clearance"])
+
+
 def proven(folder, words, intervals, tmp_path):
     """Run with random commands in every interval; return the sheet of what SUMO's saveTLSStates
     wrote."""
-    scenario, strategy = replace(load_scenario(folder), steps=intervals), parse("no-control", words)
+    scenario, strategy = (
+        with_demand(load_scenario(folder), steps=intervals),
+        parse("no-control", words),
+    )
     chosen = (
-        settings(scenario).changed(gateways_fixed=False, mesoscopic=False).changed(**strategy.city)
+        settings(scenario)
+        .changed(gateways_fixed=False, mesoscopic=False)
+        .changed(**strategy.changes)
     )
     city, network, random = city_of(scenario.network), scenario.network, np.random.default_rng(5)
     programmes = [city.net_file, *own_files(scenario, chosen.additional)]
@@ -98,7 +110,7 @@ def proven(folder, words, intervals, tmp_path):
         if not row or row[-1][1] != element.get("state"):
             row.append((float(element.get("time")), element.get("state")))
     sheet, own = (
-        proof_sheet(each, programmes, end=end, step=chosen.step_length)
+        proof_sheet(each, programmes, end=end, step=chosen.step_length, waits={})
         for each in (states, observed)
     )
     assert all(np.array_equal(sheet[key], own[key]) for key in VIOLATIONS)
@@ -127,18 +139,17 @@ def test_a_run_says_that_signals_break_rules(imported, tmp_path):
     scenario, faults = imported["static"], ["signal:B1@1-2", "signal:B2@3-5"]
     for settings_, said in (({"faults": faults}, True), ({}, False)):
         out = tmp_path / str(said)
-        text = run_controllers(
-            scenario, ["no-control+max-pressure"], settings=settings_, steps=8, out=out
-        )
+        changed = load_scenario(scenario, settings_)
+        rows = run_controllers(changed, ["no-control+max-pressure"], steps=8, out=out)
         table = pd.read_csv(out / "signals.csv")
         assert list(table)[2] == "signal"
         assert sorted(table.signal) == ["B1", "B2", "C1", "C2"]
+        cleared = table.shortest_clearance_s >= 8.0  # 5 s, and the yellow of the cars beside
+        assert (cleared == (table.short_clearances == 0)).all()
+        assert cleared.all() != said
         broken = table[list(VIOLATIONS)].to_numpy().sum()
-        assert (
-            (broken > 0)
-            == said
-            == (f"signals break their rules {broken} times, see {out}/signals.csv" in text)
-        )
+        assert (broken > 0) == said
+        assert rows["signal_violations"].tolist() == [broken]
         assert pd.read_csv(out / "runs.csv").signal_violations.tolist() == [broken]
 
 

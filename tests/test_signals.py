@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from signal_rules import MIN_GREEN, watched
 
-from cosim.plant.max_pressure import Roads
 from cosim.plant.plant import SumoPlant
+from cosim.plant.pressure import Roads
 from cosim.plant.settings import Settings
 from cosim.sumo.net import city_of
 from cosim.sumo.signals import read_signals
@@ -82,13 +82,13 @@ def test_signals_that_are_not_simple_are_left_alone(city, tmp_path):
     (tmp_path / "net.xml").write_text(text)
     changed = replace(city, net_file=tmp_path / "net.xml")
     simple, others = read_signals(changed)
-    assert others == ["c11", "c12"]
+    assert others == {"c11": "actuated signal", "c12": "delay_based signal"}
     assert not {"c11", "c12"} & {s.id for s in simple}
     last = night.replace("night", "last").replace('offset="0"', 'offset="7"')
     (tmp_path / "more.add.xml").write_text(f"<additional>{last}</additional>")
     simple, others = read_signals(changed, [tmp_path / "more.add.xml"])
-    assert others == ["c11"]
-    assert [s.offset for s in simple if s.id == "c12"] == [7.0]
+    assert others == {"c11": "actuated signal"}
+    assert [s.offset for s in simple if s.id == "c12"] == ["7"]
 
 
 def test_pressure_is_upstream_minus_downstream(city, scenario):

@@ -6,18 +6,12 @@ import numpy as np
 import pytest
 import tiny
 
+import nmfd
 from cosim.plant.settings import Settings
-from nmfd.controllers.rules import NoControl
-from nmfd.controllers.strategy import (
-    ALONE,
-    CITY_NUMBERS,
-    CITY_WORDS,
-    CONTROLLERS,
-    city_words,
-    parse,
-)
+from cosim.plant.strategy import WORDS, Word, parse, vocabulary
+from nmfd.controllers import strategy as regional
+from nmfd.controllers.strategy import ALONE, CONTROLLERS
 from nmfd.errors import InputError
-from nmfd.model.planning import planning_model
 from nmfd.types import Observation
 
 
@@ -48,7 +42,7 @@ def test_what_a_name_means(name, controller, city):
     """Only without control may signals with gateways be actuated."""
     strategy = parse(name)
     assert (strategy.name, strategy.controller.name) == (name, controller)
-    assert strategy.city == {"gateways_fixed": controller != ALONE, **city}
+    assert strategy.changes == {"gateways_fixed": controller != ALONE, **city}
     assert hash(strategy) == hash(parse(name))
 
 
@@ -67,13 +61,73 @@ def test_who_guides(name, guides):
 
 
 def test_every_controller_and_word_is_a_strategy():
-    names = set(Settings.model_fields)
     for controller in CONTROLLERS:
         assert parse(controller).controller is CONTROLLERS[controller]
-    for word in (*CITY_WORDS, *(f"{stem}-50" for stem in CITY_NUMBERS)):
-        assert parse(word).city == parse(f"no-control+{word}").city
-        assert set(parse(f"mpc-pc+{word}").city) <= names
-    assert len(city_words()) == len(CITY_WORDS) + len(CITY_NUMBERS)
+    words = [word.lstrip("+").replace("-N", "-50") for word in vocabulary()]
+    for word in words:
+        assert parse(word).changes == parse(f"no-control+{word}").changes
+        assert set(parse(f"mpc-pc+{word}").changes) <= set(Settings.model_fields)
+    assert {"max-pressure", "guided", "metering-50"} <= set(words)
+
+
+def test_a_new_word_is_one_entry(monkeypatch):
+    monkeypatch.setitem(WORDS, "half", Word("compliance", 0.5, "half of the drivers follow"))
+    strategy = parse("dpc-pcrg+half")
+    assert strategy.city.compliance == 0.5
+    assert regional.parse("dpc-pcrg+half").labels == ("half",)
+    assert vocabulary()["+half"] == "half of the drivers follow"
+
+
+def test_settings_are_a_city():
+    city = Settings(signals="max-pressure", guidance_period=60.0)
+    strategy = parse(nmfd.PiGating(kp=2.0), city)
+    assert strategy.name == "pi-gating(kp=2.0)+guidance-period-60+max-pressure"
+    assert parse(strategy.name).changes == strategy.changes
+    assert parse("pi-gating+guided", city).changes["guided"]
+    assert parse("pi-gating", Settings(chain_limit=0.2)).name == "pi-gating+chain_limit=0.2"
+    with pytest.raises(InputError, match="actuated and max-pressure exclude each other"):
+        parse("pi-gating+actuated", city)
+
+
+@pytest.mark.parametrize(
+    "options, name",
+    [
+        (nmfd.NoControl(), "no-control"),
+        (nmfd.PiGating(), "pi-gating"),
+        (nmfd.PiGating(kp=2.0, set_point=(100.0,)), "pi-gating(set_point=[100.0], kp=2.0)"),
+        (nmfd.EconomicMpc(guidance=True, horizon=4), "mpc-pcrg(horizon=4)"),
+        (nmfd.EconomicMpc(terminal=True), "mpc-pc-terminal"),
+        (nmfd.Probing(guidance=True), "probing-pcrg"),
+        (nmfd.PricingRule(metering=True), "pricing-rule(metering=true)"),
+        (nmfd.Dpc(), "dpc-pcrg"),
+        (nmfd.Dpc(guidance=False), "dpc-pc"),
+        (nmfd.Bound(plan="a.npz"), 'bound-pc(plan="a.npz")'),
+    ],
+    ids=repr,
+)
+def test_options_have_a_name_that_means_them(options, name):
+    strategy = regional.parse(options)
+    assert strategy.name == name
+    again = regional.parse(f"{name}()" if "(" not in name else name)
+    one, other = (each.controller.default for each in (again, strategy))
+    assert one.model_dump(exclude={"guidance"}) == other.model_dump(exclude={"guidance"})
+    assert one.guides == other.guides
+
+
+@pytest.mark.parametrize(
+    "name, expected",
+    [
+        ("pi-gating(kp)", "expected pi-gating(key=value, ...)"),
+        ("pi-gating(kq=1)", "kq: unknown key; allowed here: model, set_point"),
+        ("mpc-pc(guidance=true)", "guidance: is false for mpc-pc"),
+        ("pi-gating(kp=-1)", "greater than or equal to 0"),
+    ],
+)
+def test_wrong_options_in_a_name(name, expected):
+    with pytest.raises(InputError) as caught:
+        regional.parse(name)
+    assert expected in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 def test_the_table_with_most_words_applies(scenario):
@@ -83,7 +137,7 @@ def test_the_table_with_most_words_applies(scenario):
         "dpc-pc+max-pressure+rerouting-30",
         "dpc-pcrg+max-pressure",
     ]
-    scenario = replace(scenario, controller_options=dict.fromkeys(tables, {}))
+    scenario = replace(scenario, controller_options={name: {} for name in tables})
     for name, expected in (
         ("dpc-pc", "dpc-pc"),
         ("dpc-pc+webster", "dpc-pc"),
@@ -97,7 +151,7 @@ def test_the_table_with_most_words_applies(scenario):
 
 
 def test_tables_that_fit_equally_well_are_an_error(scenario):
-    tables = dict.fromkeys(["dpc-pc+max-pressure", "dpc-pc+metering"], {})
+    tables = {"dpc-pc+max-pressure": {}, "dpc-pc+metering": {}}
     rivals = replace(scenario, controller_options=tables)
     with pytest.raises(
         InputError, match=r'fit it equally well; add a table \[controllers."dpc-pc\+metering\+max-p'
@@ -154,13 +208,14 @@ def test_the_regional_model_takes_no_words_for_a_city():
 
 
 def test_an_object_is_a_strategy(scenario):
-    controller = NoControl(planning_model(scenario))
+    controller = nmfd.controller("no-control", scenario)
     strategy = parse(controller, "max-pressure")
-    assert (strategy.name, strategy.city["signals"]) == ("no-control+max-pressure", "max-pressure")
+    assert (strategy.name, strategy.city.signals) == ("no-control+max-pressure", "max-pressure")
     assert strategy.make(scenario) is controller
     assert strategy.planning(scenario).network.hash == scenario.network.hash
-    with pytest.raises(InputError, match="an object with reset and act"):
-        parse(type("Half", (), {"reset": lambda self: None})())
+    for wrong in (type("Half", (), {"reset": lambda self: None})(), nmfd.PiGating):
+        with pytest.raises(InputError, match="an object with reset and act"):
+            parse(wrong)
     with pytest.raises(InputError, match="reads no policy"):
         strategy.make(scenario, tiny)
 

@@ -244,7 +244,7 @@ def test_vehicles_of_a_loaded_state_begin_where_they_are(tmp_path):
     assert len(traffic.vehicles) == len(plain(config)) == 11
     imported(config)
     result = run(tmp_path / "scenarios" / "x", "no-control", seed=0, progress=False)
-    assert result.departures.sum() == 11
+    assert result["departures"].sum() == 11
 
 
 def test_what_is_left_out_is_said_first_and_last(tmp_path):

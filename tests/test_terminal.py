@@ -11,7 +11,8 @@ from nmfd import closed_loop
 from nmfd.api import controller as make_controller
 from nmfd.api import load_scenario
 from nmfd.controllers.mpc import edge_model, terminal
-from nmfd.controllers.mpc.controller import EconomicMpc
+from nmfd.controllers.mpc.controller import EconomicMpc, MpcController
+from nmfd.controllers.strategy import check_tables, parse
 from nmfd.errors import InputError
 from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
@@ -65,8 +66,8 @@ def test_more_vehicles_cost_more_and_the_later_the_less(scenario, learned):
 
 def test_the_plan_descends_on_both_sums(scenario, learned):
     """The gradient of edge_model with what lies beyond, by finite differences."""
-    planning = planning_model(scenario, NAME)
-    mpc = EconomicMpc(planning, guidance=False, terminal=learned)
+    planning = parse(NAME).own_planning(scenario)
+    mpc = MpcController(planning, EconomicMpc(), terminal=learned)
     used = np.flatnonzero(planning.destinations)
     model = edge_model.build(planning.network, used, guidance=False, step=planning.step)
     start, demand = (
@@ -92,19 +93,19 @@ def test_the_plan_descends_on_both_sums(scenario, learned):
 
 def test_mpc_looks_beyond_its_horizon(scenario, learned):
     """Even with what little was learned here."""
-    planning = planning_model(scenario, NAME)
+    planning = parse(NAME).own_planning(scenario)
     plain, far = (
         closed_loop.run(
             NmfdPlant(scenario),
-            EconomicMpc(planning, guidance=False, terminal=known),
+            MpcController(planning, EconomicMpc(), terminal=known),
             scenario,
             seed=1,
         )
         for known in (None, learned)
     )
-    assert far.accumulation.sum() < 0.9 * plain.accumulation.sum()
+    assert far["accumulation"].sum() < 0.9 * plain["accumulation"].sum()
     assert (plain.controller, far.controller) == ("mpc-pc", NAME)
-    assert not far.status.any()
+    assert not far["status"].any()
 
 
 @pytest.mark.parametrize(
@@ -137,9 +138,7 @@ def test_the_same_seed_learns_the_same_and_the_file_keeps_it(scenario, learned, 
         terminal.read(tmp_path / "value.npz", planning, NAME)
 
 
-def test_ipopt_knows_none(scenario, learned):
-    planning = replace(
-        planning_model(scenario, NAME), controller_options={NAME: {"solver": "ipopt"}}
-    )
+def test_ipopt_knows_none(scenario):
+    ordered = replace(scenario, controller_options={NAME: {"solver": "ipopt"}})
     with pytest.raises(InputError, match="ipopt has no terminal cost"):
-        EconomicMpc(planning, guidance=False, terminal=learned)
+        check_tables(ordered)

@@ -13,6 +13,7 @@ import torch
 from nmfd.api import load_scenario
 from nmfd.controllers import training
 from nmfd.controllers.dpc import rollout as rollout_module
+from nmfd.controllers.dpc.options import Dpc
 from nmfd.controllers.dpc.policy import Architecture, Policy
 from nmfd.controllers.dpc.policy_file import load_policy
 from nmfd.controllers.dpc.rollout import Rollout
@@ -170,9 +171,7 @@ def test_a_validation_is_the_scenario_itself(scenario):
             policy, torch.zeros(1, 2, 2), rollout.demand[:, None], torch.Generator()
         ).item()
     for seed in (0, 1):
-        assert training.validate(policy, rollout, seed, training.Training()) == pytest.approx(
-            expected, rel=1e-5
-        )
+        assert training.validate(policy, rollout, seed, Dpc()) == pytest.approx(expected, rel=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -189,10 +188,8 @@ def test_a_validation_is_perturbed_as_the_training(scenario, chosen):
     rollout.total_time_spent = lambda policy, x, demand, generator: (
         asked.append(demand) or total(policy, x, demand, generator)
     )
-    plain = training.validate(policy, rollout, 0, training.Training())
-    values = [
-        training.validate(policy, rollout, seed, training.Training(**chosen)) for seed in (0, 0, 1)
-    ]
+    plain = training.validate(policy, rollout, 0, Dpc())
+    values = [training.validate(policy, rollout, seed, Dpc(**chosen)) for seed in (0, 0, 1)]
     assert [demand.shape[1] for demand in asked] == [2, 18, 18, 18]
     assert values[0] == values[1] != plain
     sums = asked[1].sum((0, 2, 3)) / quiet.demand.sum()
@@ -330,7 +327,7 @@ def test_holding_costs_by_the_vehicle(scenario):
     """Vehicles that would leave per second, times the mean closed share of their boundaries, times
     the cost."""
     rollout, costly = (
-        Rollout(planning_model(scenario, "dpc-pc"), holding_cost=cost) for cost in (0.0, 30.0)
+        Rollout(parse("dpc-pc").own_planning(scenario), holding_cost=cost) for cost in (0.0, 30.0)
     )
     x, generator = rollout.start[None], torch.manual_seed(0)
     network = scenario.network

@@ -12,8 +12,8 @@ import trajectories
 from commands import cosim, good
 
 from cosim.evaluation import tuning
+from cosim.plant.strategy import parse
 from nmfd.api import load_scenario
-from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError, RunFailed
 from nmfd.runs import config
 
@@ -119,7 +119,7 @@ def test_an_interrupt_in_a_generation_keeps_its_candidates(city, tmp_path, runs,
         return run_many(*arguments, **options)
 
     monkeypatch.setattr(tuning, "run_many", interrupted)
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(KeyboardInterrupt, match="parts; the same command goes on"):
         tune(order(city, tmp_path / "parts", trials=6))
     pd.testing.assert_frame_equal(whole, tune(order(city, tmp_path / "parts", trials=6)))
 
@@ -133,6 +133,18 @@ def test_a_candidate_whose_run_failed_has_no_score(city, tmp_path, runs):
     failing.update(range(len(runs[0]) + 1, len(runs[0]) + 3))
     with pytest.raises(RunFailed, match="SUMO fell over"):
         tune(order(city, tmp_path / "other", trials=1, levels=(1.0, 1.6)))
+
+
+def test_a_failed_first_candidate_has_no_number(city, tmp_path, runs):
+    _, failing = runs
+    failing.add(1)
+    for words in ("SUMO fell over", "no candidate has a score"):
+        with pytest.raises(RunFailed, match=words):
+            tune(order(city, tmp_path, trials=1))
+    tune(order(city, tmp_path, trials=2))
+    head = (tmp_path / "tune.toml").read_text().splitlines()[0]
+    assert head.startswith("# Best of 2 candidates: ")
+    assert head.endswith(" veh s; the first: failed")
 
 
 @pytest.mark.parametrize(
@@ -185,7 +197,9 @@ def test_options_that_train_a_policy_train_one_for_every_candidate(city, tmp_pat
             scenario, strategy, seed, demand, tts=1e6 * seen[-1], trips=9, completed=9
         )
 
-    monkeypatch.setattr(tuning, "processes", lambda jobs, _: [(job, job.job()) for job in jobs])
+    monkeypatch.setattr(
+        tuning, "in_processes", lambda jobs, *_: [(n, job()) for n, job in enumerate(jobs)]
+    )
     made_up.instead_of_sumo(monkeypatch, made)
     chosen = tuning.Tuning(
         scenario=city,

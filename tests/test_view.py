@@ -1,27 +1,30 @@
 """The view: watching changes nothing, frames of live and finished runs agree, and the page draws
 them."""
 
+import asyncio
 import multiprocessing
 import queue
 import socket
 import threading
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import tiny_city
 from bokeh.document import Document
 from bokeh.embed import components, file_html
-from bokeh.models import Button
+from bokeh.models import Button, PlainText, Title
 from bokeh.resources import CDN
+from tornado.httpclient import AsyncHTTPClient
 
 from cosim.evaluation.simulate import Simulation, simulate
+from cosim.plant.strategy import parse
 from cosim.sumo.net import city_of
 from cosim.view import live, page, picture
 from cosim.view.picture import CityPicture, Frame
 from nmfd.api import load_scenario
-from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError, RunFailed
 from nmfd.metrics import total_time_spent
 
@@ -121,6 +124,9 @@ def test_the_page_draws_every_street_and_escapes_names(drawn, whole):
     content = file_html(document, CDN, title=EVIL)
     assert EVIL not in content
     assert EVIL not in one.numbers.text
+    for title in document.select({"type": Title}):
+        assert isinstance(title.text, PlainText), "$$ would begin mathematics"
+    assert one.numbers.disable_math
     for plot in (
         one.curves.region,
         one.curves.plane,
@@ -168,6 +174,10 @@ def test_finished_runs_on_one_page_with_a_slider(drawn, plain):
     most = int(np.argmax([frame.accumulation.sum() for frame in later]))
     assert slider.value == pytest.approx(most * drawn.step / 60)
     assert len(arguments["words"]) == STEPS + 1
+    for title, of_regions in zip(arguments["titles"], arguments["texts"], strict=True):
+        shown = [text.text for text in of_regions]
+        assert [text.split(",")[0] for text in shown] == ["Region 0", "Region 1", "Region 2"]
+        assert title.text.text in shown
     script, div = components(layout, wrap_script=False)
     assert EVIL not in script
     assert EVIL not in div
@@ -194,9 +204,9 @@ def test_runs_in_processes_of_their_own(scenario, strategy, tmp_path):
         wait(lambda: show.runs[1].over)
         viewer._toggle()
         wait(lambda: show.over)
-        viewer._choose(1)
+        viewer._page.regions.value = "2"
         assert viewer._pause.label == "Finished"
-        assert viewer._page.region == 1
+        assert viewer._page.region == 2
         assert show.runs[0].row["completed_veh"] > 0
         assert len(show.runs[0].whole) == STEPS + 1
         assert isinstance(show.runs[1].error, InputError)
@@ -215,6 +225,50 @@ def test_a_process_that_dies_is_an_error(scenario, strategy):
         assert isinstance(show.runs[0].error, RunFailed)
     finally:
         show.close()
+
+
+@pytest.fixture
+def site(drawn, whole):
+    """The server of a page of one finished run, in an event loop that has not begun."""
+    seen = live.Seen("no-control", whole, whole[-1], row={})
+    show = SimpleNamespace(runs=[seen], picture=drawn, over=True, now=whole[-1].time)
+    loop = asyncio.new_event_loop()
+    asyncio.set_event_loop(loop)
+    server = live.PageServer(show)
+    yield server
+    server._server.stop(wait=False)
+    loop.close()
+
+
+@pytest.mark.parametrize(
+    "host, status",
+    [
+        ("localhost", 200),
+        ("127.0.0.1", 200),
+        ("[::1]", 200),
+        ("LOCALHOST", 200),
+        ("attacker.example", 404),
+        ("localhost.attacker.example", 404),
+        ("attackerlocalhost", 404),
+        ("127.0.0.1.nip.io", 404),
+        ("127x0x0x1", 404),
+    ],
+)
+def test_the_page_answers_to_the_names_of_this_machine_only(site, host, status):
+    """Another web page can make its own name lead here (DNS rebinding), and would read the run."""
+    port = int(site.address.split(":")[2].strip("/"))
+
+    async def answers(path):
+        request = f"http://127.0.0.1:{port}{path}"
+        headers = {"Host": f"{host}:{port}"}
+        return await AsyncHTTPClient().fetch(request, headers=headers, raise_error=False)
+
+    page = site.loop.run_sync(lambda: answers("/"))
+    assert page.code == status
+    assert (b"Bokeh" in page.body) == (status == 200)
+    assert site.loop.run_sync(lambda: answers("/static/js/bokeh.min.js")).code == status
+    no_websocket = site.loop.run_sync(lambda: answers("/ws"))
+    assert no_websocket.code == (400 if status == 200 else 404)
 
 
 @pytest.mark.slow

@@ -1,5 +1,5 @@
-"""The page in a browser: the slider and the region of a report, pause and pace of live runs, names
-that stay text."""
+"""The page in a browser: slider and region of a report, pause and pace of live runs, names as
+text."""
 
 import re
 import shutil
@@ -16,11 +16,13 @@ from nmfd.studies import plots
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 NAME = "no-control+guided+compliance-100+guidance-period-60"  # wider than a telephone
 EVIL = "<script>alert(1)</script>"
+DOLLARS = "ü <b>$$x^$$</b>"  # which Bokeh would take as mathematics
 DENSITIES = """() => [0, 1].map(n => Array.from(Bokeh.documents[0].get_model_by_name(`map${n}`)
     .renderers.map(one => one.data_source.data).find(data => data.edge).density))"""
 NUMBERS = "() => Bokeh.documents[0].get_model_by_name('numbers').text"
-PLANE = "() => Bokeh.documents[0].get_model_by_name('plane').title.text"
-LINES = "() => Bokeh.documents[0].get_model_by_name('trips').renderers.map(one => one.glyph.line_color.value)"
+PLANE = "() => Bokeh.documents[0].get_model_by_name('plane').title.text.text"
+LINES = """() => Bokeh.documents[0].get_model_by_name('trips')
+    .renderers.map(one => one.glyph.line_color.value)"""
 TIME = "() => Bokeh.documents[0].get_model_by_name('time').value"
 RANGES = "() => [0, 1].map(n => Bokeh.documents[0].get_model_by_name(`map${n}`).x_range.end)"
 NARROW = "() => document.documentElement.scrollWidth <= window.innerWidth + 1"
@@ -31,6 +33,11 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no 
 def scenario(tmp_path_factory):
     path = tiny_city.imported(tmp_path_factory.mktemp("browser")) / "scenario.toml"
     path.write_text(re.sub(r'(?m)^name = ".*"$', f'name = "{EVIL}"', path.read_text(), count=1))
+    network = path.parents[2] / "networks" / "tiny" / "network.toml"
+    toml = network.read_text()
+    for name in re.findall(r'(?m)^name = "(.*)"$', toml)[1:]:
+        toml = toml.replace(f'name = "{name}"', f'name = "{name} {DOLLARS}"')
+    network.write_text(toml)
     return path.parent
 
 
@@ -63,6 +70,7 @@ def opened(address: str, origin: str, width: int):
             "request",
             lambda one: one.url.startswith((origin, "data:", "blob:")) or wrong.append(one.url),
         )
+        page.set_default_timeout(120_000)  # the machine may be busy
         page.goto(address)
         page.wait_for_function("() => window.Bokeh && Bokeh.documents.length")
         yield page
@@ -88,6 +96,7 @@ def test_the_report(report, width):
         page.locator("select").first.select_option(index=1)
         page.wait_for_timeout(300)
         assert page.evaluate(PLANE).startswith("Region 1")
+        assert page.evaluate(PLANE).endswith(f"{DOLLARS}: MFD plane")
         page.get_by_role("button", name="Play").click()
         page.wait_for_timeout(2000)
         assert page.evaluate(DENSITIES) == at_the_end
@@ -115,16 +124,21 @@ def test_the_report(report, width):
         assert page.evaluate("() => [...document.images].every(one => one.naturalWidth > 100)")
 
 
-@pytest.mark.parametrize("width", [1400, 390])
-def test_the_live_page(width):
+@pytest.mark.parametrize("width, host", [(1400, "localhost"), (390, "127.0.0.1")])
+def test_the_live_page(width, host, tmp_path):
     """Two runs that take minutes, so that they are under way when the browser has started."""
+    good(call("nmfd", "new-controller", tmp_path / "mine.py"))
+    (tmp_path / "mine.py").rename(tmp_path / "$$a^$$.py")
+    mine = "$$a^$$.py:MyController"
     command = [sys.executable, "-m", "cosim", "watch", "grid7_peak", "--controller", "no-control"]
     process = subprocess.Popen(
-        [*command, "--against", "pi-gating"], stderr=subprocess.PIPE, text=True
+        [*command, "--against", mine], stderr=subprocess.PIPE, text=True, cwd=tmp_path
     )
     try:
         address = re.search(r"http://localhost:\d+/", process.stderr.readline())[0]
+        address = address.replace("localhost", host)
         with opened(address, address, width) as page:
+            assert mine in page.get_by_role("table").inner_text()
 
             def minutes():
                 return float(re.search(r">([\d.]+) min<", page.evaluate(NUMBERS))[1])
@@ -134,9 +148,7 @@ def test_the_live_page(width):
 
             def wait_for_other_numbers():
                 shown = page.evaluate(NUMBERS)
-                page.wait_for_function(
-                    f"before => ({NUMBERS})() !== before", arg=shown, timeout=20_000
-                )
+                page.wait_for_function(f"before => ({NUMBERS})() !== before", arg=shown)
 
             wait_for_other_numbers()
             press("Pause")
@@ -146,7 +158,7 @@ def test_the_live_page(width):
             page.wait_for_timeout(2000)
             assert minutes() == before
             page.locator("select").last.select_option(index=1)
-            page.wait_for_function(f"() => ({PLANE})().startsWith('Region 1')", timeout=10_000)
+            page.wait_for_function(f"() => ({PLANE})().startsWith('Region 1')")
             page.locator("select").first.select_option("slow")
             press("Go on")
             wait_for_other_numbers()

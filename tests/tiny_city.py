@@ -5,7 +5,6 @@ import gzip
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,7 +16,7 @@ from cosim.importing.importer import import_city
 from cosim.importing.streets import Streets, graph
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
-from nmfd.model.scenario import Scenario
+from nmfd.model.scenario import Scenario, with_demand
 from nmfd.types import Controls
 
 CONFIG = """<configuration>
@@ -111,18 +110,25 @@ def imported(folder: Path, regions: int = 3, source: Path | None = None, **optio
     return scenario
 
 
+class Record(SimpleNamespace):
+    """Arrays of a record, by name and, as those of a Result, by item."""
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        return getattr(self, name)
+
+
 @contextmanager
 def played(
     scenario: Scenario, intervals: int, gates: float, splits: np.ndarray | None = None, **overrides
 ) -> Iterator:
     """A plant after so many intervals with all u at `gates`, its state and its record; the ledger
     is checked in every interval."""
-    scenario = replace(scenario, steps=intervals)
+    scenario = with_demand(scenario, steps=max(intervals, 1))
     plant = SumoPlant(scenario, settings=settings(scenario).changed(**overrides))
     controls = Controls(perimeter=np.where(scenario.network.adjacency, gates, 0.0), splits=splits)
     try:
         states = [plant.reset(0), *(plant.step(controls) for _ in range(intervals))]
-        yield plant, states[-1], SimpleNamespace(**plant.record()) if intervals else None
+        yield plant, states[-1], Record(**plant.record()) if intervals else None
     finally:
         plant.close()
 

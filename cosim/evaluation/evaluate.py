@@ -1,12 +1,15 @@
-"""Evaluation: controllers x seeds x demand levels of one or several scenarios in SUMO, in one
-ranked table.
+"""Evaluation of controllers x seeds x demand levels in SUMO.
+
+It compares controllers in one or several scenarios.
 
     <out>/[<scenario>/]demand-<level>/   results of the runs
-    <out>/runs.csv, manifest.json        one row per run; commands, commits, versions, seeds and hashes (run_many)
-    <out>/evaluate.md                    tables paired by seed, and why; of several scenarios the ranking first
+    <out>/runs.csv                       one row per run
+    <out>/manifest.json                  commands, commits, versions, seeds and hashes (run_many)
+    <out>/evaluate.md                    tables paired by seed, with reasons; the ranking of
+                                         several scenarios first
 
-A suite is a TOML file: `seeds = [2000, 2001]` and a table [scenarios] of demand levels, `grid7_peak
-= [0.8, 1.0]`.
+A suite is a TOML file: `seeds = [2000, 2001]` and a table [scenarios] of demand levels,
+`grid7_peak = [0.8, 1.0]`.
 """
 
 import random
@@ -20,15 +23,15 @@ from pydantic import Field
 
 from cosim.evaluation import explain, results, statistics
 from cosim.evaluation.runs import city_key, runs_of
+from cosim.plant.strategy import Strategy
 from nmfd.api import load_scenario
-from nmfd.controllers.strategy import Strategy
 from nmfd.model.scenario import Scenario
 from nmfd.runs import config, files
+from nmfd.runs.frame import Table
 from nmfd.runs.run_many import TABLE, Run, read_manifest, run_many
-from nmfd.runs.tables import markdown_table
 from nmfd.types import HOST_TIMES
 
-Planned: TypeAlias = Sequence[tuple[Scenario, Sequence[float]]]  # with demand levels
+Planned: TypeAlias = list[tuple[Scenario, Sequence[float]]]  # with demand levels
 
 
 class Suite(config.Settings):
@@ -48,22 +51,23 @@ def read_suite(
     Scenarios are shipped names, or folders seen from that of the file. Raises InputError.
     """
     suite = config.checked(Suite, config.read(file), file)
-    beside = {name: file.parent / name for name in suite.scenarios}
-    folders = {
-        name: path if (path / "scenario.toml").is_file() else Path(name)
-        for name, path in beside.items()
-    }
-    scenarios = [
-        (load_scenario(folders[name], settings), levels) for name, levels in suite.scenarios.items()
-    ]
+    scenarios: Planned = []
+    for name, levels in suite.scenarios.items():
+        folder = file.parent / name
+        if not (folder / "scenario.toml").is_file():
+            folder = Path(name)
+        scenarios.append((load_scenario(folder, settings), levels))
     return scenarios, suite.seeds
 
 
-def evaluate(runs: Sequence[Run], out: Path, **how: Any) -> pd.DataFrame:
-    """Do the runs that are not in `out`, write the tables, and return one row per run; how: see
-    nmfd.runs.run_many."""
+def evaluate(runs: Sequence[Run], out: Path, **how: Any) -> Table:
+    """Do the runs that are not in `out`, write tables, return a row per run.
+
+    how: see nmfd.runs.run_many
+    """
     rows = run_many(runs, out, **how)
-    if len(done := results.finished_rows(rows)):
+    done = results.finished_rows(rows)
+    if len(done):
         files.write_text(out / "evaluate.md", report(out, done))
     return rows
 
@@ -74,8 +78,10 @@ def plan(
     seeds: Sequence[int],
     policies: Mapping[str, Path] | None = None,
 ) -> list[Run]:
-    """Return all runs of an evaluation, seed by seed; policies: strategy name -> file instead of
-    the scenario's."""
+    """Return all runs of an evaluation, seed by seed.
+
+    policies: strategy name -> file instead of the scenario's
+    """
     runs = []
     for scenario, levels in scenarios:
         city = city_key(scenario, strategies)
@@ -96,63 +102,50 @@ def plan(
 
 def report(out: Path, rows: pd.DataFrame) -> str:
     """Return evaluate.md for the finished runs."""
-    names = list(dict.fromkeys(rows["scenario"]))
-    parts = [] if len(names) == 1 else [ranking(rows)]
+    names = rows["scenario"].unique()
+    several = len(names) > 1
+    parts = []
+    if several:
+        parts.append(statistics.ranking(rows))
     for name in names:
         finished = results.read(out, name)
-        parts += [f"# {name}"] if len(names) > 1 else []
-        parts += [
-            statistics.markdown(finished.rows),
-            *(explain.text(level, finished) for level in finished.levels),
-        ]
+        if several:
+            parts.append(f"# {name}")
+        parts.append(statistics.markdown(finished.rows))
+        for level in finished.levels:
+            parts.append(explain.text(level, finished))
     return "\n\n".join(parts)
 
 
-def ranking(rows: pd.DataFrame) -> str:
-    """Return controllers by their mean change of TTS over scenarios and demand levels, as
-    markdown."""
-    changes: dict[str, list[float]] = {}
-    for _, part in rows.groupby("scenario", sort=False):
-        for row in statistics.statistics(part).to_dict("records"):
-            same = row["controller"] == row["against"]
-            changes.setdefault(row["controller"], []).append(0.0 if same else row["change_percent"])
-    order = sorted(changes.items(), key=lambda item: float(np.mean(item[1])))
-    table = [
-        [place, name, f"{np.mean(each):+.1f} %", len(each)]
-        for place, (name, each) in enumerate(order, 1)
-    ]
-    return markdown_table(
-        ["rank", "controller", "mean change of TTS", "scenarios and demand levels"], table
-    )
-
-
 def check(runs: Sequence[Run], out: Path, number: int, *, workers: int = 1) -> list[str]:
-    """Do `number` runs of a table again, by a fixed draw, and return a line per difference.
+    """Repeat `number` runs of a table, and return a line per difference.
+
+    The runs are chosen by a fixed draw.
 
     out: folder with runs.csv and manifest.json, with or without the results
     """
     kept = results.finished_rows(pd.read_csv(out / TABLE)).to_dict("records")
     rows = {(row["folder"], row["controller"], row["seed"]): row for row in kept}
-    keys = {name: folder["key"] for name, folder in read_manifest(out)["folders"].items()}
+    folders = read_manifest(out)["folders"]
     chosen = random.Random(0).sample(list(runs), min(number, len(runs)))
-    lines = [
-        f"{run.file}: {name} was {keys.get(run.folder, {}).get(name)}, is {value}"
-        for run in chosen
-        for name, value in run.key.items()
-        if name != "controller" and keys.get(run.folder, {}).get(name) != value
-    ]
+    lines = []
+    for run in chosen:
+        key = folders.get(run.folder, {}).get("key", {})
+        for name, value in run.key.items():
+            if name != "controller" and key.get(name) != value:
+                lines.append(f"{run.file}: {name} was {key.get(name)}, is {value}")
     with files.temporary_folder() as folder:
         run_many(chosen, folder, workers=workers)
         again = pd.read_csv(folder / TABLE)  # as the kept table went through a file
-    own = {*HOST_TIMES, "evaluation_time_s", "wall_time_s"}.union(
-        name for name in again if "_ms" in name
-    )
+    times = [*HOST_TIMES, "evaluation_time_s", "wall_time_s"]  # differ from run to run
+    times += [name for name in again if "_ms" in name]
+    again = again.drop(columns=times, errors="ignore")
     for row in again.to_dict("records"):
         old = rows.get((row.get("folder", ""), row["controller"], row["seed"]), {})
         for name, value in row.items():
             before = old.get(name, np.nan)
-            if name not in own and before != value and not (pd.isna(value) and pd.isna(before)):
-                lines.append(
-                    f"{row['controller']}, seed {row['seed']}: {name} was {before}, is {value}"
-                )
+            missing = pd.isna(value) and pd.isna(before)
+            if before != value and not missing:
+                run_label = f"{row['controller']}, seed {row['seed']}"
+                lines.append(f"{run_label}: {name} was {before}, is {value}")
     return lines

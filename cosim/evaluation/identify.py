@@ -1,17 +1,15 @@
-"""Identification of the regional model and split ratios of a SUMO city from loading runs: `cosim
-identify`.
+"""Identification of the regional model of a SUMO city: `cosim identify`.
 
 First the city is loaded without perimeter control, and every region's MFD is fitted to its outflow
 samples. Then it is loaded under a probing controller, whose set points come from these MFDs, and
-the whole model is fitted to all runs by prediction error.
+the whole model, with the split ratios, is fitted to all runs by prediction error.
 """
 
 import os
 import re
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
-from itertools import chain
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +18,13 @@ import pandas as pd
 
 from cosim.evaluation.model_validation import observed, outflow_samples
 from cosim.evaluation.runs import runs_of
+from cosim.plant.strategy import parse
 from cosim.sumo.net import city_of, network_folder
 from nmfd.api import load_scenario
-from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
 from nmfd.metrics import largest_accumulation
 from nmfd.model import authority, identification, mfd
-from nmfd.model.planning import GUIDED, GUIDING
+from nmfd.model.planning import GUIDED
 from nmfd.model.regional_model import RegionalModel, network_toml
 from nmfd.model.scenario import Scenario
 from nmfd.runs import config, files, shipped
@@ -37,12 +35,162 @@ from nmfd.studies import fit_quality, plots
 from nmfd.types import Result
 
 PATHS = ("net", "regions")  # keys of [sumo] in network.toml
+UNGUIDED_STAGES = ("no-control", "probing-pc")
+GUIDED_STAGES = ("route-guidance", "probing-pcrg")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """A regional model to identify.
+
+    guided: with route guidance, first towards the drivers' own split ratios, then probing
+    options: words of the strategies, such as max-pressure
+    levels: factors on the demand
+    iterations: of the fit
+    out: folder of the loading runs
+    """
+
+    scenario: Scenario
+    guided: bool
+    options: Sequence[str]
+    levels: Sequence[float]
+    seeds: Sequence[int]
+    iterations: int
+    out: Path
+    workers: int
+    progress: Callable[..., None] | None
+
+    def loading_runs(self, stage: int, **setup: object) -> list[Result]:
+        """Do the runs of stage 0 or 1 that are not finished; return all of them.
+
+        setup: options of the controller
+        """
+        controllers = GUIDED_STAGES if self.guided else UNGUIDED_STAGES
+        strategy = parse("+".join([controllers[stage], *self.options]))
+        table = strategy.table(self.scenario)
+        tables = dict(self.scenario.controller_options)
+        tables[table] = {**tables.get(table, {}), **setup}
+        tuned = replace(self.scenario, controller_options=tables)
+        runs = []
+        for level in self.levels:
+            folder = f"level-{level:g}"
+            runs += runs_of(tuned, [strategy], self.seeds, demand=level, folder=folder)
+        show = self._progress(f"loading runs {stage + 1} of 2; ")
+        raise_failures(run_many(runs, self.out, workers=self.workers, progress=show))
+        return [Result.read(self.out / run.file) for run in runs]
+
+    def fit(
+        self, static: RegionalModel, runs: Sequence[Result], samples: Sequence[dict]
+    ) -> RegionalModel:
+        """Return the model that predicts the runs best.
+
+        static: result of `static_model`, which nearly empty regions keep
+        """
+        seen = [observed(run) for run in runs]
+        show = self._progress("fitting, ")
+        model = identification.fit(
+            static, seen, iterations=self.iterations, progress=show, **self.scenario.scheme
+        )
+        return as_it_was(static, model, fit_quality.nearly_empty(samples))
+
+    def held_out(
+        self, static: RegionalModel, runs: Sequence[Result], model: RegionalModel
+    ) -> pd.DataFrame | None:
+        """Return errors of predictions of the last seed by a fit without it.
+
+        They are None if there is one seed only.
+
+        model: fitted to all runs; it knows which critical accumulations were seen
+        """
+        if len(self.seeds) == 1:
+            return None
+        last = self.seeds[-1]
+        kept = [run for run in runs if run.seed != last]
+        unseen = [observed(run) for run in runs if run.seed == last]
+        without = self.fit(static, kept, outflow_samples(static, kept))
+        without = replace(without, critical_above=model.critical_above)
+        return fit_quality.predictions(without, unseen, self.scenario.scheme)
+
+    def _progress(self, stage: str) -> Callable[..., None] | None:
+        """Return a progress function whose notes begin with the stage."""
+        show = self.progress
+        if show is None:
+            return None
+        return lambda done, total, note="": show(done, total, stage + note)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Identified:
+    """A regional model that was fitted to loading runs.
+
+    runs: of both stages
+    samples: of the MFD of each region
+    fits: quality of the fit, a row per region
+    held_out: errors of predictions of the last seed by a fit without it; None for one seed
+    verdict: whether perimeter control can help
+    """
+
+    task: Task
+    model: RegionalModel
+    runs: Sequence[Result]
+    samples: Sequence[dict]
+    fits: pd.DataFrame
+    held_out: pd.DataFrame | None
+    verdict: authority.Verdict
+
+    def fit_text(self) -> str:
+        """Return the quality of the fit, and the errors of the seed held out."""
+        lines = [fit_quality.fit_table(self.model, self.fits)]
+        if self.held_out is not None:
+            step = self.task.scenario.step
+            lines += wrapped(fit_quality.prediction_text(self.held_out, step))
+        return "\n".join(lines)
+
+    def write(self, out: Path, target: Path) -> None:
+        """Write the model, and what its fit is based on.
+
+        out: folder of samples, figures and quality of the fit
+        target: folder of the model and its verdict
+        """
+        files.write_text(out / "fit.txt", self.fit_text() + "\n")
+        fit_quality.write_fits(out / "fit.csv", self.fits, self.held_out)
+        rows = []
+        for region, cloud in enumerate(self.samples):
+            for branch, points in cloud.items():
+                rows += [(region, branch, *point) for point in points]
+        table = pd.DataFrame(
+            rows, columns=["region", "branch", "accumulation_veh", "outflow_veh_s"]
+        )
+        files.write_table(out / "samples.csv", table, float_format="%.6g")
+        plots.draw_mfds(out / "mfd.png", self.model, self.samples)
+        own = network_folder(self.task.scenario.network)
+        sumo = config.read(own / "network.toml").get("sumo", {})
+        for key in PATHS:
+            if isinstance(sumo.get(key), str):
+                sumo[key] = files.relative(own / sumo[key], target)
+        target.mkdir(parents=True, exist_ok=True)
+        text = network_toml(self.model, sumo, self._comment())
+        files.write_text(target / "network.toml", text)
+        files.write_text(target / authority.FILE, self.verdict.text())
+
+    def _comment(self) -> str:
+        """Return the comment above the model that says where it comes from."""
+        name = self.task.scenario.name
+        seeds = self.task.seeds
+        controllers = ", ".join(dict.fromkeys(run.controller for run in self.runs))
+        times = ", ".join(f"{level:g}" for level in self.task.levels)
+        return (
+            f"Written by cosim identify from {len(self.runs)} runs of {name} under {controllers};\n"
+            f"# loading runs: demand times {times}, seeds {min(seeds)} to {max(seeds)}."
+        )
 
 
 def without_model(scenario: Scenario) -> bool:
     """Return True if no table of a guiding controller names a model."""
-    tables = scenario.controller_options.items()
-    return not any(name.startswith(GUIDING) and "model" in options for name, options in tables)
+    for name, table in scenario.controller_options.items():
+        if "model" in table and parse(name).controller_guides:
+            return False
+    return True
 
 
 def identify(
@@ -58,10 +206,9 @@ def identify(
     workers: int = 1,
     out: Path | None = None,
 ) -> str:
-    """Fit the regional model of a SUMO city to loading runs and write its network.toml; return a
-    report.
+    """Fit the regional model of a SUMO city to loading runs, and write it.
 
-    The same call continues after an interruption.
+    It returns a report. The same call continues after an interruption.
 
     scenario: a scenario, or a network with a scenario of its name beside it; name or folder
     levels: factors on the demand of the loading runs
@@ -74,180 +221,148 @@ def identify(
     iterations: of the fit
     out: folder of samples, figures and loading runs, runs/SCENARIO-identify if None
     Raises: InputError for a network without a folder or one that must not be written, RunFailed if
-    a run failed
+        a run failed
     """
-    loaded = load_scenario(scenario, settings)
-    strategy = parse("no-control", "" if city == "own" else city or "")
-    options = [word for word in strategy.words if word != "guided"]
-    how: dict[str, Any] = {"levels": levels, "seeds": range(1000, 1000 + seeds), "options": options}
-    how |= {"network": network, "iterations": iterations, "workers": workers}
-    both = city is None and network is None and without_model(loaded)
+    first = load_scenario(scenario, settings)
+    protected = first.protected
+    strategy = parse("no-control", None if city == "own" else city)
+    options = [word for word in strategy.labels if word != "guided"]
+    both = city is None and network is None and without_model(first)
+    main = out or Path("runs") / f"{files.file_name(first.name)}-identify"
     report: list[str] = []
-    for guided in [False, True] if both else [strategy.guides]:
-        loaded = load_scenario(
-            scenario, settings
-        )  # the second model takes the split ratios of the first
-        folder = Path("runs") / f"{files.file_name(loaded.name)}-identify{'-guided' * guided}"
-        if out is not None:
-            folder = out / "guided" if both and guided else out
-        with locked(folder), watched("identify", None) as show:
-            report.append(
-                _identify(
-                    loaded,
+    try:
+        for guided in [False, True] if both else [strategy.guides]:
+            # The second model takes the split ratios of the first.
+            loaded = replace(load_scenario(scenario, settings), protected=protected)
+            folder = main
+            if guided and out is None:
+                folder = main.with_name(f"{main.name}-guided")
+            elif guided and both:
+                folder = main / "guided"
+            with locked(folder), watched("identify", None) as show:
+                target = _target(loaded, network, guided=guided, options=options)
+                if protect:
+                    shipped.beside(
+                        loaded.folder or Path(), "scenario.toml", "a scenario of your own"
+                    )
+                task = Task(
+                    scenario=loaded,
                     guided=guided,
-                    protect=protect and not report,
+                    options=options,
+                    levels=levels,
+                    seeds=range(1000, 1000 + seeds),
+                    iterations=iterations,
                     out=folder,
+                    workers=workers,
                     progress=show,
-                    **how,
                 )
-            )
-    return "\n".join(
-        [*report, f"Next: cosim run {scenario} --controller pi-gating --against no-control"]
-    )
+                found = identified(task)
+                found.write(folder, target)
+            regions = found.verdict.protect
+            written = protect and not report
+            proposed = _proposal(loaded, regions, written=written)
+            if written and proposed:
+                protected = regions
+            report += [
+                found.fit_text(),
+                *wrapped("\n".join([*found.verdict.sentences, *proposed])),
+                f"Written to {os.path.normpath(target / 'network.toml')}; "
+                f"samples and figures to {folder}",
+            ]
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"finished runs are in {main}; the same command goes on") from None
+    # Last, so that the same command finds the same scenario after an interruption.
+    if protected != first.protected:
+        _write_protected(first, protected)
+    report.append(f"Next: cosim run {scenario} --controller pi-gating --against no-control")
+    return "\n".join(report)
 
 
-def _identify(
-    loaded: Scenario,
-    *,
-    levels: Sequence[float],
-    seeds: Sequence[int],
-    guided: bool,
-    options: Sequence[str],
-    network: Path | None,
-    iterations: int,
-    protect: bool,
-    out: Path,
-    workers: int,
-    progress: Callable[..., None] | None,
-) -> str:
-    """Load a city, fit one regional model, and write its network.toml and verdict.txt; return the
-    fit as text.
+def _target(
+    scenario: Scenario, network: Path | None, *, guided: bool, options: Sequence[str]
+) -> Path:
+    """Return the folder of the model.
 
-    guided: with route guidance, first towards the drivers' own split ratios, then probing
-    options: words of the strategies, such as max-pressure
+    Raises: InputError if it must not be written, before hours of loading
     """
-    own = network_folder(loaded.network)
-    target = network or (own / GUIDED if guided and not options and without_model(loaded) else own)
+    own = network_folder(scenario.network)
+    target = own
+    if network is not None:
+        target = network
+    elif guided and not options and without_model(scenario):
+        target = own / GUIDED
     if (guided or options) and target.resolve() == own.resolve():
-        what = f"--with: {loaded.name} runs on {target}, the model of its own drivers and signals"
-        raise InputError(f"{what}; name another folder with --network")
+        raise InputError(
+            f"--with: {scenario.name} runs on {target}, the model of its own drivers and signals; "
+            "name another folder with --network"
+        )
     if shipped.installed(target):
         shipped.beside(own, "network.toml", "another folder with --network")
     there = next(folder for folder in (target, *target.absolute().parents) if folder.exists())
-    if not there.is_dir() or not os.access(there, os.W_OK):  # before hours of loading
+    if not there.is_dir() or not os.access(there, os.W_OK):
         raise InputError(f"--network: {there} is no folder that can be written to; choose another")
-    if protect:
-        shipped.beside(loaded.folder or Path(), "scenario.toml", "a scenario of your own")
-    stages = ("route-guidance", "probing-pcrg") if guided else ("no-control", "probing-pc")
+    return target
 
-    def load(stage: int, **setup: object) -> list[Result]:
-        """Do the loading runs of a stage at all levels that are not finished; return all of
-        them."""
-        strategy, tables = parse("+".join([stages[stage], *options])), loaded.controller_options
-        table = strategy.table(loaded)
-        tuned = replace(
-            loaded, controller_options={**tables, table: {**tables.get(table, {}), **setup}}
-        )
-        each = (
-            runs_of(tuned, [strategy], seeds, demand=level, folder=f"level-{level:g}")
-            for level in levels
-        )
-        runs = list(chain.from_iterable(each))
-        show = _named(progress, f"loading runs {stage + 1} of 2; ")
-        raise_failures(run_many(runs, out, workers=workers, progress=show))
-        return [Result.read(out / run.file) for run in runs]
 
-    first = load(0)
-    static = static_model(loaded, first, guided=guided)
-    second = load(1, set_point=tuple(static.mfds[region].critical for region in loaded.protected))
-    runs = [*first, *second]
-
-    def fitted(runs: Sequence[Result], samples: Sequence[dict]) -> RegionalModel:
-        fitting, seen = _named(progress, "fitting, "), list(map(observed, runs))
-        model = identification.fit(
-            static, seen, iterations=iterations, progress=fitting, **loaded.scheme
-        )
-        return as_it_was(static, model, fit_quality.nearly_empty(samples))
-
+def identified(task: Task) -> Identified:
+    """Load a city, and fit a regional model to the runs."""
+    scenario = task.scenario
+    first = task.loading_runs(0)
+    static = static_model(scenario, first, guided=task.guided)
+    set_point = tuple(static.mfds[region].critical for region in scenario.protected)
+    runs = first + task.loading_runs(1, set_point=set_point)
     samples = outflow_samples(static, runs)
-    model = fitted(runs, samples)
-    states, city = [run.accumulation for run in runs], city_of(static)
+    model = task.fit(static, runs, samples)
+
+    states = [run["accumulation"] for run in runs]
+    city = city_of(static)
     lane_km = np.bincount(city.edge_region, city.lane_metres, city.regions) / 1000.0
-    model = fit_quality.with_guesses(
-        model, samples, lane_km, states, fastest=loaded.substeps / loaded.step
-    )
-    fits = fit_quality.region_fits(model, samples, states, seeds=len(seeds), lane_km=lane_km)
-    text, errors = fit_quality.fit_table(model, fits), None
-    if len(seeds) > 1:  # the last seed is held out once
-        kept = [run for run in runs if run.seed != seeds[-1]]
-        without = replace(
-            fitted(kept, outflow_samples(static, kept)), critical_above=model.critical_above
-        )
-        unseen = [observed(run) for run in runs if run.seed == seeds[-1]]
-        errors = fit_quality.predictions(without, unseen, loaded.scheme)
-        text += "\n".join(["", *wrapped(fit_quality.prediction_text(errors, loaded.step))])
-    files.write_text(out / "fit.txt", text + "\n")
-    fit_quality.write_fits(out / "fit.csv", fits, errors)
-    clouds = (
-        (i, branch, points) for i, cloud in enumerate(samples) for branch, points in cloud.items()
-    )
-    rows = [(i, branch, *point) for i, branch, points in clouds for point in points]
-    table = pd.DataFrame(rows, columns=["region", "branch", "accumulation_veh", "outflow_veh_s"])
-    files.write_table(out / "samples.csv", table, float_format="%.6g")
-    plots.draw_mfds(out / "mfd.png", model, samples)
+    fastest = scenario.substeps / scenario.step
+    model = fit_quality.with_guesses(model, samples, lane_km, states, fastest=fastest)
+    fits = fit_quality.region_fits(model, samples, states, seeds=len(task.seeds), lane_km=lane_km)
     model = replace(model, placeholder=False, doubts=tuple(fits["doubts"]))
-    verdict = run_verdict(loaded, model, first)
-    model = replace(model, controllable=verdict.boundaries.shares)
-    under, times = (
-        ", ".join(dict.fromkeys(run.controller for run in runs)),
-        ", ".join(map("{:g}".format, levels)),
+    verdict = run_verdict(scenario, model, first)
+    return Identified(
+        task=task,
+        model=replace(model, controllable=verdict.boundaries.shares),
+        runs=runs,
+        samples=samples,
+        fits=fits,
+        held_out=task.held_out(static, runs, model),
+        verdict=verdict,
     )
-    comment = f"Written by cosim identify from {len(runs)} runs of {loaded.name} under {under};\n"
-    comment += f"# loading runs: demand times {times}, seeds {min(seeds)} to {max(seeds)}."
-    sumo = config.read(own / "network.toml").get("sumo", {})
-    sumo |= {
-        key: files.relative(own / sumo[key], target)
-        for key in PATHS
-        if isinstance(sumo.get(key), str)
-    }
-    target.mkdir(parents=True, exist_ok=True)
-    files.write_text(target / "network.toml", network_toml(model, sumo, comment))
-    files.write_text(target / authority.FILE, verdict.text())
-    proposed = _protected(loaded, verdict.protect, write=protect)
-    where = f"Written to {os.path.normpath(target / 'network.toml')}; samples and figures to {out}"
-    return "\n".join([text, *wrapped("\n".join([*verdict.sentences, *proposed])), where])
 
 
-def _protected(scenario: Scenario, regions: tuple[int, ...], *, write: bool) -> list[str]:
-    """Return the proposal to protect `regions`, unless the scenario does; if told to, write it.
-    Raises InputError."""
+def _proposal(scenario: Scenario, regions: tuple[int, ...], *, written: bool) -> list[str]:
+    """Return the proposal to protect some regions, unless the scenario does."""
     if not regions or set(regions) == set(scenario.protected):
         return []
-    names, now = (
-        ", ".join(scenario.network.titles[region] for region in regions),
-        list(scenario.protected),
-    )
-    line, path = f"protected = {list(regions)}", Path(scenario.where)
-    if write:
-        text = path.read_text(encoding="utf-8")
-        top, bracket, tables = text.partition("\n[")
-        top, count = re.subn(r"(?m)^protected\s*=\s*\[[^\]]*\].*$", line, top)
-        changed = (top if count else f"{top}\n{line}\n") + bracket + tables
-        if tomllib.loads(changed) != tomllib.loads(text) | {"protected": list(regions)}:
-            raise InputError(f"{path}: protected: cannot be changed here; write {line} yourself")
-        files.write_text(path, changed)
-    what = "was written there" if write else "with --protect it is written there"
-    return [f"Protect {names}: {line} instead of {now} in {path}; {what}."]
+    names = ", ".join(scenario.network.titles[region] for region in regions)
+    instead = f"protected = {list(regions)} instead of {list(scenario.protected)}"
+    what = "was written there" if written else "with --protect it is written there"
+    return [f"Protect {names}: {instead} in {Path(scenario.where)}; {what}."]
 
 
-def _named(progress: Callable[..., None] | None, stage: str) -> Callable[..., None] | None:
-    """Return a progress function whose notes begin with the stage."""
-    return progress and (lambda done, total, note="": progress(done, total, stage + note))
+def _write_protected(scenario: Scenario, regions: tuple[int, ...]) -> None:
+    """Write the regions to protect into the scenario. Raises InputError."""
+    path = Path(scenario.where)
+    line = f"protected = {list(regions)}"
+    text = path.read_text(encoding="utf-8")
+    top, bracket, tables = text.partition("\n[")
+    top, count = re.subn(r"(?m)^protected\s*=\s*\[[^\]]*\].*$", line, top)
+    if not count:
+        top += f"\n{line}\n"
+    changed = top + bracket + tables
+    if tomllib.loads(changed) != tomllib.loads(text) | {"protected": list(regions)}:
+        raise InputError(f"{path}: protected: cannot be changed here; write {line} yourself")
+    files.write_text(path, changed)
 
 
 def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool) -> RegionalModel:
-    """Return the network with fitted MFDs, and own split ratios unless guided. Raises InputError
-    for empty runs."""
+    """Return the network with fitted MFDs, and own splits unless guided.
+
+    Raises: InputError for empty runs
+    """
     network = replace(
         scenario.network, exit_rates=None, capacity=None, storage=None, critical_above={}
     )
@@ -257,30 +372,34 @@ def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool)
         raise InputError(
             "--levels: every region was nearly empty in all loading runs; give higher levels"
         )
-    fastest, clouds = scenario.substeps / scenario.step, map(fit_quality.own_points, samples)
-    mfds = (
-        curve if n in empty else mfd.fit(*cloud.T, max_rate=fastest)
-        for n, (curve, cloud) in enumerate(zip(network.mfds, clouds, strict=True))
-    )
+    fastest = scenario.substeps / scenario.step
+    mfds = list(network.mfds)
+    for region, cloud in enumerate(samples):
+        if region not in empty:
+            points = fit_quality.own_points(cloud)
+            mfds[region] = mfd.fit(*points.T, max_rate=fastest)
     network = replace(network, mfds=tuple(mfds))
     if guided:  # the reference of theta stays that of the plant (cosim.plant.guidance)
         return network
     crossings = sum(result["crossings"].sum(axis=0) for result in results)
-    return replace(
-        network, observed_split_ratios=identification.observed_split_ratios(network, crossings)
-    )
+    ratios = identification.observed_split_ratios(network, crossings)
+    return replace(network, observed_split_ratios=ratios)
 
 
 def as_it_was(
     network: RegionalModel, model: RegionalModel, regions: Sequence[int]
 ) -> RegionalModel:
-    """Return `model` with some regions as in `network`, because a fit to few vehicles does not
-    extend to more."""
+    """Return `model` with some regions as in `network`.
+
+    A fit to few vehicles does not extend to more.
+    """
     alone = np.isin(np.arange(model.regions), regions)
-    mfds = tuple((network if alone[n] else model).mfds[n] for n in range(model.regions))
+    mfds = list(model.mfds)
+    for region in regions:
+        mfds[region] = network.mfds[region]
     rates = np.where(alone[:, None], 1.0, model.exit_rates)
     storage = np.where(alone, np.maximum(model.storage, [mfd.jam for mfd in mfds]), model.storage)
-    return replace(model, mfds=mfds, exit_rates=rates, storage=storage)
+    return replace(model, mfds=tuple(mfds), exit_rates=rates, storage=storage)
 
 
 def run_verdict(
@@ -288,29 +407,27 @@ def run_verdict(
 ) -> authority.Verdict:
     """Judge from runs with open gateways whether perimeter control can help."""
     passed = sum(result["gateway_flow"].sum(axis=0, dtype=float) for result in results)
-    reached = ~np.isnan(
-        results[0]["gateway_original_green"][0]
-    )  # NaN without a signal under control
-    gateways = [
-        (g.source, g.target, *of)
-        for g, *of in zip(city_of(network).gateways, passed, reached, strict=True)
-    ]
+    # NaN without a signal under control
+    reached = ~np.isnan(results[0]["gateway_original_green"][0])
+    gateways = []
+    for gateway, vehicles, held in zip(city_of(network).gateways, passed, reached, strict=True):
+        gateways.append((gateway.source, gateway.target, vehicles, held))
     boundaries = authority.Boundaries.of_gateways(network.regions, gateways)
-    trip = sum(r.trips * r.mean_trip_time_s for r in results)
-    lost = sum(
-        r.trips * r.mean_departure_delay_s + r.departed_veh * r.mean_time_loss_s for r in results
-    )
-    started = np.sum([result["departures"].sum(axis=(0, 2)) for result in results], axis=0).astype(
-        float
-    )
-    where = f"in {len(results)} loading run{'s' * (len(results) > 1)} under {results[0].controller}"
+    trip = 0.0
+    lost = 0.0
+    for run in results:
+        trip += run.trips * run.mean_trip_time_s
+        lost += run.trips * run.mean_departure_delay_s + run.departed_veh * run.mean_time_loss_s
+    slowness = trip / (trip - lost) if trip > lost else np.nan
+    started = np.sum([result["departures"].sum(axis=(0, 2)) for result in results], axis=0)
+    plural = "s" if len(results) > 1 else ""
     return authority.verdict(
         network,
         boundaries,
-        most=largest_accumulation(result.accumulation for result in results),
-        started=started,
-        waiting=max(float(result.backlog.sum(axis=(1, 2)).max()) for result in results),
-        slowness=trip / (trip - lost) if trip > lost else np.nan,
-        where=where,
+        most=largest_accumulation(result["accumulation"] for result in results),
+        started=started.astype(float),
+        waiting=max(float(result["backlog"].sum(axis=(1, 2)).max()) for result in results),
+        slowness=slowness,
+        where=f"in {len(results)} loading run{plural} under {results[0].controller}",
         scenario=os.path.relpath(scenario.folder) if scenario.folder else scenario.name,
     )

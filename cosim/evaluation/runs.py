@@ -1,4 +1,4 @@
-"""Runs in SUMO for nmfd.runs.run_many: jobs, and everything that their results depend on."""
+"""Runs in SUMO for nmfd.runs.run_many: jobs and what they depend on."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -10,12 +10,12 @@ import numpy as np
 from cosim.evaluation.simulate import Simulation
 from cosim.plant import incidents
 from cosim.plant.launch import own_vehicles
-from cosim.plant.programmes import check_strategy
-from cosim.plant.settings import FILES, MAX_PRESSURE, own_files, settings
-from cosim.sumo.net import check_adjacency, city_files, load_city
+from cosim.plant.programmes import check_strategy, scenario_city
+from cosim.plant.settings import FILES, own_files, settings
+from cosim.plant.strategy import Strategy, check_tables
+from cosim.sumo.net import check_adjacency, city_files
 from cosim.sumo.signals import HELD, read_signals
 from cosim.sumo.xml_files import read_xml
-from nmfd.controllers.strategy import Strategy
 from nmfd.model.scenario import Scenario, with_demand
 from nmfd.runs.files import file_hash, run_name
 from nmfd.runs.run_many import Run
@@ -40,61 +40,57 @@ def runs_of(
     folder: below that of all runs
     Raises: InputError if a strategy cannot run in this city
     """
+    if city is None:
+        city = city_key(scenario, strategies)
+    if policies is None:
+        policies = {}
     flows = np.ascontiguousarray(with_demand(scenario, factor=demand).demand)
     shared = {
-        **(city or city_key(scenario, strategies)),
+        **city,
         "steps": scenario.steps,
         "demand": float(demand),
         "demand_hash": hashlib.sha256(flows.tobytes()).hexdigest()[:16],
     }
-    own = policies or {}
+    keys = {}
     for strategy in strategies:
-        strategy.make(scenario, own.get(strategy.name))  # reports mistakes before the first run
-    keys = {
-        s.name: {**shared, "controller": s.fingerprint(scenario, own.get(s.name))}
-        for s in strategies
-    }
-    cost = SECONDS_PER_TRIP * scenario.step * float(flows.sum())
-    return [
-        Run(
-            run_name(s.name, seed),
-            keys[s.name],
-            Simulation(scenario, s, seed, demand, own.get(s.name)),
-            folder,
-            cost,
-        )
-        for seed in seeds
-        for s in strategies
-    ]
+        policy = policies.get(strategy.name)
+        strategy.make(scenario, policy)  # reports mistakes before the first run
+        own = strategy.fingerprint(scenario, policy)
+        keys[strategy.name] = {**shared, "controller": own}
+    expected = SECONDS_PER_TRIP * scenario.step * float(flows.sum())
+    runs = []
+    for seed in seeds:
+        for strategy in strategies:
+            name = strategy.name
+            job = Simulation(scenario, strategy, seed, demand, policies.get(name))
+            runs.append(Run(run_name(name, seed), keys[name], job, folder, expected))
+    return runs
 
 
 def city_key(scenario: Scenario, strategies: Sequence[Strategy]) -> dict[str, object]:
-    """Check that the strategies can run in the city; return what all runs there depend on. Raises
-    InputError."""
+    """Return what all runs in the city depend on.
+
+    Raises: InputError if a strategy cannot run in it
+    """
     chosen = settings(scenario)
+    check_tables(scenario)
     files = city_files(scenario.network)
-    city = load_city(*files, scenario.network.regions)
+    city = scenario_city(scenario, chosen)
     check_adjacency(city, scenario.network)
     own_vehicles(scenario, chosen, city)
-    used = {strategy.city.get("signals", chosen.signals) for strategy in strategies}
     simple, _ = read_signals(city, own_files(scenario, chosen.additional), HELD)
-    everywhere = MAX_PRESSURE in used
-    incidents.check(
-        scenario.ordered_faults,
-        city,
-        "faults",
-        [signal.id for signal in simple] if everywhere else (),
-    )
+    driven = []
+    if any(one.settings(scenario).signals_from_outside for one in strategies):
+        driven = [signal.id for signal in simple]
+    incidents.check(scenario.ordered_faults, city, "faults", driven)
     for path in own_files(scenario, (*chosen.background, *chosen.additional)):
         read_xml(path)
     for strategy in strategies:
         check_strategy(strategy, scenario, city)
     sumo = chosen.model_dump(mode="json", exclude_defaults=True)
-    hashes = {
-        key: [file_hash(path) for path in own_files(scenario, sumo[key])]
-        for key in FILES
-        if key in sumo
-    }
+    for key in FILES:
+        if key in sumo:
+            sumo[key] = [file_hash(path) for path in own_files(scenario, sumo[key])]
     return {
         "scenario": scenario.name,
         "network": scenario.network.name,
@@ -103,7 +99,7 @@ def city_key(scenario: Scenario, strategies: Sequence[Strategy]) -> dict[str, ob
         "net_file_hash": file_hash(files.net_file),
         "regions_hash": file_hash(files.regions_csv),
         "measurement_std_veh": scenario.measurement_std,
-        "sumo": {**sumo, **hashes},
+        "sumo": sumo,
         "libsumo": metadata.version("libsumo"),
         "faults": list(scenario.faults),
     }

@@ -1,5 +1,6 @@
 """One closed-loop run in SUMO, and the facts in its result."""
 
+import json
 import math
 import time
 from collections import Counter
@@ -17,20 +18,19 @@ from cosim.plant.max_pressure import FACTS as PRESSURE_FACTS
 from cosim.plant.meter import COMPLETED, GIVEN_UP, REMOVED, UNDER_WAY, WAITING, Trip
 from cosim.plant.plant import Observer, SumoPlant
 from cosim.plant.record import RECORD, TOTALS, settled
-from cosim.plant.settings import own_files, settings
+from cosim.plant.settings import Settings, own_files
+from cosim.plant.strategy import Strategy
 from cosim.sumo.arrays import RegionCounts
 from cosim.sumo.net import City, Gateway, gateway_room_taken
 from nmfd import closed_loop, metrics
 from nmfd.arrays import PerRegion
-from nmfd.controllers.strategy import Strategy
 from nmfd.model.scenario import Scenario, with_demand
 from nmfd.runs import config
 from nmfd.runs.files import atomic
 from nmfd.types import Result
 
-FULL_SHARE = (
-    0.8  # of an edge's room: a queue that reaches its upstream end leaves gaps that move backwards
-)
+# Share of an edge's room: a queue that reaches its upstream end leaves gaps that move backwards.
+FULL_SHARE = 0.8
 # Attribute of a result, column of runs.csv -> meaning.
 FACTS = config.read(Path(__file__).with_name("columns.toml"))["runs"] | PRESSURE_FACTS
 
@@ -71,88 +71,100 @@ def simulate(
     Raises: InputError if the strategy cannot run in this city
     """
     begin = time.perf_counter()
-    strategy, scenario = job.strategy, with_demand(job.scenario, factor=job.demand)
+    strategy = job.strategy
+    scenario = with_demand(job.scenario, factor=job.demand)
     controller = strategy.make(scenario, job.policy)
     with ExitStack() as stack:
-        file = stack.enter_context(atomic(job.trip_file)) if job.trip_file else None
-        chosen = settings(scenario).changed(**strategy.city)
+        trip_file = stack.enter_context(atomic(job.trip_file)) if job.trip_file else None
+        chosen = strategy.settings(scenario)
         plant = SumoPlant(
             scenario,
             settings=chosen,
-            trip_file=file,
+            trip_file=trip_file,
             planning=strategy.planning(scenario),
             observer=observer,
             gui=gui,
         )
         stack.callback(plant.close)
         result = closed_loop.run(plant, controller, scenario, seed=job.seed, progress=progress)
-        result = result.assign(controller=strategy.name, plant="sumo").add(
-            {}, RECORD, **plant.record()
-        )
+        used = scenario.settings | {"sumo": chosen.model_dump(mode="json", exclude_defaults=True)}
+        about = {"controller": strategy.name, "plant": "sumo", "settings": json.dumps(used)}
+        result = result.add(about, RECORD, **plant.record())
+        gateways = [f"{gate.from_edge} to {gate.to_edge}" for gate in plant.city.gateways]
+        result = result.label(gateway=gateways, edge=list(plant.city.edges))
         if gui:
             return result
-        plant_facts, leaks, emissions = (
-            plant.facts(),
-            set(plant.actuation.leaks()),
-            plant.trip_facts(),
-        )
-        programmes, end = (
-            own_files(scenario, chosen.additional),
-            chosen.begin + scenario.steps * scenario.step,
-        )
-        shown, files, totals = (
-            plant.actuation.states,
-            [plant.city.net_file, *programmes],
-            plant.edge_totals(),
-        )
-        sheet = proof_sheet(shown, files, end=end, step=chosen.step_length)
-        measures, totals["trip_time_by_origin"] = trip_measures(
-            plant.meter.trips(), plant.city.regions
-        )
-        result = settled(
-            result.add({}, {**RECORD, **SHEET, **TOTALS}, **plant.record(), **sheet, **totals)
-        )
-        facts = {
-            "scenario": job.scenario.name,
-            "scenario_folder": str(scenario.folder or ""),
-            "demand": float(job.demand),
-            **plant_facts,
-            **measures,
-            **emissions,
-            "teleports": int(result.teleports.sum()),
-            "signal_violations": int(sum(sheet[name].sum() for name in VIOLATIONS)),
-            **queue_facts(result, plant.city),
-            "longest_queue_veh": int(result.queue_max.max()),
-            "notes": metrics.notes(result),
-            "outside_training": strategy.outside_training(scenario, job.demand, job.policy),
-            "leaking_share": leaking_share(result, plant.city, leaks),
-            **estimation_errors(result, scenario.network.critical),
-            "overhead_share": 1.0 - plant_facts["sumo_time_s"] / result.wall_time,
-            "setup_time_s": time.perf_counter() - begin - result.wall_time,
-            "jumps": int(result.jumps.sum()),
-        }
+        result = _with_facts(result, plant, job, scenario, chosen)
+    setup = time.perf_counter() - begin - result.wall_time
+    return result.assign(setup_time_s=setup)
+
+
+def _with_facts(
+    result: Result, plant: SumoPlant, job: Simulation, scenario: Scenario, chosen: Settings
+) -> Result:
+    """End the simulation and return its result with all facts."""
+    waits = plant.longest_waits()
+    plant_facts = plant.facts()
+    leaks = set(plant.actuation.leaks())
+    emissions = plant.trip_facts()
+    totals = plant.edge_totals()
+    measures, by_origin = trip_measures(plant.meter.trips(), plant.city.regions)
+    totals["trip_time_by_origin"] = by_origin
+    sheet = proof_sheet(
+        plant.actuation.states,
+        [plant.city.net_file, *own_files(scenario, chosen.additional)],
+        end=chosen.begin + scenario.steps * scenario.step,
+        step=chosen.step_length,
+        waits=waits,
+    )
+    arrays = {**plant.record(), **sheet, **totals}
+    result = settled(result.add({}, {**RECORD, **SHEET, **TOTALS}, **arrays))
+    facts = {
+        "scenario": job.scenario.name,
+        "scenario_folder": str(scenario.folder or ""),
+        "demand": float(job.demand),
+        **plant_facts,
+        **measures,
+        **emissions,
+        "teleports": int(result["teleports"].sum()),
+        "signal_violations": int(sum(sheet[name].sum() for name in VIOLATIONS)),
+        **queue_facts(result, plant.city),
+        "longest_queue_veh": int(result["queue_max"].max()),
+        "notes": metrics.notes(result),
+        "outside_training": job.strategy.outside_training(scenario, job.demand, job.policy),
+        "leaking_share": leaking_share(result, plant.city, leaks),
+        **estimation_errors(result, scenario.network.critical),
+        "overhead_share": 1.0 - plant_facts["sumo_time_s"] / result.wall_time,
+        "setup_time_s": math.nan,
+        "jumps": int(result["jumps"].sum()),
+    }
     return result.add(facts)
 
 
 def regional_outflow(record: Mapping[str, np.ndarray] | Result, step: float) -> RegionCounts:
-    """Return trips that ended in every region and vehicles that left it (T, R) [veh/s].
+    """Return the outflow of every region (veh/s, (T, R)).
 
-    record: arrays of cosim.plant.record.RECORD; step: control interval [s]
+    It counts trips that end there and vehicles that leave.
+
+    record: arrays of cosim.plant.record.RECORD
+    step: control interval (s)
     """
     return (record["arrivals"] + record["crossings"].sum(axis=(2, 3))) / step
 
 
 def trip_measures(trips: Sequence[Trip], regions: int) -> tuple[dict[str, float], PerRegion]:
-    """Return counts and times [s] of the trips that were due: of private vehicles, and apart of
-    others.
+    """Return measures of the trips that were due, and times by origin.
 
-    And the mean time (R,) [s] of the private ones by region of origin; NaN without any.
+    Measures are of private vehicles, and apart of others; the mean time (s, (R,)) of private ones
+    by region of origin is NaN without any.
     """
     table = pd.DataFrame(trips, columns=Trip._fields).astype(Trip.__annotations__)
-    private, other = table[table["private"]], table[~table["private"]]
+    private = table[table["private"]]
+    other = table[~table["private"]]
     count = Counter(private["outcome"])
     entered = table[table["outcome"].isin((COMPLETED, REMOVED, UNDER_WAY))]
-    public, entered = entered[entered["public"]], entered[entered["private"]]
+    public = entered[entered["public"]]
+    entered = entered[entered["private"]]
     row = {
         "trips": len(private),
         "departed_veh": len(entered),
@@ -173,42 +185,51 @@ def trip_measures(trips: Sequence[Trip], regions: int) -> tuple[dict[str, float]
         "other_time_spent_veh_s": other["time"].sum(),
         "other_departure_delay_veh_s": other["departure_delay"].sum(),
     }
-    return row, private.groupby("origin")["time"].mean().reindex(range(regions)).to_numpy()
+    by_origin = private.groupby("origin")["time"].mean().reindex(range(regions))
+    return row, by_origin.to_numpy()
 
 
 def queue_facts(result: Result, city: City) -> dict[str, float]:
     """Return queues on the edges before gateways, every edge once."""
     edges = [gateway.from_edge for gateway in city.gateways]
     upstream = [edges.index(edge) for edge in dict.fromkeys(edges)]
-    full = gateway_room_taken(result.edge_vehicles.astype(float), city)[:, upstream] >= FULL_SHARE
+    taken = gateway_room_taken(result["edge_vehicles"].astype(float), city)
+    full = taken[:, upstream] >= FULL_SHARE
     return {
-        "gateway_queue_mean_veh": float(result.gateway_queue[:, upstream].mean()),
-        "gateway_queue_max_veh": float(result.gateway_queue_max[:, upstream].max()),
+        "gateway_queue_mean_veh": float(result["gateway_queue"][:, upstream].mean()),
+        "gateway_queue_max_veh": float(result["gateway_queue_max"][:, upstream].max()),
         "gateway_full_share": float(full.mean()),
     }
 
 
 def estimation_errors(result: Result, critical: PerRegion) -> dict[str, float]:
-    """Return the root mean square errors of estimated states, NaN if they were exact.
+    """Return root mean square errors of estimated states.
 
-    Of the accumulation of a region as a share of critical (R,) [veh], and of its parts with
-    vehicles [veh].
+    They are those of the accumulation of a region, as a share of `critical` (veh, (R,)), and of its
+    parts with vehicles (veh); NaN if the states were exact.
     """
     if not result.estimated:
         return {"estimate_rmse_share": math.nan, "estimate_cell_rmse_veh": math.nan}
-    off, used = result.observed - result.accumulation, (result.accumulation > 0).any(axis=0)
+    off = result["observed"] - result["accumulation"]
+    used = (result["accumulation"] > 0).any(axis=0)
     shares = [_rms(off[:, i].sum(axis=1)) / limit for i, limit in enumerate(critical)]
     return {"estimate_rmse_share": _rms(shares), "estimate_cell_rmse_veh": _rms(off[:, used])}
 
 
 def _rms(values: ArrayLike) -> float:
-    return float(np.sqrt(np.mean(np.square(values)))) if np.size(values) else 0.0
+    if not np.size(values):
+        return 0.0
+    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def leaking_share(result: Result, city: City, leaks: Collection[Gateway]) -> float:
-    """Return the share of the boundary flow that passes gateways without a signal under control."""
-    flow = result.gateway_flow.sum(axis=0)
-    leaking = sum(
-        passed for gateway, passed in zip(city.gateways, flow, strict=True) if gateway in leaks
-    )
+    """Return the share of the boundary flow without a signal under control.
+
+    leaks: gateways that nothing controls
+    """
+    flow = result["gateway_flow"].sum(axis=0)
+    leaking = 0.0
+    for gateway, passed in zip(city.gateways, flow, strict=True):
+        if gateway in leaks:
+            leaking += passed
     return float(leaking / max(flow.sum(), 1))

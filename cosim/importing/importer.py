@@ -21,6 +21,8 @@ from cosim.importing.generated import morning_peak
 from cosim.importing.partition import finish, own_regions, partition
 from cosim.importing.streets import Streets, read_streets
 from cosim.sumo.net import load_city
+from cosim.sumo.signals import timetabled, without_effect
+from cosim.sumo.xml_files import check_path
 from nmfd.errors import InputError
 from nmfd.model import authority
 from nmfd.model.regional_model import network_toml
@@ -87,6 +89,7 @@ def import_city(
     first = None if begin is None else seconds(begin, "--begin")
     last = None if end is None else seconds(end, "--end")
     for folder in (out, scenario):
+        check_path(folder)
         if folder.name in ("", "..") or "," in str(folder):
             raise InputError(
                 f"--out: expected a folder such as networks/mycity, without a comma, got {folder} instead"
@@ -140,7 +143,8 @@ def import_city(
             streets, folder, files, model.options(case, clock), factor, meso, seeds, progress
         )
         progress("partition")
-        left = quality.left_alone(streets, traffic.switched)
+        switched = sorted({*traffic.switched, *timetabled(case.net)})
+        left = quality.left_alone(streets, switched, without_effect(case.options, mesoscopic))
         if count is not None:
             labels = partition(streets, baseline, count, uncontrollable=left)
         else:
@@ -190,7 +194,7 @@ def import_city(
                 case,
                 name=scenario.name,
                 files=files,
-                leave=traffic.switched,
+                leave=switched,
                 network_path=os.path.relpath(out, scenario).replace(os.sep, "/"),
                 protected=int(np.argmax(load / np.bincount(labels, streets.lane_metres))),
                 factor=factor,

@@ -1,7 +1,7 @@
 """Tables of regions and gateways, and the verdict on control at the gateways."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,12 +11,10 @@ from cosim.importing.baseline import INTERVAL_S, Baseline
 from cosim.importing.streets import Streets
 from cosim.sumo.arrays import EdgeMask, EdgeNumbers
 from cosim.sumo.net import City
-from cosim.sumo.signals import HELD, STATIC
+from cosim.sumo.signals import CONTROLLED, STATIC, TIMETABLE, control, unfit
 from nmfd.model import authority
 from nmfd.model.authority import Boundaries, Verdict
 from nmfd.model.regional_model import RegionalModel
-
-CONTROLLED = "controlled"  # gateway with a signal that perimeter control uses
 
 
 class Tables(NamedTuple):
@@ -54,7 +52,7 @@ def tables(
             "lanes": " ".join(map(str, g.lanes)),
             "signal": g.signal or "",
             "links": " ".join(map(str, g.links)),
-            "control": "no signal" if g.signal is None else left_alone.get(g.signal, CONTROLLED),
+            "control": control(g, streets.logics, left_alone),
             "kind": kinds.get(g.signal or "", ""),
             "flow_veh": moves[streets.number[g.from_edge], streets.number[g.to_edge]],
         }
@@ -92,20 +90,24 @@ def tables(
     )
 
 
-def left_alone(streets: Streets, switched: Sequence[str] = ()) -> dict[str, str]:
+def left_alone(
+    streets: Streets, switched: Iterable[str] = (), everywhere: str = ""
+) -> dict[str, str]:
     """Return the signals that perimeter control does not use, with the reason.
 
-    switched: signals whose programme a timetable changes
+    switched: signals whose programme a timetable changes; everywhere: reason for all signals
     """
+    if everywhere:
+        return dict.fromkeys(streets.logics, everywhere)
     reasons = {
         signal: "no programme"
         for signal in streets.link_signals
         if signal and signal not in streets.logics
     }
     for signal, logic in streets.logics.items():
-        if logic.programme == "off" or logic.kind not in HELD:
-            reasons[signal] = "switched off" if logic.programme == "off" else f"{logic.kind} signal"
-    return reasons | dict.fromkeys(switched, "programme follows a timetable")
+        if reason := unfit(logic):
+            reasons[signal] = reason
+    return reasons | dict.fromkeys(switched, TIMETABLE)
 
 
 def import_verdict(

@@ -13,6 +13,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from cosim.importing.case import seconds
+from cosim.sumo import signals
 from cosim.sumo.arrays import EdgeMask, EdgeNumbers, PerEdge, Points
 from cosim.sumo.net import NORMAL, for_cars, points_along, size
 from cosim.sumo.xml_files import attribute, network_root, read_xml
@@ -20,12 +21,10 @@ from nmfd.errors import InputError
 
 
 @dataclass(frozen=True, kw_only=True)
-class Logic:
+class Logic(signals.Logic):
     """Signal programme with its cycle [s]; kind: SUMO's type, or "branching" if phases do not
     follow in order."""
 
-    programme: str
-    kind: str
     cycle: float
 
 
@@ -184,4 +183,5 @@ def _logic(element: ElementTree.Element, path: Path) -> Logic:
     if kind == "static" and any(phase.get("next") for phase in phases):
         kind = "branching"
     cycle = sum(seconds(phase.get("duration", "0"), where) for phase in phases)
-    return Logic(programme=element.get("programID", "0"), kind=kind, cycle=cycle)
+    states = tuple(phase.get("state", "") for phase in phases)
+    return Logic(programme=element.get("programID", "0"), kind=kind, cycle=cycle, states=states)

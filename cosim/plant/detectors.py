@@ -1,5 +1,4 @@
-"""Loop detectors on a share of the links, a share of the vehicles as probes, and the estimate from
-both.
+"""Loop detectors on some links, some vehicles as probes, and the estimate.
 
 Loops are SUMO's own, on every lane of an equipped link, at up to three places along it (Vigos,
 Papageorgiou and Wang, "Real-time estimation of vehicle-count within signalized links",
@@ -12,6 +11,7 @@ while they wait to enter.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,10 +27,12 @@ from nmfd.types import Controls
 LAYOUT = 0x6C6F6F70  # seed of the places of the loops: a property of the city, not of a run
 PROBES = 0x70726F62  # keeps the random numbers of the probes apart from others of the same seed
 VEHICLE_LENGTH_M = 5.0  # SUMO's passenger car
-STATIONS, SPACING_M = 3, 50.0  # largest number of loops along a lane, and lane length per loop
+STATIONS = 3  # largest number of loops along a lane
+SPACING_M = 50.0  # lane length per loop
 # Standard deviation over mean [-] of the density over the links of a region, and of the readings
 # along one link, measured in a run of grid7 that locked.
-SPREAD_OVER_LINKS, SPREAD_ALONG_LINK = 1.3, 1.0
+SPREAD_OVER_LINKS = 1.3
+SPREAD_ALONG_LINK = 1.0
 READING_PERIOD_S = 3.0
 
 
@@ -38,8 +40,8 @@ READING_PERIOD_S = 3.0
 class Layout:
     """The places of the loops.
 
-    edges: equipped links, as numbers in the city's edges; positions: of the loops on each of their
-        lanes [m]
+    edges: equipped links, as numbers in the city's edges
+    positions: of the loops on each of their lanes [m]
     counted: (G,) bool, gateways at which vehicles are counted
     """
 
@@ -48,17 +50,32 @@ class Layout:
     counted: GatewayMask
 
 
+class _Loop(NamedTuple):
+    """One loop.
+
+    name: in SUMO; position: on its lane [m]; edge: number of its link
+    """
+
+    name: str
+    lane: str
+    position: float
+    edge: int
+
+
 def lay_out(city: City, share: float) -> Layout:
-    """Return loops on a `share` of the links of every region; a larger share contains a smaller
-    one."""
-    random, links = np.random.default_rng(LAYOUT), []
-    place = random.uniform(
-        0.02, 0.98, len(city.edges)
-    )  # within the part of the link that a loop stands for
+    """Return loops on a `share` of the links of every region.
+
+    A larger share contains a smaller one.
+    """
+    random = np.random.default_rng(LAYOUT)
+    # Place of the loop within the part of the link that it stands for, as a share.
+    place = random.uniform(0.02, 0.98, len(city.edges))
+    edges: list[int] = []
     for region in range(city.regions):
         own = np.flatnonzero(city.edge_region == region)
-        links += list(random.permutation(own)[: int(np.ceil(share * len(own) - 1e-9))])
-    edges = sorted(int(n) for n in links)
+        count = int(np.ceil(share * len(own) - 1e-9))
+        edges += [int(n) for n in random.permutation(own)[:count]]
+    edges.sort()
     names = {city.edges[n] for n in edges}
     return Layout(
         edges=tuple(edges),
@@ -68,29 +85,31 @@ def lay_out(city: City, share: float) -> Layout:
 
 
 def _stations(length: float, place: float) -> tuple[float, ...]:
+    """Return the positions [m] of the loops of a lane of this length [m]."""
     count = int(min(STATIONS, max(1, length // SPACING_M)))
     return tuple(float((n + place) / count * length) for n in range(count))
 
 
 def instruments(city: City, layout: Layout, probe_share: float) -> Instruments:
     """Return shares and errors that follow from the layout."""
-    lane_length, region = city.lane_metres, city.edge_region
+    lane_length = city.lane_metres
+    region = city.edge_region
     equipped = np.isin(np.arange(len(region)), layout.edges)
-    weights = lane_length, lane_length * equipped, lane_length**2 * equipped
-    whole, seen, squares = (np.bincount(region, weight, city.regions) for weight in weights)
+    whole = np.bincount(region, lane_length, city.regions)
+    seen = np.bincount(region, lane_length * equipped, city.regions)
+    squares = np.bincount(region, lane_length**2 * equipped, city.regions)
     share = seen / whole
-    boundary, counted = np.zeros((2, city.regions, city.regions))
+    boundary = np.zeros((city.regions, city.regions))
+    counted = np.zeros((city.regions, city.regions))
     for gateway, there in zip(city.gateways, layout.counted, strict=True):
         boundary[gateway.source, gateway.target] += 1.0
         counted[gateway.source, gateway.target] += there
+    # Samples of links are weighted by lane length. Which links hold the queues lasts; how far the
+    # queues reach along them changes.
+    spread = SPREAD_OVER_LINKS**2 * (1.0 - share) + SPREAD_ALONG_LINK**2
     return Instruments(
         detector_share=share,
-        # Of samples of links, weighted by lane length: which links hold the queues lasts, their
-        # reach changes.
-        detector_error=np.sqrt(
-            (SPREAD_OVER_LINKS**2 * (1.0 - share) + SPREAD_ALONG_LINK**2) * squares
-        )
-        / np.maximum(seen, 1e-9),
+        detector_error=np.sqrt(spread * squares) / np.maximum(seen, 1e-9),
         detector_noise=SPREAD_ALONG_LINK * np.sqrt(squares) / np.maximum(seen, 1e-9),
         counted_share=counted / np.maximum(boundary, 1.0),
         counted_gateways=counted,
@@ -99,12 +118,14 @@ def instruments(city: City, layout: Layout, probe_share: float) -> Instruments:
 
 
 def write_loops(city: City, layout: Layout, period: float, path: Path) -> None:
-    """Write the loops as an additional file for SUMO. period: of its own means [s], which go
-    nowhere"""
-    rows = [
-        f'  <inductionLoop id="{loop}" lane="{lane}" pos="{position:.2f}" period="{period:g}" file="NUL"/>\n'
-        for loop, lane, position, _ in _loops(city, layout)
-    ]
+    """Write the loops as an additional file for SUMO.
+
+    period: SUMO's aggregation period [s]; its output is discarded
+    """
+    rows = []
+    for loop in _loops(city, layout):
+        place = f'lane="{loop.lane}" pos="{loop.position:.2f}"'
+        rows.append(f'  <inductionLoop id="{loop.name}" {place} period="{period:g}" file="NUL"/>\n')
     path.write_text(f"<additional>\n{''.join(rows)}</additional>\n", encoding="utf-8")
 
 
@@ -130,25 +151,32 @@ class Estimation:
         known: Instruments,
         planning: PlanningModel,
     ):
-        """meter: follows the probes; known: of the layout (`instruments`); planning: model of the
-        filter"""
-        self._session, self._meter, self._known, self._layout, self._city = (
-            session,
-            meter,
-            known,
-            layout,
-            city,
-        )
-        self._filter, self._flow = Estimator(planning, known), meter.gateway_flow()
+        """meter: follows the probes; known: of the layout (`instruments`)
+
+        planning: model of the filter
+        """
+        self._session = session
+        self._meter = meter
+        self._known = known
+        self._layout = layout
+        self._city = city
+        self._filter = Estimator(planning, known)
         self.accumulation = self._filter.accumulation
         loops = _loops(city, layout)
-        self._loops, edges = [name for name, *_ in loops], [edge for *_, edge in loops]
-        each = dict(zip(layout.edges, map(len, layout.positions), strict=True))
+        self._loops = [loop.name for loop in loops]
+        edges = [loop.edge for loop in loops]
+        stations = dict(zip(layout.edges, map(len, layout.positions), strict=True))
         # The length of lane that a loop stands for.
-        self._length = np.array([city.length[city.edges[edge]] / each[edge] for edge in edges])
+        self._length = np.array([city.length[city.edges[edge]] / stations[edge] for edge in edges])
         self._region = city.edge_region[edges]
-        self._occupancy, self._samples = np.zeros(len(self._loops)), 0
-        self._departed = meter.probe_departures.copy()
+        self._begin()
+
+    def _begin(self) -> None:
+        """Begin the sums of a control interval."""
+        self._occupancy = np.zeros(len(self._loops))
+        self._samples = 0
+        self._departed = self._meter.probe_departures.copy()
+        self._flow = self._meter.gateway_flow()
 
     def sample(self) -> None:
         occupancy = self._session.loop_occupancy
@@ -156,44 +184,49 @@ class Estimation:
         self._samples += 1
 
     def update(self, controls: Controls) -> None:
-        """Filter the readings of the interval that has just ended under `controls`."""
+        """Filter the readings of the interval that ended under `controls`."""
         self.accumulation = self._filter.step(controls, self.readings())
 
     def backlog(self) -> PerPair:
-        """Return (R, R) [veh]: metered trips that wait, and the probes that wait to enter, scaled
-        up."""
+        """Return (R, R) [veh], the trips that wait.
+
+        These are metered trips, and probes that wait to enter, scaled up.
+        """
         return self._meter.held() + self._meter.probe_backlog() / max(self._known.probe_share, 1e-9)
 
     def readings(self) -> Readings:
         """Return the readings since the last call."""
-        known, regions, meter = self._known, self._city.regions, self._meter
+        known = self._known
+        regions = self._city.regions
+        meter = self._meter
         density = self._occupancy / max(self._samples, 1) / 100.0 / VEHICLE_LENGTH_M
         lane_length = np.bincount(self._region, self._length, regions)
         share = known.detector_share * lane_length / np.maximum(lane_length, 1e-9)
         vehicles = np.bincount(self._region, density * self._length, regions)
-        counts, flow = np.zeros((regions, regions)), meter.gateway_flow()
-        for gateway, there, crossed in zip(
-            self._city.gateways, self._layout.counted, flow - self._flow, strict=True
-        ):
-            counts[gateway.source, gateway.target] += crossed if there else 0.0
-        departed = meter.probe_departures - self._departed
-        self._occupancy, self._samples = np.zeros(len(self._loops)), 0
-        self._departed, self._flow = meter.probe_departures.copy(), flow
-        unknown = np.full((regions, regions), np.nan)
+        crossed = meter.gateway_flow() - self._flow
+        counts = np.zeros((regions, regions))
+        for n in np.flatnonzero(self._layout.counted):
+            gateway = self._city.gateways[n]
+            counts[gateway.source, gateway.target] += crossed[n]
+        on_the_way = departed = np.full((regions, regions), np.nan)
+        if known.probe_share > 0:
+            on_the_way = meter.probes()
+            departed = (meter.probe_departures - self._departed).astype(float)
+        self._begin()
         with np.errstate(divide="ignore", invalid="ignore"):
             return Readings(
                 accumulation=np.where(share > 0, vehicles / share, np.nan),
                 crossings=np.where(known.counted_share > 0, counts / known.counted_share, np.nan),
-                probes=meter.probes() if known.probe_share > 0 else unknown,
-                probe_departures=departed.astype(float) if known.probe_share > 0 else unknown,
+                probes=on_the_way,
+                probe_departures=departed,
             )
 
 
-def _loops(city: City, layout: Layout) -> list[tuple[str, str, float, int]]:
-    """Return name, lane, position [m] and link (its number) of every loop."""
-    return [
-        (f"{lane}#{n}", lane, position, edge)
-        for edge, positions in zip(layout.edges, layout.positions, strict=True)
-        for lane in city.lane_ids[city.edges[edge]]
-        for n, position in enumerate(positions)
-    ]
+def _loops(city: City, layout: Layout) -> list[_Loop]:
+    """Return all loops."""
+    loops = []
+    for edge, positions in zip(layout.edges, layout.positions, strict=True):
+        for lane in city.lane_ids[city.edges[edge]]:
+            for n, position in enumerate(positions):
+                loops.append(_Loop(f"{lane}#{n}", lane, position, edge))
+    return loops

@@ -1,5 +1,4 @@
-"""Faults of a simulated city: closed streets, and signals that run their own programme whatever is
-commanded."""
+"""Faults of a city: closed streets, and signals that take no commands."""
 
 from collections.abc import Collection, Sequence
 
@@ -13,41 +12,46 @@ from cosim.sumo.signals import GREEN
 from nmfd.errors import InputError
 from nmfd.faults import Fault
 
-CLOSED_SPEED_M_S = (
-    0.001  # speed limit of a closed street: vehicles on it stand, and soon none can enter
-)
+# Speed limit of a closed street: vehicles on it stand, and soon none can enter.
+CLOSED_SPEED_M_S = 0.001
 
 
 def check(faults: Sequence[Fault], city: City, where: str, others: Collection[str] = ()) -> None:
-    """Raise InputError for an edge or signal that the city does not have; others: signals without a
-    gateway."""
+    """Raise InputError for an edge or signal that the city does not have.
+
+    others: signals without a gateway
+    """
     signals = {gateway.signal for gateway in city.gateways} | {*others}
     for fault in faults:
         if fault.kind == "closed" and fault.value not in city.edges:
             raise InputError(
-                f"{where}: closed: edge {fault.value!r} is not in {city.net_file}; name one that cars use"
+                f"{where}: closed: edge {fault.value!r} is not in {city.net_file}; "
+                "name one that cars use"
             )
         if fault.kind == "signal" and fault.value not in signals:
             raise InputError(
-                f"{where}: signal: {fault.value!r} is no signal that is commanded; name one at a gateway"
+                f"{where}: signal: {fault.value!r} is no signal that is commanded; "
+                "name one at a gateway"
             )
 
 
 class Incidents:
-    """Faults of one run, and all setting of signal states, which they may prevent.
+    """Injected faults of one run.
 
-    Call `begin` at the start of every control interval and `play` before every simulation step. A
-    signal that stops or starts to obey shows yellow first where it loses a green.
+    All signal states are set through this object, because a fault can block them. A signal that
+    stops or starts to obey shows yellow first where it loses a green. Call `begin` at the start of
+    every control interval and `play` before every simulation step.
     """
 
     def __init__(self, faults: Sequence[Fault], session: Session, city: City):
-        self._faults, self._session, self._city = faults, session, city
+        self._faults = faults
+        self._session = session
+        self._city = city
         self._limits: dict[str, list[float]] = {}  # closed edge -> speed limits of its lanes before
-        self._own = {
-            fault.value: session.programme_id(fault.value)
-            for fault in faults
-            if fault.kind == "signal"
-        }
+        self._own: dict[str, str] = {}  # signal -> its programme
+        for fault in faults:
+            if fault.kind == "signal":
+                self._own[fault.value] = session.programme_id(fault.value)
         self._silent: set[str] = set()  # signals that do not obey
         self._failed: set[str] = set()  # signals whose state SUMO refused in this interval
         self._commanded: dict[str, str] = {}  # signal -> last commanded state
@@ -65,23 +69,34 @@ class Incidents:
 
     def begin(self, k: int) -> None:
         """Start the faults of control interval k, and end those that are over."""
-        active = [fault for fault in self._faults if fault.active(k)]
-        closed, silent = (
-            {f.value for f in active if f.kind == kind} for kind in ("closed", "signal")
-        )
+        closed: set[str] = set()
+        silent: set[str] = set()
+        for fault in self._faults:
+            if not fault.active(k):
+                continue
+            if fault.kind == "closed":
+                closed.add(fault.value)
+            elif fault.kind == "signal":
+                silent.add(fault.value)
         for edge in closed - self._limits.keys():
             self._limits[edge] = self._session.limit_speed(edge, [CLOSED_SPEED_M_S])
         for edge in self._limits.keys() - closed:
             self._session.limit_speed(edge, self._limits.pop(edge))
-        changed, self._silent, self._failed = sorted(silent ^ self._silent), silent, set()
+        changed = sorted(silent ^ self._silent)
+        self._silent = silent
+        self._failed = set()
         for signal in changed:
             self._change(signal)
 
     def play(self, now: float) -> None:
-        """End the transitions that are over at `now` [s]; call after all that shows states."""
-        for signal in [signal for signal, end in self._yellow_end.items() if now >= end - 1e-6]:
-            del self._yellow_end[signal]
-            self._change(signal)
+        """End the transitions that are over at `now` [s].
+
+        Call it after everything that shows states.
+        """
+        for signal, end in list(self._yellow_end.items()):
+            if now >= end - 1e-6:
+                del self._yellow_end[signal]
+                self._change(signal)
 
     def show(self, signal: str, state: str) -> None:
         """Set the state of a signal, unless it does not obey."""
@@ -97,24 +112,30 @@ class Incidents:
 
     def problem(self) -> str:
         """Return what was wrong in this interval, "" if nothing was."""
-        streets = [f"edge {edge} closed" for edge in sorted(self._limits)]
-        return ", ".join(
-            [*streets, *(f"signal {signal} took no programme" for signal in sorted(self.refused))]
-        )
+        problems = [f"edge {edge} closed" for edge in sorted(self._limits)]
+        problems += [f"signal {signal} took no programme" for signal in sorted(self.refused)]
+        return ", ".join(problems)
 
     def _obeys(self, signal: str) -> bool:
         return signal not in self._silent and signal not in self._yellow_end
 
     def _change(self, signal: str) -> None:
-        """Switch between own programme and commanded state, through yellow if a green ends."""
-        session, shown = self._session, self._session.signal_state(signal)
+        """Switch between own programme and commanded state.
+
+        If a green ends, yellow comes first.
+        """
+        session = self._session
+        shown = session.signal_state(signal)
         target = None if signal in self._silent else self._commanded.get(signal)
         if target is None:
             session.restart_programme(signal, self._own[signal])
-        coming = session.signal_state(signal) if target is None else target
-        between = "".join(
-            "y" if a in GREEN and b not in GREEN else a for a, b in zip(shown, coming, strict=True)
-        )
+            coming = session.signal_state(signal)
+        else:
+            coming = target
+        between = ""
+        for light, next_light in zip(shown, coming, strict=True):
+            loses_green = light in GREEN and next_light not in GREEN
+            between += "y" if loses_green else light
         if between != shown:
             session.set_signal_state(signal, between)
             self._yellow_end[signal] = session.time + DEFAULT_YELLOW_S

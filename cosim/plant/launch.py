@@ -1,7 +1,7 @@
 """Start of SUMO for one run: vehicles, additional files and command line."""
 
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from functools import cached_property
 from pathlib import Path
 
@@ -18,21 +18,17 @@ from cosim.sumo.trips import PLANNING_SEEDS, make_trips, turning_flows
 from cosim.sumo.xml_files import file_list
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
+from nmfd.runs.files import temporary_folder
 
 # Equipped drivers take the fastest route by the mean speeds of the last 180 s: at the departure,
 # for which their route must be read no earlier, and every minute from then on.
-REROUTING = [
-    "--route-steps",
-    "1",
-    "--device.rerouting.pre-period",
-    "60",
-    "--device.rerouting.period",
-    "60",
-    "--device.rerouting.adaptation-interval",
-    "1",
-    "--device.rerouting.adaptation-steps",
-    "180",
-]
+REROUTING = {
+    "route-steps": "1",
+    "device.rerouting.pre-period": "60",
+    "device.rerouting.period": "60",
+    "device.rerouting.adaptation-interval": "1",
+    "device.rerouting.adaptation-steps": "180",
+}
 GIVEN = ("step-length", "time-to-teleport", "collision.action")  # arguments of Session
 
 
@@ -44,12 +40,12 @@ def own_vehicles(scenario: Scenario, settings: Settings, city: City) -> Recorded
 
 
 class Launch:
-    """Starts SUMO for one run after the other, with files in a temporary folder that `close`
-    removes.
+    """Start of SUMO for one run after the other.
+
+    Files are in a temporary folder, which `close` removes.
 
     vehicles: ids of those of the last run; held: its trips under metering
-    trip_file, emission_file: SUMO's tripinfo output, and its emissions by edge at the end of the
-        run
+    trip_file: SUMO's tripinfo output; emission_file: emissions by edge at the end of the run
     """
 
     def __init__(
@@ -63,25 +59,29 @@ class Launch:
         trip_file: Path | None,
         gui: bool,
     ):
-        """layout: of the loop detectors; trip_file: of SUMO's tripinfo, to be kept; gui: in the
-        window of sumo-gui"""
-        self._scenario, self._settings, self._city, self._signals = (
-            scenario,
-            settings,
-            city,
-            signals,
-        )
-        self._layout, self._kept, self._gui = layout, trip_file is not None, gui
-        self._temporary = tempfile.TemporaryDirectory(prefix="cosim-", ignore_cleanup_errors=True)
-        self._folder = Path(self._temporary.name)
+        """layout: loop detectors to install
+
+        trip_file: where to keep SUMO's tripinfo
+        gui: show the run in sumo-gui
+        """
+        self._scenario = scenario
+        self._settings = settings
+        self._city = city
+        self._signals = signals
+        self._layout = layout
+        self._kept = trip_file is not None
+        self._gui = gui
+        self._temporary = ExitStack()
+        self._folder = self._temporary.enter_context(temporary_folder())
         self.vehicles: list[str] = []
         self.held: HeldTrips | None = None
         self.trip_file = trip_file or self._folder / "tripinfo.xml"
         self.emission_file = self._folder / "emissions.xml"
 
     def start(self, seed: int) -> Session:
-        """Return a simulation whose trips, drivers and reroutes follow from `seed`."""
-        settings, routes = self._settings, self._folder / "trips.rou.xml"
+        """Return a simulation in which everything random follows from `seed`."""
+        settings = self._settings
+        routes = self._folder / "trips.rou.xml"
         self.vehicles = self._write_vehicles(routes, seed)
         beside = own_files(self._scenario, settings.background)
         if settings.routes and beside and not seed:
@@ -108,28 +108,37 @@ class Launch:
         )
 
     def close(self) -> None:
-        self._temporary.cleanup()
+        self._temporary.close()
 
     def _options(self) -> list[str]:
+        """Return SUMO's options, as on its command line."""
         settings = self._settings
-        options = [
-            *outputs.options(self.trip_file, detailed=self._kept),
-            "--begin",
-            str(settings.begin),
-        ]
-        options += ["--ignore-route-errors", str(bool(settings.routes)).lower()]
+        options = outputs.options(self.trip_file, detailed=self._kept)
+        chosen = {
+            "begin": str(settings.begin),
+            "ignore-route-errors": str(bool(settings.routes)).lower(),
+        }
         if settings.rerouting > 0:
-            options += [*REROUTING, "--device.rerouting.probability", str(settings.rerouting)]
-        more = (recorded.MESOSCOPIC if settings.mesoscopic else {}) | settings.options
-        for key, value in more.items():
+            chosen |= REROUTING
+            chosen["device.rerouting.probability"] = str(settings.rerouting)
+        others = dict(settings.options)
+        if settings.mesoscopic:
+            others = recorded.MESOSCOPIC | others
+        for key, value in others.items():
             if f"--{key}" not in options and key not in GIVEN:
-                options += [f"--{key}", value]
+                chosen.setdefault(key, value)
+        for key, value in chosen.items():
+            options += [f"--{key}", value]
         return [*options, "--additional-files", file_list(self._additional())]
 
     def _additional(self) -> list[Path]:
-        """Return the additional files in SUMO's order of reading: the last programme of a signal
-        runs."""
-        scenario, settings, folder = self._scenario, self._settings, self._folder
+        """Return the additional files in the order in which SUMO reads them.
+
+        The last programme of a signal runs.
+        """
+        scenario = self._scenario
+        settings = self._settings
+        folder = self._folder
         steered, others = self._signals
         additional = own_files(scenario, settings.additional)
         if settings.signals == WEBSTER:
@@ -146,24 +155,33 @@ class Launch:
 
     def _write_vehicles(self, path: Path, seed: int) -> list[str]:
         """Write the route file of one run, and return the ids of its vehicles."""
-        scenario, settings, originals = self._scenario, self._settings, self._vehicles_of(seed)
-        factor, begin = (scenario.demand_factor, settings.begin) if settings.routes else (1.0, 0.0)
-        jitter = recorded.JITTER_S if settings.routes and seed else 0.0
+        scenario = self._scenario
+        settings = self._settings
+        originals = self._vehicles_of(seed)
+        factor = 1.0
+        begin = 0.0
+        jitter = 0.0
+        if settings.routes:
+            factor = scenario.demand_factor
+            begin = settings.begin
+            jitter = recorded.JITTER_S if seed else 0.0
         drawn = recorded.draw(originals, seed=seed, factor=factor, jitter=jitter, begin=begin)
         if settings.metering > 0.0:
             self.held = recorded.write_held_trips(
                 originals, drawn, path, self._shared_routes, self._city.region_of
             )
             if settings.routes and not self.held.orders:
-                some = f"those without stops, via edges and attributes other than {', '.join(recorded.ORDERED)}"
-                none = "none of the vehicles in sumo.routes can wait: only"
-                raise InputError(f"{scenario.where}: sumo.metering: {none} {some} can; omit it")
+                raise InputError(
+                    f"{scenario.where}: sumo.metering: none of the vehicles in sumo.routes "
+                    "can wait: only those without stops, via edges and attributes other than "
+                    f"{', '.join(recorded.ORDERED)} can; omit it"
+                )
         else:
             recorded.write_recorded_trips(originals, drawn, path)
         return [name for _, _, name in drawn]
 
     def _vehicles_of(self, seed: int) -> RecordedTrips:
-        """Return the recorded trips, or trips that are made from the demand by `seed`."""
+        """Return the recorded trips, or trips made from the demand by `seed`."""
         if self._settings.routes:
             return self._recorded
         return as_recorded(make_trips(self._city, self._scenario.demand, self._scenario.step, seed))
@@ -177,7 +195,7 @@ class Launch:
         return recorded.read_routes(own_files(self._scenario, self._settings.additional))
 
     def _planning_trips(self) -> Iterator[tuple[float, Sequence[str]]]:
-        """Yield departure [s] and edges of the trips that Webster's plan is made for."""
+        """Yield departure [s] and edges of the trips for Webster's plan."""
         originals = self._vehicles_of(PLANNING_SEEDS[0])
         for depart, element in zip(originals.depart.tolist(), originals.elements, strict=True):
             edges, driven = recorded.edges_of(element, self._shared_routes)

@@ -1,4 +1,4 @@
-"""The exact vehicle ledger of a run: accumulations x_ij, and every crossing of a boundary.
+"""The exact vehicle ledger of a run: accumulations x_ij and crossings.
 
 SUMO's tripinfo has the outcome of vehicles that have left (cosim.sumo.outputs): an arrival at the
 last edge of the final route, else a removal.
@@ -6,7 +6,7 @@ last edge of the final route, else a removal.
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -24,13 +24,11 @@ from nmfd.ledger import LedgerError
 from nmfd.types import State
 
 POLL_PERIOD_S = 3.0  # longest time between two looks at the entry edges
-COMPLETED, REMOVED, UNDER_WAY, WAITING, GIVEN_UP = (
-    "completed",
-    "removed",
-    "under way",
-    "waiting",
-    "given up",
-)
+COMPLETED = "completed"
+REMOVED = "removed"
+UNDER_WAY = "under way"
+WAITING = "waiting"
+GIVEN_UP = "given up"
 
 
 @dataclass
@@ -51,7 +49,7 @@ class _Vehicle:
 
 
 class Event(NamedTuple):
-    """A departure (source None), or the entry of a vehicle into another region.
+    """A departure (source None), or an entry into another region.
 
     edge: last one of its route; free: the driver may take another route (no public transport, no
         stops)
@@ -70,8 +68,8 @@ class Trip(NamedTuple):
 
     origin: region; public: public transport
     outcome: COMPLETED, REMOVED on the road, UNDER_WAY, WAITING to enter, or GIVEN_UP before that
-    departure_delay, time, time_loss: [s], waiting to enter; in all, until its end or now; against
-        driving freely, NaN if it is not known yet
+    departure_delay: time spent waiting to enter [s]; time: in all, until its end or now [s]
+    time_loss: against driving freely [s], NaN if it is not known yet
     """
 
     origin: int
@@ -92,10 +90,11 @@ class Meter:
 
     Since the beginning [veh]:
     departures (R, R); probe_departures (R, R), of probes; arrivals (R,), completed trips
-    removals (R, R) [i, j], vehicles taken out in i on their way to j; given_up (R, R), trips
-    dropped before they began crossings (R, R, R) [i, h, j] from i to h by a gateway; jumps (R, R,
-    R), without one: teleports, streets closed to
-        cars, vehicles moved by another program, or too fast to be seen in between
+    removals (R, R) [i, j], vehicles taken out in i on their way to j
+    given_up (R, R), trips dropped before they began
+    crossings (R, R, R) [i, h, j], from i to h by a gateway; jumps (R, R, R), without one:
+        teleports, streets closed to cars, vehicles moved by another program, or too fast to be seen
+        in between
     redirected (R, R, R) [i, j, l], in i, bound for j and from now on for l
     teleports; entry_flow, (source region, first edge behind the boundary) -> vehicles
     """
@@ -108,16 +107,19 @@ class Meter:
         trips: TripReader | None = None,
         metering: Metering | None = None,
     ):
-        """probes: vehicles that are also counted apart; metering: trips that wait outside
+        """probes: vehicles that are also counted apart
 
+        metering: trips that wait outside
         trips: ends of trips; None if SUMO cannot write them at once: all are arrivals then
         """
+        self._session = session
+        self._city = city
+        self._probes = probes
+        self._trips = trips
         self._metering = metering
-        self._session, self._city, self._probes, self._trips = session, city, probes, trips
         self._vehicles: dict[str, _Vehicle] = {}
-        self._gone: dict[
-            str, list[_Vehicle]
-        ] = {}  # not in tripinfo yet; several if an id is used again
+        # Vehicles that are not in tripinfo yet; several if an id is used again.
+        self._gone: dict[str, list[_Vehicle]] = {}
         self._teleporting: set[str] = set()
         self._ended: list[Trip] = []
         self._spent = np.zeros(2)  # by their trips [veh s]: other, private
@@ -129,21 +131,27 @@ class Meter:
         self._poll_steps = max(1, int(min(0.5 * shortest, POLL_PERIOD_S) / session.step_length))
         self._steps = 0
         self._seen: dict[str, tuple[str, ...]] = dict.fromkeys(entries, ())
-        self.teleports, regions = 0, city.regions
-        self._running, self.departures, self.probe_departures, self.removals, self.given_up = (
-            np.zeros((5, regions, regions), dtype=int)
+        regions = city.regions
+        self._running = np.zeros((regions, regions), dtype=int)
+        self.departures, self.probe_departures, self.removals, self.given_up = np.zeros(
+            (4, regions, regions), dtype=int
         )
         self.arrivals = np.zeros(regions, dtype=int)
         self.crossings, self.jumps, self.redirected = np.zeros(
             (3, regions, regions, regions), dtype=int
         )
+        self.teleports = 0
         self.entry_flow: Counter[tuple[int, str]] = Counter()
         # Several movements may lead from one region to one edge: they share its flow.
         self._alike = Counter((g.source, g.to_edge) for g in city.gateways)
 
     def state(self, step: int, time: float) -> State:
-        """Return the state at `time` [s] since the start, when control step `step` begins. Raises
-        LedgerError."""
+        """Return the state when control step `step` begins.
+
+        time: since the start [s]
+
+        Raises LedgerError.
+        """
         return State(
             step=step,
             time=time,
@@ -155,16 +163,16 @@ class Meter:
 
     def gateway_flow(self) -> PerGateway:
         """Return (G,) [veh] over each gateway since the beginning."""
-        return np.array(
-            [
-                self.entry_flow[g.source, g.to_edge] / self._alike[g.source, g.to_edge]
-                for g in self._city.gateways
-            ]
-        )
+        flows = []
+        for gateway in self._city.gateways:
+            entry = gateway.source, gateway.to_edge
+            flows.append(self.entry_flow[entry] / self._alike[entry])
+        return np.array(flows)
 
     def observe(self) -> list[Event]:
         """Account for the last simulation step; return departures, then entries."""
-        session, events = self._session, []
+        session = self._session
+        events: list[Event] = []
         arrived = list(session.arrived())
         for vehicle in session.loaded():
             try:
@@ -177,9 +185,8 @@ class Meter:
             self._teleporting.add(vehicle)
         self._teleporting.difference_update(session.ended_teleport())
         for vehicle in session.departed():
-            if (
-                vehicle in self._vehicles and self._vehicles[vehicle].departed
-            ):  # its id is used again
+            before = self._vehicles.get(vehicle)
+            if before and before.departed:  # its id is used again
                 self._leave(vehicle)
                 if vehicle in arrived:
                     arrived.remove(vehicle)
@@ -188,21 +195,23 @@ class Meter:
                 Event(vehicle, None, known.origin, known.destination, known.edge, known.free)
             )
         self._steps += 1
-        for edge, region in self._entries.items() if self._steps % self._poll_steps == 0 else ():
-            present = session.vehicles_on(edge)
-            if present != self._seen[edge]:
-                for vehicle in set(present).difference(self._seen[edge]):
-                    events += self._enter(vehicle, edge, region)
-                self._seen[edge] = present
+        if self._steps % self._poll_steps == 0:
+            for edge, region in self._entries.items():
+                present = session.vehicles_on(edge)
+                if present != self._seen[edge]:
+                    for vehicle in set(present).difference(self._seen[edge]):
+                        events += self._enter(vehicle, edge, region)
+                    self._seen[edge] = present
         for vehicle in arrived:
             self._leave(vehicle)
-        events.sort(
-            key=lambda event: (event.source is not None, event.vehicle)
-        )  # set order is not reproducible
+        # The order of a set is not reproducible.
+        events.sort(key=lambda event: (event.source is not None, event.vehicle))
         return events
 
     def accumulation(self, step: int = 0) -> PerPair:
-        """Return x_ij (R, R) [veh], with every vehicle counted where it is now, on junctions too.
+        """Return x_ij (R, R) [veh], with every vehicle counted where it is now.
+
+        Vehicles on junctions count, too.
 
         step: control step, for messages
         Raises LedgerError if the count differs from departures minus arrivals and removals, in
@@ -220,13 +229,11 @@ class Meter:
             self._cross(known, self._city.region_of.get(self._session.road(vehicle), known.region))
             counted[known.region, known.destination] += 1
         away = self._teleporting.difference(on_road)
-        if (
-            len(on_road) + len(away) < self._running.sum()
-        ):  # the mesoscopic model holds vehicles off a jammed road
+        if len(on_road) + len(away) < self._running.sum():
+            # The mesoscopic model holds vehicles off a jammed road.
             under_way = {vehicle for vehicle, known in self._vehicles.items() if known.departed}
-            away |= under_way.difference(on_road).intersection(
-                self._session.known()
-            )  # the others have left
+            held = under_way.difference(on_road)
+            away |= held.intersection(self._session.known())  # the others have left
         for vehicle in away:
             known = self._vehicles[vehicle]
             counted[known.region, known.destination] += 1
@@ -234,14 +241,19 @@ class Meter:
             raise LedgerError(f"vehicle ledger broken at control step {step}{self._unknown_ends()}")
         balance = int(self.departures.sum() - self.arrivals.sum() - self.removals.sum())
         if counted.sum() != balance or (counted != self._running).any():
-            i, j = np.unravel_index(int(np.abs(counted - self._running).argmax()), counted.shape)
-            raise LedgerError(
-                f"vehicle ledger broken at control step {step}, {self._session.time:g} s: {counted.sum()} vehicles are "
-                f"in the city, but {self.departures.sum()} departures minus {self.arrivals.sum()} arrivals"
-                f"{f' and {self.removals.sum()} removed' if self.removals.any() else ''} are {balance}; in region {i} "
-                f"bound for {j} there are {counted[i, j]}, and {self._running[i, j]} were followed there"
-            )
+            raise LedgerError(self._difference(counted, balance, step))
         return counted.astype(float)
+
+    def _difference(self, counted: np.ndarray, balance: int, step: int) -> str:
+        """Return how the vehicles that were counted (R, R) differ from the books."""
+        i, j = np.unravel_index(int(np.abs(counted - self._running).argmax()), counted.shape)
+        removed = f" and {self.removals.sum()} removed" if self.removals.any() else ""
+        return (
+            f"vehicle ledger broken at control step {step}, {self._session.time:g} s: "
+            f"{counted.sum()} vehicles are in the city, but {self.departures.sum()} departures "
+            f"minus {self.arrivals.sum()} arrivals{removed} are {balance}; in region {i} bound for "
+            f"{j} there are {counted[i, j]}, and {self._running[i, j]} were followed there"
+        )
 
     def close_books(self) -> None:
         """Book the ends of the last vehicles after the simulation.
@@ -251,53 +263,60 @@ class Meter:
         if self._trips is None:
             return
         self._settle(self._trips.finish(self._gone))
-        trips, booked = self._trips, (int(self.arrivals.sum()), int(self.removals.sum()))
-        if self._gone or (trips.completed, trips.removed) != booked:
+        trips = self._trips
+        arrivals = int(self.arrivals.sum())
+        removals = int(self.removals.sum())
+        if self._gone or (trips.completed, trips.removed) != (arrivals, removals):
             raise LedgerError(
-                f"vehicle ledger broken at the end: {booked[0]} completed trips and {booked[1]} removed vehicles were "
-                f"booked, but SUMO's tripinfo has {trips.completed} and {trips.removed}{self._unknown_ends()}"
+                f"vehicle ledger broken at the end: {arrivals} completed trips and {removals} "
+                f"removed vehicles were booked, but SUMO's tripinfo has {trips.completed} and "
+                f"{trips.removed}{self._unknown_ends()}"
             )
 
     def backlog(self) -> PerPair:
-        """Return (R, R) [veh] due to depart from i for j, but not inserted yet; book those that
-        SUMO dropped."""
+        """Return (R, R) [veh] due to depart from i for j, but not inserted yet.
+
+        Trips that SUMO dropped meanwhile are booked.
+        """
         pending = self._session.pending()
         waiting = self.held() + self._waiting(pending)
-        ahead = {
-            vehicle for vehicle, known in self._vehicles.items() if not known.departed
-        }.difference(pending)
-        for vehicle in sorted(ahead.difference(self._session.known())) if ahead else ():
-            self._leave(vehicle)
+        ahead = {vehicle for vehicle, known in self._vehicles.items() if not known.departed}
+        ahead.difference_update(pending)
+        if ahead:
+            for vehicle in sorted(ahead.difference(self._session.known())):
+                self._leave(vehicle)
         for vehicle, known in self._vehicles.items():
-            if (
-                not known.departed and known.due < self._session.time
-            ):  # or not, if it waits for a person
+            # A vehicle that waits for a person may be due later than it said.
+            if not known.departed and known.due < self._session.time:
                 self._time(vehicle, known)
         return waiting
 
     def time_spent(self) -> Float[np.ndarray, "2"]:
-        """Return the total time spent since the beginning [veh s], of other and of private
-        vehicles."""
+        """Return (2,) [veh s] spent so far, by other and by private vehicles."""
         spent = self._spent.copy()
         for trip in self._open():
             spent[int(trip.private)] += trip.time
         return spent
 
     def trips(self) -> list[Trip]:
-        """Return all trips that were due; time losses of those under way are known when the books
-        are closed."""
+        """Return all trips that were due.
+
+        Time losses of those under way are known when the books are closed.
+        """
         return [*self._ended, *self._open()]
 
     def _open(self) -> Iterator[Trip]:
         """Yield the trips that were due and have not ended."""
-        now, losses = self._session.time, {} if self._trips is None else self._trips.under_way
+        now = self._session.time
+        losses: Mapping[str, float] = {} if self._trips is None else self._trips.under_way
         for vehicle, known in self._vehicles.items():
             if known.departed:
                 yield _trip(known, UNDER_WAY, now, losses.get(vehicle, math.nan))
             elif known.due < now:
                 yield _trip(known, WAITING, now)
-        for origin, due in [] if self._metering is None else self._metering.waiting():
-            yield Trip(origin, True, WAITING, now - due, now - due)
+        if self._metering is not None:
+            for origin, due in self._metering.waiting():
+                yield Trip(origin, True, WAITING, now - due, now - due)
 
     def _end(self, trip: Trip) -> None:
         self._ended.append(trip)
@@ -305,10 +324,12 @@ class Meter:
 
     def held(self) -> PerPair:
         """Return (R, R) [veh] of the backlog: metered trips."""
-        return np.zeros(self._running.shape) if self._metering is None else self._metering.backlog()
+        if self._metering is None:
+            return np.zeros(self._running.shape)
+        return self._metering.backlog()
 
     def probes(self) -> PerPair:
-        """Return (R, R) [veh] of the accumulation when it was last counted: probes."""
+        """Return (R, R) [veh], the probes of the accumulation last counted."""
         counted = np.zeros(self._running.shape)
         for vehicle in self._probes & self._vehicles.keys():
             known = self._vehicles[vehicle]
@@ -328,54 +349,69 @@ class Meter:
         return waiting
 
     def _settle(self, ends: Iterable[End]) -> None:
+        """Book the ends of trips that tripinfo tells."""
         for end in ends:
-            if (
-                end.vehicle not in self._gone
-            ):  # removed by another program, which SUMO does not call arrived
-                if end.vehicle not in self._vehicles:
+            name = end.vehicle
+            if name not in self._gone:  # removed by another program: SUMO does not call it arrived
+                if name not in self._vehicles:
                     raise LedgerError(
-                        f"vehicle ledger broken: {end.vehicle} ended a trip, but was never seen to load"
+                        f"vehicle ledger broken: {name} ended a trip, but was never seen to load"
                     )
-                self._under_way(end.vehicle)
-                self._leave(end.vehicle)
-            self._book(self._gone[end.vehicle].pop(0), end)
-            if not self._gone[end.vehicle]:
-                del self._gone[end.vehicle]
+                self._under_way(name)
+                self._leave(name)
+            self._book(self._gone[name].pop(0), end)
+            if not self._gone[name]:
+                del self._gone[name]
 
     def _unknown_ends(self) -> str:
         if not self._gone:
             return ""
         return (
-            f": SUMO's tripinfo does not tell how the trips of {len(self._gone)} vehicles ended (such as "
-            f"{min(self._gone)}): is the disk full? Or does their type have has.tripinfo.device = false? Remove that"
+            f": SUMO's tripinfo does not tell how the trips of {len(self._gone)} vehicles ended "
+            f"(such as {min(self._gone)}): is the disk full? Or does their type have "
+            "has.tripinfo.device = false? Remove that"
         )
 
     def _book(self, gone: _Vehicle, end: End) -> None:
-        self._end(_trip(gone, REMOVED if end.reason else COMPLETED, end.time, end.time_loss))
-        i, j = gone.region, gone.destination
-        h = self._city.region_of.get(end.edge, i if end.reason else j)
+        """Book the end of a vehicle that has left."""
+        i = gone.region
+        j = gone.destination
         if end.reason:
+            self._end(_trip(gone, REMOVED, end.time, end.time_loss))
+            h = self._city.region_of.get(end.edge, i)
             self.removals[h, j] += 1
         else:
+            self._end(_trip(gone, COMPLETED, end.time, end.time_loss))
+            h = self._city.region_of.get(end.edge, j)
             self.arrivals[h] += 1
             self.redirected[i, j, h] += h != j
             j = h
-        (self.crossings if (i, h) in self._joined else self.jumps)[i, h, j] += h != i
+        if h != i:
+            self._passages(i, h)[i, h, j] += 1
+
+    def _passages(self, i: int, h: int) -> np.ndarray:
+        """Return the book (R, R, R) of passages from i to h: crossings or jumps."""
+        return self.crossings if (i, h) in self._joined else self.jumps
 
     def _load(self, vehicle: str) -> _Vehicle:
-        if vehicle not in self._vehicles:
-            session, route = self._session, self._session.route(vehicle)
-            origin, destination = (
-                self._city.region_of.get(edge, 0) for edge in (route[0], route[-1])
-            )
+        """Return a vehicle, which may be new."""
+        known = self._vehicles.get(vehicle)
+        if known is None:
+            session = self._session
+            region_of = self._city.region_of
+            route = session.route(vehicle)
             private = session.is_private(vehicle)
-            public = not private and session.is_public(vehicle)
             known = _Vehicle(
-                origin, destination, route[-1], session.is_free(vehicle), private, public
+                origin=region_of.get(route[0], 0),
+                destination=region_of.get(route[-1], 0),
+                edge=route[-1],
+                free=session.is_free(vehicle),
+                private=private,
+                public=not private and session.is_public(vehicle),
             )
             self._vehicles[vehicle] = known
             self._time(vehicle, known)
-        return self._vehicles[vehicle]
+        return known
 
     def _time(self, vehicle: str, known: _Vehicle) -> None:
         """Note when a vehicle was due, and its departure delay until now."""
@@ -385,34 +421,38 @@ class Meter:
         known.due = departed - known.waited
 
     def _depart(self, vehicle: str) -> _Vehicle:
-        """Book a departure where the vehicle is first seen, for where its route leads by now."""
+        """Record a departure from the vehicle's region to its destination.
+
+        Both are the current ones.
+        """
         known = self._load(vehicle)
         with suppress(REFUSALS):  # gone already
             self._time(vehicle, known)
             self._follow(vehicle, known)
             known.origin = self._city.region_of.get(self._session.road(vehicle), known.origin)
-        known.departed, known.region, known.announced = True, known.origin, known.origin
+        known.departed = True
+        known.region = known.origin
+        known.announced = known.origin
         self._running[known.origin, known.destination] += 1
         self.departures[known.origin, known.destination] += 1
         self.probe_departures[known.origin, known.destination] += vehicle in self._probes
         return known
 
     def _under_way(self, vehicle: str) -> _Vehicle:
-        """Return a vehicle on the road, even if another program put it there without a
-        departure."""
+        """Return a vehicle on the road, even if another program put it there."""
         known = self._vehicles.get(vehicle)
-        return known if known and known.departed else self._depart(vehicle)
+        if known and known.departed:
+            return known
+        return self._depart(vehicle)
 
     def _follow(self, vehicle: str, known: _Vehicle) -> None:
         """Book a change of the destination."""
         edge = self._session.route(vehicle)[-1]
         if edge == known.edge:
             return
-        before, known.edge, known.destination = (
-            known.destination,
-            edge,
-            self._city.region_of.get(edge, 0),
-        )
+        before = known.destination
+        known.edge = edge
+        known.destination = self._city.region_of.get(edge, 0)
         if known.departed and known.destination != before:
             self.redirected[known.region, before, known.destination] += 1
             self._running[known.region, before] -= 1
@@ -421,7 +461,8 @@ class Meter:
     def _leave(self, vehicle: str) -> None:
         """Take a vehicle out; its end is booked when tripinfo has it."""
         self._teleporting.discard(vehicle)
-        known, ended = self._vehicles.pop(vehicle), self._session.time - self._session.step_length
+        known = self._vehicles.pop(vehicle)
+        ended = self._session.time - self._session.step_length
         if not known.departed:  # given up before it departed
             self.given_up[known.origin, known.destination] += 1
             self._end(_trip(known, GIVEN_UP, ended))
@@ -433,6 +474,7 @@ class Meter:
             self._gone.setdefault(vehicle, []).append(known)
 
     def _enter(self, vehicle: str, edge: str, region: int) -> list[Event]:
+        """Book a vehicle on the first edge behind a boundary; return its Event."""
         known = self._under_way(vehicle)
         if vehicle in self._teleporting or known.region == known.announced == region:
             return []
@@ -444,15 +486,17 @@ class Meter:
         return [Event(vehicle, source, region, known.destination, known.edge, known.free)]
 
     def _cross(self, known: _Vehicle, region: int) -> None:
+        """Book a vehicle that is in `region` now."""
         if region != known.region:
-            joined = (known.region, region) in self._joined
-            (self.crossings if joined else self.jumps)[known.region, region, known.destination] += 1
+            passages = self._passages(known.region, region)
+            passages[known.region, region, known.destination] += 1
             self._running[known.region, known.destination] -= 1
             self._running[region, known.destination] += 1
             known.region = region
 
 
 def _trip(known: _Vehicle, outcome: str, end: float, time_loss: float = 0.0) -> Trip:
+    """Return the trip of a vehicle until `end` [s]."""
     time = max(end - known.due, 0.0)
     waited = known.waited if known.departed else time
     return Trip(known.origin, known.private, outcome, waited, time, time_loss, known.public)

@@ -1,4 +1,4 @@
-"""The SUMO city as a plant: the protocol and the controllers of the regional plants."""
+"""The SUMO city as a plant."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -13,39 +13,43 @@ from cosim.plant.incidents import Incidents
 from cosim.plant.launch import Launch
 from cosim.plant.meter import Meter
 from cosim.plant.metering import Metering
-from cosim.plant.programmes import city_signals
+from cosim.plant.programmes import city_signals, scenario_city
 from cosim.plant.record import Recorder
 from cosim.plant.sampling import SAMPLE_PERIOD_S, StreetMeans, StreetSampler
-from cosim.plant.settings import ESTIMATE, MAX_PRESSURE, Settings, check_lanes
+from cosim.plant.settings import ESTIMATE, Settings, check_lanes
 from cosim.plant.settings import settings as settings_of
 from cosim.plant.stuck import Junctions
+from cosim.plant.waits import Waits
 from cosim.sumo.arrays import PerEdge
-from cosim.sumo.net import City, check_adjacency, city_of
+from cosim.sumo.net import City, check_adjacency
 from cosim.sumo.outputs import TripReader, edge_emissions
 from cosim.sumo.session import Session
+from cosim.sumo.signals import read_links
 from nmfd.model.planning import PlanningModel, planning_model
 from nmfd.model.scenario import Scenario
 from nmfd.types import Controls, Observation, State
 
-GUIDANCE = (
-    0x67756964  # keeps the random numbers of the guided drivers apart from others of the same seed
-)
+# Keeps the random numbers of the guided drivers apart from others of the same seed.
+GUIDANCE = 0x67756964
 
 
 class Observer:
-    """Base class of observers, which read a run and may delay it; an exception of theirs ends the
-    run."""
+    """Callbacks during a run.
+
+    They block the simulation; an exception aborts it.
+    """
 
     def began(self, city: City, state: State) -> None:
         """Take the initial state."""
 
     def sampled(self, time: float, vehicles: PerEdge, speed: PerEdge) -> None:
-        """Take a sample every few seconds: SUMO's time [s], vehicles (E,) [veh], mean speed (E,)
-        [m/s]."""
+        """Take a sample every few seconds.
+
+        time: SUMO's [s]; vehicles: (E,) [veh]; speed: (E,) [m/s], mean
+        """
 
     def recorded(self, controls: Controls, state: State, row: Mapping[str, np.ndarray]) -> None:
-        """Take controls, new state and row of the record (cosim.plant.record) after a control
-        interval."""
+        """Take controls, new state and row of the record of an interval."""
 
 
 class SumoPlant:
@@ -67,21 +71,24 @@ class SumoPlant:
     ):
         """Build the network if need be.
 
-        settings: instead of the table [sumo]; trip_file: for SUMO's tripinfo, complete after
-            `trip_facts`
-        gui: show the run in sumo-gui; planning: model of the estimator, that of the scenario if
-            None
+        settings: instead of the table [sumo]
+        trip_file: for SUMO's tripinfo, complete after `trip_facts`
+        gui: show the run in sumo-gui
+        planning: model of the estimator; that of the scenario if None
         Raises InputError for a city that does not fit the scenario's network or the settings.
         """
-        self._scenario, self._planning = scenario, planning or planning_model(scenario)
+        self._scenario = scenario
+        self._planning = planning or planning_model(scenario)
         self._observer = observer or Observer()
-        self._settings = settings = settings or settings_of(scenario)
+        settings = settings or settings_of(scenario)
+        self._settings = settings
         check_lanes(scenario, settings)
-        self.city: City = city_of(scenario.network)
+        self.city: City = scenario_city(scenario, settings)
         check_adjacency(self.city, scenario.network)
         self._layout = lay_out(self.city, settings.detector_share)
         self._instruments = instruments(self.city, self._layout, settings.probe_share)
-        self.steered, self.other_signals = signals = city_signals(self.city, scenario, settings)
+        signals = city_signals(self.city, scenario, settings)
+        self.steered, self.other_signals = signals
         self._launch = Launch(
             scenario, settings, self.city, signals, self._layout, trip_file=trip_file, gui=gui
         )
@@ -90,22 +97,28 @@ class SumoPlant:
     def reset(self, seed: int) -> State:
         """Start a simulation whose trips, drivers and reroutes follow from `seed`."""
         self._end_session()
-        scenario, settings, city = self._scenario, self._settings, self.city
-        self._k, self._session = 0, self._launch.start(seed)
-        session = self._session
+        scenario = self._scenario
+        settings = self._settings
+        city = self.city
+        session = self._launch.start(seed)
+        self._k = 0
+        self._session = session
         self._trips = TripReader(self._launch.trip_file, session.flush or (lambda: None))
         self._incidents = Incidents(scenario.ordered_faults, session, city)
-        held, critical = self._launch.held, self._planning.network.critical
         self._metering = None
-        if held is not None:
+        if self._launch.held is not None:
             self._metering = Metering(
-                session, held, critical, level=settings.metering, step=scenario.step
+                session,
+                self._launch.held,
+                self._planning.network.critical,
+                level=settings.metering,
+                step=scenario.step,
             )
         estimated = settings.measurement == ESTIMATE
         known = probes(self._launch.vehicles, settings.probe_share if estimated else 0.0, seed)
-        self.meter = meter = Meter(
-            session, city, known, self._trips if session.flush else None, self._metering
-        )
+        trips = self._trips if session.flush else None
+        meter = Meter(session, city, known, trips, self._metering)
+        self.meter = meter
         self._estimation = None
         if estimated:
             self._estimation = Estimation(
@@ -121,10 +134,10 @@ class SumoPlant:
             ways_return=settings.ways_return,
             period=settings.guidance_period,
             lanes=not settings.mesoscopic,
-            turn_late=settings.signals != MAX_PRESSURE,
+            turn_late=not settings.signals_from_outside,
             random=np.random.default_rng([seed, GUIDANCE]),
         )
-        flows = self._launch.turning_flows() if settings.signals == MAX_PRESSURE else None
+        flows = self._launch.turning_flows() if settings.signals_from_outside else None
         self.actuation = Actuation(
             session,
             city,
@@ -135,29 +148,29 @@ class SumoPlant:
             self._incidents,
             flows,
         )
-        self._junctions = None if settings.mesoscopic else Junctions(session, city)
+        self._junctions = None
+        self._waits = None
+        if not settings.mesoscopic:  # that model has no lanes
+            self._junctions = Junctions(session, city)
+            self._waits = Waits(session, read_links(city.net_file), self.actuation.states)
         self._state = meter.state(0, 0.0)
         self._recorder = Recorder(meter, self._guide, self.actuation)
         self._observer.began(city, self._state)
         return self._state
 
     def step(self, controls: Controls) -> State:
-        """Simulate one control interval: actuate, simulate, measure and guide in every simulation
-        step; then record."""
-        session, scenario = self.session, self._scenario
+        """Simulate one control interval, and record it.
+
+        In every simulation step: actuate, simulate, measure and guide.
+        """
+        session = self.session
+        scenario = self._scenario
         steps = round(scenario.step / session.step_length)
-        reading, sampling = (
-            min(max(1, round(seconds / session.step_length)), steps)
-            for seconds in (READING_PERIOD_S, SAMPLE_PERIOD_S)
-        )
+        reading = self._period(READING_PERIOD_S, steps)
+        sampling = self._period(SAMPLE_PERIOD_S, steps)
         self._incidents.begin(self._k)
         self.actuation.command(controls.perimeter, self._sampler.last[0])
-        splits = controls.splits
-        if controls.prices is not None or (
-            splits is None and self._settings.guided
-        ):  # by travel times alone
-            splits = scenario.network.nominal_splits
-        self._guide.command(splits, self._streets, controls.prices)
+        self._guide.command(self._splits(controls), self._streets, controls.prices)
         if self._metering:
             self._metering.command(controls.metering, self._state.accumulation.sum(axis=1))
         if self._junctions:
@@ -167,24 +180,28 @@ class SumoPlant:
             if self._metering:
                 self._metering.play()
             session.step()
-            self.actuation.observe()
+            self.actuation.observe(self._waits)
             events = self.meter.observe()
             if self._estimation and n % reading == 0:
                 self._estimation.sample()
             if n % sampling == 0:
                 self._sampler.sample()
+                if self._waits:
+                    self._waits.sample()
                 if n < steps:
                     self.actuation.update(self._sampler.last[0])
                 self._observer.sampled(session.time, *self._sampler.last)
             self._guide.apply(events)
         self._k += 1
         state = self.meter.state(self._k, self._k * scenario.step)
-        self._streets = streets = self._sampler.finish(self._incidents.closed)
+        streets = self._sampler.finish(self._incidents.closed)
+        self._streets = streets
         realised = self.actuation.realised()
         if self._estimation:
-            self._estimation.update(
-                controls if realised is None else replace(controls, perimeter=realised)
-            )
+            acted = controls
+            if realised is not None:
+                acted = replace(controls, perimeter=realised)
+            self._estimation.update(acted)
         self._state = replace(state, problem=self._incidents.problem(), realised=realised)
         row = self._recorder.add(streets)
         self._observer.recorded(controls, self._state, row)
@@ -192,13 +209,13 @@ class SumoPlant:
 
     def observe(self) -> Observation | None:
         """Return the estimate; None if the exact state is measured."""
-        if (known := self._estimation) is None:
+        if self._estimation is None:
             return None
         return Observation(
             step=self._k,
             time=self._state.time,
-            accumulation=known.accumulation,
-            backlog=known.backlog(),
+            accumulation=self._estimation.accumulation,
+            backlog=self._estimation.backlog(),
             realised=self._state.realised,
         )
 
@@ -212,7 +229,7 @@ class SumoPlant:
         return self._recorder.record()
 
     def facts(self) -> dict[str, float]:
-        """Return scalar facts of the run so far, by the names of the columns of its table."""
+        """Return scalar facts of the run so far, by columns of its table."""
         return {
             "sumo_time_s": self.session.sumo_time,
             "signals_left_alone": len(self.other_signals),
@@ -221,8 +238,12 @@ class SumoPlant:
             **self.actuation.pressure_facts(),
         }
 
+    def longest_waits(self) -> dict[str, float]:
+        """Return signal -> longest wait of a driver at red so far [s]."""
+        return self._waits.longest() if self._waits else {}
+
     def trip_facts(self) -> dict[str, float]:
-        """End the simulation, close the books, and return emissions [kg] of all vehicles.
+        """End the simulation, close the books, and return emissions [kg].
 
         Raises LedgerError if SUMO's tripinfo differs from the books.
         """
@@ -238,7 +259,10 @@ class SumoPlant:
         return {"co2_kg": co2, "fuel_kg": fuel}
 
     def edge_totals(self) -> dict[str, np.ndarray]:
-        """Return the arrays over edges of cosim.plant.record.TOTALS; call it after `trip_facts`."""
+        """Return the arrays of cosim.plant.record.TOTALS over edges.
+
+        Call it after `trip_facts`.
+        """
         emitted = {edge: co2 for edge, (co2, _) in self._emissions.items()}
         co2 = {edge: emitted.get(edge, 0.0) for edge in self.city.edges}
         for (_, edge), turn in self.city.over.items():
@@ -250,11 +274,27 @@ class SumoPlant:
 
     @property
     def session(self) -> Session:
-        """Return the running simulation. Raises RuntimeError before the first reset and after the
-        end."""
+        """Return the running simulation.
+
+        Raises RuntimeError before the first reset and after the end.
+        """
         if self._session is None:
             raise RuntimeError("no simulation is running; call reset(seed) first")
         return self._session
+
+    def _period(self, seconds: float, steps: int) -> int:
+        """Return a period in simulation steps, from 1 to `steps`."""
+        return min(max(1, round(seconds / self.session.step_length)), steps)
+
+    def _splits(self, controls: Controls) -> np.ndarray | None:
+        """Return the split ratios of the guidance.
+
+        They are the nominal ones for guidance by travel times.
+        """
+        by_travel_times = controls.splits is None and self._settings.guided
+        if controls.prices is not None or by_travel_times:
+            return self._scenario.network.nominal_splits
+        return controls.splits
 
     def _end_session(self) -> None:
         if self._session is not None:

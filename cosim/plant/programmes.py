@@ -1,7 +1,7 @@
-"""Signal programmes other than those of the network file: actuated ones, and plans by SUMO's own
-tools."""
+"""Signal programmes beside those of the network: actuated, or optimised."""
 
 import re
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from xml.etree.ElementTree import Element, ElementTree, SubElement
@@ -14,25 +14,38 @@ from cosim.plant.max_pressure import MAX_GREEN_S
 from cosim.plant.settings import (
     ACTUATED,
     FIXED,
-    MAX_PRESSURE,
     Settings,
     check_lanes,
     own_files,
-    settings,
 )
-from cosim.sumo.net import City
+from cosim.plant.strategy import Strategy
+from cosim.sumo.net import City, city_of
 from cosim.sumo.programs import run_tool
-from cosim.sumo.signals import HELD, STATIC, Signal, phases_of, read_signals
+from cosim.sumo.session import Phase
+from cosim.sumo.signals import (
+    HELD,
+    STATIC,
+    TIMETABLE,
+    Signal,
+    held_city,
+    phases_of,
+    read_logics,
+    read_signals,
+    timetabled,
+    without_effect,
+)
 from cosim.sumo.xml_files import attribute, read_xml
-from nmfd.controllers.strategy import Strategy
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
 
 
 def check_strategy(strategy: Strategy, scenario: Scenario, city: City) -> None:
-    """Raise InputError, in a line that begins with the strategy, if it cannot run in this city."""
+    """Raise InputError if a strategy cannot run in this city.
+
+    The message begins with the strategy.
+    """
     try:
-        chosen = settings(scenario).changed(**strategy.city)
+        chosen = strategy.settings(scenario)
         check_lanes(scenario, chosen)
         if chosen.signals != FIXED:
             city_signals(city, scenario, chosen)
@@ -40,53 +53,82 @@ def check_strategy(strategy: Strategy, scenario: Scenario, city: City) -> None:
         raise InputError(f"controller {strategy.name} cannot run here: {error}") from None
 
 
+def scenario_city(scenario: Scenario, settings: Settings) -> City:
+    """Return the scenario's city, with signals only where commands can hold.
+
+    Raises InputError.
+    """
+    city = city_of(scenario.network)
+    additional = own_files(scenario, settings.additional)
+    logics = read_logics(city.net_file, additional)
+    return held_city(city, logics, _left_alone(city, settings, additional, logics))
+
+
 def city_signals(
     city: City, scenario: Scenario, settings: Settings
 ) -> tuple[list[Signal], list[str]]:
-    """Return the signals to run another programme, and the names of those that cannot.
+    """Return the signals to run another programme, and those that cannot.
 
     Signals with gateways that stay fixed-time are in neither. Raises InputError if
     `settings.signals` fits none.
     """
-    pressure = settings.signals == MAX_PRESSURE
-    kinds = HELD if pressure else (STATIC,)
-    simple, others = read_signals(city, own_files(scenario, settings.additional), kinds)
-    left = {signal.id for signal in simple} & set(settings.leave_signals)
-    simple, others = (
-        [signal for signal in simple if signal.id not in left],
-        sorted({*others, *left}),
-    )
+    outside = settings.signals_from_outside
+    kinds = HELD if outside else (STATIC,)
+    additional = own_files(scenario, settings.additional)
+    simple, others = read_signals(city, additional, kinds)
+    left = _left_alone(city, settings, additional, [signal.id for signal in simple])
+    others |= left
+    simple = [signal for signal in simple if signal.id not in left]
     if settings.signals != FIXED and not simple:
+        kind = "" if outside else "fixed-time "
         raise InputError(
-            f"{city.net_file}: sumo.signals: {settings.signals} needs {'' if pressure else 'fixed-time '}signals "
-            f"with several green phases, but none of the {len(others)} signals here is one; choose fixed"
+            f"{city.net_file}: sumo.signals: {settings.signals} needs {kind}signals with several "
+            f"green phases, but none of the {len(others)} signals here is one"
+            f"{_counted(others.values())}; choose fixed"
         )
-    fixed = settings.gateways_fixed and settings.signals == ACTUATED
-    kept = {gateway.signal for gateway in city.gateways if fixed}
-    return [signal for signal in simple if signal.id not in kept], others
+    kept = set()
+    if settings.gateways_fixed and settings.signals == ACTUATED:
+        kept = {gateway.signal for gateway in city.gateways}
+    return [signal for signal in simple if signal.id not in kept], sorted(others)
+
+
+def _left_alone(
+    city: City, settings: Settings, additional: Sequence[Path], signals: Iterable[str]
+) -> dict[str, str]:
+    """Return which of `signals` perimeter control does not use, and why."""
+    everywhere = without_effect(settings.options, settings.mesoscopic)
+    if everywhere:
+        return dict.fromkeys(signals, everywhere)
+    reasons = dict.fromkeys(settings.leave_signals, "left alone by the scenario")
+    reasons |= dict.fromkeys(timetabled(city.net_file, additional), TIMETABLE)
+    return {signal: reasons[signal] for signal in signals if signal in reasons}
+
+
+def _counted(reasons: Iterable[str]) -> str:
+    """Return how often each reason occurs, in parentheses; "" without any."""
+    counts = [f"{reason}: {count}" for reason, count in Counter(reasons).most_common()]
+    return f" ({', '.join(counts)})" if counts else ""
 
 
 def write_actuated(path: Path, signals: Iterable[Signal]) -> None:
-    """Write an additional file that makes fixed-time signals gap-based actuated ones of SUMO.
+    """Write an additional file that makes fixed-time signals actuated ones.
+
+    They are SUMO's, based on gaps.
 
     A stage lasts up to 1.5 times its fixed time: in congestion, the shares of the green are those
     of the programme.
     """
     root = Element("additional")
     for signal in signals:
-        about = {
-            "id": signal.id,
-            "type": "actuated",
-            "programID": "plan",
-            "offset": f"{signal.offset:g}",
-        }
-        logic = SubElement(root, "tlLogic", about)
+        about = {"type": "actuated", "programID": "plan", "offset": signal.offset}
+        logic = SubElement(root, "tlLogic", {"id": signal.id} | about)
+        stages = signal.stages
         for n, (phase, low) in enumerate(
             zip(signal.phases, least_times(signal.phases), strict=True)
         ):
             row = SubElement(logic, "phase", duration=f"{phase.duration:g}", state=phase.state)
             high = max(min(1.5 * phase.duration, MAX_GREEN_S), MIN_GREEN_S, low)
-            if n in signal.stages and low != high:
+            if n in stages and low != high:
                 row.attrib |= {"minDur": f"{low:g}", "maxDur": f"{high:g}"}
     ElementTree(root).write(path)
 
@@ -94,73 +136,74 @@ def write_actuated(path: Path, signals: Iterable[Signal]) -> None:
 def write_optimised(
     folder: Path, city: City, others: Sequence[str], trips: Iterable[tuple[float, Sequence[str]]]
 ) -> list[Path]:
-    """Write fixed-time plans by SUMO's own tools: cycles by Webster's formula, then offsets for
-    green waves.
+    """Write fixed-time plans by SUMO's own tools.
 
-    others: signals that keep their programme; trips: departure [s] and edges, sorted by departure
+    Cycles come from Webster's formula, then offsets for green waves.
+
+    others: signals that keep their programme
+    trips: departure [s] and edges, sorted by departure
     Raises InputError if a tool fails.
     """
-    rows = [
-        f'<vehicle id="{n}" depart="{depart:.2f}"><route edges={quoteattr(" ".join(edges))}/></vehicle>'
-        for n, (depart, edges) in enumerate(trips)
-    ]
-    (folder / "planned.xml").write_text(
-        "\n".join(["<routes>", *rows, "</routes>\n"]), encoding="utf-8"
-    )
-    plans = [folder / "cycles.add.xml", folder / "offsets.add.xml"]
-    for tool, plan, options in (
-        (
-            "tlsCycleAdaptation.py",
-            plans[0],
-            ("-u", "-y", "3", "-p", "webster", f"--skip={','.join(others)}"),
-        ),
-        ("tlsCoordinator.py", plans[1], ("-a", plans[0].name)),
-    ):
-        files = "-n", str(city.net_file.resolve()), "-r", "planned.xml", "-o", plan.name
-        result = run_tool(tool, *files, *options, folder=folder)
-        if result.returncode:
-            words = (result.stderr.strip() or "no message").splitlines()[-1]
-            raise InputError(
-                f"{city.net_file}: {tool} cannot plan its signals ({words}); choose other signals"
-            )
-        if plan == plans[0]:
-            _keep_times(plan, city.net_file)
-    # Whole seconds: perimeter control follows programmes second by second.
+    rows = ["<routes>"]
+    for n, (depart, edges) in enumerate(trips):
+        route = f"<route edges={quoteattr(' '.join(edges))}/>"
+        rows.append(f'<vehicle id="{n}" depart="{depart:.2f}">{route}</vehicle>')
+    rows.append("</routes>\n")
+    (folder / "planned.xml").write_text("\n".join(rows), encoding="utf-8")
+    cycles = folder / "cycles.add.xml"
+    offsets = folder / "offsets.add.xml"
+    webster = ("-u", "-y", "3", "-p", "webster", f"--skip={','.join(others)}")
+    _plan("tlsCycleAdaptation.py", city, cycles, *webster)
+    _keep_times(cycles, city.net_file)
+    _plan("tlsCoordinator.py", city, offsets, "-a", cycles.name)
+    # Offsets in whole seconds, as in plans of practice.
     whole = re.sub(
         r'offset="([^"]+)"',
-        lambda m: f'offset="{round(float(m[1]))}"',
-        plans[1].read_text(encoding="utf-8"),
+        lambda found: f'offset="{round(float(found[1]))}"',
+        offsets.read_text(encoding="utf-8"),
     )
-    plans[1].write_text(whole, encoding="utf-8")
-    return plans
+    offsets.write_text(whole, encoding="utf-8")
+    return [cycles, offsets]
+
+
+def _plan(tool: str, city: City, plan: Path, *options: str) -> None:
+    """Write a plan by a tool of SUMO, in the folder of the plan.
+
+    Raises InputError if the tool fails.
+    """
+    files = ("-n", str(city.net_file.resolve()), "-r", "planned.xml", "-o", plan.name)
+    result = run_tool(tool, *files, *options, folder=plan.parent)
+    if result.returncode:
+        words = (result.stderr.strip() or "no message").splitlines()[-1]
+        raise InputError(
+            f"{city.net_file}: {tool} cannot plan its signals ({words}); choose other signals"
+        )
 
 
 def _keep_times(plan: Path, net_file: Path) -> None:
-    """Lengthen phases of a plan to their least times in the network's programmes, within the same
-    cycle.
+    """Lengthen phases of a plan to their least times in the network.
 
-    The seconds come from the phases that exceed theirs most.
+    The cycle stays: the seconds come from the phases that exceed their least times most.
     """
-
-    def key(logic: Element) -> tuple[str, ...]:
-        return attribute(logic, "id"), *(phase.state for phase in phases_of(logic))
-
-    least_of = {
-        key(logic): np.array(least_times(phases_of(logic)))
-        for logic in read_xml(net_file).iter("tlLogic")
-    }
+    least_of = {}
+    for logic in read_xml(net_file).iter("tlLogic"):
+        phases = phases_of(logic)
+        least_of[_key(logic, phases)] = np.array(least_times(phases))
     root = read_xml(plan)
     for logic in root.iter("tlLogic"):
-        planned, least = (
-            np.array([phase.duration for phase in phases_of(logic)]),
-            least_of[key(logic)],
-        )
+        phases = phases_of(logic)
+        planned = np.array([phase.duration for phase in phases])
+        least = least_of[_key(logic, phases)]
         seconds = np.maximum(planned, least)
         while seconds.sum() > planned.sum() + 1e-6 and (seconds > least).any():
             longest = np.argmax(seconds - least)
-            seconds[longest] -= min(
-                1.0, seconds.sum() - planned.sum(), seconds[longest] - least[longest]
-            )
+            excess = seconds.sum() - planned.sum()
+            seconds[longest] -= min(1.0, excess, seconds[longest] - least[longest])
         for row, duration in zip(logic.iter("phase"), seconds, strict=True):
             row.set("duration", f"{duration:g}")
     ElementTree(root).write(plan)
+
+
+def _key(logic: Element, phases: Sequence[Phase]) -> tuple[str, ...]:
+    """Return what programmes of the same signal with the same states share."""
+    return attribute(logic, "id"), *(phase.state for phase in phases)

@@ -1,5 +1,6 @@
-"""The record of a run in SUMO per control interval, beside its states and controls."""
+"""The record of a run in SUMO per control interval."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -11,47 +12,45 @@ from cosim.plant.sampling import StreetMeans
 from nmfd.runs import config
 from nmfd.types import Quantity, Result
 
-BOOKS = (
-    "departures",
-    "arrivals",
-    "removals",
-    "given_up",
-    "crossings",
-    "jumps",
-    "redirected",
-)  # of the meter
-RECORD, TOTALS = (
-    {name: Quantity(tuple(axes.split()), unit, text) for name, (axes, unit, text) in arrays.items()}
-    for arrays in config.read(Path(__file__).with_name("record.toml")).values()
-)
+# The books of the meter.
+BOOKS = ("departures", "arrivals", "removals", "given_up", "crossings", "jumps", "redirected")
+
+
+def _quantities(table: Mapping[str, tuple[str, str, str]]) -> dict[str, Quantity]:
+    """Return what a table of record.toml says of its arrays."""
+    quantities = {}
+    for name, (axes, unit, text) in table.items():
+        quantities[name] = Quantity(tuple(axes.split()), unit, text)
+    return quantities
+
+
+_TABLES = config.read(Path(__file__).with_name("record.toml"))
+RECORD = _quantities(_TABLES["record"])
+TOTALS = _quantities(_TABLES["totals"])
 
 
 def settled(result: Result) -> Result:
-    """Return a result with a record whose last state, completed and removed trips follow from the
-    closed books.
+    """Return a result with a record, corrected by the closed books.
 
-    SUMO may report the end of a trip late, or in the last step only (cosim.plant.meter).
+    SUMO may report the end of a trip late, or in the last step only (cosim.plant.meter). So the
+    last state, completed and removed trips follow from the books.
     """
-
-    def since_start(counts: np.ndarray) -> np.ndarray:
-        return np.concatenate([np.zeros_like(counts[:1]), counts]).cumsum(axis=0).astype(float)
-
-    moved, redirected = (result.crossings + result.jumps).sum(axis=0), result.redirected.sum(axis=0)
-    inside = (result.departures - result.removals).sum(axis=0) - np.diag(
-        result.arrivals.sum(axis=0)
-    )
-    inside = (
-        inside
-        + moved.sum(axis=0)
-        - moved.sum(axis=1)
-        + redirected.sum(axis=1)
-        - redirected.sum(axis=2)
-    )
+    moved = (result["crossings"] + result["jumps"]).sum(axis=0)
+    redirected = result["redirected"].sum(axis=0)
+    arrivals = np.diag(result["arrivals"].sum(axis=0))
+    inside = (result["departures"] - result["removals"]).sum(axis=0) - arrivals
+    inside = inside + moved.sum(axis=0) - moved.sum(axis=1)
+    inside = inside + redirected.sum(axis=1) - redirected.sum(axis=2)
     return result.assign(
-        accumulation=np.concatenate([result.accumulation[:-1], inside[None].astype(float)]),
-        completed=since_start(result.arrivals.sum(axis=1)),
-        removed=since_start(result.removals + result.given_up),
+        accumulation=np.concatenate([result["accumulation"][:-1], inside[None].astype(float)]),
+        completed=_since_start(result["arrivals"].sum(axis=1)),
+        removed=_since_start(result["removals"] + result["given_up"]),
     )
+
+
+def _since_start(counts: np.ndarray) -> np.ndarray:
+    """Return (K + 1, ...), sums of counts (K, ...) before every interval."""
+    return np.concatenate([np.zeros_like(counts[:1]), counts]).cumsum(axis=0).astype(float)
 
 
 class Recorder:
@@ -59,29 +58,36 @@ class Recorder:
 
     def __init__(self, meter: Meter, guide: Guide, actuation: Actuation):
         """Their counts so far belong to no interval."""
-        self._meter, self._guide, self._actuation = meter, guide, actuation
+        self._meter = meter
+        self._guide = guide
+        self._actuation = actuation
         self._rows: list[dict[str, np.ndarray]] = []
         self._before = self._totals()
 
     def add(self, streets: StreetMeans) -> dict[str, np.ndarray]:
-        """Add and return the row of the interval that has just ended. streets: its means"""
+        """Add and return the row of the interval that has just ended.
+
+        streets: its means
+        """
         totals = self._totals()
-        added = {key: total - self._before[key] for key, total in totals.items()}
-        row = {
-            # Half the memory for counts, which fill the record of a long run.
-            **{key: a.astype(np.int32) if a.dtype.kind == "i" else a for key, a in added.items()},
-            "gateway_green": self._actuation.as_shown(added["gateway_green"]),
-            "gateway_original_green": self._actuation.original_green,
-            "gateway_command": self._actuation.room.command_of_gateways(),
-            "gateway_share": self._actuation.room.gateway_shares(),
-            "production": streets.production,
-            "mean_accumulation": streets.accumulation,
-            "edge_vehicles": streets.vehicles.astype(
-                np.float16
-            ),  # to 0.1 %, as small as an integer
-            "gateway_queue": streets.queue,
-            "gateway_queue_max": streets.queue_max,
-        }
+        actuation = self._actuation
+        row: dict[str, np.ndarray] = {}
+        for name, total in totals.items():
+            added = total - self._before[name]
+            if added.dtype.kind == "i":
+                # Half the memory for counts, which fill the record of a long run.
+                added = added.astype(np.int32)
+            row[name] = added
+        ungated = actuation.ungated(row["gateway_original_green"])
+        row["gateway_green"] = actuation.as_shown(row["gateway_green"], ungated)
+        row["gateway_original_green"] = ungated
+        row["gateway_command"] = actuation.room.command_of_gateways()
+        row["gateway_share"] = actuation.room.gateway_shares()
+        row["production"] = streets.production
+        row["mean_accumulation"] = streets.accumulation
+        row["edge_vehicles"] = streets.vehicles.astype(np.float16)  # to 0.1 %, 2 bytes each
+        row["gateway_queue"] = streets.queue
+        row["gateway_queue_max"] = streets.queue_max
         self._rows.append(row)
         self._before = totals
         return row
@@ -96,15 +102,16 @@ class Recorder:
             self._rows[-1][name] = self._rows[-1][name] + total - self._before[name]
 
     def _booked(self) -> dict[str, np.ndarray]:
-        other, private = self._meter.time_spent()
-        spent = {"time_spent": private, "other_time_spent": other}
-        return {name: getattr(self._meter, name).copy() for name in BOOKS} | spent
+        """Return the books so far."""
+        booked = {name: getattr(self._meter, name).copy() for name in BOOKS}
+        booked["other_time_spent"], booked["time_spent"] = self._meter.time_spent()
+        return booked
 
     def _totals(self) -> dict[str, np.ndarray]:
-        return {
-            **self._booked(),
-            "teleports": np.array(self._meter.teleports),
-            "guided": self._guide.realised.copy(),
-            "gateway_flow": self._meter.gateway_flow(),
-            "gateway_green": self._actuation.green_time(),
-        }
+        """Return everything that is counted from the beginning."""
+        totals = self._booked()
+        totals["teleports"] = np.array(self._meter.teleports)
+        totals["guided"] = self._guide.realised.copy()
+        totals["gateway_flow"] = self._meter.gateway_flow()
+        totals["gateway_green"], totals["gateway_original_green"] = self._actuation.green_time()
+        return totals

@@ -1,5 +1,6 @@
-"""Gates with room: a command per boundary, shared over its gateways by the room before and behind
-them.
+"""Gates with room: a command per boundary, shared over its gateways.
+
+The room before and behind the gateways decides.
 
 A command u_ih is the share s = (u_ih - u_min) / (u_max - u_min) of what the boundary i -> h can let
 through. Gateway g of this boundary gets the share of green
@@ -19,6 +20,8 @@ distribution of metered traffic flow in perimeter control: queue and delay balan
 2021.
 """
 
+from collections import defaultdict, deque
+
 import numpy as np
 
 from cosim.sumo.arrays import PerEdge, PerGateway
@@ -30,7 +33,9 @@ CHAIN_M = 400.0  # before a gateway
 
 
 class Room:
-    """The shares of one run: `command` once per control interval, `update` every few seconds.
+    """The shares of one run.
+
+    Call `command` once per control interval and `update` every few seconds.
 
     share: (G,) [-], of green, from now on
     """
@@ -38,38 +43,44 @@ class Room:
     def __init__(
         self, session: Session, city: City, green: PerGateway, *, limit: float, lanes: bool
     ):
-        """green: original one (G,), NaN where no command arrives; lanes: the simulation has lanes
+        """green: original one (G,) [s], NaN where no command arrives
 
+        lanes: the simulation has lanes
         limit: share of the room; 0: all gateways of a boundary get the same share
         """
-        gateways, number = city.gateways, city.number
-        self._session, self._limit = session, limit
-        self._source, self._target = (
-            np.array([(g.source, g.target) for g in gateways], dtype=int).reshape(-1, 2).T
-        )
-        self._capacity = np.nan_to_num(green) * [len(g.lanes) for g in gateways]
-        obedient = np.flatnonzero(self._capacity > 0)
-        pairs = self._source[obedient], self._target[obedient]
-        self._boundaries = {
-            (int(i), int(h)): obedient[(pairs[0] == i) & (pairs[1] == h)]
-            for i, h in set(zip(*pairs, strict=True))
-        }
+        gateways = city.gateways
+        number = city.number
+        self._session = session
+        self._limit = limit
+        self._source = np.array([gateway.source for gateway in gateways], dtype=int)
+        self._target = np.array([gateway.target for gateway in gateways], dtype=int)
+        self._capacity = np.nan_to_num(green) * [len(gateway.lanes) for gateway in gateways]
+        boundaries = defaultdict[tuple[int, int], list[int]](list)
+        for n in np.flatnonzero(self._capacity > 0):  # the gateways that obey
+            boundaries[gateways[n].source, gateways[n].target].append(n)
+        self._boundaries = {pair: np.array(members) for pair, members in boundaries.items()}
         self._room = city.room
-        self._behind = np.array([number[g.to_edge] for g in gateways], dtype=int)
-        self._chains = [[number[edge] for edge in upstream(city, g.from_edge)] for g in gateways]
-        self._lanes = [
-            [f"{g.from_edge}_{lane}" for lane in g.lanes] if lanes else [] for g in gateways
-        ]
-        self._lane_room = np.array(
-            [len(g.lanes) * max(city.length[g.from_edge] / JAM_SPACING, 1.0) for g in gateways]
-        )
+        self._behind = np.array([number[gateway.to_edge] for gateway in gateways], dtype=int)
+        self._chains: list[list[int]] = []  # of edges
+        self._lanes: list[list[str]] = []
+        lane_room = []
+        for gateway in gateways:
+            edge = gateway.from_edge
+            self._chains.append([number[street] for street in upstream(city, edge)])
+            self._lanes.append([f"{edge}_{lane}" for lane in gateway.lanes] if lanes else [])
+            lane_room.append(len(gateway.lanes) * max(city.length[edge] / JAM_SPACING, 1.0))
+        self._lane_room = np.array(lane_room)
         self._commanded = np.ones((city.regions, city.regions))
         self._shares: list[PerGateway] = []  # since the last command
         self.share = np.ones(len(gateways))
 
     def command(self, share: PerPair, vehicles: PerEdge) -> None:
-        """Set the shares (R, R) [-] of the boundaries. vehicles: (E,) [veh] on the streets"""
-        self._commanded, self._shares = share, []
+        """Set the shares (R, R) [-] of the boundaries.
+
+        vehicles: (E,) [veh] on the streets
+        """
+        self._commanded = share
+        self._shares = []
         self.update(vehicles)
 
     def update(self, vehicles: PerEdge) -> None:
@@ -80,11 +91,11 @@ class Room:
             chain = [vehicles[edges].sum() / self._room[edges].sum() for edges in self._chains]
             before = np.clip(np.maximum(own / self._lane_room, chain), 0.0, 1.0)
             behind = vehicles[self._behind] / self._room[self._behind]
+            urgency = before - behind
             floor = np.clip(2.0 * before / self._limit - 1.0, 0.0, 1.0)
             for pair, members in self._boundaries.items():
-                urgency, capacity = (before - behind)[members], self._capacity[members]
                 self.share[members] = shared(
-                    self._commanded[pair], urgency, floor[members], capacity
+                    self._commanded[pair], urgency[members], floor[members], self._capacity[members]
                 )
         self._shares.append(self.share)
 
@@ -97,11 +108,14 @@ class Room:
         return np.mean(self._shares, axis=0)
 
     def realised(self) -> PerPair | None:
-        """Return the mean shares (R, R) [-] since the command, which counts where no gate obeys;
-        None without limit."""
+        """Return (R, R) [-], the mean share of each boundary since the command.
+
+        The commanded share counts where no gateway is controlled. None if `chain_limit` is 0.
+        """
         if self._limit == 0:
             return None
-        realised, share = self._commanded.copy(), self.gateway_shares()
+        realised = self._commanded.copy()
+        share = self.gateway_shares()
         for pair, members in self._boundaries.items():
             realised[pair] = np.average(share[members], weights=self._capacity[members])
         return realised
@@ -110,25 +124,31 @@ class Room:
 def shared(
     share: float, urgency: PerGateway, floor: PerGateway, capacity: PerGateway
 ) -> PerGateway:
-    """Return clip(urgency + m, floor, 1) with the mean `share`, weighted by capacity, or `floor` if
-    that is more."""
+    """Return clip(urgency + m, floor, 1) with the mean `share`.
+
+    The mean is weighted by capacity; it is that of `floor` if that is more.
+    """
     if share >= 1.0:
         return np.ones(len(urgency))
-    bends = np.sort(
-        np.concatenate([floor - urgency, 1.0 - urgency])
-    )  # m where the mean, piecewise linear, bends
+    # The mean is piecewise linear in m, with bends where a gateway reaches floor or 1.
+    bends = np.sort(np.concatenate([floor - urgency, 1.0 - urgency]))
     means = np.clip(urgency + bends[:, None], floor, 1.0) @ (capacity / capacity.sum())
     return np.clip(urgency + np.interp(share, means, bends), floor, 1.0)
 
 
 def upstream(city: City, edge: str) -> list[str]:
-    """Return `edge` and all streets that lead there past no signal and end less than CHAIN_M before
-    its end."""
-    chain, waiting = {edge: city.length[edge]}, [edge]
+    """Return `edge` and the streets that lead there past no signal.
+
+    They end less than CHAIN_M before the end of `edge`.
+    """
+    to_the_end = {edge: city.length[edge]}  # street -> distance from its begin to the gateway [m]
+    waiting = deque([edge])
     while waiting:
-        street = waiting.pop(0)
+        street = waiting.popleft()
+        if to_the_end[street] >= CHAIN_M:
+            continue
         for source in city.before[street]:
-            if chain[street] < CHAIN_M and source not in city.signals and source not in chain:
-                chain[source] = chain[street] + city.length[source]
+            if source not in city.signals and source not in to_the_end:
+                to_the_end[source] = to_the_end[street] + city.length[source]
                 waiting.append(source)
-    return list(chain)
+    return list(to_the_end)

@@ -1,4 +1,4 @@
-"""Travel times along streets and over junctions, and searches for the fastest ways at these times.
+"""Travel times of streets and junctions, and searches for fastest routes.
 
 A few vehicles are on one street at a time, so recent minutes count together, the newest most: on a
 street by the mean speed, over a junction by Little's law, vehicles on it over vehicles that get
@@ -7,6 +7,10 @@ interval counts half.
 """
 
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, cached_property, partial
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -16,6 +20,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from cosim.plant.sampling import STANDING_M_S, StreetMeans
 from cosim.sumo.arrays import EdgeMask, GatewayMask, MoveEnds, PerEdge, PerGateway, PerMove
 from cosim.sumo.net import City
+from nmfd.arrays import PerRegion
 
 MESO_SMOOTHING = 0.5  # weight of the newest control interval in the mesoscopic model
 WINDOW_S = 300.0  # after which an observation counts a third
@@ -24,52 +29,65 @@ PRIOR_VEH_S = 3.0  # at the speed limit, which count besides
 FAR_S = 1e9  # longer than any way
 MOST_NODES = 20_000_000  # of the searches that are kept, of 12 bytes each
 FEWEST_TREES = 8  # that are kept, however large the city: one decision needs as many
+PerNode = Float[np.ndarray, " nodes"]  # of a graph of moves
+Nodes = Int[np.ndarray, " nodes"]
+GatewayNumbers = Int[np.ndarray, " G"]
 
 
 class TravelTimes:
     """Travel times of one run.
 
-    first, second: (M,), numbers of the edges that each move joins; free: (E,) [s], in free flow;
-        free_turns: (M,) [s]
-    edges: (E,) [s], present times along edges; turns: (M,) [s], of moves over junctions
+    first, second: numbers of the edges that each move joins (M,); move: these two -> its number
+    free, free_turns: in free flow, along edges (s, (E,)) and of moves over junctions (s, (M,))
+    edges, turns: the same at present
     """
 
     def __init__(self, city: City, *, lanes: bool = True):
         """lanes: False in the mesoscopic model"""
         self._lanes = lanes
-        moves = [(e, f) for e, after in city.successors.items() for f in after]
-        self.first, self.second = np.array([(city.number[e], city.number[f]) for e, f in moves]).T
+        names = [
+            (edge, after) for edge, next_ones in city.successors.items() for after in next_ones
+        ]
+        pairs = [(city.number[edge], city.number[after]) for edge, after in names]
+        self.move = {pair: n for n, pair in enumerate(pairs)}
+        self.first, self.second = np.array(pairs).T
         self._length = np.array([city.length[edge] for edge in city.edges])
         self._limit = np.array([city.speed[edge] for edge in city.edges])
-        self.free, self.free_turns = (
-            self._length / self._limit,
-            np.array([city.turn_time[move] for move in moves]),
-        )
-        self.edges, self.turns = self.free.copy(), self.free_turns.copy()
-        inside = {edge: n for n, edge in enumerate(city.inside)}
+        self.free = self._length / self._limit
+        self.free_turns = np.array([city.turn_time[move] for move in names])
+        self.edges = self.free.copy()
+        self.turns = self.free_turns.copy()
         self._longest = np.array(list(city.inside.values())) / STANDING_M_S
         # Pairs of moves and internal edges that they lead over, which several moves may share.
-        over = [
-            (n, inside[edge])
-            for n, move in enumerate(moves)
-            for edge in city.over.get(move, ())
-            if edge in inside
-        ]
+        inside = {edge: n for n, edge in enumerate(city.inside)}
+        over = []
+        for n, move in enumerate(names):
+            over += [(n, inside[edge]) for edge in city.over.get(move, ()) if edge in inside]
         self._move, self._via = np.array(over, dtype=int).reshape(-1, 2).T
-        # Weighted sums: time [veh s] and distance [veh m] on edges, time and ways over [veh] on
-        # internal ones.
-        self._spent, self._driven = np.zeros((2, len(city.edges)))
-        self._crossing, self._crossed = np.zeros((2, len(inside)))
+        # Weighted sums on edges: time [veh s] and distance [veh m].
+        self._spent = np.zeros(len(city.edges))
+        self._driven = np.zeros(len(city.edges))
+        # The same on internal edges: time [veh s] and vehicles that got over them [veh].
+        self._crossing = np.zeros(len(inside))
+        self._crossed = np.zeros(len(inside))
 
     def learn(self, seen: StreetMeans) -> None:
         """Update the times from the means of a control interval."""
-        if not self._lanes:
-            now = np.where(
-                np.isnan(seen.speed), self.free, self._length / np.maximum(seen.speed, STANDING_M_S)
-            )
+        if self._lanes:
+            kept = math.exp(-seen.duration / WINDOW_S)
+            self._learn_edges(seen, kept)
+            self._learn_turns(seen, kept)
+        else:
+            speed = np.maximum(seen.speed, STANDING_M_S)
+            now = np.where(np.isnan(seen.speed), self.free, self._length / speed)
             self.edges = self.edges + MESO_SMOOTHING * (np.maximum(now, self.free) - self.edges)
-            return
-        kept, spent = math.exp(-seen.duration / WINDOW_S), seen.timed * seen.duration
+
+    def _learn_edges(self, seen: StreetMeans, kept: float) -> None:
+        """Update the times along edges.
+
+        kept: weight of earlier observations (-)
+        """
+        spent = seen.timed * seen.duration
         used = spent > 0.0
         kept_here = np.where(used, kept, min(kept, EMPTY_WEIGHT))
         self._spent = kept_here * self._spent + spent
@@ -77,6 +95,12 @@ class TravelTimes:
         speed = (self._driven + PRIOR_VEH_S * self._limit) / (self._spent + PRIOR_VEH_S)
         speed[seen.speed == 0.0] = 0.0  # closed, or all vehicles stand
         self.edges = np.maximum(self._length / np.maximum(speed, STANDING_M_S), self.free)
+
+    def _learn_turns(self, seen: StreetMeans, kept: float) -> None:
+        """Update the times of moves over junctions.
+
+        kept: weight of earlier observations (-)
+        """
         self._crossing = kept * self._crossing + seen.crossing * seen.duration
         self._crossed = kept * self._crossed + seen.crossed * seen.duration
         # Over each internal edge [s], 0 without vehicles.
@@ -87,98 +111,129 @@ class TravelTimes:
 
 
 class Moves:
-    """Moves between allowed edges as a graph of these edges, from first[n] to second[n] or,
-    reversed, back.
+    """Moves between allowed edges as a graph whose nodes are these edges.
 
-    number: edge -> its node, -1 for edges that are not allowed
+    number: edge -> its node, -1 for edges that are not allowed (E,)
     """
 
     def __init__(self, first: MoveEnds, second: MoveEnds, *, allowed: EdgeMask, reverse: bool):
-        """first, second: (M,), numbers of edges; allowed: (E,)"""
+        """first, second: numbers of edges (M,)
+        allowed: edges that are nodes (E,)
+        reverse: moves lead from second to first
+        """
         self.edges = np.flatnonzero(allowed)
         self.number = np.full(len(allowed), -1)
         self.number[self.edges] = np.arange(len(self.edges))
-        rows, columns = (
-            self.number[part] for part in ((second, first) if reverse else (first, second))
-        )
+        rows = self.number[second if reverse else first]
+        columns = self.number[first if reverse else second]
         kept = np.flatnonzero(allowed[first] & allowed[second])
         kept = kept[np.lexsort((columns[kept], rows[kept]))]
-        self._kept, self._second, self._columns = kept, second[kept], columns[kept].astype(np.int32)
-        self._begins = np.searchsorted(rows[kept], np.arange(len(self.edges) + 1)).astype(np.int32)
+        nodes = np.arange(len(self.edges) + 1)
+        self._kept = kept
+        self._second = second[kept]
+        self._columns = columns[kept].astype(np.int32)
+        self._begins = np.searchsorted(rows[kept], nodes).astype(np.int32)
         self._ids = self.edges.tolist()
 
-    def costing(
-        self, time: PerEdge, turns: PerMove, ahead: Float[np.ndarray, " nodes"] | None = None
-    ) -> csr_array:
-        """Return the graph with costs [s]: of a move (turns, (M,)) and of the edge that it leads to
-        (time, (E,)).
+    def costing(self, time: PerEdge, turns: PerMove, ahead: PerNode | None = None) -> csr_array:
+        """Return the graph with costs (s).
 
-        ahead: (nodes,) [s]; costs are less by the time that a move comes nearer, so that a search
-            from t finds cost +
-        ahead - ahead[t], and detours last (A*)
+        They are the times of each move and of the edge that it leads to.
+
+        time: of edges (s, (E,)); turns: of moves (s, (M,))
+        ahead: lower bound of the time from each node to the nearest aim (s, (nodes,)), for an A*
+            search: edge costs are reduced by the drop in this bound. Distances returned are
+            therefore cost + ahead - ahead[start], and detours come last.
         """
         cost = np.maximum(time[self._second] + turns[self._kept], 1e-3)
         if ahead is not None:
             cost += ahead[self._columns] - np.repeat(ahead, np.diff(self._begins))
-        return csr_array((cost, self._columns, self._begins), shape=(len(self.edges),) * 2)
+        return self._graph(cost)
 
-    def leading_to(self, nodes: Int[np.ndarray, " G"]) -> Bool[np.ndarray, "nodes G"]:
-        """Return (all nodes, G) bool: each of `nodes` (G,) can be reached from it."""
-        moves = csr_array(
-            (np.ones(len(self._columns)), self._columns, self._begins), shape=(len(self.edges),) * 2
-        )
+    def leading_to(self, nodes: GatewayNumbers) -> Bool[np.ndarray, "nodes G"]:
+        """Return which nodes lead to each of `nodes` (bool, (all nodes, G))."""
+        moves = self._graph(np.ones(len(self._columns)))
         # Nodes that lead to each other are reached from the same ones: in most cities nearly all.
         _, part = connected_components(moves, connection="strong")
         _, once, which = np.unique(part[nodes], return_index=True, return_inverse=True)
-        return np.isfinite(dijkstra(moves.T.tocsr(), indices=nodes[once], unweighted=True)).T[
-            :, which
-        ]
+        steps = dijkstra(moves.T.tocsr(), indices=nodes[once], unweighted=True)
+        return np.isfinite(steps).T[:, which]
 
-    def ahead(
-        self, nodes: Int[np.ndarray, " G"], time: PerEdge, turns: PerMove
-    ) -> Float[np.ndarray, " nodes"]:
-        """Return (all nodes,) [s], just below the time to the nearest of `nodes` (G,), FAR_S if
-        there is none."""
+    def ahead(self, nodes: GatewayNumbers, time: PerEdge, turns: PerMove) -> PerNode:
+        """Return a lower bound of the time to the nearest of `nodes` (s).
+
+        It is FAR_S for nodes that lead to none.
+
+        time: of edges (s, (E,)); turns: of moves (s, (M,))
+        """
         least = dijkstra(self.costing(time, turns).T.tocsr(), indices=nodes, min_only=True)
-        return np.where(
-            np.isfinite(least), (1.0 - 1e-6) * least, FAR_S
-        )  # below: no move may cost nothing
+        # Just below the least time, because no move may cost nothing.
+        return np.where(np.isfinite(least), (1.0 - 1e-6) * least, FAR_S)
 
-    def path(self, before: Int[np.ndarray, " nodes"], first: int, last: int) -> list[int]:
-        """Return the edges from node `first` to node `last` by the predecessors of a search from
-        `last`."""
+    def path(self, before: Nodes, first: int, last: int) -> list[int]:
+        """Return the edges from node `first` to node `last`.
+
+        before: predecessors of a search from `last`
+        """
         way = [self._ids[first]]
         while first != last:
             first = before[first]
             way.append(self._ids[first])
         return way
 
+    def _graph(self, cost: Float[np.ndarray, " kept"]) -> csr_array:
+        """Return the moves as a graph with these costs."""
+        return csr_array((cost, self._columns, self._begins), shape=(len(self.edges),) * 2)
+
+
+class _Tree(NamedTuple):
+    """One search.
+
+    most: its limit (s); costs: of every node (s, (nodes,)); before: predecessors (nodes,)
+    """
+
+    most: float
+    costs: PerNode
+    before: Nodes
+
 
 class Searches:
-    """Cache of searches by owner and beginning, at most `most` nodes in all; the least recently
-    used go first."""
+    """Cache of searches by owner and beginning.
+
+    The least recently used go first.
+    """
 
     def __init__(self, most: int = MOST_NODES):
-        self._most, self._nodes = most, 0
-        self._trees: dict[tuple[object, int], tuple[float, np.ndarray, np.ndarray]] = {}
+        """most: nodes of all searches that are kept"""
+        self._most = most
+        self._nodes = 0
+        self._trees: dict[tuple[object, int], _Tree] = {}
 
-    def tree(
-        self, owner: object, begin: int, costs: csr_array, most: float
-    ) -> tuple[float, Float[np.ndarray, " nodes"], Int[np.ndarray, " nodes"]]:
-        """Return limit [s], costs [s] and predecessors of the search of `owner` from node `begin`,
-        up to `most` [s]."""
+    def tree(self, owner: object, begin: int, costs: csr_array, most: float) -> _Tree:
+        """Return the search of `owner` from a node.
+
+        most: limit that the search has at least (s)
+        """
         tree = self._trees.pop((owner, begin), None)
-        self._nodes += costs.shape[0] if tree is None else 0
-        if tree is None or tree[0] < most:
-            tree = most, *dijkstra(costs, indices=begin, return_predecessors=True, limit=most)
+        if tree is None:
+            self._nodes += costs.shape[0]
+        if tree is None or tree.most < most:
+            found = dijkstra(costs, indices=begin, return_predecessors=True, limit=most)
+            tree = _Tree(most, *found)
         while self._nodes > self._most and len(self._trees) >= FEWEST_TREES:
-            self._nodes -= len(self._trees.pop(next(iter(self._trees)))[1])
+            oldest = next(iter(self._trees))
+            self._nodes -= len(self._trees.pop(oldest).costs)
         self._trees[owner, begin] = tree
         return tree
 
 
 class Trees:
-    """Fastest ways by `moves` from single edges, searched on demand and no further than needed."""
+    """Fastest routes by `moves` from single edges.
+
+    They are searched on demand and no further than needed.
+
+    time: of every edge (s, (E,)); number: edge -> its node, as in `Moves`
+    """
 
     def __init__(
         self,
@@ -186,120 +241,306 @@ class Trees:
         time: PerEdge,
         turns: PerMove,
         searches: Searches,
-        ahead: Float[np.ndarray, " nodes"] | None = None,
+        ahead: PerNode | None = None,
     ):
-        """time: (E,) [s]; turns: (M,) [s]; ahead: (nodes,) [s], see `Moves.costing`"""
-        self.time, self.number = time, moves.number
-        self._moves, self._costs = moves, moves.costing(time, turns, ahead)
+        """time: of edges (s, (E,)); turns: of moves (s, (M,))
+        ahead: see `Moves.costing` (s, (nodes,))
+        """
+        self.time = time
+        self.number = moves.number
+        self._moves = moves
+        self._costs = moves.costing(time, turns, ahead)
+        self._searches = searches
         # Not this object itself: `searches` would hold it, and both would stay until the garbage is
         # collected.
-        self._searches, self._owner = searches, object()
+        self._owner = object()
 
-    def costs(self, begin: int, most: float) -> Float[np.ndarray, " nodes"]:
-        """Return (nodes,) [s] from edge `begin`; more than `most` may be infinite."""
-        return self._searches.tree(self._owner, int(self.number[begin]), self._costs, most)[1]
+    def costs(self, begin: int, most: float) -> PerNode:
+        """Return the times from edge `begin` (s, (nodes,)).
+
+        Times above `most` may be infinite.
+        """
+        node = int(self.number[begin])
+        return self._searches.tree(self._owner, node, self._costs, most).costs
 
     def back(self, begin: int, end: int) -> list[int]:
         """Return the edges from `end` back to `begin`, after `costs` of `begin`."""
-        first, last = int(self.number[end]), int(self.number[begin])
-        return self._moves.path(
-            self._searches.tree(self._owner, last, self._costs, 0.0)[2], first, last
-        )
+        first = int(self.number[end])
+        last = int(self.number[begin])
+        before = self._searches.tree(self._owner, last, self._costs, 0.0).before
+        return self._moves.path(before, first, last)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A next region for a driver.
+
+    time: of the fastest route by it (s), infinite if too long
+    exists: True if there is a route, however long
+    route: returns its edges
+    """
+
+    time: float
+    exists: bool
+    route: Callable[[], list[int]]
+
+
+class Exits:
+    """Gateways out of one region, with the moves that lead there and on.
+
+    Gateway g leads from edge first[g] to second[g]. Gateways begins[n] to
+    ends[n] - 1 lead into region neighbours[n].
+
+    first, second, move: edges of each gateway, and move from one to the other (G,)
+    inside: moves in the region; outside: reversed moves elsewhere
+    first_nodes, second_nodes: nodes of first[g] in `inside`, and of second[g] in `outside` (G,)
+    """
+
+    def __init__(self, gateways: Int[np.ndarray, "G 4"], *, inside: Moves, outside: Moves):
+        """gateways: first, second, move and next region, which rises"""
+        self.first, self.second, self.move, next_region = gateways.T.copy()
+        self.neighbours, self.begins = np.unique(next_region, return_index=True)
+        self.ends = np.append(self.begins[1:], len(next_region))
+        self.inside = inside
+        self.outside = outside
+        self.first_nodes = inside.number[self.first]
+        self.second_nodes = outside.number[self.second]
+
+    @cached_property
+    def leading(self) -> Bool[np.ndarray, "inside G"]:
+        """Return which edges inside lead to each gateway."""
+        return self.inside.leading_to(self.first_nodes)
+
+    @cached_property
+    def reached(self) -> Bool[np.ndarray, "outside G"]:
+        """Return which edges outside each gateway leads to."""
+        return self.outside.leading_to(self.second_nodes)
 
 
 class Ways:
-    """Fastest ways out of one region by each of its G gateways (first[g] -> second[g], into
-    next_region[g]).
+    """Fastest routes out of one region by each of its G gateways.
 
-    Gateways begins[n] to ends[n] - 1 lead into region neighbours[n]. Searches start where drivers
-    are and where they go, on demand and no further than needed. A way that comes back into the
-    region before it leaves for good (`returning`) has the same end, from the last gateway on.
+    Searches start where drivers are and where they go, on demand and no further than needed. A
+    route that comes back into the region before it leaves for good (`returning`) has the same end,
+    from the last gateway on.
     """
 
     def __init__(
         self,
-        first: Int[np.ndarray, " G"],
-        second: Int[np.ndarray, " G"],
-        next_region: Int[np.ndarray, " G"],
+        exits: Exits,
         *,
-        inside: Moves,
-        outside: Moves,
         crossing: PerGateway,
-        leading: Bool[np.ndarray, "inside G"],
-        reached: Bool[np.ndarray, "nodes G"],
-        ahead: Float[np.ndarray, " nodes"],
+        ahead: PerNode,
         time: PerEdge,
         turns: PerMove,
         searches: Searches,
         everywhere: tuple[Trees, PerGateway, PerGateway] | None = None,
     ):
-        """first, second, next_region: (G,), the last one rising
-        inside: moves in the region; outside: reversed moves elsewhere; crossing: (G,) [s], over
-            each gateway
-        leading: (nodes of `inside`, G), first[g] can be reached; reached: (nodes of `outside`, G),
-            from second[g]
-        ahead: (nodes of `outside`,) [s], to the nearest second[g] at times not above `time` (E,)
-            and `turns` (M,) [s]
-        everywhere: ways by all moves, (G,) [s] over each gateway on these, and (G,) [s], not above
-            the time from behind the nearest gateway back to first[g]; None if no way may come back
+        """crossing: time over each gateway (s, (G,))
+        ahead: time from the nearest second[g] to nodes of `outside`, at times not above `time`
+            (s, (E,)) and `turns` (s, (M,))
+        everywhere: routes by all moves; time over each gateway on these; and, not above it, the
+            time from behind the nearest gateway back to first[g]; None if no route may come back
         """
-        self.time, self._ahead, self._leading, self._reached = time, ahead, leading, reached
-        self._there, self._onward = (
-            Trees(inside, time, turns, searches),
-            Trees(outside, time, turns, searches, ahead),
-        )
-        self._first, self._second, self._entering = first, second, crossing + time[second]
-        self._exits, self._entries, self._everywhere = (
-            inside.number[first],
-            outside.number[second],
-            everywhere,
-        )
-        self.neighbours, self.begins = np.unique(next_region, return_index=True)
-        self.ends = np.append(self.begins[1:], len(next_region))
+        self.exits = exits
+        self.time = time
+        self._there = Trees(exits.inside, time, turns, searches)
+        self._onward = Trees(exits.outside, time, turns, searches, ahead)
+        self._ahead = ahead
+        self._everywhere = everywhere
+        self._entering = crossing + time[exits.second]
+
+    def choices(self, here: int, target: int, longest: float, detour: float) -> list[Choice]:
+        """Return the fastest routes from `here` to `target` by each next region.
+
+        longest: no less than the fastest of all takes (s), infinite if unknown
+        detour: beyond this, routes that take longer are left out (s)
+        """
+        begins = self.exits.begins
+        cost, reached = self.cost(here, target, detour + longest)
+        times = np.minimum.reduceat(cost, begins).tolist()
+        exists = np.logical_or.reduceat(reached, begins).tolist()
+        choices = []
+        for n, begin in enumerate(begins.tolist()):
+            gateway = begin + int(cost[begin : self.exits.ends[n]].argmin())
+            route = partial(self.route, here, gateway, target)
+            choices.append(Choice(times[n], exists[n], route))
+        fastest = min(times, default=math.inf)
+        time, gateway = self.returning(here, target, min(fastest, longest))
+        if time < fastest:
+            n = int(np.searchsorted(begins, gateway, side="right")) - 1
+            route = partial(self.route, here, gateway, target, returning=True)
+            choices[n] = Choice(time, True, route)
+        return choices
 
     def cost(self, here: int, target: int, most: float) -> tuple[PerGateway, GatewayMask]:
-        """Return (G,) [s] from the end of `here` to that of `target`, infinite above `most`; (G,),
-        a way exists."""
+        """Return times by gateway, and through which gateways a route exists.
+
+        The times (s, (G,)) are from the end of `here` to that of `target`, infinite above `most`.
+        """
         last = int(self._onward.number[target])
-        open_ways = self._leading[self._there.number[here]] & self._reached[last]
+        open_ways = self.exits.leading[self._there.number[here]] & self.exits.reached[last]
         there = self._to_entries(here, max(most - self._ahead[last], 0.0))
-        if (nearest := float(there.min(initial=np.inf))) == np.inf:
+        nearest = float(there.min(initial=np.inf))
+        if nearest == np.inf:
             return there, open_ways
-        return there + self._from_entries(
-            target, max(most - min(nearest, most) - self._ahead[last], 0.0)
-        ), open_ways
+        left = max(most - min(nearest, most) - self._ahead[last], 0.0)
+        return there + self._from_entries(target, left), open_ways
 
     def returning(self, here: int, target: int, most: float) -> tuple[float, int]:
-        """Return [s] of the fastest way of all, and its last gateway, after `cost`.
+        """Return the time of the fastest route of all (s), and its last gateway.
 
-        Infinite if it takes `most` or longer, or does not come back into the region.
+        The time is infinite if it is `most` or longer, or if the route does not come back into the
+        region. Call it after `cost`.
         """
         if self._everywhere is None:
             return np.inf, 0
         trees, over, back = self._everywhere
-        end = over + self.time[self._second] + self._from_entries(target, 0.0)
+        end = over + self.time[self.exits.second] + self._from_entries(target, 0.0)
         # By then it has left, and come back, which alone takes too long for most gateways.
-        end[self._to_entries(here, 0.0).min(initial=np.inf) + back + end >= most] = np.inf
-        if (nearest := float(end.min(initial=np.inf))) == np.inf:
+        left = self._to_entries(here, 0.0).min(initial=np.inf)
+        end[left + back + end >= most] = np.inf
+        nearest = float(end.min(initial=np.inf))
+        if nearest == np.inf:
             return np.inf, 0
-        cost = trees.costs(here, most - nearest)[trees.number[self._first]] + end
+        cost = trees.costs(here, most - nearest)[trees.number[self.exits.first]] + end
         gateway = int(cost.argmin())
         return float(cost[gateway]), gateway
 
     def route(self, here: int, gateway: int, target: int, *, returning: bool = False) -> list[int]:
-        """Return the edges from `here` to `target` through `gateway`, after `cost`; or those of
-        `returning`."""
-        trees = self._everywhere[0] if returning and self._everywhere else self._there
-        first, second = int(self._first[gateway]), int(self._second[gateway])
-        return trees.back(here, first)[::-1] + self._onward.back(target, second)
+        """Return the edges from `here` to `target` through a gateway.
+
+        Call it after `cost`, or after `returning` for a route that comes back.
+        """
+        trees = self._there
+        if returning and self._everywhere:
+            trees = self._everywhere[0]
+        inside = trees.back(here, int(self.exits.first[gateway]))
+        return inside[::-1] + self._onward.back(target, int(self.exits.second[gateway]))
 
     def _to_entries(self, here: int, most: float) -> PerGateway:
-        """Return (G,) [s] from the end of `here` to that of second[g]."""
-        return self._there.costs(here, most)[self._exits] + self._entering
+        """Return times from the end of `here` to that of second[g] (s, (G,))."""
+        return self._there.costs(here, most)[self.exits.first_nodes] + self._entering
 
     def _from_entries(self, target: int, most: float) -> PerGateway:
-        """Return (G,) [s] from the end of second[g] to that of `target`."""
-        return (
-            self._onward.costs(target, most)[self._entries]
-            + self._ahead[self._onward.number[target]]
+        """Return times from the end of second[g] to that of `target` (s, (G,))."""
+        cost = self._onward.costs(target, most)[self.exits.second_nodes]
+        return cost + self._ahead[self._onward.number[target]]
+
+
+class RegionRoutes:
+    """Routes within and out of every region, as drivers see them.
+
+    Classes of drivers see different travel times. Prices lengthen the times through all regions but
+    `free` ones. Searches are kept for one control interval.
+
+    regions: all regions
+    """
+
+    def __init__(
+        self,
+        city: City,
+        times: TravelTimes,
+        taste: Float[np.ndarray, "classes E"],
+        *,
+        ways_return: bool,
+        lanes: bool,
+    ):
+        """taste: factors of the times that every class sees (-, (classes, E))
+        ways_return: routes may leave a region and come back; lanes: False in the mesoscopic model
+        """
+        self.regions = tuple(range(city.regions))
+        self._edge_region = city.edge_region
+        self._times = times
+        self._taste = taste
+        self._lanes = lanes
+        ends = (times.first, times.second)
+        self._homeward = []
+        self._exits = []
+        for region in self.regions:
+            here = city.edge_region == region
+            self._homeward.append(Moves(*ends, allowed=here, reverse=True))
+            inside = Moves(*ends, allowed=here, reverse=False)
+            outside = Moves(*ends, allowed=~here, reverse=True)
+            rows = []
+            for gateway in city.gateways:
+                if gateway.source == region:
+                    pair = city.number[gateway.from_edge], city.number[gateway.to_edge]
+                    rows.append((*pair, times.move[pair], gateway.target))
+            gateways = np.array(rows, dtype=int).reshape(-1, 4)
+            self._exits.append(Exits(gateways, inside=inside, outside=outside))
+        self._everywhere = None
+        if ways_return:
+            everywhere = np.full(len(city.edges), True)
+            self._everywhere = Moves(*ends, allowed=everywhere, reverse=False)
+            back = Moves(*ends, allowed=everywhere, reverse=True)
+            self._homeward = [back] * city.regions
+        self._ahead = cache(self._ahead_of)
+        # Results of one control interval.
+        self._trees = cache(self._trees_of)
+        self.ways = cache(self._ways_of)
+        self.command(None)
+
+    def command(self, prices: PerRegion | None) -> None:
+        """Begin a control interval with new travel times.
+
+        prices: of the regions (-, (R,)); None: no prices
+        """
+        self._prices = np.zeros(len(self.regions)) if prices is None else prices
+        self._searches = Searches()
+        self._trees.cache_clear()
+        self.ways.cache_clear()
+
+    def free(self, destination: int) -> tuple[int, ...]:
+        """Return the regions without a price for drivers to `destination`."""
+        free = [r for r in self.regions if r == destination or not self._prices[r]]
+        return tuple(free)
+
+    def home(self, region: int, driver_class: int, free: tuple[int, ...]) -> Trees:
+        """Return routes to edges of a region.
+
+        They stay inside it, unless routes may return.
+        """
+        return self._trees(self._homeward[region], driver_class, free)
+
+    def _trees_of(self, moves: Moves, driver_class: int, free: tuple[int, ...]) -> Trees:
+        seen = self._seen(driver_class, free)
+        return Trees(moves, seen, self._times.turns, self._searches)
+
+    def _ways_of(self, region: int, driver_class: int, free: tuple[int, ...]) -> Ways:
+        """Return routes out of a region to edges of others."""
+        exits = self._exits[region]
+        turns = self._times.turns
+        over = turns[exits.move]
+        everywhere = None
+        if self._everywhere:
+            trees = self._trees(self._everywhere, driver_class, free)
+            back = self._ahead(self._homeward[region], region, driver_class)[exits.first]
+            everywhere = (trees, over, back)
+        return Ways(
+            exits,
+            crossing=over if self._lanes else np.zeros(len(over)),
+            ahead=self._ahead(exits.outside, region, driver_class),
+            time=self._seen(driver_class, free),
+            turns=turns,
+            searches=self._searches,
+            everywhere=everywhere,
         )
+
+    def _seen(self, driver_class: int, free: tuple[int, ...]) -> PerEdge:
+        """Return the times (s, (E,)) that a class of drivers sees.
+
+        They are lengthened by the prices of all regions but `free`.
+        """
+        prices = self._prices.copy()
+        prices[list(free)] = 0.0
+        return self._times.edges * (1.0 + prices)[self._edge_region] * self._taste[driver_class]
+
+    def _ahead_of(self, back: Moves, region: int, driver_class: int) -> np.ndarray:
+        """Return the time from behind the nearest gateway (s, (nodes,)).
+
+        It is the time in free flow. back: reversed moves
+        """
+        nodes = back.number[self._exits[region].second]
+        free = self._times.free * self._taste[driver_class]
+        return back.ahead(nodes, free, self._times.free_turns)

@@ -1,9 +1,10 @@
-"""The table [sumo] of scenario.toml: simulation, actuation and measurement of the city."""
+"""The table [sumo]: simulation, actuation and measurement of a city."""
 
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Self, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self
 
-from pydantic import model_validator
+from pydantic import AfterValidator, model_validator
 
 from nmfd.errors import InputError
 from nmfd.runs import config
@@ -12,9 +13,47 @@ from nmfd.runs.config import Problem, Seconds, Share, Text, Texts, setting
 if TYPE_CHECKING:  # heavy, and the help of a command imports this module
     from nmfd.model.scenario import Scenario
 
-Signals = Literal["fixed", "webster", "actuated", "max-pressure"]
-FIXED, WEBSTER, ACTUATED, MAX_PRESSURE = get_args(Signals)
-EXACT, ESTIMATE = "exact", "estimate"
+FIXED = "fixed"
+WEBSTER = "webster"
+ACTUATED = "actuated"
+MAX_PRESSURE = "max-pressure"
+
+
+class SignalControl(NamedTuple):
+    """Control of the signals.
+
+    text: what it does, for help
+    outside: "module:Class" that sets all signals itself, as cosim.plant.max_pressure.MaxPressure
+        does; "" if SUMO runs programmes
+    """
+
+    text: str
+    outside: str = ""
+
+    def load(self) -> Any:
+        """Return the class that sets all signals."""
+        module, _, name = self.outside.partition(":")
+        return getattr(import_module(module), name)
+
+
+SIGNAL_CONTROLS = {
+    FIXED: SignalControl("the programmes of the network"),
+    WEBSTER: SignalControl("fixed-time signals, optimised for the scenario's demand"),
+    ACTUATED: SignalControl("signals that extend green while vehicles arrive"),
+    MAX_PRESSURE: SignalControl(
+        "max-pressure control of all signals", "cosim.plant.max_pressure:MaxPressure"
+    ),
+}
+
+
+def _known(name: str) -> str:
+    if name not in SIGNAL_CONTROLS:
+        raise ValueError(f"should be one of {', '.join(SIGNAL_CONTROLS)}")
+    return name
+
+
+EXACT = "exact"
+ESTIMATE = "estimate"
 FILES = ("routes", "background", "additional")
 
 
@@ -22,7 +61,7 @@ class Settings(config.Settings):
     """The city in SUMO. Files are relative to the scenario's folder."""
 
     step_length: float = setting(
-        "time step, a divisor of the control interval", 1.0, unit="s", gt=0.0, le=1.0
+        "time step, a divisor of the control interval", 1.0, unit="s", ge=0.01, le=1.0
     )
     time_to_teleport: float = setting(
         "waiting time before SUMO moves a vehicle on; -1: never", -1.0, unit="s", ge=-1.0
@@ -39,10 +78,13 @@ class Settings(config.Settings):
     )
     additional: Texts = setting("additional files: vehicle types, stops, signal programmes", ())
     options: dict[Text, Text] = setting(
-        "SUMO's options that change the traffic, such as max-depart-delay; other keys of [sumo] override them",
+        "SUMO's options that change the traffic, such as max-depart-delay; other keys of [sumo] "
+        "override them",
         {},
     )
-    signals: Signals = setting("control of the signals", FIXED)
+    signals: Annotated[str, AfterValidator(_known)] = setting(
+        f"control of the signals: {', '.join(SIGNAL_CONTROLS)}", FIXED
+    )
     lookahead: float = setting(
         "green after a change of stage over which max-pressure compares; less: fewer changes",
         1.0,
@@ -51,8 +93,8 @@ class Settings(config.Settings):
     )
     leave_signals: Texts = setting("signals that perimeter control does not change", ())
     chain_limit: Share = setting(
-        "share of the room before a gateway beyond which no command holds vehicles there; 0: no limit, and the same "
-        "share for all gateways of a boundary",
+        "share of the room before a gateway beyond which no command holds vehicles there; 0: no "
+        "limit, and the same share for all gateways of a boundary",
         0.6,
     )
     gateways_fixed: bool = setting(
@@ -82,11 +124,16 @@ class Settings(config.Settings):
     detector_share: Share = setting("share of the links with loop detectors", 0.3)
     probe_share: Share = setting("share of the vehicles that are probes", 0.1)
 
+    @property
+    def signals_from_outside(self) -> bool:
+        """True if a class of this package sets all signals, such as max-pressure."""
+        return bool(SIGNAL_CONTROLS[self.signals].outside)
+
     @model_validator(mode="after")
     def _is_possible(self) -> Self:
         if self.measurement == ESTIMATE and self.detector_share == self.probe_share == 0:
-            problem = '"estimate" needs sumo.detector_share or sumo.probe_share, but both are 0; raise one of them'
-            raise Problem("measurement", problem)
+            problem = '"estimate" needs sumo.detector_share or sumo.probe_share, but both are 0'
+            raise Problem("measurement", f"{problem}; raise one of them")
         return self
 
 
@@ -98,19 +145,16 @@ def settings(scenario: "Scenario") -> Settings:
     """
     path = scenario.where
     if scenario.initial is not None:
-        raise config.error(
-            path,
-            "initial",
-            "a city in SUMO begins empty; remove it, or use the regional model (nmfd)",
-        )
+        remedy = "remove it, or use the regional model (nmfd)"
+        raise config.error(path, "initial", f"a city in SUMO begins empty; {remedy}")
     result = config.checked(Settings, scenario.sumo, path, "sumo.")
     for key in FILES:
         for file in own_files(scenario, getattr(result, key)):
             if not file.is_file():
-                raise config.error(
-                    path, f"sumo.{key}", f"no such file: {file}; give the path of an existing one"
-                )
-    if abs(scenario.step / result.step_length - round(scenario.step / result.step_length)) > 1e-9:
+                problem = f"no such file: {file}; give the path of an existing one"
+                raise config.error(path, f"sumo.{key}", problem)
+    steps = scenario.step / result.step_length
+    if steps < 1.0 or abs(steps - round(steps)) > 1e-9:
         expected = f"a divisor of the control interval {scenario.step:g} s"
         raise config.error(path, "sumo.step_length", config.got(expected, result.step_length))
     return result
@@ -122,11 +166,18 @@ def own_files(scenario: "Scenario", names: Texts) -> list[Path]:
 
 
 def check_lanes(scenario: "Scenario", settings: Settings) -> None:
-    """Raise InputError for settings that the mesoscopic model, which has no lanes, cannot do."""
-    for key, values, what in (
-        ("signals", (MAX_PRESSURE,), "counts vehicles lane by lane"),
-        ("measurement", (ESTIMATE,), "needs loop detectors on lanes"),
-    ):
-        if settings.mesoscopic and (value := getattr(settings, key)) in values:
-            what += ", but SUMO's mesoscopic model has no lanes; omit it, or import the city without --mesoscopic"
-            raise InputError(f"{scenario.where}: sumo.{key}: {value} {what}")
+    """Check that no setting needs lanes if the city is mesoscopic.
+
+    Raises: InputError
+    """
+    if not settings.mesoscopic:
+        return
+    problem = ""
+    if settings.signals_from_outside:
+        problem = f"signals: {settings.signals} counts vehicles lane by lane"
+    elif settings.measurement == ESTIMATE:
+        problem = f"measurement: {ESTIMATE} needs loop detectors on lanes"
+    if problem:
+        problem += ", but SUMO's mesoscopic model has no lanes"
+        remedy = "omit it, or import the city without --mesoscopic"
+        raise InputError(f"{scenario.where}: sumo.{problem}; {remedy}")

@@ -1,4 +1,4 @@
-"""Help for vehicles that SUMO would let stand forever, on lanes and on junctions.
+"""Help for vehicles that SUMO would let stand forever.
 
 SUMO gives a vehicle any route that its street leads to, and leaves the lane change to the vehicle.
 Two leaders of neighbouring lanes that wait for each other's lane block a street forever, and soon
@@ -28,11 +28,15 @@ GAP_M = 2.5  # behind and before a vehicle that is put on a street
 
 
 class Lanes:
-    """The lanes of one simulation. near_m: from there to its end, a lane cannot be left; 0: it
-    always can."""
+    """The lanes of one simulation.
+
+    near_m: distance to its end within which a lane cannot be left [m]; 0: it always can
+    """
 
     def __init__(self, session: Session, near_m: float = QUEUE_END_M):
-        self._session, self._near, self._lane = session, near_m, cache(session.lane)
+        self._session = session
+        self._near = near_m
+        self._lane = cache(session.lane)
 
     def too_late(self, vehicle: str, way: Sequence[str]) -> bool:
         """Return True if a vehicle on way[0] cannot take this way any more."""
@@ -42,34 +46,42 @@ class Lanes:
         return left < self._near and way[1] not in onward
 
     def way_out(self, vehicle: str, target: str) -> list[str]:
-        """Return a way to edge `target` for a leader that stands at the end of a wrong lane, [] for
-        other vehicles."""
+        """Return a way to edge `target` for a leader at the end of a wrong lane.
+
+        It is [] for other vehicles.
+        """
         if self._session.standing_time(vehicle) < LEADER_PATIENCE_S:
             return []
         left, onward = self._left(vehicle)
         here, *after = self._session.route(vehicle)[self._session.route_index(vehicle) :]
         if left > LEADER_M or not after or after[0] in onward:
             return []
-        ways = [
-            (time, way)
-            for time, way in (self._session.fastest(edge, target) for edge in sorted(onward))
-            if way
-        ]
-        return [here, *min(ways)[1]] if ways else []
+        ways = []
+        for edge in sorted(onward):
+            time, way = self._session.fastest(edge, target)
+            if way:
+                ways.append((time, way))
+        if not ways:
+            return []
+        _, fastest = min(ways)
+        return [here, *fastest]
 
     def _left(self, vehicle: str) -> tuple[float, frozenset[str]]:
-        """Return the way to the end of the vehicle's lane [m], and the edges that the lane leads
-        to."""
+        """Return the way to the end of a vehicle's lane [m], and edges behind."""
         lane, position = self._session.place(vehicle)
         length, onward = self._lane(lane)
         return length - position, onward
 
 
 class Junctions:
-    """The junctions of one simulation with lanes. freed: vehicles put on a street so far."""
+    """The junctions of one simulation with lanes.
+
+    freed: vehicles put on a street so far
+    """
 
     def __init__(self, session: Session, city: City):
-        self._session, self.freed = session, 0
+        self._session = session
+        self.freed = 0
         self._inside: dict[str, list[str]] = defaultdict(list)  # junction -> its internal edges
         for edge in sorted(city.region_of):
             if edge.startswith(":"):
@@ -79,25 +91,31 @@ class Junctions:
     def free(self) -> None:
         """Free the vehicles of all junctions, those first that have stood longest."""
         for edges in self._inside.values():
-            standing = [
-                (-self._session.standing_time(vehicle), vehicle)
-                for edge in edges
-                if self._session.halting(edge)
-                for vehicle in self._session.vehicles_on(edge)
-            ]
-            self._free(
-                [vehicle for time, vehicle in sorted(standing) if -time >= JUNCTION_PATIENCE_S]
-            )
+            standing = []
+            for edge in edges:
+                if not self._session.halting(edge):
+                    continue
+                for vehicle in self._session.vehicles_on(edge):
+                    time = self._session.standing_time(vehicle)
+                    if time >= JUNCTION_PATIENCE_S:
+                        standing.append((-time, vehicle))
+            self._free([vehicle for _, vehicle in sorted(standing)])
 
     def _free(self, vehicles: list[str]) -> None:
-        """Put the vehicles of one junction on the streets behind it, if there is room for all."""
-        ahead = [(vehicle, self._behind(self._session.place(vehicle)[0])) for vehicle in vehicles]
-        length = {vehicle: self._session.vehicle_length(vehicle) for vehicle in vehicles}
-        if any(self._session.room(lane) < length[vehicle] + 2.0 * GAP_M for vehicle, lane in ahead):
-            return
-        for lane in dict.fromkeys(lane for _, lane in ahead):
-            vehicle = next(vehicle for vehicle, other in ahead if other == lane)
-            self.freed += self._session.set_down(vehicle, lane, length[vehicle] + GAP_M)
+        """Put the vehicles of one junction on the streets behind it.
+
+        Nothing happens unless there is room for all.
+        """
+        lanes: dict[str, str] = {}  # lane behind the junction -> first vehicle that goes there
+        for vehicle in vehicles:
+            lane = self._behind(self._session.place(vehicle)[0])
+            length = self._session.vehicle_length(vehicle)
+            if self._session.room(lane) < length + 2.0 * GAP_M:
+                return
+            lanes.setdefault(lane, vehicle)
+        for lane, vehicle in lanes.items():
+            position = self._session.vehicle_length(vehicle) + GAP_M
+            self.freed += self._session.set_down(vehicle, lane, position)
 
     def _street_behind(self, lane: str) -> str:
         """Return the lane of a street that a lane on a junction leads to."""

@@ -18,19 +18,25 @@ OVERFULL = 1.2
 
 
 class Supervisor:
-    """The regions whose gates are open against the command; call `opened` once per control
-    interval."""
+    """The regions whose gates are open against the command.
+
+    Call `opened` once per control interval.
+    """
 
     def __init__(self, network: RegionalModel, step: float):
         """step: control interval [s]"""
-        self._network, self._patience = network, max(round(PATIENCE_S / step), 1)
+        self._network = network
+        self._patience = max(round(PATIENCE_S / step), 1)
         self._before: list[PerRegion] = []  # accumulations of the past intervals [veh]
-        self._held = self._open_for = np.zeros(
-            network.regions, dtype=int
-        )  # control intervals, so far and left
+        # Control intervals that every region was held so far, and that it is open from now on.
+        self._held = np.zeros(network.regions, dtype=int)
+        self._open_for = np.zeros(network.regions, dtype=int)
 
     def opened(self, share: PerPair, accumulation: PerRegion) -> Bool[np.ndarray, " R"]:
-        """Return the regions to open. share: commanded (R, R) [-]; accumulation: (R,) now [veh]"""
+        """Return the regions to open.
+
+        share: commanded (R, R) [-]; accumulation: (R,) now [veh]
+        """
         adjacency = self._network.adjacency
         self._before = [*self._before[-self._patience :], accumulation]
         self._open_for = np.maximum(self._open_for - 1, 0)
@@ -38,8 +44,8 @@ class Supervisor:
         futile = (self._held >= self._patience) & overfull & (accumulation >= self._before[0])
         self._open_for[futile] = self._patience
         is_open = self._open_for > 0
-        mean = (share * adjacency).sum(axis=0) / np.maximum(adjacency.sum(axis=0), 1)
-        self._held = np.where(
-            (mean < HELD_SHARE) & adjacency.any(axis=0) & ~is_open, self._held + 1, 0
-        )
+        entries = adjacency.sum(axis=0)
+        mean = (share * adjacency).sum(axis=0) / np.maximum(entries, 1)
+        held = (mean < HELD_SHARE) & (entries > 0) & ~is_open
+        self._held = np.where(held, self._held + 1, 0)
         return is_open

@@ -1,5 +1,6 @@
-"""A city before anything runs: its regions and gateways as tables and on a map."""
+"""A city before anything runs: regions and gateways in tables and a map."""
 
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from cosim.importing import maps, quality
 from cosim.importing.streets import read_streets
 from cosim.plant.settings import own_files, settings
 from cosim.sumo import net
+from cosim.sumo.signals import timetabled, without_effect
 from nmfd.api import load_scenario
 from nmfd.model.regional_model import RegionalModel, load_network
 from nmfd.model.scenario import Scenario
@@ -36,63 +38,81 @@ class City:
         >>> len(city.regions), city.gateways.columns.tolist()[:4]
         (5, ['source', 'target', 'from_edge', 'to_edge'])
 
-    network: the regional model; scenario: None for a network alone
+    network: the regional model
+    scenario: None for a network alone
     """
 
     def __init__(self, city: Path | str | Scenario | RegionalModel):
-        """city: a loaded scenario or network, its folder or its name. Raises InputError without a
-        SUMO city."""
+        """Read the city.
+
+        city: a loaded scenario or network, its folder or its name
+        Raises: InputError without a SUMO city
+        """
         if not isinstance(city, Scenario | RegionalModel):
             folder = shipped.found(city, shipped.SCENARIO, shipped.NETWORK)
-            city = (
-                load_network(folder)
-                if (folder / "network.toml").is_file()
-                else load_scenario(folder)
-            )
-        self.scenario = city if isinstance(city, Scenario) else None
-        self.network = city.network if isinstance(city, Scenario) else city
+            if (folder / "network.toml").is_file():
+                city = load_network(folder)
+            else:
+                city = load_scenario(folder)
         self.name = city.name
-        setup = None if self.scenario is None else settings(self.scenario)
-        additional = own_files(self.scenario, setup.additional) if self.scenario and setup else ()
-        left = setup.leave_signals if setup else ()
-        self._streets = read_streets(net.city_files(self.network).net_file, additional)
+        self.scenario: Scenario | None = None
+        additional: Sequence[Path] = ()
+        left: Sequence[str] = ()
+        switched_off = ""
+        if isinstance(city, Scenario):
+            self.scenario = city
+            self.network = city.network
+            setup = settings(city)
+            additional = own_files(city, setup.additional)
+            left = setup.leave_signals
+            switched_off = without_effect(setup.options, setup.mesoscopic)
+        else:
+            self.network = city
         built = net.city_of(self.network)
-        self._regions = np.array([built.region_of.get(edge, -1) for edge in self._streets.edges])
-        of_region = [
-            self._streets.drivable & (self._regions == r) for r in range(self.network.regions)
-        ]
-        self._places = np.stack(
-            [self._streets.centre[members].mean(axis=0) for members in of_region]
-        )
-        reasons = quality.left_alone(self._streets) | dict.fromkeys(
-            left, "left alone by the scenario"
-        )
+        streets = read_streets(built.net_file, additional)
+        regions = np.array([built.region_of.get(edge, -1) for edge in streets.edges])
+        places = []
+        for region in range(self.network.regions):
+            members = streets.drivable & (regions == region)
+            places.append(streets.centre[members].mean(axis=0))
+        reasons = dict.fromkeys(left, "left alone by the scenario")
+        timetables = timetabled(built.net_file, additional)
+        reasons |= quality.left_alone(streets, timetables, switched_off)
         names = self.network.region_names
-        self._tables = quality.tables(self._streets, self._regions, names, built, None, reasons)
+        self._streets = streets
+        self._regions = regions
+        self._places = np.stack(places)
+        self._tables = quality.tables(streets, regions, names, built, None, reasons)
 
     @cached_property
     def regions(self) -> pd.DataFrame:
-        """One row per region.
+        """Table with a row per region.
 
-        name, edges and lane_km for cars, signals, gateways and controlled ones, centre x_m and
-        y_m, and critical_veh, jam_veh and max_outflow_veh_s of its MFD
+        Its columns are name, edges and lane_km for cars, signals, gateways and controlled ones,
+        centre x_m and y_m, and critical_veh, jam_veh and max_outflow_veh_s of its MFD.
         """
         rows = pd.DataFrame(self._tables.quality[:-1])[REGION_COLUMNS].astype({"region": int})
         rows["x_m"], rows["y_m"] = self._places.round(1).T
         rows["critical_veh"] = self.network.seen_critical
-        for column, attribute in (("jam_veh", "jam"), ("max_outflow_veh_s", "capacity")):
-            rows[column] = [getattr(mfd, attribute) for mfd in self.network.mfds]
+        rows["jam_veh"] = [mfd.jam for mfd in self.network.mfds]
+        rows["max_outflow_veh_s"] = [mfd.capacity for mfd in self.network.mfds]
         return rows
 
     @cached_property
     def gateways(self) -> pd.DataFrame:
-        """One row per movement over a boundary: edges, lanes, signal with its links, and its
-        control."""
+        """Table with a row per movement over a boundary.
+
+        It shows edges, lanes, signal with its links, and control.
+        """
         return pd.DataFrame(self._tables.gateways).drop(columns="flow_veh")
 
     def plot(self, ax: Axes | None = None) -> Axes:
-        """Draw streets in the colour of their region, and gateways, into `ax` or a new figure."""
-        ax = plots.figure(6.5, 6.0).subplots() if ax is None else ax
+        """Draw gateways, and streets in the colour of their region.
+
+        ax: axes of a new figure if None
+        """
+        if ax is None:
+            ax = plots.figure(6.5, 6.0).subplots()
         names = self.network.region_names
         return maps.region_map(ax, self._streets, self._regions, names, self._places, self._tables)
 

@@ -1,5 +1,7 @@
-"""Figures of an evaluation in SUMO: functions that draw into `ax`, and the files of one demand
-level."""
+"""Figures of an evaluation in SUMO.
+
+Functions draw into `ax`; others write the files of one or several demand levels.
+"""
 
 from collections import defaultdict
 from collections.abc import Mapping
@@ -14,16 +16,12 @@ from cosim.evaluation.results import Finished, Level
 from nmfd.studies import plots
 from nmfd.studies.benchmark import draw_accumulations, interval
 
-Points = dict[
-    str, dict[float, tuple[float, float]]
-]  # controller -> level -> mean and half of the interval
+# Controller -> level -> mean and half of its 95 % interval.
+Points = Mapping[str, Mapping[float, tuple[float, float]]]
 
 
-def over_levels(
-    ax: Axes, values: Mapping[str, Mapping[float, tuple[float, float]]], label: str
-) -> Axes:
-    """Draw a quantity over the demand level: controller -> level -> mean and half of its 95 %
-    interval."""
+def over_levels(ax: Axes, values: Points, label: str) -> Axes:
+    """Draw a quantity over the demand level."""
     plots.with_intervals(ax, values)
     levels = sorted({level for points in values.values() for level in points})
     ax.axhline(1.0, color="#777777", linestyle="--", linewidth=1.0)
@@ -34,14 +32,13 @@ def over_levels(
 
 
 def ranked(rows: pd.DataFrame) -> list[str]:
-    """Return the controllers of one demand level, the best first: by paired change, else by mean
-    time spent."""
-    table = statistics.statistics(rows).set_index("controller")
-    score = (
-        table["change_percent"]
-        .where(table.index != table["against"], 0.0)
-        .fillna(table[statistics.TTS])
-    )
+    """Return the controllers of one demand level, the best first.
+
+    They are ranked by paired change, or else by mean time spent, on the seeds that all have.
+    """
+    table = statistics.statistics(statistics.on_common_seeds(rows)).set_index("controller")
+    score = table["change_percent"].mask(table.index == table["against"], 0.0)
+    score = score.fillna(table[statistics.TTS])
     return list(score.sort_values(kind="stable").index)
 
 
@@ -52,8 +49,10 @@ def pair(rows: pd.DataFrame) -> list[str]:
 
 
 def draw_all(finished: Finished) -> None:
-    """Draw the pictures of every demand level into its folder, and those of several levels beside
-    them."""
+    """Draw the pictures of every demand level into its folder.
+
+    Those of several levels are beside the folders.
+    """
     for level in finished.levels:
         draw_level(level.folder, finished, level)
     if len(finished.levels) > 1:
@@ -61,30 +60,33 @@ def draw_all(finished: Finished) -> None:
 
 
 def draw_level(out: Path, finished: Finished, level: Level) -> None:
-    """Draw all pictures of one demand level into the folder `out`."""
-    rows, network = level.rows, finished.scenario.network
-    seed = int(
-        rows["seed"].value_counts().sort_index().idxmax()
-    )  # the first one that most controllers have
+    """Draw all pictures of one demand level into a folder."""
+    rows = level.rows
+    network = finished.scenario.network
+    # The first seed that most controllers have.
+    seed = int(rows["seed"].value_counts().sort_index().idxmax())
     runs = level.results()
-    title = f"seed {seed}{', shaded: all seeds' if rows['seed'].nunique() > 1 else ''}"
+    title = f"seed {seed}"
+    if rows["seed"].nunique() > 1:
+        title += ", shaded: all seeds"
     draw_accumulations(out, finished.scenario, runs, seed=seed, title=title)
-    shown = pair(rows[rows["seed"] == seed])
     there = {run.controller: run for run in runs if run.seed == seed}
-    clouds = [(name, model_validation.outflow_samples(network, [there[name]])) for name in shown]
-    samples = [
-        {name: np.concatenate([*of[n].values()]) for name, of in clouds}
-        for n in range(network.regions)
-    ]
+    samples: list[dict] = [{} for _ in range(network.regions)]
+    for name in pair(rows[rows["seed"] == seed]):
+        clouds = model_validation.outflow_samples(network, [there[name]])
+        for of_region, cloud in zip(samples, clouds, strict=True):
+            of_region[name] = np.concatenate([*cloud.values()])
     plots.draw_mfds(out / "mfd.png", network, samples)
 
 
 def draw_levels(out: Path, rows: pd.DataFrame) -> None:
-    """Draw trips served (the frontier) and time spent over several demand levels into the folder
-    `out`."""
+    """Draw trips served (the frontier) and time spent over demand levels.
+
+    out: folder of the files
+    """
     against = statistics.compared_with(rows)
-    ratios: Points = defaultdict(dict)
-    shares: Points = defaultdict(dict)
+    ratios: dict[str, dict] = defaultdict(dict)
+    shares: dict[str, dict] = defaultdict(dict)
     for level, names in statistics.groups(rows).items():
         reference = statistics.by_seed(rows, level, against)
         for name in names:
@@ -94,13 +96,16 @@ def draw_levels(out: Path, rows: pd.DataFrame) -> None:
             pair = statistics.paired(statistics.by_seed(rows, level, name), reference)
             if name != against and not np.isnan(pair.percent):
                 ratios[name][level] = 1.0 + pair.percent / 100.0, pair.percent_half / 100.0
-    for file, values, label in (
-        ("frontier.png", shares, "trips served / trips due [-]"),
-        ("demand.png", ratios, f"total time spent / that of {against} [-]"),
-    ):
-        if values:
-            drawing = plots.figure(7.5, 4.8)
-            ax = over_levels(drawing.subplots(), values, label)
-            drawing.suptitle("mean over seeds, 95 % intervals", fontsize="medium")
-            plots.legend_below(drawing, [ax])
-            plots.save(drawing, out / file)
+    _draw_over_levels(out / "frontier.png", shares, "trips served / trips due [-]")
+    _draw_over_levels(out / "demand.png", ratios, f"total time spent / that of {against} [-]")
+
+
+def _draw_over_levels(file: Path, values: Points, label: str) -> None:
+    """Draw a quantity over the demand level into a file, unless it is unknown."""
+    if not values:
+        return
+    drawing = plots.figure(7.5, 4.8)
+    ax = over_levels(drawing.subplots(), values, label)
+    drawing.suptitle("mean over seeds, 95 % intervals", fontsize="medium")
+    plots.legend_below(drawing, [ax])
+    plots.save(drawing, file)

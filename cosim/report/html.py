@@ -1,4 +1,7 @@
-"""The report: one self-contained HTML page about the finished runs of one or several folders."""
+"""The report: one self-contained HTML page about finished runs.
+
+The runs may lie in several folders.
+"""
 
 import base64
 import json
@@ -27,15 +30,19 @@ from nmfd.studies import plots
 from nmfd.studies.benchmark import REFERENCE
 
 CAPTIONS = config.read(Path(__file__).with_name("captions.toml"))
-PICTURES, LEVEL_PICTURES = CAPTIONS["level"], CAPTIONS["levels"]  # file -> caption
-QUANTITIES = CAPTIONS[
-    "card"
-]  # column -> label, unit on the card, format of a value, sign of an improvement, meaning
+PICTURES = CAPTIONS["level"]  # file -> caption
+LEVEL_PICTURES = CAPTIONS["levels"]
+# Column -> label, unit on the card, format of a value, sign of an improvement, meaning.
+QUANTITIES = CAPTIONS["card"]
 
 
 class Figure(NamedTuple):
-    """Figure of the card: of the best strategy, before of the reference; better: None if not
-    significant."""
+    """Figure of the card.
+
+    value: under the best strategy
+    before: under the reference; "" without one
+    better: None if the change is not significant
+    """
 
     label: str
     value: str
@@ -47,7 +54,9 @@ class Figure(NamedTuple):
 
 
 def write_page(path: Path, runs: Sequence[Finished], *, seed: int | None = None) -> Path:
-    """Write the page of the runs to `path`; the first folder has its map with a slider.
+    """Write the page of the runs, and return its path.
+
+    The first folder has its map with a slider.
 
     seed: of the runs on the map; the first that both have if None
     Raises: InputError if there is no run with this seed
@@ -71,47 +80,53 @@ def write_page(path: Path, runs: Sequence[Finished], *, seed: int | None = None)
 
 
 def _map(run: Finished, seed: int | None) -> tuple[int, str, str]:
-    """Return seed, script and HTML of the best run beside its reference, with a slider over their
-    time."""
+    """Return seed, script and HTML of the map with a slider over time.
+
+    It shows the best run beside its reference.
+    """
     level = run.level()
     names = figures.pair(level.rows)
     seeds = [set(statistics.by_seed(level.rows, level.demand, name)) for name in names]
-    if not (common := sorted(set.intersection(*seeds))):
-        names, common = names[:1], sorted(seeds[0])
-    if seed is not None and seed not in common:
+    common = sorted(set.intersection(*seeds))
+    if not common:
+        names = names[:1]
+        common = sorted(seeds[0])
+    if seed is None:
+        seed = common[0]
+    elif seed not in common:
         raise InputError(
             f"--seed: {' and '.join(names)} have no run with seed {seed}; choose from {common}"
         )
-    seed = common[0] if seed is None else seed
     picture = CityPicture.of(run.scenario, run.map())
     results = {name: level.read(name, seed) for name in names}
     whole = {name: frames(picture, result) for name, result in results.items()}
     picture = replace(picture, steps=max(map(len, whole.values())) - 1)
-    layers, tones = totals(picture, list(results.values())), plots.colours(run.rows["controller"])
+    layers = totals(picture, list(results.values()))
+    tones = plots.colours(run.rows["controller"])
     return seed, *components(with_slider(picture, whole, tones, layers), wrap_script=False)
 
 
 def _run(run: Finished) -> dict:
     """Return what the page shows of a folder."""
-    level, rows = run.level(), run.rows
-    seeds = ", ".join(map(str, sorted(set(rows["seed"]))))
+    level = run.level()
+    rows = run.rows
     heading, shown, name = card(level.rows)
-    manifest = json.dumps(
-        {"runs": level.key, "controllers": level.controllers, "sessions": run.sessions}, indent=1
-    )
+    pictures = []
+    if len(run.levels) > 1:
+        heading = f"Demand times {level.demand:g}: {heading}"
+        pictures = _pictures(partial(figures.draw_levels, rows=rows), LEVEL_PICTURES)
     minutes = level.key["steps"] * level.key["step_s"] / 60
-    pictures = (
-        _pictures(partial(figures.draw_levels, rows=rows), LEVEL_PICTURES)
-        if len(run.levels) > 1
-        else []
-    )
+    seeds = ", ".join(map(str, sorted(set(rows["seed"]))))
+    made = {"runs": level.key, "controllers": level.controllers, "sessions": run.sessions}
+    manifest = json.dumps(made, indent=1)
     return {
         "name": run.path.resolve().name,
-        "heading": f"Demand times {level.demand:g}: " * (len(run.levels) > 1) + heading,
+        "heading": heading,
+        "warnings": statistics.warnings(statistics.statistics(level.rows)),
         "figures": shown,
         "why": explain.paragraph(level, run, name),
-        "intro": f"Scenario {run.scenario.name}, {minutes:.0f} min in SUMO; seeds {seeds}. With the same seed every "
-        "controller has the same trips.",
+        "intro": f"Scenario {run.scenario.name}, {minutes:.0f} min in SUMO; seeds {seeds}. "
+        "With the same seed every controller has the same trips.",
         "pictures": pictures,
         "levels": [_level(run, level) for level in run.levels],
         "manifest": re.sub(r"(?<![\w.])/(?:[^/\s\"']+/)+", "", manifest),  # no folders of a machine
@@ -119,65 +134,78 @@ def _run(run: Finished) -> dict:
 
 
 def card(rows: pd.DataFrame) -> tuple[str, list[Figure], str]:
-    """Return a sentence, the figures that were recorded, and the name of the best strategy of one
-    demand level.
+    """Return the card of one demand level: a sentence, figures, and a name.
 
-    It is compared with the reference on the seeds that both have.
+    The name is that of the best strategy. It is compared with the reference on the seeds that both
+    have. Figures that were not recorded are left out.
     """
-    level, (against, name) = rows["demand"].iloc[0], (figures.pair(rows) * 2)[:2]
+    against, *others = figures.pair(rows)
+    name = others[0] if others else against
+    level = rows["demand"].iloc[0]
     heading = name
-    than = "without control" if against == REFERENCE else f"under {against}"
+    than = f"under {against}"
+    if against == REFERENCE:
+        than = "without control"
     shown = []
     for column, (label, unit, form, good, meaning) in QUANTITIES.items():
-        now, before = (statistics.by_seed(rows, level, one, column) for one in (name, against))
-        common, pair = [seed for seed in now if seed in before], statistics.paired(now, before)
+        now = statistics.by_seed(rows, level, name, column)
+        before = statistics.by_seed(rows, level, against, column)
+        pair = statistics.paired(now, before)
+        common = [seed for seed in now if seed in before]
         value = mean(now[seed] for seed in common or now) / unit
+        if math.isnan(value):
+            continue
         figure = Figure(label, form.format(value), meaning)
         if name != against and not math.isnan(pair.percent):
             reference = mean(before[seed] for seed in common) / unit
             change, verdict, better = _judged(pair, good)
-            figure = Figure(
-                label,
-                figure.value,
-                meaning,
-                f"{form.format(reference)} {than}",
-                change,
-                verdict,
-                better,
+            figure = figure._replace(
+                before=f"{form.format(reference)} {than}",
+                change=change,
+                verdict=verdict,
+                better=better,
             )
             if column == statistics.TTS:
-                heading = f"{name} compared with {against.replace('-', ' ')}: {change} time spent, {verdict}."
-                figure = figure._replace(
-                    label="Vehicle hours saved", value=form.format(reference - value)
-                )
-        shown += [] if math.isnan(value) else [figure]
+                comparison = f"{name} compared with {against.replace('-', ' ')}"
+                heading = f"{comparison}: {change} time spent, {verdict}."
+                saved = form.format(reference - value)
+                figure = figure._replace(label="Vehicle hours saved", value=saved)
+        shown.append(figure)
     return heading, shown, name
 
 
 def _judged(pair: statistics.Paired, good: int) -> tuple[str, str, bool | None]:
-    """Return change, verdict and better of a figure; good: sign of an improvement."""
-    seeds, half, clear = pair.seeds, pair.percent_half, pair.significant
-    digits = 0 if half >= 1.0 or seeds == 1 else 1
-    spread = "" if seeds == 1 else f" ± {max(half, 0.1):.{digits}f}"
-    size = f"{abs(pair.percent):.{digits}f}{spread} % {'more' if pair.percent > 0 else 'less'}"
-    change = size if pair.percent or half else "no change"
-    few = f"no proof ({seeds} seed{'s' * (seeds > 1)})"
-    verdict = (
-        few if seeds < statistics.FEWEST_SEEDS else "significant" if clear else "not significant"
-    )
-    return change, verdict, pair.percent * good > 0 if clear else None
+    """Return change, verdict and better of a figure.
+
+    good: sign of an improvement
+    """
+    one_seed = pair.seeds == 1
+    digits = 0 if one_seed or pair.percent_half >= 1.0 else 1
+    spread = "" if one_seed else f" ± {max(pair.percent_half, 0.1):.{digits}f}"
+    direction = "more" if pair.percent > 0 else "less"
+    change = f"{abs(pair.percent):.{digits}f}{spread} % {direction}"
+    if not pair.percent and not pair.percent_half:
+        change = "no change"
+    if pair.significant:
+        return change, "significant", pair.percent * good > 0
+    if pair.seeds >= statistics.FEWEST_SEEDS:
+        return change, "not significant", None
+    plural = "" if one_seed else "s"
+    return change, f"no proof ({pair.seeds} seed{plural})", None
 
 
 def _level(run: Finished, level: Level) -> dict:
     """Return what the page shows of a demand level."""
     rows = level.rows
+    table = statistics.statistics(rows)
     draw = partial(figures.draw_level, finished=run, level=level)
     regions = statistics.by_region(
         level, run.map(), run.scenario.network.region_names, figures.pair(rows)
     )
     return {
         "title": f"Demand times {level.demand:g}",
-        "tables": [_html(table) for table in statistics.shown(statistics.statistics(rows))],
+        "tables": [_html(part) for part in statistics.shown(table)],
+        "warnings": statistics.warnings(table),
         "regions": None if regions is None else _html(regions),
         "pairs": _html(statistics.pairs(rows).drop(columns="demand")),
         "runs": _html(rows),
@@ -186,12 +214,16 @@ def _level(run: Finished, level: Level) -> dict:
 
 
 def _pictures(draw: Callable[[Path], None], captions: dict[str, str]) -> list[tuple[str, str]]:
-    """Return data URI and caption of the pictures that `draw` writes into a folder."""
+    """Return data URI and caption of pictures.
+
+    draw: writes them into a folder
+    """
     pictures = []
     with files.temporary_folder() as folder:
         draw(folder)
         for name, caption in captions.items():
-            if (file := folder / f"{name}.png").is_file():
+            file = folder / f"{name}.png"
+            if file.is_file():
                 encoded = base64.b64encode(file.read_bytes()).decode()
                 pictures.append((f"data:image/png;base64,{encoded}", caption))
     return pictures

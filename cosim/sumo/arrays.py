@@ -1,8 +1,8 @@
 """Shapes of a city's arrays for annotations, beside those of nmfd.arrays.
 
-E edges, G gateways, I internal edges of turns over junctions, M moves from edge to edge, R regions,
-T control intervals, N trips. One letter is one number within a call or an object, checked in tests
-(tests/conftest.py).
+E edges, G gateways, I internal edges of turns over junctions, M moves from edge to edge,
+R regions, T control intervals, N trips. A letter is the same number within a call or an object;
+tests/conftest.py checks this.
 """
 
 import numpy as np

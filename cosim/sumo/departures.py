@@ -15,7 +15,7 @@ import libsumo
 from cosim.sumo.session import ERRORS, REFUSALS, one_line, start_quietly
 from nmfd.errors import InputError
 from nmfd.runs.files import temporary_folder
-from nmfd.runs.run_many import Run, processes
+from nmfd.runs.pool import in_processes
 
 IDLE_S = 86400.0  # without a new vehicle: the end of a simulation that has no end
 # No vehicle or person leaves its queue; trips get routes when they are due.
@@ -60,10 +60,8 @@ def read_departures(
     options: of SUMO, with absolute paths. SUMO runs in a process of its own.
     Raises InputError with SUMO's words and the file `where`.
     """
-    job = Run(
-        "departures", {}, partial(_said, {**options, **UNDRIVEN}, math.inf if end is None else end)
-    )
-    [(_, outcome)] = processes([job], 1)
+    job = partial(_said, {**options, **UNDRIVEN}, math.inf if end is None else end)
+    [(_, outcome)] = in_processes([job], 1, [None])
     if isinstance(outcome, str):
         raise InputError(f"{where}: sumo cannot run it: {outcome}; correct the input")
     return outcome

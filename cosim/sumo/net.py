@@ -1,13 +1,13 @@
-"""A SUMO network cut into regions: edge -> region, and the gateways between regions."""
+"""A SUMO network cut into regions, and the gateways between them."""
 
 import csv
 import math
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -41,11 +41,13 @@ class CityFiles(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Gateway:
-    """A boundary movement from an edge in region `source` over a junction to an edge in region
-    `target`.
+    """A boundary movement: a turn from one region into another.
 
-    signal: the one that controls it, None where it leaks; links: its indices in the signal's state
-    lanes: numbers of those that it comes from
+    source, target: regions
+    from_edge, to_edge: last edge in `source`, first edge in `target`
+    signal: the signal that controls all of the turn; None where it leaks
+    links: indices of the turn in the signal's state
+    lanes: numbers of the lanes of `from_edge` that lead over the boundary
     """
 
     source: int
@@ -59,21 +61,20 @@ class Gateway:
 
 @dataclass(frozen=True, kw_only=True)
 class City:
-    """A SUMO network cut into regions 0 .. regions - 1; only what cars may use, except in
-    region_of.
+    """A SUMO network cut into regions 0 .. regions - 1.
 
-    edges: normal ones, sorted; length [m], lanes, speed [m/s], lane_ids: by these
-    region_of: normal and internal edge -> region; an internal edge has that of the edge that it
+    It holds only what cars may use; `region_of` holds the other edges, too.
+
+    region_of: normal or internal edge -> region; an internal edge belongs to the region that it
         leads to
+    edges: normal edges, sorted
+    length, lanes, speed, lane_ids: edge -> length (m), number of lanes, limit (m/s), ids of lanes
     successors: edge -> following edges, sorted
-    turn_time: (from_edge, to_edge) -> free-flow time on the junction [s], as far as where a turn
-        waits
-    over: (from_edge, to_edge) -> internal edges of this turn, in order; inside: internal edge of a
-        turn -> length [m]
-    gateways: sorted by source, target, from_edge, to_edge; signals: edge -> signal at its end
-    number: edge -> its place in `edges`; before: edge -> edges that lead there, sorted
-    edge_region, lane_metres, room: by number, (E,) the region, length times lanes [m], and [veh] at
-        JAM_SPACING
+    turn_time: (from_edge, to_edge) -> free-flow time on the junction (s), up to where a turn waits
+    gateways: sorted by source, target, from_edge, to_edge
+    signals: edge -> signal at its end
+    over: (from_edge, to_edge) -> internal edges of this turn, in order
+    inside: internal edge of a turn -> length (m)
     """
 
     net_file: Path
@@ -93,10 +94,12 @@ class City:
 
     @cached_property
     def number(self) -> dict[str, int]:
+        """Map each edge to its place in `edges`."""
         return {edge: n for n, edge in enumerate(self.edges)}
 
     @cached_property
     def before(self) -> dict[str, list[str]]:
+        """Map each edge to the edges that lead there, sorted."""
         before: dict[str, list[str]] = {edge: [] for edge in self.edges}
         for edge, after in self.successors.items():
             for other in after:
@@ -105,22 +108,42 @@ class City:
 
     @cached_property
     def edge_region(self) -> np.ndarray:
+        """Region of each edge (E,)."""
         return np.array([self.region_of[edge] for edge in self.edges])
 
     @cached_property
     def lane_metres(self) -> PerEdge:
+        """Length times lanes of each edge (m, (E,))."""
         return np.array([self.length[edge] * self.lanes[edge] for edge in self.edges])
 
     @property
     def room(self) -> PerEdge:
+        """Standing vehicles that fit on each edge (veh, (E,))."""
         return np.maximum(self.lane_metres / JAM_SPACING, 1.0)
 
 
-_Lane: TypeAlias = tuple[float, float, str]  # length [m], speed [m/s], id
+class _Lane(NamedTuple):
+    """A lane for cars: its length (m), speed limit (m/s) and id."""
+
+    length: float
+    speed: float
+    id: str
+
+
+class _Crossing(NamedTuple):
+    """An internal edge of a junction: free-flow time on it (s), length (m)."""
+
+    time: float
+    length: float
 
 
 class _Connection(NamedTuple):
-    """A link from lane to lane; via: lane on the junction; link: index in the signal's state."""
+    """A connection from lane to lane.
+
+    via: lane on the junction; None if there is none
+    signal, link: the signal that controls it, and its index in the signal's state
+    lane, to_lane: numbers of the lanes of `source` and `target`
+    """
 
     source: str
     target: str
@@ -131,8 +154,23 @@ class _Connection(NamedTuple):
     to_lane: int
 
 
+class _Net(NamedTuple):
+    """The content of a net.xml.
+
+    lanes_of: normal edge -> its lanes for cars
+    internal: internal edge -> its time and length
+    """
+
+    lanes_of: dict[str, list[_Lane]]
+    internal: dict[str, _Crossing]
+    connections: list[_Connection]
+
+
 def network_folder(network: RegionalModel) -> Path:
-    """Return the folder of `network`. Raises InputError for one that was not loaded from a file."""
+    """Return the folder of a network.
+
+    Raises: InputError for a network that was not loaded from a file
+    """
     if network.folder is None:
         raise InputError(
             f"network {network.name}: was not loaded from a folder; load it with load_network"
@@ -141,14 +179,16 @@ def network_folder(network: RegionalModel) -> Path:
 
 
 def city_files(network: RegionalModel) -> CityFiles:
-    """Return the SUMO files of `network`. Raises InputError for a wrong table [sumo] or a missing
-    file."""
+    """Return the SUMO files of a network.
+
+    Raises: InputError for a wrong table [sumo] or a missing file
+    """
     folder = network_folder(network)
     path = folder / "network.toml"
     content = config.read(path)
     if "sumo" not in content:
-        what = "this network has no city to simulate: use nmfd benchmark, or add [sumo] with net and regions"
-        raise InputError(f"{path}: sumo: missing; {what}")
+        remedy = "use nmfd benchmark, or add [sumo] with net and regions"
+        raise InputError(f"{path}: sumo: missing; this network has no city to simulate: {remedy}")
     table = config.checked(CityTable, content["sumo"], path, "sumo.")
     files = CityFiles(folder / table.net, folder / table.regions)
     for key, file in zip(("net", "regions"), files, strict=True):
@@ -167,159 +207,183 @@ def city_of(network: RegionalModel) -> City:
 def load_city(net_file: Path, regions_csv: Path, regions: int) -> City:
     """Read a net.xml (or net.xml.gz) and the region of each of its edges.
 
-    Raises InputError for a broken file, an unknown edge, an edge without a region and a region
-    without edges.
+    Raises: InputError for a broken file, an unknown edge, an edge without a region, or a region
+        without edges
     """
-    lanes_of, internal, connections = _read_net(Path(net_file))
+    net = _read_net(Path(net_file))
     given = read_regions(Path(regions_csv), regions)
+    edges = tuple(sorted(edge for edge, lanes in net.lanes_of.items() if lanes))
     for edge in given:
-        if edge not in lanes_of and edge not in internal:
+        if edge not in net.lanes_of and edge not in net.internal:
             raise InputError(
-                f"{regions_csv}: edge {edge} is not in {net_file}; remove it or give the network it is of"
+                f"{regions_csv}: edge {edge} is not in {net_file}; "
+                "remove it or give the network it is of"
             )
-    edges = tuple(sorted(edge for edge, lanes in lanes_of.items() if lanes))
-    if missing := [edge for edge in edges if edge not in given]:
+    missing = [edge for edge in edges if edge not in given]
+    if missing:
         raise InputError(
-            f"{regions_csv}: edge {missing[0]} has no region ({len(missing)} such edges); add a line for every edge"
+            f"{regions_csv}: edge {missing[0]} has no region ({len(missing)} such edges); "
+            "add a line for every edge"
         )
-    if empty := set(range(regions)) - {given[edge] for edge in edges}:
+    empty = set(range(regions)) - {given[edge] for edge in edges}
+    if empty:
         raise InputError(
-            f"{regions_csv}: region {min(empty)} has no edges; every region from 0 to {regions - 1} needs one"
+            f"{regions_csv}: region {min(empty)} has no edges; "
+            f"every region from 0 to {regions - 1} needs one"
         )
-    cars = {lane for lanes in lanes_of.values() for _, _, lane in lanes}
-    links = [
-        c
-        for c in connections
-        if cars.issuperset((f"{c.source}_{c.lane}", f"{c.target}_{c.to_lane}"))
-    ]
-    over = _turns_over_junctions(links, connections)
-    successors: dict[str, list[str]] = {edge: [] for edge in edges}
-    for source, target in sorted({(c.source, c.target) for c in links}):
-        successors[source].append(target)
+    return _derived(Path(net_file), net, edges, given, regions)
+
+
+def _derived(
+    net_file: Path, net: _Net, edges: tuple[str, ...], given: Mapping[str, int], regions: int
+) -> City:
+    """Return the city of a network whose edges have a region each.
+
+    edges: those for cars, sorted; given: edge -> region, of others, too
+    """
     region_of = {edge: given[edge] for edge in edges}
-    all_regions = region_of | {
-        edge: region for edge, region in given.items() if not edge.startswith(":")
-    }
+    for edge, region in given.items():
+        if not edge.startswith(":"):
+            region_of[edge] = region
+    links = _links_for_cars(net)
+    successors: dict[str, list[str]] = {edge: [] for edge in edges}
+    for source, target in sorted({(link.source, link.target) for link in links}):
+        successors[source].append(target)
+    turn_time = {}
+    for link in links:
+        time = net.internal[_stem(link.via)].time if link.via else 0.0
+        turn_time[link.source, link.target] = time
+    over = _turns_over_junctions(links, net.connections)
+    inside = {}
+    for edge in sorted(set().union(*over.values())):
+        length = net.internal[edge].length
+        if length > 0.0:
+            inside[edge] = length
+    lanes = {edge: net.lanes_of[edge] for edge in edges}
     return City(
-        net_file=Path(net_file),
+        net_file=net_file,
         regions=regions,
-        region_of=all_regions | _internal_regions(connections, all_regions, internal),
+        region_of=region_of | _internal_regions(net, region_of),
         edges=edges,
-        length={e: lanes_of[e][0][0] for e in edges},
-        lanes={e: len(lanes_of[e]) for e in edges},
-        lane_ids={e: tuple(lane for _, _, lane in lanes_of[e]) for e in edges},
-        speed={e: max(speed for _, speed, _ in lanes_of[e]) for e in edges},
+        length={edge: own[0].length for edge, own in lanes.items()},
+        lanes={edge: len(own) for edge, own in lanes.items()},
+        lane_ids={edge: tuple(lane.id for lane in own) for edge, own in lanes.items()},
+        speed={edge: max(lane.speed for lane in own) for edge, own in lanes.items()},
         successors={edge: tuple(after) for edge, after in successors.items()},
-        turn_time={
-            (c.source, c.target): internal[c.via.rpartition("_")[0]][0] if c.via else 0.0
-            for c in links
-        },
+        turn_time=turn_time,
         gateways=_gateways(links, region_of),
-        signals={c.source: c.signal for c in links if c.signal},
+        signals={link.source: link.signal for link in links if link.signal},
         over=over,
-        inside={
-            edge: internal[edge][1]
-            for edge in sorted(set().union(*over.values()))
-            if internal[edge][1] > 0.0
-        },
+        inside=inside,
     )
 
 
 def check_adjacency(city: City, network: RegionalModel) -> None:
-    """Raise InputError unless the gateways join exactly the regions that network.toml calls
-    adjacent."""
+    """Raise InputError unless gateways join exactly the adjacent regions.
+
+    Which regions are adjacent is in network.toml.
+    """
     where = f"{network.folder}/network.toml: regions"
     joined = np.zeros((city.regions, city.regions), dtype=bool)
     for gateway in city.gateways:
-        i, h, ends = (
-            gateway.source,
-            gateway.target,
-            f"edge {gateway.from_edge} leads to {gateway.to_edge}",
-        )
+        i = gateway.source
+        h = gateway.target
         if not network.adjacency[i, h]:
             raise InputError(
-                f"{where}[{i}].adjacent: region {h} is missing, although {ends}; add it, or move the edges to other "
-                "regions"
+                f"{where}[{i}].adjacent: region {h} is missing, although edge {gateway.from_edge} "
+                f"leads to {gateway.to_edge}; add it, or move the edges to other regions"
             )
         joined[i, h] = True
     for i, h in np.argwhere(network.adjacency & ~joined):
         raise InputError(
-            f"{where}[{i}].adjacent: lists {h}, but no edge leads from region {i} to region {h} in {city.net_file}; "
-            "remove it, or change the regions of edges"
+            f"{where}[{i}].adjacent: lists {h}, but no edge leads from region {i} to region {h} "
+            f"in {city.net_file}; remove it, or change the regions of edges"
         )
 
 
 def edge_shapes(city: City) -> list[Points]:
-    """Return (n, 2) [m] for every edge: its line on the map, midway between its outermost lanes."""
+    """Return the line of every edge on the map, (n, 2) (m).
+
+    It lies midway between the outermost lanes for cars.
+    """
     shapes: dict[str, Points] = {}
     with network_root(city.net_file) as root:
         for edge in root.iterfind("edge"):
-            lanes = [
-                np.array(
-                    [point.split(",")[:2] for point in attribute(lane, "shape").split()],
-                    dtype=float,
-                )
-                for lane in edge.iter("lane")
-                if for_cars(lane)
-            ]
-            if lanes:
-                same = len(lanes[0]) == len(lanes[-1])
-                shapes[attribute(edge, "id")] = (lanes[0] + lanes[-1]) / 2 if same else lanes[0]
+            lanes = [_shape(lane) for lane in edge.iter("lane") if for_cars(lane)]
+            if not lanes:
+                continue
+            shape = lanes[0]
+            if len(lanes[0]) == len(lanes[-1]):
+                shape = (lanes[0] + lanes[-1]) / 2
+            shapes[attribute(edge, "id")] = shape
     return [shapes[edge] for edge in city.edges]
 
 
+def _shape(lane: ElementTree.Element) -> Points:
+    """Return the line of a <lane>, (n, 2) (m), without heights."""
+    points = attribute(lane, "shape").split()
+    return np.array([point.split(",")[:2] for point in points], dtype=float)
+
+
 def points_along(shape: Points, marks: Callable[[float], ArrayLike]) -> Float[np.ndarray, "*n 2"]:
-    """Return points (..., 2) [m] on a line (n, 2) [m]; marks: its length [m] -> their distances
-    from its beginning."""
+    """Return points (..., 2) on a line.
+
+    shape: the line (m, (n, 2))
+    marks: length of the line (m) -> distances of the points from its beginning (m)
+    """
     along = np.append(0.0, np.cumsum(np.hypot(*np.diff(shape, axis=0).T)))
     at = marks(float(along[-1]))
     return np.stack([np.interp(at, along, axis) for axis in shape.T], axis=-1)
 
 
-def _read_net(
-    path: Path,
-) -> tuple[dict[str, list[_Lane]], dict[str, tuple[float, float]], list[_Connection]]:
-    """Return edge -> lanes for cars; internal edge -> (time [s], length [m]); connections."""
+def _read_net(path: Path) -> _Net:
+    """Read a SUMO network. Raises InputError."""
     lanes_of: dict[str, list[_Lane]] = {}
-    internal: dict[str, tuple[float, float]] = {}
+    internal: dict[str, _Crossing] = {}
     connections: list[_Connection] = []
     with network_root(path) as root:
         for element in root.iterfind("edge"):
-            edge, open_lanes = attribute(element, "id"), filter(for_cars, element.iter("lane"))
+            edge = attribute(element, "id")
             lanes = [
-                (size(one, "length"), size(one, "speed"), attribute(one, "id"))
-                for one in open_lanes
+                _Lane(size(lane, "length"), size(lane, "speed"), attribute(lane, "id"))
+                for lane in element.iter("lane")
+                if for_cars(lane)
             ]
             if element.get("function", "normal") in NORMAL:
                 lanes_of[edge] = lanes
-            else:
-                internal[edge] = max(
-                    ((long / speed, long) for long, speed, _ in lanes), default=(0.0, 0.0)
-                )
+                continue
+            times = [_Crossing(lane.length / lane.speed, lane.length) for lane in lanes]
+            internal[edge] = max(times, default=_Crossing(0.0, 0.0))
         for element in root.iterfind("connection"):
-            source, target, via = (
-                attribute(element, "from"),
-                attribute(element, "to"),
-                element.get("via"),
-            )
-            numbers = (
-                element.get("linkIndex", "-1"),
-                attribute(element, "fromLane"),
-                attribute(element, "toLane"),
-            )
-            if via and via.rpartition("_")[0] not in internal:
+            source = attribute(element, "from")
+            via = element.get("via")
+            if via and _stem(via) not in internal:
                 raise LookupError(f"connection from {source} by way of {via}: no such edge")
-            connections.append(
-                _Connection(source, target, via, element.get("tl"), *map(int, numbers))
+            connection = _Connection(
+                source=source,
+                target=attribute(element, "to"),
+                via=via,
+                signal=element.get("tl"),
+                link=int(element.get("linkIndex", "-1")),
+                lane=int(attribute(element, "fromLane")),
+                to_lane=int(attribute(element, "toLane")),
             )
+            connections.append(connection)
     if not lanes_of:
         raise InputError(f"{path}: has no edges; build it with netconvert")
-    return lanes_of, internal, connections
+    return _Net(lanes_of, internal, connections)
+
+
+def _stem(name: str) -> str:
+    """Return the edge of a lane, or the junction of an internal edge."""
+    return name.rpartition("_")[0]
 
 
 def size(lane: ElementTree.Element, name: str) -> float:
-    """Return the length [m] or speed [m/s] of a <lane>. Raises ValueError unless it is above 0 and
-    finite."""
+    """Return the length (m) or speed (m/s) of a <lane>.
+
+    Raises: ValueError unless it is above 0 and finite
+    """
     value = float(attribute(lane, name))
     if not 0.0 < value < math.inf:
         raise ValueError(
@@ -330,13 +394,18 @@ def size(lane: ElementTree.Element, name: str) -> float:
 
 def for_cars(lane: ElementTree.Element) -> bool:
     """Return True if cars may use a <lane>."""
-    if (allowed := lane.get("allow")) is not None:
-        return bool({"all", "passenger"} & set(allowed.split()))
-    return not {"all", "passenger"} & set(lane.get("disallow", "").split())
+    cars = {"all", "passenger"}
+    allowed = lane.get("allow")
+    if allowed is not None:
+        return bool(cars & set(allowed.split()))
+    return not cars & set(lane.get("disallow", "").split())
 
 
 def read_regions(path: Path, regions: int = 10**6) -> dict[str, int]:
-    """Return edge -> region, less than `regions`, of a csv file edge,region. Raises InputError."""
+    """Return edge -> region of a csv file with the columns edge,region.
+
+    Raises: InputError, also for a region that is not less than `regions`
+    """
     check_file(path, "give a table with the columns edge,region")
     try:
         with path.open(encoding="utf-8-sig", newline="") as stream:
@@ -366,67 +435,97 @@ def read_regions(path: Path, regions: int = 10**6) -> dict[str, int]:
     return region_of
 
 
-def _internal_regions(
-    connections: Sequence[_Connection], region_of: Mapping[str, int], internal: Collection[str]
-) -> dict[str, int]:
-    """Return internal edge -> region of the edge it leads to; without cars, that of any edge of the
-    junction."""
+def _links_for_cars(net: _Net) -> list[_Connection]:
+    """Return the connections from a lane for cars to a lane for cars."""
+    cars: set[str] = set()
+    for lanes in net.lanes_of.values():
+        cars.update(lane.id for lane in lanes)
+    links = []
+    for connection in net.connections:
+        source_lane = f"{connection.source}_{connection.lane}"
+        target_lane = f"{connection.target}_{connection.to_lane}"
+        if source_lane in cars and target_lane in cars:
+            links.append(connection)
+    return links
+
+
+def _internal_regions(net: _Net, region_of: Mapping[str, int]) -> dict[str, int]:
+    """Return internal edge -> region of the edge that it leads to.
+
+    An internal edge without cars gets the region of another one of its junction.
+    """
     regions: dict[str, int] = {}
+    for connection in net.connections:
+        target = region_of.get(connection.target)
+        if target is None:
+            continue
+        if connection.via:
+            regions[_stem(connection.via)] = target
+        if connection.source.startswith(":"):
+            regions[connection.source] = target
     of_junction: dict[str, int] = {}
-    for connection in connections:
-        if (target := region_of.get(connection.target)) is not None:
-            if connection.via:
-                regions[connection.via.rpartition("_")[0]] = target
-            if connection.source.startswith(":"):
-                regions[connection.source] = target
     for edge, region in regions.items():
-        of_junction.setdefault(edge.rpartition("_")[0], region)
-    return {
-        edge: regions.get(edge, of_junction.get(edge.rpartition("_")[0], 0)) for edge in internal
-    }
+        of_junction.setdefault(_stem(edge), region)
+    return {edge: regions.get(edge, of_junction.get(_stem(edge), 0)) for edge in net.internal}
 
 
 def _turns_over_junctions(
     links: Sequence[_Connection], connections: Sequence[_Connection]
 ) -> dict[tuple[str, str], tuple[str, ...]]:
-    """Return (from_edge, to_edge) -> internal edges in between; two if the turn waits in the middle
-    of a junction."""
-    onward = {(c.source, c.lane): c.via for c in connections if c.source.startswith(":")}
+    """Return (from_edge, to_edge) -> internal edges in between.
+
+    There are two if the turn waits in the middle of the junction.
+    """
+    onward = {}
+    for connection in connections:
+        if connection.source.startswith(":"):
+            onward[f"{connection.source}_{connection.lane}"] = connection.via
     over: dict[tuple[str, str], tuple[str, ...]] = {}
     for link in links:
-        way, via = [], link.via
+        way = []
+        via = link.via
         while via:
-            edge, _, lane = via.rpartition("_")
-            way.append(edge)
-            via = onward.get((edge, int(lane)))
+            way.append(_stem(via))
+            via = onward.get(via)
         if way:
             over[link.source, link.target] = tuple(way)
     return over
 
 
-def _gateways(links: list[_Connection], region_of: dict[str, int]) -> tuple[Gateway, ...]:
+def _gateways(links: Sequence[_Connection], region_of: Mapping[str, int]) -> tuple[Gateway, ...]:
+    """Return the links from region to region, those of a turn together."""
     movements: dict[tuple[int, int, str, str], list[_Connection]] = {}
     for link in links:
-        source, target = region_of[link.source], region_of[link.target]
+        source = region_of[link.source]
+        target = region_of[link.target]
         if source != target:
             movements.setdefault((source, target, link.source, link.target), []).append(link)
-    return tuple(
-        Gateway(
-            source=key[0],
-            target=key[1],
-            from_edge=key[2],
-            to_edge=key[3],
-            signal=members[0].signal,
+    gateways = []
+    for (source, target, from_edge, to_edge), members in sorted(movements.items()):
+        gateway = Gateway(
+            source=source,
+            target=target,
+            from_edge=from_edge,
+            to_edge=to_edge,
+            signal=_common_signal(members),
             links=tuple(sorted(link.link for link in members if link.signal)),
             lanes=tuple(sorted({link.lane for link in members})),
         )
-        for key, members in sorted(movements.items())
-    )
+        gateways.append(gateway)
+    return tuple(gateways)
+
+
+def _common_signal(links: list[_Connection]) -> str | None:
+    """Return the signal that controls all links of a movement, None if there is none."""
+    signals = {link.signal for link in links}
+    return signals.pop() if len(signals) == 1 else None
 
 
 def gateway_movements(city: City) -> dict[str, dict[int, int]]:
-    """Return signal -> link index -> number of the gateway, of the links that lead over a
-    boundary."""
+    """Return signal -> link index -> number of the gateway.
+
+    Only links that lead over a boundary are there.
+    """
     movements: dict[str, dict[int, int]] = {}
     for number, gateway in enumerate(city.gateways):
         if gateway.signal is not None:
@@ -437,7 +536,9 @@ def gateway_movements(city: City) -> dict[str, dict[int, int]]:
 def gateway_room_taken(
     edge_vehicles: Float[np.ndarray, "*intervals E"], city: City
 ) -> Float[np.ndarray, "*intervals G"]:
-    """Return (..., G) [-], the share of the room before each gateway that edge_vehicles (..., E)
-    [veh] take."""
+    """Return the taken share of the room before each gateway, (..., G).
+
+    edge_vehicles: vehicles on each edge (veh, (..., E))
+    """
     before = [city.number[gateway.from_edge] for gateway in city.gateways]
     return edge_vehicles[..., before] / city.room[before]

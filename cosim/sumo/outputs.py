@@ -1,4 +1,4 @@
-"""SUMO's output files: tripinfo, read while SUMO writes it, and emissions by edge."""
+"""SUMO's output files: tripinfo while SUMO writes it, emissions by edge."""
 
 import math
 import xml.etree.ElementTree as ElementTree
@@ -17,8 +17,10 @@ KG_PER_MG = 1e-6
 class End(NamedTuple):
     """The end of a vehicle's trip.
 
-    time: [s], of the simulation; edge: last one, "" if unknown
-    reason: tripinfo's `vaporized`, "" at the end of the route; time_loss: [s]
+    time: of the simulation (s)
+    edge: the last one; "" if unknown
+    reason: tripinfo's `vaporized`; "" at the end of the route
+    time_loss: against driving freely (s)
     """
 
     vehicle: str
@@ -31,33 +33,46 @@ class End(NamedTuple):
 class TripReader:
     """Reader of SUMO's tripinfo output while SUMO writes it.
 
-    completed, removed: vehicles so far, at the last edge of their route or before
-    under_way: vehicle on the road at the end of the simulation -> time loss [s]
+    completed: vehicles that reached the last edge of their route so far
+    removed: vehicles that ended before it so far
+    under_way: vehicle on the road at the end of the simulation -> time loss (s)
     """
 
     def __init__(self, path: Path, flush: Callable[[], None] = lambda: None):
-        """flush: makes SUMO write what it buffers (about ten trips)"""
-        self._path, self._flush, self._offset = path, flush, 0
+        """Prepare to read the file.
+
+        flush: makes SUMO write what it buffers (about ten trips)
+        """
+        self._path = path
+        self._flush = flush
+        self._offset = 0
         self._parser: ElementTree.XMLPullParser[Element] = ElementTree.XMLPullParser()
-        self.completed = self.removed = 0
+        self.completed = 0
+        self.removed = 0
         self.under_way: dict[str, float] = {}
 
     def ends(self) -> list[End]:
-        """Return the trips that ended since the last call. Raises RunFailed for a broken file."""
+        """Return the trips that ended since the last call.
+
+        Raises: RunFailed for a broken file
+        """
         self._flush()
         return self._read(lambda vehicle: True)
 
     def finish(self, gone: Container[str] = ()) -> list[End]:
-        """Return the last ends after the simulation; SUMO lists vehicles under way then, too,
-        `gone` are none of these.
+        """Return the trips that ended last, after the end of the simulation.
 
-        Raises RunFailed for a file that is not whole.
+        gone: vehicles that have left, although SUMO lists them as under way
+        Raises: RunFailed for a file that is not whole
         """
         return self._read(gone.__contains__, last=True)
 
     def _read(self, left: Callable[[str], bool], last: bool = False) -> list[End]:
-        """left: a vehicle of which SUMO says that it has not arrived has left, as after a teleport
-        to its end."""
+        """Return the ends in what SUMO has written since the last call.
+
+        left: says of a vehicle without an arrival that it has left, as after a teleport to its end
+        last: the file must be whole
+        """
         try:
             with self._path.open("rb") as stream:
                 stream.seek(self._offset)
@@ -65,75 +80,77 @@ class TripReader:
                 self._offset = stream.tell()
             if last:
                 self._parser.close()
-            elements = [event[-1] for event in self._parser.read_events()]
-            trips = [
-                self._trip(e, left)
-                for e in elements
-                if isinstance(e, Element) and e.tag == "tripinfo"
-            ]
+            ends = []
+            for event in self._parser.read_events():
+                element = event[-1]
+                if isinstance(element, Element) and element.tag == "tripinfo":
+                    end = self._trip(element, left)
+                    if end is not None:
+                        ends.append(end)
         except BROKEN as error:
             raise unfinished(self._path, error) from None
-        return [end for end in trips if end is not None]
+        return ends
 
     def _trip(self, element: Element, left: Callable[[str], bool]) -> End | None:
-        vehicle, reason = element.get("id", ""), element.get("vaporized", "")
-        depart, loss = (
-            float(attribute(element, "depart")),
-            max(float(element.get("timeLoss", 0.0)), 0.0),
-        )
+        """Count a <tripinfo>; return its end, None if it is under way."""
+        vehicle = element.get("id", "")
+        reason = element.get("vaporized", "")
+        depart = float(attribute(element, "depart"))
+        time_loss = max(float(element.get("timeLoss", 0.0)), 0.0)
         ended = float(attribute(element, "arrival")) >= 0 or (depart >= 0 and left(vehicle))
-        edge, time = (
-            element.get("arrivalLane", "").rpartition("_")[0],
-            depart + float(attribute(element, "duration")),
-        )
-        element.clear()
-        if ended:
-            self.completed, self.removed = (
-                self.completed + (not reason),
-                self.removed + bool(reason),
-            )
-            return End(vehicle, time, edge, reason, loss)
-        if depart >= 0:
-            self.under_way[vehicle] = loss
-        return None
+        edge = element.get("arrivalLane", "").rpartition("_")[0]
+        time = depart + float(attribute(element, "duration"))
+        element.clear()  # the tree of a long run would take much memory
+        if not ended:
+            if depart >= 0:
+                self.under_way[vehicle] = time_loss
+            return None
+        if reason:
+            self.removed += 1
+        else:
+            self.completed += 1
+        return End(vehicle, time, edge, reason, time_loss)
 
 
 def options(trip_file: Path, *, detailed: bool) -> list[str]:
-    """Return SUMO's options for a `trip_file` that `TripReader` can read; detailed: with emissions
-    of every trip."""
-    others = [
-        "--tripinfo-output.write-unfinished",
-        "true",
-        "--tripinfo-output.write-undeparted",
-        "true",
-    ]
+    """Return SUMO's options for a tripinfo file that `TripReader` can read.
+
+    detailed: with the emissions of every trip
+    """
     # Not 0: SUMO draws a random number for every vehicle unless it is 0, and others decide who has
     # a rerouting device.
-    emitting = "--device.emissions.probability", "1" if detailed else "1e-12"
-    return ["--tripinfo-output", str(trip_file), *others, *emitting]
+    emitting = "1" if detailed else "1e-12"
+    given = ["--tripinfo-output", str(trip_file)]
+    given += ["--tripinfo-output.write-unfinished", "true"]
+    given += ["--tripinfo-output.write-undeparted", "true"]
+    return [*given, "--device.emissions.probability", emitting]
 
 
 def write_emission_data(path: Path, target: Path) -> None:
-    """Write an additional file that makes SUMO write emissions by edge over the whole run to
-    `target`."""
-    data = f'id="cosim" type="emissions" withInternal="true" excludeEmpty="true" file={quoteattr(str(target))}'
+    """Write an additional file that makes SUMO write emissions by edge.
+
+    target: SUMO's output, over the whole run
+    """
+    data = 'id="cosim" type="emissions" withInternal="true" excludeEmpty="true"'
+    data += f" file={quoteattr(str(target))}"
     path.write_text(f"<additional><edgeData {data}/></additional>\n", encoding="utf-8")
 
 
 def edge_emissions(path: Path) -> dict[str, tuple[float, float]]:
-    """Return edge, normal or on a junction -> CO2 and fuel [kg] of all vehicles.
+    """Return CO2 and fuel of all vehicles (kg) by edge, also on junctions.
 
     path: file of `write_emission_data`, complete at the end of the simulation
     Raises: RunFailed for a file that is not whole
     """
+    emissions = {}
     try:
-        edges = [edge.attrib for edge in ElementTree.parse(path).iter("edge")]
-        return {
-            edge["id"]: (KG_PER_MG * float(edge["CO2_abs"]), KG_PER_MG * float(edge["fuel_abs"]))
-            for edge in edges
-        }
+        for edge in ElementTree.parse(path).iter("edge"):
+            co2 = KG_PER_MG * float(edge.attrib["CO2_abs"])
+            fuel = KG_PER_MG * float(edge.attrib["fuel_abs"])
+            emissions[edge.attrib["id"]] = (co2, fuel)
     except BROKEN as error:
         raise unfinished(path, error) from None
+    return emissions
 
 
 def unfinished(path: Path, error: Exception) -> RunFailed:

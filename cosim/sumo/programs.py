@@ -14,34 +14,36 @@ HOME = Path(sumo.SUMO_HOME)
 
 
 def run_sumo(program: str, options: Mapping[str, object], *flags: str, where: str) -> None:
-    """Run one of SUMO's programs. Raises InputError with its first error line and the file
-    `where`."""
-    arguments = [text for name, value in options.items() for text in (f"--{name}", str(value))]
-    done = _run([str(HOME / "bin" / program), *arguments, *flags])
+    """Run one of SUMO's programs.
+
+    Raises InputError with its first error line and the file `where`.
+    """
+    command = [str(HOME / "bin" / program)]
+    for name, value in options.items():
+        command += [f"--{name}", str(value)]
+    done = _run([*command, *flags])
     if done.returncode:
         lines = (done.stderr + done.stdout).splitlines()
         error = next((line for line in lines if "rror" in line), "no reason given")
-        raise InputError(
-            f"{where}: {program} cannot run it: {' '.join(error.split())}; correct the input"
-        )
+        reason = " ".join(error.split())
+        raise InputError(f"{where}: {program} cannot run it: {reason}; correct the input")
 
 
 def run_tool(
     tool: str, *arguments: str, folder: Path, seconds: float | None = None
 ) -> subprocess.CompletedProcess:
-    """Run a Python tool of SUMO in a folder, for so many seconds at most, and return its outcome.
+    """Run a Python tool of SUMO in a folder; return its outcome.
+
+    seconds: time limit
 
     Raises subprocess.TimeoutExpired.
     """
-    return _run(
-        [sys.executable, str(HOME / "tools" / tool), *arguments], cwd=folder, timeout=seconds
-    )
+    command = [sys.executable, str(HOME / "tools" / tool), *arguments]
+    return _run(command, cwd=folder, timeout=seconds)
 
 
 def _run(command: list[str], **more: object) -> subprocess.CompletedProcess:
-    environment = os.environ | {
-        "SUMO_HOME": str(HOME),
-        "PYTHONHASHSEED": "0",
-    }  # sets in the same order every time
+    # With this seed, sets have the same order every time.
+    environment = os.environ | {"SUMO_HOME": str(HOME), "PYTHONHASHSEED": "0"}
     how = {"capture_output": True, "text": True, "errors": "replace", "stdin": subprocess.DEVNULL}
     return subprocess.run(command, env=environment, **how, **more)  # type: ignore[call-overload]

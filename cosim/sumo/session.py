@@ -1,4 +1,7 @@
-"""The SUMO session; only it and `departures` import libsumo. At most one simulation per process."""
+"""The SUMO session: at most one simulation per process.
+
+Only this module and `departures` import libsumo.
+"""
 
 import ctypes
 import math
@@ -21,17 +24,22 @@ from nmfd.errors import InputError, RunFailed
 
 REFUSALS = libsumo.TraCIException  # of one order: the simulation goes on
 ERRORS = (REFUSALS, libsumo.FatalTraCIError)
-KEPT_BYTES = {
-    -1: 64 << 20,
-    -3: 32 << 20,
-}  # by M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of malloc.h: see _keep_freed
+# By M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of malloc.h: see _keep_freed.
+KEPT_BYTES = {-1: 64 << 20, -3: 32 << 20}
 GUI_OPTIONS = ("--start", "true", "--delay", "20")
+ACTUATED = (
+    libsumo.constants.TRAFFICLIGHT_TYPE_ACTUATED,
+    libsumo.constants.TRAFFICLIGHT_TYPE_DELAYBASED,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Phase:
-    """One phase of a signal programme: duration [s] and one character per link (SUMO's G g y r u o
-    O s)."""
+    """One phase of a signal programme.
+
+    duration: (s)
+    state: a character per link, of SUMO's G g y r u o O s
+    """
 
     duration: float
     state: str
@@ -41,9 +49,10 @@ class Phase:
 class Programme:
     """A signal programme.
 
-    id: among those of the signal; position: in its cycle when it was read [s]; static: fixed-time,
-        phases in order
+    position: in its cycle when it was read (s)
+    static: fixed-time, with the phases in order
     actuated: timed by detectors, and always in one of its phases
+    id: among the programmes of the signal
     """
 
     signal: str
@@ -55,15 +64,17 @@ class Programme:
 
     @property
     def cycle(self) -> float:
+        """Duration of all phases (s)."""
         return sum(phase.duration for phase in self.phases)
 
 
 class Session:
     """One running simulation.
 
-    time: of the simulation [s]; sumo_time: wall time inside SUMO's own step [s]; command: command
-        line of the same run
-    A second libsumo.start would silently replace the first simulation: here it is an error.
+    time: of the simulation (s)
+    sumo_time: wall time inside SUMO's own step (s)
+    command: command line of the same run
+    flush: makes SUMO write its output buffers; None where that is not possible
     """
 
     _open = False
@@ -80,15 +91,20 @@ class Session:
         options: tuple[str, ...] = (),
         gui: bool = False,
     ):
-        """Start the simulation, in the window of sumo-gui if `gui`.
+        """Start the simulation.
 
-        Raises RuntimeError if another session is open in this process, InputError if SUMO refuses
-        to start.
+        gui: in the window of sumo-gui
+        Raises: RuntimeError if another session is open in this process, InputError if SUMO refuses
+            to start
         """
+        # A second libsumo.start would silently replace the first simulation.
         if Session._open:
             raise RuntimeError("a SUMO session is already open in this process; close it first")
         _keep_freed()
-        self.sumo_time, self.step_length = 0.0, step_length
+        self.sumo_time = 0.0
+        self.step_length = step_length
+        self.flush = _flush_all()
+        self._gui = gui
         routes = file_list([route_file] if isinstance(route_file, Path) else route_file)
         settings = {
             "net-file": net_file,
@@ -101,12 +117,10 @@ class Session:
             "no-warnings": "true",
             "duration-log.disable": "true",
         }
-        self.command = [
-            "sumo",
-            *(part for key, value in settings.items() for part in (f"--{key}", str(value))),
-        ]
+        self.command = ["sumo"]
+        for key, value in settings.items():
+            self.command += [f"--{key}", str(value)]
         self.command += options
-        self._gui, self.flush = gui, _flush_all()  # the latter makes SUMO write its output buffers
         try:
             if gui:
                 libsumo.start(["sumo-gui", *self.command[1:], *GUI_OPTIONS])
@@ -118,62 +132,59 @@ class Session:
             ) from None
         Session._open = True
         self.time = libsumo.simulation.getTime()
-        self._lanes = cache(
-            lambda edge: tuple(f"{edge}_{n}" for n in range(libsumo.edge.getLaneNumber(edge)))
-        )
+        self._lanes = cache(_lanes_of)
         self._bind()
 
     def _bind(self) -> None:
-        """Bind SUMO's functions that need no translation; a Python call around them would cost as
-        much as they do."""
-        simulation, vehicle, edge, lane = (
-            libsumo.simulation,
-            libsumo.vehicle,
-            libsumo.edge,
-            libsumo.lane,
-        )
+        """Bind SUMO's functions that need no translation.
+
+        A Python call around them would cost as much as they do.
+        """
+        simulation = libsumo.simulation
+        vehicle = libsumo.vehicle
+        edge = libsumo.edge
+        light = libsumo.trafficlight
         # Vehicles in the last step: read from files; inserted; ended as SUMO says, which tripinfo
         # may deny, without those that a program removed; taken off the road to be moved on; back on
         # the road, or gone for good.
-        self.loaded, self.departed = simulation.getLoadedIDList, simulation.getDepartedIDList
+        self.loaded = simulation.getLoadedIDList
+        self.departed = simulation.getDepartedIDList
         self.arrived = simulation.getArrivedIDList
         self.started_teleport = simulation.getStartingTeleportIDList
         self.ended_teleport = simulation.getEndingTeleportIDList
         # Vehicles now: on the road, without teleporting ones; all that are loaded and have not
         # arrived; due to depart.
-        self.running, self.known = vehicle.getIDList, vehicle.getLoadedIDList
+        self.running = vehicle.getIDList
+        self.known = vehicle.getLoadedIDList
         self.pending = simulation.getPendingVehicles
-        # One vehicle: edge, normal or internal; route; place on it; speed [m/s]; time since it
-        # stopped [s]; length [m].
-        self.road, self.route, self.route_index = (
-            vehicle.getRoadID,
-            vehicle.getRoute,
-            vehicle.getRouteIndex,
-        )
+        # One vehicle: edge, normal or internal; route; place on it; speed (m/s); time since it
+        # stopped (s); length (m).
+        self.road = vehicle.getRoadID
+        self.route = vehicle.getRoute
+        self.route_index = vehicle.getRouteIndex
         self.vehicle_speed = vehicle.getSpeed
-        self.standing_time, self.vehicle_length = vehicle.getWaitingTime, vehicle.getLength
+        self.standing_time = vehicle.getWaitingTime
+        self.vehicle_length = vehicle.getLength
         # One edge: its vehicles, their number, and of these under 0.1 m/s. One lane: the number of
         # its vehicles.
-        self.vehicles_on, self.vehicle_count = (
-            edge.getLastStepVehicleIDs,
-            edge.getLastStepVehicleNumber,
-        )
-        self.halting, self.lane_vehicles = (
-            edge.getLastStepHaltingNumber,
-            lane.getLastStepVehicleNumber,
-        )
-        # One loop detector: share of the last step in which a vehicle was on it [%].
+        self.vehicles_on = edge.getLastStepVehicleIDs
+        self.vehicle_count = edge.getLastStepVehicleNumber
+        self.halting = edge.getLastStepHaltingNumber
+        self.lane_vehicles = libsumo.lane.getLastStepVehicleNumber
+        # One loop detector: share of the last step in which a vehicle was on it (%).
         self.loop_occupancy = libsumo.inductionloop.getLastStepOccupancy
         # Signals: all of the network; state of one, a character per link; id of its programme; run
         # one of its own.
-        light = libsumo.trafficlight
-        self.signals, self.signal_state = light.getIDList, light.getRedYellowGreenState
-        self.programme_id, self.restart_programme = light.getProgram, light.setProgram
+        self.signals = light.getIDList
+        self.signal_state = light.getRedYellowGreenState
+        self.programme_id = light.getProgram
+        self.restart_programme = light.setProgram
 
     def close(self) -> None:
-        """End the simulation, which completes SUMO's own outputs; a second call does nothing.
+        """End the simulation, which completes SUMO's own outputs.
 
-        libsumo cannot close a window, which stays until this process ends.
+        A second call does nothing. libsumo cannot close a window, which stays until this process
+        ends.
         """
         if Session._open:
             Session._open = False
@@ -181,7 +192,10 @@ class Session:
                 libsumo.close()
 
     def step(self) -> None:
-        """Advance by one simulation step. Raises RunFailed with SUMO's words if it gives up."""
+        """Advance by one simulation step.
+
+        Raises: RunFailed with SUMO's words if it gives up
+        """
         before = time.perf_counter()
         try:
             libsumo.simulationStep()
@@ -191,77 +205,101 @@ class Session:
         self.time = libsumo.simulation.getTime()
 
     def speeds(self, edge: str) -> tuple[float, float]:
-        """Return two mean speeds [m/s] of an edge, the limit if it is empty: of its vehicles, and
-        of SUMO's routing.
+        """Return the mean speed of vehicles on an edge, and SUMO's own (m/s).
 
-        In the second one, an empty lane counts as one vehicle at the limit, so that a queue for one
-        turn does not deter drivers with another lane.
+        Both are the limit if the edge is empty. In SUMO's own, which is for routing, an empty lane
+        counts as one vehicle at the limit. So a queue for one turn does not deter drivers with
+        another lane.
         """
         routing = libsumo.edge.getLastStepMeanSpeed(edge)
         lanes = self._lanes(edge)
-        if len(lanes) > 1:
-            counts = [libsumo.lane.getLastStepVehicleNumber(lane) for lane in lanes]
-            if total := sum(counts):  # 0 in the mesoscopic model, which has no lanes
-                speed = libsumo.lane.getLastStepMeanSpeed
-                return sum(
-                    n * speed(lane) for n, lane in zip(counts, lanes, strict=True) if n
-                ) / total, routing
-        return routing, routing
+        if len(lanes) == 1:
+            return routing, routing
+        vehicles = 0
+        metres_per_second = 0.0
+        for lane in lanes:
+            count = libsumo.lane.getLastStepVehicleNumber(lane)
+            if count:
+                vehicles += count
+                metres_per_second += count * libsumo.lane.getLastStepMeanSpeed(lane)
+        if not vehicles:  # always in the mesoscopic model, which has no lanes
+            return routing, routing
+        return metres_per_second / vehicles, routing
 
     def teleports(self) -> int:
-        """Return SUMO's own count so far: the mesoscopic model has no events for them."""
+        """Return SUMO's own count of teleports so far.
+
+        The mesoscopic model has no events for them.
+        """
         return int(libsumo.simulation.getParameter("", "stats.teleports.total"))
 
     def is_free(self, vehicle: str) -> bool:
-        """Return True if the driver may take another route: a private vehicle without stops."""
+        """Return True if the driver may take another route.
+
+        That is a driver of a private vehicle without stops.
+        """
         return self.is_private(vehicle) and not libsumo.vehicle.getStops(vehicle, 1)
 
     def is_private(self, vehicle: str) -> bool:
-        """Return False for public transport, and for classes that no controller commands."""
-        return libsumo.vehicle.getVehicleClass(
-            vehicle
-        ) not in BOUND and not libsumo.vehicle.getLine(vehicle)
+        """Return False for vehicles that no controller commands."""
+        kind = libsumo.vehicle.getVehicleClass(vehicle)
+        return kind not in BOUND and not libsumo.vehicle.getLine(vehicle)
 
     def is_public(self, vehicle: str) -> bool:
-        """Return True for public transport: by its class, or a vehicle with a line."""
-        return libsumo.vehicle.getVehicleClass(vehicle) in PUBLIC or bool(
-            libsumo.vehicle.getLine(vehicle)
-        )
+        """Return True for public transport, by its class or because of a line."""
+        kind = libsumo.vehicle.getVehicleClass(vehicle)
+        return kind in PUBLIC or bool(libsumo.vehicle.getLine(vehicle))
 
     def departure(self, vehicle: str) -> tuple[float, float]:
-        """Return the time of the departure, or else now, and the departure delay until then [s]; <
-        0: not due yet."""
+        """Return time and delay of a departure (s).
+
+        The time is now if the vehicle has not departed. The delay is below 0 if it is not due yet.
+        """
         departed = libsumo.vehicle.getDeparture(vehicle)
-        return departed if departed >= 0.0 else self.time, libsumo.vehicle.getDepartDelay(vehicle)
+        if departed < 0.0:
+            departed = self.time
+        return departed, libsumo.vehicle.getDepartDelay(vehicle)
 
     def place(self, vehicle: str) -> tuple[str, float]:
-        """Return the lane of a vehicle, and the position on it [m]."""
+        """Return the lane of a vehicle, and the position on it (m)."""
         return libsumo.vehicle.getLaneID(vehicle), libsumo.vehicle.getLanePosition(vehicle)
 
     def lane(self, lane: str) -> tuple[float, frozenset[str]]:
-        """Return the length of a lane [m], and the edges that it leads to."""
+        """Return the length of a lane (m), and the edges that it leads to."""
         onward = {libsumo.lane.getEdgeID(link[0]) for link in libsumo.lane.getLinks(lane)}
         return libsumo.lane.getLength(lane), frozenset(onward)
 
     def next_lane(self, lane: str) -> str:
-        """Return the lane that a lane on a junction leads to, of a street or on the junction."""
+        """Return the lane that a lane on a junction leads to.
+
+        It may lie on the junction, too.
+        """
         return libsumo.lane.getLinks(lane)[0][0]
 
-    def room(self, lane: str) -> float:
-        """Return the free length at the beginning of a lane [m]."""
-        position, length = libsumo.vehicle.getLanePosition, libsumo.vehicle.getLength
+    def first_on(self, lane: str) -> str | None:
+        """Return the vehicle nearest to the end of a lane, None if the lane is empty."""
         vehicles = libsumo.lane.getLastStepVehicleIDs(lane)
-        return min(
-            (position(v) - length(v) for v in vehicles), default=libsumo.lane.getLength(lane)
-        )
+        return vehicles[-1] if vehicles else None
+
+    def room(self, lane: str) -> float:
+        """Return the free length at the beginning of a lane (m)."""
+        vehicle = libsumo.vehicle
+        names = libsumo.lane.getLastStepVehicleIDs(lane)
+        ends = [vehicle.getLanePosition(name) - vehicle.getLength(name) for name in names]
+        return min(ends, default=libsumo.lane.getLength(lane))
 
     def set_down(self, vehicle: str, lane: str, position: float) -> bool:
-        """Put a vehicle at `position` [m] on a lane of its route; return False if SUMO refuses."""
+        """Put a vehicle on a lane of its route; return False if SUMO refuses.
+
+        position: on the lane (m)
+        """
         return _accepted(libsumo.vehicle.moveTo, vehicle, lane, position)
 
     def fastest(self, edge: str, target: str) -> tuple[float, tuple[str, ...]]:
-        """Return time [s] and edges of a car's fastest way on empty streets, () if there is
-        none."""
+        """Return time (s) and edges of a car's fastest way on empty streets.
+
+        There are no edges if there is no way.
+        """
         try:
             stage = libsumo.simulation.findRoute(edge, target)
         except REFUSALS:  # the edge is closed to cars, such as a bus street
@@ -269,8 +307,7 @@ class Session:
         return stage.travelTime, tuple(stage.edges)
 
     def set_route(self, vehicle: str, edges: list[str]) -> bool:
-        """Give a vehicle on edges[0] a new route; return False if SUMO refuses it and keeps the old
-        one."""
+        """Give a vehicle on edges[0] a new route; return False if it is refused."""
         return _accepted(libsumo.vehicle.setRoute, vehicle, edges)
 
     def begin_trip(self, order: Mapping[str, str]) -> None:
@@ -285,25 +322,23 @@ class Session:
             libsumo.vehicle.setSpeedFactor(order["vehID"], float(factor))
 
     def programme(self, signal: str) -> Programme:
-        """Return the programme that runs on `signal` now."""
-        light, types = libsumo.trafficlight, libsumo.constants
+        """Return the programme that runs on a signal now."""
+        light = libsumo.trafficlight
         active = light.getProgram(signal)
         logic = self._logic(signal, active)
-        elapsed = sum(phase.duration for phase in logic.phases[: light.getPhase(signal) + 1])
+        until_switch = sum(phase.duration for phase in logic.phases[: light.getPhase(signal) + 1])
+        in_order = not any(phase.next for phase in logic.phases)
         return Programme(
             signal=signal,
             id=active,
             phases=tuple(Phase(duration=p.duration, state=p.state) for p in logic.phases),
-            position=elapsed - (light.getNextSwitch(signal) - libsumo.simulation.getTime()),
-            static=logic.type == types.TRAFFICLIGHT_TYPE_STATIC
-            and not any(phase.next for phase in logic.phases),
-            actuated=logic.type
-            in (types.TRAFFICLIGHT_TYPE_ACTUATED, types.TRAFFICLIGHT_TYPE_DELAYBASED),
+            position=until_switch - (light.getNextSwitch(signal) - libsumo.simulation.getTime()),
+            static=logic.type == libsumo.constants.TRAFFICLIGHT_TYPE_STATIC and in_order,
+            actuated=logic.type in ACTUATED,
         )
 
     def state_underneath(self, signal: str, programme: str) -> str:
-        """Return the state that a programme of `signal` would show without the states that were
-        set."""
+        """Return the state that a programme would show if none had been set."""
         logic = self._logic(signal, programme)
         return logic.phases[logic.currentPhaseIndex].state
 
@@ -312,19 +347,27 @@ class Session:
         return _accepted(libsumo.trafficlight.setRedYellowGreenState, signal, state)
 
     def limit_speed(self, edge: str, limits: list[float]) -> list[float]:
-        """Set the speed limits [m/s] of an edge, one per lane or one for all; return those
-        before."""
+        """Set the speed limits of an edge; return those before (m/s).
+
+        limits: one per lane, or one for all (m/s)
+        """
         lanes = self._lanes(edge)
         before = [libsumo.lane.getMaxSpeed(lane) for lane in lanes]
-        for lane, limit in zip(
-            lanes, limits * len(lanes) if len(limits) == 1 else limits, strict=True
-        ):
+        if len(limits) == 1:
+            limits = limits * len(lanes)
+        for lane, limit in zip(lanes, limits, strict=True):
             libsumo.lane.setMaxSpeed(lane, limit)
         return before
 
     def _logic(self, signal: str, programme: str) -> Any:
+        """Return a programme of a signal as SUMO's own object."""
         logics = libsumo.trafficlight.getAllProgramLogics(signal)
         return next(logic for logic in logics if logic.programID == programme)
+
+
+def _lanes_of(edge: str) -> tuple[str, ...]:
+    """Return the lanes of an edge."""
+    return tuple(f"{edge}_{n}" for n in range(libsumo.edge.getLaneNumber(edge)))
 
 
 def _accepted(order: Callable, *arguments: object) -> bool:
@@ -337,27 +380,35 @@ def _accepted(order: Callable, *arguments: object) -> bool:
 
 
 def _flush_all() -> Callable[[], None] | None:
-    """Return OutputDevice::flushAll of SUMO, which is not in its API, by its name in the library of
-    Linux and macOS."""
+    """Return OutputDevice::flushAll of SUMO; None where it is not found.
+
+    It is not in SUMO's API, but has this name in the library on Linux and macOS.
+    """
     try:
-        flush = ctypes.CDLL(libsumo._libsumo.__file__)["_ZN12OutputDevice8flushAllEv"]
-    except (AttributeError, OSError):
+        library = ctypes.CDLL(sys.modules["libsumo._libsumo"].__file__)
+        flush = library["_ZN12OutputDevice8flushAllEv"]
+    except (AttributeError, KeyError, OSError):
         return None
-    flush.argtypes, flush.restype = (), None
+    flush.argtypes = ()
+    flush.restype = None
     return flush
 
 
 def _keep_freed() -> None:
-    """Make glibc keep freed memory: new pages took a sixth of the time of a guided run in
-    Luxembourg."""
+    """Make glibc keep freed memory.
+
+    New pages took a sixth of the time of a guided run in Luxembourg.
+    """
     with suppress(AttributeError, OSError, TypeError):
         for option, size in KEPT_BYTES.items():
             ctypes.CDLL(None).mallopt(option, size)
 
 
 def start_quietly(command: list[str]) -> None:
-    """Start libsumo. Raises FatalTraCIError with what SUMO writes to stderr, which the library does
-    not hand on."""
+    """Start libsumo.
+
+    Raises: FatalTraCIError with what SUMO writes to stderr, which the library does not hand on
+    """
     with tempfile.TemporaryFile() as said:
         sys.stderr.flush()
         stderr = os.dup(2)
@@ -376,10 +427,10 @@ def start_quietly(command: list[str]) -> None:
         with suppress(BrokenPipeError):  # perhaps nobody reads on
             sys.stderr.write(words)
         return
-    lines = [
-        line.removeprefix("Error: ") for line in words.splitlines() if line.startswith("Error: ")
-    ]
-    raise libsumo.FatalTraCIError(lines[0] if lines else one_line(failure))
+    for line in words.splitlines():
+        if line.startswith("Error: "):
+            raise libsumo.FatalTraCIError(line.removeprefix("Error: "))
+    raise libsumo.FatalTraCIError(one_line(failure))
 
 
 def one_line(error: Exception) -> str:

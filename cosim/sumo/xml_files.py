@@ -1,4 +1,4 @@
-"""SUMO's XML files: reading them, gzipped or not, and naming several to SUMO."""
+"""SUMO's XML files: how they are read, and named to SUMO."""
 
 import gzip
 import io
@@ -9,16 +9,15 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from nmfd.errors import InputError
-from nmfd.runs.files import check_file
+from nmfd.runs.files import check_file, check_name
 
-# Errors of a file that is cut off, no XML, in an unknown encoding, or with missing or wrong
-# attributes.
+# Errors of a file that is cut off, no XML, in an unknown encoding, or without an attribute.
 BROKEN = (OSError, EOFError, zlib.error, ElementTree.ParseError, LookupError, TypeError, ValueError)
 MAX_INCLUDE_DEPTH = 20  # of files that include each other
 
 
 def attribute(element: ElementTree.Element, name: str) -> str:
-    """Return the text of a required attribute. Raises ValueError, one of BROKEN."""
+    """Return the text of a required attribute. Raises ValueError."""
     value = element.get(name)
     if value is None:
         raise ValueError(f"{element.tag} {element.get('id', '')}".rstrip() + f": {name}: missing")
@@ -26,8 +25,7 @@ def attribute(element: ElementTree.Element, name: str) -> str:
 
 
 def child(element: ElementTree.Element, tag: str) -> ElementTree.Element:
-    """Return the first required element `tag` directly below `element`. Raises ValueError, one of
-    BROKEN."""
+    """Return the first element `tag` directly below. Raises ValueError."""
     below = element.find(tag)
     if below is None:
         raise ValueError(f"{element.tag}: {tag}: missing")
@@ -35,8 +33,11 @@ def child(element: ElementTree.Element, tag: str) -> ElementTree.Element:
 
 
 def read_xml(path: Path, depth: int = 0) -> ElementTree.Element:
-    """Return the root of an XML file with the files that it includes (<include href="..."/>).
-    Raises InputError."""
+    """Return the root of an XML file with the files that it includes.
+
+    depth: number of files above it that include it, <include href="..."/>
+    Raises: InputError
+    """
     with stream_of(path) as stream:
         root = ElementTree.parse(stream).getroot()
     if depth > MAX_INCLUDE_DEPTH:
@@ -45,11 +46,10 @@ def read_xml(path: Path, depth: int = 0) -> ElementTree.Element:
         )
     parts: list[ElementTree.Element] = []
     for part in root:
-        parts += (
-            read_xml(path.parent / part.get("href", ""), depth + 1)
-            if part.tag == "include"
-            else [part]
-        )
+        if part.tag == "include":
+            parts += read_xml(path.parent / part.get("href", ""), depth + 1)
+        else:
+            parts.append(part)
     root[:] = parts
     return root
 
@@ -60,8 +60,12 @@ def stream_of(
     kind: str = "an XML file that SUMO could read",
     remedy: str = "correct or replace it",
 ) -> Iterator[io.BufferedIOBase]:
-    """Yield a binary stream, unzipped if it is a .gz file. Raises InputError, for one of BROKEN in
-    the block, too."""
+    """Yield a binary stream of a file, unzipped if it is a .gz file.
+
+    kind, remedy: for the message of an error
+    Raises: InputError, also for one of BROKEN in the block
+    """
+    check_path(path)
     check_file(path)
     try:
         with gzip.open(path, "rb") if path.suffix == ".gz" else path.open("rb") as stream:
@@ -74,8 +78,10 @@ def stream_of(
 
 @contextmanager
 def network_root(net: Path) -> Iterator[ElementTree.Element]:
-    """Yield the root of a SUMO network. Raises InputError if it is none, or if the block misses a
-    part of it."""
+    """Yield the root of a SUMO network.
+
+    Raises: InputError if the file is none, or if the block misses a part of it
+    """
     with stream_of(net, "a SUMO network", "build it with netconvert") as stream:
         root = ElementTree.parse(stream).getroot()
         if root.tag != "net":
@@ -83,12 +89,29 @@ def network_root(net: Path) -> Iterator[ElementTree.Element]:
         yield root
 
 
+def check_path(path: Path) -> None:
+    """Check that SUMO can open a path.
+
+    Raises: InputError for a name that is not UTF-8, or that SUMO would change
+    """
+    check_name(path)
+    if "${" in str(path.absolute()):
+        raise InputError(
+            f"{path}: SUMO puts variables of the system for ${{...}} in a path; rename the file or "
+            "folder"
+        )
+
+
 def file_list(files: Sequence[Path]) -> str:
-    """Return files as an option of SUMO. Raises InputError for a path with a comma, which separates
-    files there."""
+    """Return files as an option of SUMO, which separates them by commas.
+
+    Raises: InputError for a path with a comma
+    """
     for file in files:
+        check_path(file)
         if "," in str(file):
             raise InputError(
-                f"{file}: SUMO cannot read a file with a comma in its path; rename it, or its folder"
+                f"{file}: SUMO cannot read a file with a comma in its path; "
+                "rename it, or its folder"
             )
     return ",".join(map(str, files))

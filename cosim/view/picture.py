@@ -1,5 +1,9 @@
-"""Plain data of what is drawn: a city, and frames of a live or finished run in it."""
+"""Plain data of what is drawn.
 
+They are a city, and frames of a live or finished run in it.
+"""
+
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
@@ -20,17 +24,24 @@ REGION_REACH = 0.08  # of the map's extent: places farther from all streets belo
 GATE_SETBACK = 0.015  # of the map's extent: distance of a gate from the end of its street
 BOUNDARY_SETBACK = 0.02  # of the map's extent: further distance of the mark of a boundary
 ROW = (  # variables of a result that `after` reads
-    *("gateway_green", "gateway_original_green", "gateway_queue"),
-    *("arrivals", "crossings", "edge_vehicles", "time_spent"),
+    "gateway_green",
+    "gateway_original_green",
+    "gateway_queue",
+    "arrivals",
+    "crossings",
+    "edge_vehicles",
+    "time_spent",
 )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Gate:
-    """A place where an edge ends at a boundary.
+    """Place where an edge ends at a boundary.
 
-    source, target: regions; place: (x, y) [m]; gateways: their numbers in the city; signal: True if
-        controlled
+    source, target: regions
+    place: (x, y) [m]
+    gateways: their numbers in the city
+    signal: True if controlled
     """
 
     source: int
@@ -42,14 +53,21 @@ class Gate:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CityPicture:
-    """The constant part of a picture.
+    """Constant part of a picture.
 
-    name: of the scenario; region_names: R; edges: E ids; shapes: E lines (n, 2) [m]
-    lane_km: (E,) length times lanes; lanes, region: (E,)
-    outlines: rings (n, 2) [m] of every region; places: (R, 2) [m] of its number
-    protected: regions; critical: (R,) [veh], NaN where not seen; curves: R MFDs (n, 2) in veh and
-        veh/s
-    step: control interval [s]; steps: number of them
+    name: of the scenario
+    region_names: R names
+    edges: E ids
+    shapes: E lines (n, 2) [m]
+    lane_km: (E,) length times lanes
+    lanes, region: (E,) of each edge
+    outlines: rings (n, 2) [m] of every region
+    places: (R, 2) [m] of the numbers of the regions
+    protected: regions
+    critical: (R,) critical accumulation [veh], NaN where it was not seen
+    curves: R MFDs (n, 2) in veh and veh/s
+    step: control interval [s]
+    steps: number of control intervals
     """
 
     name: str
@@ -75,48 +93,55 @@ class CityPicture:
 
     @property
     def boundaries(self) -> tuple[Gate, ...]:
-        """One gate from a region to another for all between them, the controlled ones if there are
-        any."""
+        """One gate for all between two regions, in one direction.
+
+        It stands for the controlled ones if there are any.
+        """
+        between: dict[tuple[int, int], list[Gate]] = defaultdict(list)
+        for gate in self.gates:
+            between[gate.source, gate.target].append(gate)
+        setback = BOUNDARY_SETBACK * _extent(self.shapes)
         merged = []
-        setback = BOUNDARY_SETBACK * float(np.ptp(np.concatenate(self.shapes), axis=0).max())
-        for ends in dict.fromkeys((gate.source, gate.target) for gate in self.gates):
-            gates = [gate for gate in self.gates if (gate.source, gate.target) == ends]
-            gates = [gate for gate in gates if gate.signal] or gates
-            middle = np.mean([gate.place for gate in gates], axis=0)
-            back = self.places[ends[0]] - middle
+        for (source, _), gates in between.items():
+            controlled = [gate for gate in gates if gate.signal]
+            members = controlled or gates
+            middle = np.mean([gate.place for gate in members], axis=0)
+            back = self.places[source] - middle
             x, y = middle + setback * back / max(np.hypot(*back), 1e-9)
-            numbers = tuple(n for gate in gates for n in gate.gateways)
-            merged.append(replace(gates[0], place=(float(x), float(y)), gateways=numbers))
+            numbers: list[int] = []
+            for gate in members:
+                numbers.extend(gate.gateways)
+            place = (float(x), float(y))
+            merged.append(replace(members[0], place=place, gateways=tuple(numbers)))
         return tuple(merged)
 
     @classmethod
     def of(cls, scenario: Scenario, city: City) -> Self:
         """Return the picture of a scenario's city."""
-        shapes, network = edge_shapes(city), scenario.network
+        network = scenario.network
+        shapes = edge_shapes(city)
         region = city.edge_region
         middles = np.array([shape.mean(axis=0) for shape in shapes])
-        axes = [
-            np.linspace(0.0, min(mfd.jam, CURVE_END * mfd.critical), CURVE_POINTS)
-            for mfd in network.mfds
-        ]
+        lanes = np.array([city.lanes[edge] for edge in city.edges])
+        lane_metres = np.array([city.length[edge] * city.lanes[edge] for edge in city.edges])
+        curves = []
+        for mfd in network.mfds:
+            x = np.linspace(0.0, min(mfd.jam, CURVE_END * mfd.critical), CURVE_POINTS)
+            curves.append(np.stack([x, mfd.outflow(x)], axis=1))
         return cls(
             name=scenario.name,
             region_names=network.region_names,
             edges=city.edges,
             shapes=shapes,
-            lane_km=np.array([city.length[edge] * city.lanes[edge] for edge in city.edges])
-            / 1000.0,
-            lanes=np.array([city.lanes[edge] for edge in city.edges]),
+            lane_km=lane_metres / 1000.0,
+            lanes=lanes,
             region=region,
             outlines=rings_round(shapes, region, REGION_REACH),
             places=np.stack([middles[region == r].mean(axis=0) for r in range(city.regions)]),
             gates=_gates(city, dict(zip(city.edges, shapes, strict=True))),
             protected=scenario.protected,
             critical=network.seen_critical,
-            curves=[
-                np.stack([x, mfd.outflow(x)], axis=1)
-                for x, mfd in zip(axes, network.mfds, strict=True)
-            ],
+            curves=curves,
             step=scenario.step,
             steps=scenario.steps,
         )
@@ -124,15 +149,23 @@ class CityPicture:
 
 @dataclass(frozen=True, kw_only=True)
 class Frame:
-    """The city at one moment; flows and signals are those of the last complete control interval.
+    """City at one moment.
 
-    time: since the start [s]; intervals: completed ones; whole: True at the end of an interval
-    density: (E,) [veh/km and lane]; accumulation: (R,) [veh]; outflow: (R,) [veh/s]; waiting: to
-        enter [veh]
+    Flows and signals are those of the last complete control interval.
+
+    time: since the start [s]
+    intervals: number of completed ones
+    whole: True at the end of an interval
+    density: (E,) [veh/km and lane]
+    accumulation: (R,) [veh]
+    outflow: (R,) [veh/s]
+    waiting: to enter [veh]
     completed, removed: since the start [veh]
-    time_spent: total since the start [veh s]; perimeter: (R, R) commanded u; green: (G,) share of
-        the original green,
-    NaN without control; queue: (G,) halting vehicles; note: a warning
+    time_spent: total since the start [veh s]
+    perimeter: (R, R) commanded u
+    green: (G,) share of the original green, NaN without control
+    queue: (G,) halting vehicles
+    note: a warning
     """
 
     time: float = 0.0
@@ -152,7 +185,10 @@ class Frame:
 
 
 def first(picture: CityPicture, gateways: int, state: State) -> Frame:
-    """Return the frame at the start of a run in a city with so many gateways."""
+    """Return the frame at the start of a run.
+
+    gateways: their number in the city
+    """
     regions = picture.regions
     return Frame(
         density=np.zeros(len(picture.edges), np.float16),
@@ -166,7 +202,11 @@ def first(picture: CityPicture, gateways: int, state: State) -> Frame:
 
 
 def between(picture: CityPicture, before: Frame, time: float, vehicles: PerEdge) -> Frame:
-    """Return a frame within a control interval: the last whole one with new vehicles (E,)."""
+    """Return a frame within a control interval.
+
+    before: the last whole frame, from which all else is taken
+    vehicles: (E,) now
+    """
     return replace(
         before,
         time=time,
@@ -183,10 +223,16 @@ def after(
     state: State,
     row: Mapping[str, np.ndarray],
 ) -> Frame:
-    """Return the frame at the end of a control interval."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        green = row["gateway_green"] / row["gateway_original_green"]
+    """Return the frame at the end of a control interval.
+
+    row: variable of ROW -> its values in the interval
+    """
+    ungated = row["gateway_original_green"]
+    # A gate without any green to take is open.
+    green = np.divide(row["gateway_green"], ungated, out=np.ones_like(ungated), where=ungated != 0)
     flows = {name: row[name][None] for name in ("arrivals", "crossings")}
+    removed = 0.0 if state.removed is None else float(state.removed.sum())
+    warnings = [text for text in (controls.note, state.problem) if text]
     return Frame(
         time=state.time,
         intervals=state.step,
@@ -195,61 +241,82 @@ def after(
         outflow=regional_outflow(flows, picture.step)[0],
         waiting=float(state.backlog.sum()),
         completed=state.completed,
-        removed=0.0 if state.removed is None else float(state.removed.sum()),
+        removed=removed,
         time_spent=before.time_spent + float(row["time_spent"]),
         perimeter=controls.perimeter,
         green=green,
         queue=row["gateway_queue"].astype(float),
-        note="; ".join(filter(None, (controls.note, state.problem))),
+        note="; ".join(warnings),
     )
 
 
 def frames(picture: CityPicture, result: Any) -> list[Frame]:
-    """Return the frames of a finished run: one at its start and one at the end of every control
-    interval."""
-    parts = {
-        name: getattr(result, name) for name in ("accumulation", "backlog", "completed", "removed")
-    }
-    states = [
-        State(step=k, time=k * picture.step, **{name: values[k] for name, values in parts.items()})
-        for k in range(len(result.accumulation))
-    ]
-    made = [first(picture, result.gateway_green.shape[1], states[0])]
+    """Return the frames of a finished run.
+
+    One is at its start, the others at the ends of the control intervals.
+    """
+    states = []
+    for k in range(len(result["accumulation"])):
+        state = State(
+            step=k,
+            time=k * picture.step,
+            accumulation=result["accumulation"][k],
+            backlog=result["backlog"][k],
+            completed=result["completed"][k],
+            removed=result["removed"][k],
+        )
+        states.append(state)
+    made = [first(picture, result["gateway_green"].shape[1], states[0])]
     for k, state in enumerate(states[1:]):
-        controls = Controls(perimeter=result.perimeter[k], splits=None, note=str(result.note[k]))
-        row = {name: getattr(result, name)[k] for name in ROW}
+        controls = Controls(
+            perimeter=result["perimeter"][k], splits=None, note=str(result["note"][k])
+        )
+        row = {name: result[name][k] for name in ROW}
         made.append(after(picture, made[-1], controls, state, row))
     return made
 
 
 def totals(picture: CityPicture, results: Sequence[Any]) -> dict[str, list[PerEdge]]:
-    """Return label -> values (E,) over whole runs, one of each result, to colour the streets by; {}
-    without them."""
+    """Return label -> values (E,) over whole runs to colour streets by.
+
+    There is one of each result, and none at all if a result has no emissions.
+    """
     if any("co2" not in result for result in results):
         return {}
     kilometres = picture.lane_km / picture.lanes
     return {
-        "CO2 [kg/km]": [result.co2 / kilometres for result in results],
-        "longest queue [veh]": [result.queue_max.astype(float) for result in results],
+        "CO2 [kg/km]": [result["co2"] / kilometres for result in results],
+        "longest queue [veh]": [result["queue_max"].astype(float) for result in results],
     }
 
 
+def _extent(shapes: Sequence[Points]) -> float:
+    """Return the longer side [m] of the box around all shapes."""
+    return float(np.ptp(np.concatenate(shapes), axis=0).max())
+
+
 def _gates(city: City, shapes: Mapping[str, Points]) -> tuple[Gate, ...]:
-    """Return one gate for every edge that ends at a boundary and region behind it."""
-    members: dict[tuple[str, int], list[int]] = {}
-    for n, gateway in enumerate(city.gateways):
-        members.setdefault((gateway.from_edge, gateway.target), []).append(n)
-    setback = GATE_SETBACK * float(np.ptp(np.concatenate(list(shapes.values())), axis=0).max())
+    """Return one gate for every edge that ends at a boundary.
+
+    An edge that leads to several regions has a gate for each.
+    """
+    members: dict[tuple[str, int], list[int]] = defaultdict(list)
+    for number, gateway in enumerate(city.gateways):
+        members[gateway.from_edge, gateway.target].append(number)
+    setback = GATE_SETBACK * _extent(list(shapes.values()))
+
+    def before_its_end(length: float) -> float:
+        return max(length - setback, 0.5 * length)
+
     gates = []
     for (edge, target), numbers in members.items():
-        x, y = points_along(shapes[edge], lambda length: max(length - setback, 0.5 * length))
-        gates.append(
-            Gate(
-                source=city.gateways[numbers[0]].source,
-                target=target,
-                place=(float(x), float(y)),
-                gateways=tuple(numbers),
-                signal=any(city.gateways[n].signal is not None for n in numbers),
-            )
+        x, y = points_along(shapes[edge], before_its_end)
+        gate = Gate(
+            source=city.gateways[numbers[0]].source,
+            target=target,
+            place=(float(x), float(y)),
+            gateways=tuple(numbers),
+            signal=any(city.gateways[n].signal is not None for n in numbers),
         )
+        gates.append(gate)
     return tuple(gates)

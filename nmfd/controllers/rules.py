@@ -1,29 +1,55 @@
-"""Rule-based controllers: no control, route guidance by travel times, PI gating, greedy control,
-excitation."""
+"""Rule-based controllers: open gates, PI gating, greedy, excitation."""
 
-from dataclasses import replace
+from typing import ClassVar
 
 import numpy as np
 
+from nmfd.controllers.base import Options
 from nmfd.errors import InputError
-from nmfd.model.planning import Options, PlanningModel, options
+from nmfd.model.planning import PlanningModel
 from nmfd.runs.config import PositiveNumbers, Problem, got, setting
-from nmfd.types import Controls, Observation
+from nmfd.types import Controller, Controls, Observation
 
-# Of the excitation.
+# Excitation.
 HOLD_INTERVALS = (3, 9)  # control intervals between two draws, from and to
 SET_POINT_RANGE = (0.5, 1.3)  # factor of the set points
 DISTURBED_SHARE = 0.35  # of the gateways whose u is drawn at random
 MAX_DIVERTED_SHARE = 0.6  # of the vehicles with a random next region; more locks a city
 
 
-class NoControl:
-    """Open perimeter, u = u_max everywhere, without route guidance."""
+class NoControl(Options):
+    """Open perimeter, u = u_max, without route guidance: the reference."""
 
-    name = "no-control"
+    plans: ClassVar[bool] = False
 
-    def __init__(self, planning: PlanningModel):
-        self._controls = Controls(perimeter=planning.network.open_perimeter, splits=None)
+    def make(self, planning: PlanningModel) -> Controller:
+        return Constant("no-control", Controls(perimeter=planning.network.open_perimeter))
+
+
+class RouteGuidance(Options):
+    """Open perimeter with nominal split ratios.
+
+    In a city, drivers are guided by travel times within regions.
+    """
+
+    plans: ClassVar[bool] = False
+
+    @property
+    def guides(self) -> bool:
+        return True
+
+    def make(self, planning: PlanningModel) -> Controller:
+        network = planning.network
+        controls = Controls(perimeter=network.open_perimeter, splits=network.nominal_splits)
+        return Constant("route-guidance", controls)
+
+
+class Constant:
+    """Controller that always gives the same controls."""
+
+    def __init__(self, name: str, controls: Controls):
+        self.name = name
+        self._controls = controls
 
     def reset(self, seed: int = 0) -> None:
         pass
@@ -32,19 +58,8 @@ class NoControl:
         return self._controls
 
 
-class RouteGuidance(NoControl):
-    """Open perimeter with nominal split ratios: guidance by travel times within regions."""
-
-    name = "route-guidance"
-
-    def __init__(self, planning: PlanningModel):
-        super().__init__(planning)
-        self._controls = replace(self._controls, splits=planning.network.nominal_splits)
-
-
 class SetPoint(Options):
-    """Options of controllers that hold the accumulation of protected regions; cosim identify sets
-    it for probing."""
+    """Options of controllers that hold the accumulation of protected regions."""
 
     set_point: PositiveNumbers | None = setting(
         "accumulation to hold in each protected region; by default from the MFD", None, unit="veh"
@@ -58,12 +73,15 @@ class SetPoint(Options):
         return None
 
 
-class Gating(SetPoint):
-    """Options of PI gating.
+class PiGating(SetPoint):
+    """PI control of protected regions by the gates into them.
 
-    The default gains are moderate ones: on the benchmark kp from 0 to 5 and ki from 0.01 to 0.1
-    differ by less than 2 % in total time spent. They are relative to the critical accumulation, so
-    that they carry over to other cities.
+    The equation is that of nmfd.controllers.rules.PiGate. The default gains are moderate ones: on
+    the benchmark kp from 0 to 5 and ki from 0.01 to 0.1 differ by less than 2 % in total time
+    spent. They are relative to the critical accumulation, so that they carry over to other cities.
+
+        >>> nmfd.run("economic_mpc", nmfd.PiGating(kp=2.0), steps=1).controller
+        'pi-gating(kp=2.0)'
     """
 
     outflow_share: float = setting(
@@ -76,13 +94,23 @@ class Gating(SetPoint):
     kp: float = setting("proportional gain, per relative error", 1.0, unit="-", ge=0.0)
     ki: float = setting("integral gain, per relative error", 0.01, unit="1/s", gt=0.0)
 
+    def make(self, planning: PlanningModel) -> "PiGate":
+        """Return the controller. Raise InputError without a protected region."""
+        if not planning.protected:
+            last = planning.network.regions - 1
+            remedy = f"add protected = [<region>, ...] with regions from 0 to {last}"
+            problem = "pi-gating needs at least one protected region, got none"
+            raise InputError(f"{planning.where}: protected: {problem}; {remedy}")
+        return PiGate(planning, self)
 
-class PiGating:
-    """Incremental PI control of the accumulation n_p of every protected region p.
 
-    All entries h -> p have the same opening:
+class PiGate:
+    """Incremental PI control of the accumulation of protected regions.
 
-        u_hp(k) = clip(u_hp(k-1) + kp (n_p(k-1) - n_p(k)) / n_cr + ki dt (n_set - n_p(k)) / n_cr,  u_min, u_max)
+    n_p is the accumulation of the protected region p. All entries h -> p have the same opening:
+
+        u_hp(k) = clip(u_hp(k-1) + kp (n_p(k-1) - n_p(k)) / n_cr
+                       + ki dt (n_set - n_p(k)) / n_cr,  u_min, u_max)
 
     n_cr is the critical accumulation of p, dt the control interval, n_set the option set_point or
     the accumulation of outflow_share. u_hp(k-1) is the clipped value or, if the city reports it,
@@ -92,21 +120,17 @@ class PiGating:
 
     name = "pi-gating"
 
-    def __init__(self, planning: PlanningModel):
-        """Raise InputError without a protected region or for a wrong option."""
-        network, setup = planning.network, options(Gating, planning, self.name)
-        if not planning.protected:
-            missing = "pi-gating needs at least one protected region, got none; add protected = [<region>, ...]"
-            raise InputError(
-                f"{planning.where}: protected: {missing} with regions from 0 to {network.regions - 1}"
-            )
+    def __init__(self, planning: PlanningModel, options: PiGating):
+        network = planning.network
+        mfds = [network.mfds[region] for region in planning.protected]
         self.regions = np.array(planning.protected)
-        self.critical = np.array([network.mfds[region].critical for region in self.regions])
-        self.set_point = np.array(
-            setup.set_point
-            or [network.mfds[region].reaching(setup.outflow_share) for region in self.regions]
-        )
-        self._kp, self._ki = setup.kp, setup.ki * planning.step
+        self.critical = np.array([mfd.critical for mfd in mfds])
+        set_point = options.set_point
+        if set_point is None:
+            set_point = tuple(mfd.reaching(options.outflow_share) for mfd in mfds)
+        self.set_point = np.array(set_point)
+        self._kp = options.kp
+        self._ki = options.ki * planning.step
         self._open = network.open_perimeter
         self._entries = network.adjacency[:, self.regions]
         self._bounds = network.u_min, network.u_max
@@ -114,7 +138,7 @@ class PiGating:
 
     def reset(self, seed: int = 0) -> None:
         self._gate = np.full(len(self.regions), self._bounds[1])
-        self._before = None
+        self._before: np.ndarray | None = None
 
     def act(self, observation: Observation) -> Controls:
         now = observation.accumulation.sum(axis=1)[self.regions]
@@ -127,14 +151,21 @@ class PiGating:
         self._before = now
         perimeter = self._open.copy()
         perimeter[:, self.regions] = np.where(self._entries, self._gate, 0.0)
-        return Controls(perimeter=perimeter, splits=None)
+        return Controls(perimeter=perimeter)
 
 
-class Greedy:
-    """Greedy controller of Geroliminis, Haddad and Ramezani (2013, table I), at every boundary
-    separately.
+class Greedy(Options):
+    """Bang-bang control by the more congested of two regions (GreedyGate)."""
 
-    u_ih = u_min if h is congested, n_h > n_cr,h, and i is not, or less so, n_i / jam_i < n_h / jam_h; else u_max.
+    def make(self, planning: PlanningModel) -> Controller:
+        return GreedyGate(planning)
+
+
+class GreedyGate:
+    """Greedy controller of Geroliminis, Haddad and Ramezani (2013, table I).
+
+    u_ih = u_min if h is congested and i is not, or less so; else u_max. A region is congested if
+    n > n_cr, and less so if its n / jam is smaller.
     """
 
     name = "greedy"
@@ -151,13 +182,29 @@ class Greedy:
 
     def act(self, observation: Observation) -> Controls:
         vehicles = observation.accumulation.sum(axis=1)
-        congested, fullness = vehicles > self._critical, vehicles / self._jam
+        congested = vehicles > self._critical
+        fullness = vehicles / self._jam
         hold = congested & (~congested[:, None] | (fullness[:, None] < fullness))  # [i, h]
-        return Controls(perimeter=np.where(hold, self._closed, self._open), splits=None)
+        return Controls(perimeter=np.where(hold, self._closed, self._open))
 
 
-class Probing:
-    """Excitation for identification: gating at random set points, with some gateways at a random u.
+class Probing(SetPoint):
+    """Random excitation for `cosim identify` (Excitation)."""
+
+    plans: ClassVar[bool] = False
+
+    guidance: bool = setting("split ratios are drawn as well", False)
+
+    @property
+    def guides(self) -> bool:
+        return self.guidance
+
+    def make(self, planning: PlanningModel) -> Controller:
+        return Excitation(planning, self)
+
+
+class Excitation:
+    """Gating at random set points, with some gateways at a random u.
 
     Random controls alone would lock the city early; gating alone moves all gateways of a region
     together. With guidance, theta lies between the nominal split ratios and a random point of the
@@ -165,25 +212,24 @@ class Probing:
     vary around the option set_point, or else the critical accumulation.
     """
 
-    def __init__(self, planning: PlanningModel, *, guidance: bool):
-        """Raise InputError for a wrong option."""
-        self.name = "probing-pcrg" if guidance else "probing-pc"
-        self._network, self._guidance, self._gating = planning.network, guidance, None
-        middle = options(SetPoint, planning, self.name).set_point
-        middle = middle or tuple(
-            planning.network.mfds[region].critical for region in planning.protected
-        )
+    def __init__(self, planning: PlanningModel, options: Probing):
+        self.name = "probing-pcrg" if options.guidance else "probing-pc"
+        network = planning.network
+        self._network = network
+        self._guidance = options.guidance
+        middle = options.set_point
+        if middle is None:
+            middle = tuple(network.mfds[region].critical for region in planning.protected)
+        self._gating: PiGate | None = None
         if middle:
-            gating = replace(
-                planning, controller_options={PiGating.name: {"set_point": list(middle)}}
-            )
-            self._gating = PiGating(gating)
+            self._gating = PiGate(planning, PiGating(set_point=middle))
             self._gating.critical = np.array(middle)
-        self._open = planning.network.open_perimeter
+        self._open = network.open_perimeter
         self.reset()
 
     def reset(self, seed: int = 0) -> None:
-        self._random, self._left = np.random.default_rng([seed, 0x70726F62]), 0
+        self._random = np.random.default_rng([seed, 0x70726F62])
+        self._left = 0
         if self._gating is not None:
             self._gating.reset()
 
@@ -191,20 +237,21 @@ class Probing:
         if self._left == 0:
             self._draw()
         self._left -= 1
-        perimeter = self._open if self._gating is None else self._gating.act(observation).perimeter
-        return Controls(
-            perimeter=np.where(self._disturbed, self._random_u, perimeter), splits=self._splits
-        )
+        perimeter = self._open
+        if self._gating is not None:
+            perimeter = self._gating.act(observation).perimeter
+        perimeter = np.where(self._disturbed, self._random_u, perimeter)
+        return Controls(perimeter=perimeter, splits=self._splits)
 
     def _draw(self) -> None:
-        random, network = self._random, self._network
+        random = self._random
+        network = self._network
         self._left = int(random.integers(*HOLD_INTERVALS))
         if self._gating is not None:
             self._gating.set_point = random.uniform(*SET_POINT_RANGE) * self._gating.critical
-        self._random_u = random.uniform(network.u_min, network.u_max, network.adjacency.shape)
-        self._disturbed = network.adjacency & (
-            random.random(network.adjacency.shape) < DISTURBED_SHARE
-        )
+        shape = network.adjacency.shape
+        self._random_u = random.uniform(network.u_min, network.u_max, shape)
+        self._disturbed = network.adjacency & (random.random(shape) < DISTURBED_SHARE)
         self._splits = None
         if self._guidance:
             point = random.exponential(size=network.split_mask.shape) ** 2 * network.split_mask

@@ -1,407 +1,546 @@
-"""Strategies: a controller and what else the city does, parsed once from a name such as
-pi-gating+guided+max-pressure.
+"""Strategies: a controller, and labels that name what else a city does.
 
-dpc-pc+max-pressure      max-pressure at all signals, DPC limits the green of the gateways
-no-control+rerouting-30  no control, 30 % of the drivers reroute; `rerouting-30` for short
-mine.py:Gate+actuated    a controller of the user's own (nmfd.controllers.custom), actuated signals elsewhere
+pi-gating                    a built-in controller with the options of the scenario
+pi-gating(kp=2.0)            the same with these options alone, as the object nmfd.PiGating(kp=2.0)
+mine.py:Gate                 a class in a file (nmfd.controllers.custom)
+dpc-pc+max-pressure+guided   with labels, which mean something to a city in SUMO (cosim)
+
+Labels are opaque here: they choose tables of options, policy files and the model of guided drivers.
 """
 
 import hashlib
+import json
+import re
+import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
-from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 
-from nmfd.controllers import custom, open_loop
-from nmfd.controllers.dpc import compact, policy_file
-from nmfd.controllers.dpc.options import Training
-from nmfd.controllers.mpc import controller as mpc
-from nmfd.controllers.rules import (
-    Gating,
-    Greedy,
-    NoControl,
-    PiGating,
-    Probing,
-    RouteGuidance,
-    SetPoint,
-)
+from nmfd.controllers import custom
+from nmfd.controllers.base import Options, check_fit
+from nmfd.controllers.dpc import policy_file
+from nmfd.controllers.dpc.compact import GatingRule, PricingRule
+from nmfd.controllers.dpc.options import Dpc
+from nmfd.controllers.mpc.controller import EconomicMpc
+from nmfd.controllers.open_loop import Bound
+from nmfd.controllers.rules import Greedy, NoControl, PiGating, Probing, RouteGuidance
 from nmfd.errors import InputError, did_you_mean
 from nmfd.model.planning import (
-    Options,
+    GUIDED,
     PlanningModel,
     guided_model,
-    options,
     other_model,
     planning_model,
 )
+from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs import config, shipped
-from nmfd.runs.files import file_hash
+from nmfd.runs.files import file_hash, parts_of
 from nmfd.types import Controller
 
-ALONE = "no-control"  # the controller of a name that consists of city words
+ALONE = "no-control"  # the controller of a name that consists of labels
 OWN = "own"  # table in [controllers] with the tables of the user's own controllers
-# Files that controllers read: kind, end of the name, command that makes them.
-POLICY = ("policy", ".pt", "nmfd train {folder} --controller {name}")
-PLAN = ("plan", ".npz", "nmfd bound {folder} --controller {name}")
-VALUE = ("value function", ".npz", "python scenarios/economic_mpc/terminal_cost.py {name}")
-MODEL_FREE = ("no-control", "route-guidance", "probing-pc", "probing-pcrg")  # use no regional model
+NAME_AND_OPTIONS = re.compile(r"(?P<name>[\w-]+)\((?P<options>.*)\)")
 
 
 @dataclass(frozen=True, kw_only=True)
-class ControllerType:
-    """A built-in controller, or a class of the user's own.
+class BuiltIn:
+    """A built-in controller.
 
-    name: "pi-gating", "mine.py:Gate"; text: one line for help
-    make: (planning) or (file, planning) -> controller; for a plan (file, scenario)
-    guides: may guide routes; reads: kind of the file that it needs; options: their declaration;
-        own: the user's class
+    name: as in scenario.toml, such as "mpc-pcrg"
+    text: one line for help
+    options: their class
+    fixed: options that the name fixes
+    given: all options, instead of those of the scenario
     """
 
     name: str
     text: str
-    make: Callable[..., Controller] = field(compare=False)
-    guides: bool = False
-    reads: tuple[str, str, str] | None = None
-    options: type[Options] = Options
-    own: bool = False
+    options: type[Options]
+    fixed: Mapping[str, Any] = field(default_factory=dict, compare=False)
+    given: Options | None = None
+
+    def of_table(self, table: Mapping[str, Any], where: str, prefix: str) -> Options:
+        """Return the options of a table of scenario.toml. Raise InputError."""
+        for key, value in self.fixed.items():
+            if table.get(key, value) != value:
+                problem = (
+                    f"is {json.dumps(value)} for {self.name}; remove it, or choose another name"
+                )
+                raise config.error(where, prefix + key, problem)
+        return config.checked(self.options, {**table, **self.fixed}, where, prefix)
+
+    @property
+    def default(self) -> Options:
+        """Options without a scenario: those given, or the defaults."""
+        if self.given is not None:
+            return self.given
+        return self.options(**self.fixed)
 
 
-def _pair(name: str, text: str, make: Callable, **more: Any) -> list[ControllerType]:
-    """Return a controller without ("pc" in its name) and with route guidance ("pcrg")."""
-    alone: dict[str, Any] = {
-        "name": name.format("pc"),
-        "text": f"{text}, perimeter control",
-        "make": partial(make, guidance=False),
-    }
-    both: dict[str, Any] = {
-        "name": name.format("pcrg"),
-        "text": f"{alone['text']} and route guidance",
-        "guides": True,
-    }
+def _named(name: str, text: str, options: type[Options], **fixed: Any) -> tuple[str, BuiltIn]:
+    return name, BuiltIn(name=name, text=text, options=options, fixed=fixed)
+
+
+def _pair(name: str, text: str, options: type[Options], **fixed: Any) -> list[tuple[str, BuiltIn]]:
+    """Return a controller without ("pc") and with route guidance ("pcrg")."""
+    alone = f"{text}, perimeter control"
+    both = f"{alone} and route guidance"
     return [
-        ControllerType(**alone, **more),
-        ControllerType(**both, make=partial(make, guidance=True), **more),
+        _named(name.format("pc"), alone, options, guidance=False, **fixed),
+        _named(name.format("pcrg"), both, options, guidance=True, **fixed),
     ]
 
 
-CONTROLLERS: Mapping[str, ControllerType] = {
-    kind.name: kind
-    for kind in (
-        ControllerType(
-            name="no-control", text="open perimeter, no guidance: the reference", make=NoControl
+CONTROLLERS: Mapping[str, BuiltIn] = dict(
+    [
+        _named("no-control", "open perimeter, no guidance: the reference", NoControl),
+        _named("route-guidance", "guidance by travel times alone", RouteGuidance),
+        _named("pi-gating", "PI control of the protected regions", PiGating),
+        _named("greedy", "bang-bang control by the more congested of two regions", Greedy),
+        *_pair("mpc-{}", "economic MPC", EconomicMpc, terminal=False),
+        *_pair("mpc-{}-terminal", "economic MPC with terminal cost", EconomicMpc, terminal=True),
+        *_pair("probing-{}", "random excitation for cosim identify", Probing),
+        _named("gating-rule", "gates by numbers tuned in SUMO", GatingRule),
+        _named(
+            "pricing-rule",
+            "prices of ways through regions, and gates, by numbers tuned in SUMO",
+            PricingRule,
         ),
-        ControllerType(
-            name="route-guidance",
-            text="guidance by travel times alone",
-            make=RouteGuidance,
-            guides=True,
-        ),
-        ControllerType(
-            name="pi-gating",
-            text="PI control of the protected regions",
-            make=PiGating,
-            options=Gating,
-        ),
-        ControllerType(
-            name="greedy",
-            text="bang-bang control by the more congested of two regions",
-            make=Greedy,
-        ),
-        *_pair("mpc-{}", "economic MPC", mpc.EconomicMpc, options=mpc.Mpc),
-        *_pair(
-            "mpc-{}-terminal",
-            "economic MPC with terminal cost",
-            mpc.load,
-            reads=VALUE,
-            options=mpc.Mpc,
-        ),
-        *_pair("probing-{}", "random excitation for cosim identify", Probing, options=SetPoint),
-        ControllerType(
-            name="gating-rule",
-            text="gates by numbers tuned in SUMO",
-            make=partial(compact.rule, guidance=False),
-            options=compact.Rule,
-        ),
-        ControllerType(
-            name="pricing-rule",
-            text="prices of ways through regions, and gates, by numbers tuned in SUMO",
-            make=partial(compact.rule, guidance=True),
-            guides=True,
-            options=compact.Rule,
-        ),
-        *_pair("dpc-{}", "trained policy", policy_file.load, reads=POLICY, options=Training),
-        *_pair(
-            "bound-{}", "best plan with all demand known (nmfd bound)", open_loop.read, reads=PLAN
-        ),
-    )
-}
+        *_pair("dpc-{}", "trained policy", Dpc),
+        *_pair("bound-{}", "best plan with all demand known (nmfd bound)", Bound),
+    ]
+)
 
-# Word of a strategy -> key of [sumo], value, text.
-CITY_WORDS: Mapping[str, tuple[str, Any, str]] = {
-    "webster": ("signals", "webster", "fixed-time signals, optimised for the scenario's demand"),
-    "actuated": ("signals", "actuated", "signals that extend green while vehicles arrive"),
-    "max-pressure": ("signals", "max-pressure", "max-pressure control of all signals"),
-    "estimate": (
-        "measurement",
-        "estimate",
-        "controller and guidance see what detectors and probe vehicles tell",
-    ),
-    "metering": (
-        "metering",
-        1.2,
-        "trips wait outside while their region is full, or as the controller commands",
-    ),
-    "guided": ("guided", True, "drivers are guided by travel times"),
-}
-# Word-N -> key of [sumo], least N, largest N, unit, text.
-CITY_NUMBERS: Mapping[str, tuple[str, int, int, str, str]] = {
-    "rerouting": ("rerouting", 1, 100, "percent", "N percent of the drivers reroute by themselves"),
-    "compliance": ("compliance", 0, 100, "percent", "N percent of the drivers follow the guidance"),
-    "metering": (
-        "metering",
-        1,
-        1000,
-        "percent",
-        "metering at N percent of the critical accumulation",
-    ),
-    "guidance-period": (
-        "guidance_period",
-        1,
-        3600,
-        "seconds",
-        "drivers are guided again every N seconds",
-    ),
-}
+
+@dataclass(frozen=True, kw_only=True)
+class FromFile:
+    """A controller of the user's own: the class FILE.py:CLASS of that name."""
+
+    name: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Given:
+    """A controller that the user has made: an object with `reset` and `act`."""
+
+    name: str
+    controller: Controller = field(compare=False)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Strategy:
-    """A controller and the settings of the city that go with it.
+    """A controller and the labels that go with it.
 
     name: as the user wrote it
-    city: key of [sumo] (cosim.plant.settings.Settings) -> value, instead of the scenario's
-    words: the city's part of the name
+    labels: words behind the controller; only cities in SUMO know what they mean
     """
 
     name: str
-    controller: ControllerType
-    city: Mapping[str, Any] = field(default_factory=dict, compare=False)
-    words: tuple[str, ...] = ()
+    controller: BuiltIn | FromFile | Given
+    labels: tuple[str, ...] = ()
+
+    @property
+    def own(self) -> bool:
+        """True for code of the user's own, which may crash or never answer."""
+        return not isinstance(self.controller, BuiltIn)
 
     @property
     def guides(self) -> bool:
         """True if routes may be guided, by the controller or by travel times."""
-        return bool(self.city.get("guided")) or self.controller.guides
+        return GUIDED in self.labels or self.controller_guides
+
+    @property
+    def controller_guides(self) -> bool:
+        """True if the controller may guide routes."""
+        if isinstance(self.controller, BuiltIn):
+            return self.controller.default.guides
+        return isinstance(self.controller, FromFile)
 
     def regional(self) -> "Strategy":
-        """Return the strategy itself. Raise InputError if it has words for a city in SUMO."""
-        if self.words:
-            remedy = (
-                f"needs a city in SUMO (cosim); on the regional model use {self.controller.name}"
-            )
-            raise InputError(f"strategy {self.name!r}: +{'+'.join(self.words)} {remedy}")
+        """Return the strategy itself.
+
+        Raises: InputError if it has labels, which only a city in SUMO understands
+        """
+        if self.labels:
+            labels = "+".join(self.labels)
+            remedy = f"on the regional model use {self.controller.name}"
+            problem = f"+{labels} needs a city in SUMO (cosim); {remedy}"
+            raise InputError(f"strategy {self.name!r}: {problem}")
         return self
 
     def table(self, scenario: Scenario) -> str:
-        """Return its table in [controllers], the one with most of its words. Raise InputError if
-        several fit."""
+        """Return its table in [controllers], the one with most of its labels.
+
+        Raises: InputError if several tables fit
+        """
         name = self.controller.name
-        if self.controller.own:
+        if isinstance(self.controller, FromFile):
             return str(getattr(custom.load(name), "name", name))
-        split = {table: _split(table) for table in scenario.controller_options}
-        counts = {
-            table: len(w)
-            for table, (first, w) in split.items()
-            if first == name and set(w) <= set(self.words)
-        }
-        best = [table for table, count in counts.items() if count and count == max(counts.values())]
+        if not isinstance(self.controller, BuiltIn) or self.controller.given is not None:
+            return name
+        fitting = {}
+        for table in scenario.controller_options:
+            first, labels = split(table)
+            if first == name and labels and set(labels) <= set(self.labels):
+                fitting[table] = len(labels)
+        best = [table for table, count in fitting.items() if count == max(fitting.values())]
         if len(best) > 1:
             tables = " and ".join(f'[controllers."{table}"]' for table in best)
-            problem = (
-                f'the tables {tables} fit it equally well; add a table [controllers."{self.name}"]'
+            problem = f'fit it equally well; add a table [controllers."{self.name}"]'
+            raise InputError(
+                f"scenario.toml: strategy {self.name!r}: the tables {tables} {problem}"
             )
-            raise InputError(f"scenario.toml: strategy {self.name!r}: {problem}")
         return best[0] if best else name
 
+    def options(self, scenario: Scenario) -> Options | None:
+        """Return the options for `scenario`; None for the user's own code.
+
+        Raises: InputError
+        """
+        if isinstance(self.controller, BuiltIn):
+            return self._options(self.controller, scenario)
+        return None
+
+    def _options(self, kind: BuiltIn, scenario: Scenario) -> Options:
+        if kind.given is not None:
+            return kind.given
+        prefix = f"controllers.{self.table(scenario)}."
+        return kind.of_table(self._own_table(scenario), scenario.where, prefix)
+
     def make(self, scenario: Scenario, policy: Path | None = None) -> Controller:
-        """Return a controller for `scenario`, which shares no array with it. Raise InputError.
+        """Return a controller for `scenario`, which shares no array with it.
 
         policy: file of a policy, plan or value function instead of the scenario's
+        Raises: InputError
         """
-        file, kind = self.file(scenario, policy), self.controller
-        known = scenario if kind.reads == PLAN else self._planning(scenario)
-        return kind.make(known) if file is None else kind.make(file, known)
+        kind = self.controller
+        file = self.file(scenario, policy)
+        if isinstance(kind, Given):
+            return kind.controller
+        planning = self.own_planning(scenario)
+        if isinstance(kind, FromFile):
+            return custom.OwnController(kind.name, planning)
+        options = self._options(kind, scenario)
+        where = f"{kind.name}: "
+        if kind.given is None:
+            where = f"{planning.where}: controllers.{self.table(scenario)}."
+        check_fit(options, planning, where)
+        if file is None:
+            return options.make(planning)
+        return options.load(file, planning, scenario)
 
     def planning(self, scenario: Scenario) -> PlanningModel:
-        """Return the planning model that predicts the runs of the strategy. Raise InputError.
+        """Return the planning model that predicts the runs of the strategy.
 
         It is that of the controller, or the city's model with guided drivers if nothing else guides
         routes.
+        Raises: InputError
         """
-        planned, guided = self._planning(scenario), guided_model(scenario.network)
-        if planned.network.folder == scenario.network.folder and self.guides and guided is not None:
+        planned = self.own_planning(scenario)
+        guided = guided_model(scenario.network)
+        of_city = planned.network.folder == scenario.network.folder
+        if of_city and self.guides and guided is not None:
             return replace(planned, network=other_model(scenario, guided))
         return planned
 
-    def _planning(self, scenario: Scenario) -> PlanningModel:
+    def own_planning(self, scenario: Scenario) -> PlanningModel:
+        """Return the planning model of the controller, with its options.
+
+        Raises: InputError
+        """
         table = self.table(scenario)
-        if self.controller.own:
-            tables = scenario.controller_options
-            return planning_model(
-                replace(scenario, controller_options={**tables, **tables.get(OWN, {})}), table
-            )
-        return planning_model(scenario, self.controller.name, table)
+        own = self._own_table(scenario)
+        network = self._network(scenario, own.pop("model", None), table)
+        tables = {**scenario.controller_options}
+        if isinstance(self.controller, FromFile):
+            tables |= tables.get(OWN, {})
+            tables[table] = own
+        else:
+            tables[self.controller.name] = own
+        return planning_model(replace(scenario, controller_options=tables), network)
+
+    def _own_table(self, scenario: Scenario) -> dict[str, Any]:
+        """Return the options as they were given or written.
+
+        Those of the strategy's table replace those of the controller's.
+        """
+        kind = self.controller
+        if isinstance(kind, BuiltIn) and kind.given is not None:
+            return kind.given.model_dump(exclude_unset=True, exclude=set(kind.fixed))
+        tables = scenario.controller_options
+        if isinstance(kind, FromFile):
+            tables = {**tables, **tables.get(OWN, {})}
+        return {**tables.get(kind.name, {}), **tables.get(self.table(scenario), {})}
+
+    def _network(self, scenario: Scenario, model: Any, table: str) -> RegionalModel | None:
+        """Return the regional model to plan with; None for the scenario's.
+
+        model: the option of that name. Without it, controllers that guide routes by a model plan
+            with that of guided drivers, if the city has one
+        Raises: InputError
+        """
+        kind = self.controller
+        if isinstance(kind, BuiltIn) and kind.given is not None and model is not None:
+            return other_model(scenario, shipped.found(model, shipped.NETWORK), f"{table}: model")
+        if model is not None and scenario.folder is not None:
+            prefix = f"controllers.{table}."
+            text = config.checked(Options, {"model": model}, scenario.where, prefix).model
+            where = f"{scenario.where}: {prefix}model"
+            return other_model(scenario, scenario.folder / str(text), where)
+        if isinstance(kind, BuiltIn) and kind.default.plans and kind.default.guides:
+            folder = guided_model(scenario.network)
+            if folder is not None:
+                return other_model(scenario, folder)
+        return None
 
     def file(self, scenario: Scenario, policy: Path | None = None) -> Path | None:
-        """Return the file that `make` reads, None without: `policy`, or the scenario's. Raise
-        InputError."""
-        kind, table = self.controller, self.table(scenario)
-        if kind.reads is None:
+        """Return the file that `make` reads; None if it reads none.
+
+        policy: the file, instead of the one that the options name or the scenario's
+        Raises: InputError if it is missing
+        """
+        kind = self.controller
+        reads = kind.default.reads if isinstance(kind, BuiltIn) else None
+        if not isinstance(kind, BuiltIn) or reads is None:
             if policy is not None:
                 raise InputError(f"{policy}: controller {kind.name} reads no policy; omit it")
             return None
-        text, suffix, command = kind.reads
         folder = scenario.folder or Path()
-        path = (
-            folder / (table + suffix) if policy is None else shipped.found(policy, shipped.SCENARIO)
-        )
+        table = self.table(scenario)
+        named = self._options(kind, scenario).file if policy is None else policy
+        if named is None:
+            path = folder / (table + reads.suffix)
+        elif policy is None and kind.given is None:
+            path = folder / named
+        else:
+            path = shipped.found(named, shipped.SCENARIO)
         if not path.is_file():
-            command = command.format(folder=folder, name=table)
-            raise InputError(f"{path}: no such {text} for {kind.name}; make one with: {command}")
+            command = reads.command.format(folder=folder, name=table)
+            problem = f"no such {reads.text} for {kind.name}; make one with: {command}"
+            raise InputError(f"{path}: {problem}")
         return path
 
     def fingerprint(self, scenario: Scenario, policy: Path | None = None) -> dict[str, Any]:
-        """Return what its runs depend on besides city and demand: options, files and model. Raise
-        InputError."""
-        name = self.controller.name
-        if name == ALONE:
+        """Return what its runs depend on besides city and demand.
+
+        These are options, files and model.
+        Raises: InputError
+        """
+        kind = self.controller
+        if isinstance(kind, BuiltIn) and kind.options is NoControl:
             return {}
-        tables, table, file = (
-            scenario.controller_options,
-            self.table(scenario),
-            self.file(scenario, policy),
-        )
-        tables = tables.get(OWN, {}) if self.controller.own else tables
-        setup = {**tables.get(name, {}), **tables.get(table, {})}
+        setup = json.loads(json.dumps(self._own_table(scenario), default=str))
         setup.pop("model", None)  # its hash counts
-        if name in MODEL_FREE:
-            splits = scenario.network.nominal_splits if self.controller.guides else np.empty(0)
-            return {
-                "options": setup,
-                "splits_hash": hashlib.sha256(splits.round(9).tobytes()).hexdigest()[:16],
-            }
-        model = [
-            self._planning(scenario).network.hash,
-            scenario.integrator,
-            scenario.substeps,
-            *scenario.protected,
-        ]
-        files = {} if file is None else {"policy_hash": file_hash(file)}
-        return {
-            "options": setup,
-            "model": model,
-            **files,
-            **(custom.fingerprint(name) if self.controller.own else {}),
-        }
+        if isinstance(kind, BuiltIn) and not kind.default.plans and kind.default.reads is None:
+            splits = scenario.network.nominal_splits if kind.default.guides else np.empty(0)
+            digest = hashlib.sha256(splits.round(9).tobytes()).hexdigest()[:16]
+            return {"options": setup, "splits_hash": digest}
+        model = self.own_planning(scenario).network.hash
+        scheme = [scenario.integrator, scenario.substeps, *scenario.protected]
+        result: dict[str, Any] = {"options": setup, "model": [model, *scheme]}
+        file = self.file(scenario, policy)
+        if file is not None:
+            result["policy_hash"] = file_hash(file)
+        if isinstance(kind, FromFile):
+            result |= custom.fingerprint(kind.name)
+        if isinstance(kind, Given):
+            result["object"] = custom.object_fingerprint(kind.controller)
+        return result
 
     def outside_training(self, scenario: Scenario, level: float, policy: Path | None = None) -> str:
-        """Return a sentence if `level` times the demand is outside the training range of its
-        policy, else ""."""
-        file = self.file(scenario, policy) if self.controller.reads == POLICY else None
-        return (
-            "" if file is None else policy_file.outside_training(policy_file.read_file(file), level)
-        )
+        """Return a sentence if the demand is outside the training range.
+
+        level: factor of the scenario's demand
+        """
+        kind = self.controller
+        if not isinstance(kind, BuiltIn) or kind.options is not Dpc:
+            return ""
+        file = self.file(scenario, policy)
+        assert file is not None  # Dpc reads one
+        return policy_file.outside_training(policy_file.read_file(file), level)
 
 
-def parse(controller: str | Controller, city: str = "") -> Strategy:
-    """Return the strategy CONTROLLER+WORD+..., or that of a controller object with the words of
-    `city`.
+ControllerLike: TypeAlias = str | Options | Controller | Strategy
 
-    Raises: InputError for unknown or contradictory words
+
+def parse(controller: ControllerLike) -> Strategy:
+    """Return the strategy of a controller.
+
+    controller: a name, options, or an object with `reset` and `act`
+    Raises: InputError for an unknown controller or options that are wrong
 
     >>> strategy = parse("pi-gating+max-pressure")
-    >>> strategy.controller.name, strategy.city["signals"]
-    ('pi-gating', 'max-pressure')
+    >>> strategy.controller.name, strategy.labels
+    ('pi-gating', ('max-pressure',))
     """
+    if isinstance(controller, Strategy):
+        return controller
+    if isinstance(controller, Options):
+        kind = named(controller)
+        return Strategy(name=kind.name, controller=kind)
     if isinstance(controller, str):
-        name = f"{controller}+{city}" if city else controller
-        first, words = _split(name)
-        if _city_setting(first) is not None:
-            first, words = ALONE, [first, *words]
-        kind = CONTROLLERS.get(first) or _own(first)
-        if kind is None:
-            raise _unknown(name, first, controllers=True)
+        first, labels = split(controller)
+        return Strategy(name=controller, controller=_kind(controller, first), labels=labels)
+    methods = (getattr(controller, name, None) for name in ("reset", "act"))
+    if isinstance(controller, type) or not all(map(callable, methods)):
+        expected = "a name, options such as nmfd.PiGating(), or an object with reset and act"
+        raise InputError(f"controller: expected {expected}, got {controller!r}")
+    name = str(getattr(controller, "name", type(controller).__name__))
+    return Strategy(name=name, controller=Given(name=name, controller=controller))
+
+
+def split(name: str) -> tuple[str, tuple[str, ...]]:
+    """Return the controller and the labels of a name.
+
+    The path of a user's own controller and the options in parentheses may contain +.
+    """
+    head, dot, tail = name.rpartition(".py:")
+    first, *labels = parts_of(tail, "+")
+    return head + dot + first, tuple(labels)
+
+
+def named(options: Options) -> BuiltIn:
+    """Return a built-in controller with given options.
+
+    Its name contains them.
+
+    >>> named(PiGating(kp=2.0)).name
+    'pi-gating(kp=2.0)'
+    """
+    for kind in CONTROLLERS.values():
+        if type(options) is not kind.options:
+            continue
+        values = {name: getattr(options, name) for name in kind.fixed}
+        if "guidance" in values:
+            values["guidance"] = options.guides
+        if values == kind.fixed:
+            break
     else:
-        if not (
-            callable(getattr(controller, "reset", None))
-            and callable(getattr(controller, "act", None))
-        ):
-            raise InputError(
-                f"controller: expected a name or an object with reset and act, got {controller!r}"
-            )
-        first = getattr(controller, "name", type(controller).__name__)
-        name, words = (f"{first}+{city}", _split(f"+{city}")[1]) if city else (first, [])
-        kind = ControllerType(name=first, text="object", make=lambda planning: controller)
-    settings: dict[str, Any] = {"gateways_fixed": first != ALONE}
-    by_key: dict[str, str] = {}
-    for word in words:
-        setting = _city_setting(word)
-        if setting is None:
-            raise _unknown(name, word, controllers=False)
-        key, value = setting
-        if word == "guided" and kind.guides and not kind.own:
-            raise InputError(f"strategy {name!r}: {first} guides routes itself; omit {word}")
-        if key in by_key:
-            raise InputError(
-                f"strategy {name!r}: {by_key[key]} and {word} exclude each other; omit one of them"
-            )
-        by_key[key], settings[key] = word, value
-    return Strategy(name=name, controller=kind, city=settings, words=tuple(words))
+        raise InputError(f"controller: expected options of a built-in one, got {options!r}")
+    given = []
+    for name in type(options).model_fields:
+        if name in options.model_fields_set and name not in kind.fixed:
+            given.append(f"{name}={json.dumps(getattr(options, name), default=str)}")
+    name = f"{kind.name}({', '.join(given)})" if given else kind.name
+    return replace(kind, name=name, given=options)
+
+
+def _kind(name: str, first: str) -> BuiltIn | FromFile:
+    """Return the controller of the name `first` in `name`.
+
+    Raises: InputError if it is unknown
+    """
+    if custom.FILE_AND_CLASS.fullmatch(first):
+        return FromFile(name=first)
+    if first in CONTROLLERS:
+        return CONTROLLERS[first]
+    match = NAME_AND_OPTIONS.fullmatch(first)
+    if match and match["name"] in CONTROLLERS:
+        kind = CONTROLLERS[match["name"]]
+        try:
+            table = tomllib.loads(f"options = {{{match['options']}}}")["options"]
+        except tomllib.TOMLDecodeError:
+            form = f"{match['name']}(key=value, ...), values as in scenario.toml"
+            raise InputError(f"controller {first!r}: expected {form}") from None
+        return named(kind.of_table(table, f"controller {first!r}", ""))
+    if first.endswith(".py"):
+        raise InputError(f"controller {first}: name its class, such as {first}:MyController")
+    where = f"controller {first!r}" if first == name else f"strategy {name!r}: {first!r}"
+    hint = did_you_mean(first, CONTROLLERS)
+    allowed = f"{', '.join(CONTROLLERS)} or file.py:Class"
+    raise InputError(f"{where} is unknown{hint}; choose from {allowed}")
+
+
+S = TypeVar("S", bound=Strategy)
 
 
 def parse_many(
-    given: str | Sequence[str], scenario: Scenario, *, regional: bool = False
-) -> list[Strategy]:
-    """Return the strategies of names and patterns (*, ?, [...]), as a sequence or separated by
-    commas.
+    given: ControllerLike | Sequence[ControllerLike],
+    scenario: Scenario,
+    parse: Callable[[Any], S],
+) -> list[S]:
+    """Return the strategies of controllers and patterns (*, ?, [...]).
 
-    A pattern stands for all `ready` strategies that match and are not named besides.
-    regional: without words for a city; Raises: InputError for an unknown name, none, or a pattern
-        without a match
+    given: a controller, a sequence, or names separated by commas. A pattern stands for all `ready`
+        strategies that match and are not named besides
+    parse: makes a strategy of each
+    Raises: InputError for an unknown name, none, or a pattern without a match
     """
-    names = [name.strip() for name in given.split(",")] if isinstance(given, str) else list(given)
-    if not any(names):
-        raise InputError(
-            "controllers: expected at least one controller, got none; name one, such as no-control"
-        )
-    plain = [name for name in names if not any(sign in name for sign in "*?[") or _own(name)]
-    result: dict[str, Strategy] = {}
-    for name in names:
-        if name in plain:
-            result[name] = parse(name).regional() if regional else parse(name)
+    if isinstance(given, str):
+        controllers: list[Any] = list(parts_of(given))
+    elif isinstance(given, Sequence):
+        controllers = list(given)
+    else:
+        controllers = [given]
+    if not any(controllers):
+        nothing = "expected at least one controller, got none; name one, such as no-control"
+        raise InputError(f"controllers: {nothing}")
+    plain: dict[str, S] = {}
+    order: list[str | S] = []  # patterns, and strategies
+    for controller in controllers:
+        if isinstance(controller, str) and _is_pattern(controller):
+            order.append(controller)
             continue
-        known = {one.name: one for one in ready(scenario) if not (regional and one.words)}
-        matching = [match for match in known if fnmatchcase(match, name)]
-        if not matching:
-            raise InputError(
-                f"controllers: no controller here matches {name!r}; choose from {', '.join(known)}"
-            )
-        result |= {match: known[match] for match in matching if match not in (*plain, *result)}
+        strategy = parse(controller)
+        if strategy.name in plain:
+            _check_same(strategy, plain[strategy.name])
+        plain[strategy.name] = strategy
+        order.append(strategy)
+    result: dict[str, S] = {}
+    for entry in order:
+        if isinstance(entry, str):
+            for one in _matching(entry, scenario, parse):
+                if one.name not in plain:
+                    result.setdefault(one.name, one)
+        else:
+            result[entry.name] = entry
     return list(result.values())
 
 
-def ready(scenario: Scenario) -> list[Strategy]:
-    """Return the strategies that can be made for `scenario`: built-in ones, and those with tables
-    or policies."""
-    files = sorted(scenario.folder.glob("*+*.pt")) if scenario.folder else []
-    tables = [name for name in scenario.controller_options if "+" in name]
+def _check_same(one: Strategy, other: Strategy) -> None:
+    """Raise InputError if two controller objects have the same name."""
+    if not isinstance(one.controller, Given) or not isinstance(other.controller, Given):
+        return
+    if one.controller.controller is not other.controller.controller:
+        remedy = "give each object an attribute `name` of its own"
+        raise InputError(f"controllers: two have the name {one.name!r}; {remedy}")
+
+
+def _is_pattern(name: str) -> bool:
+    plain = custom.FILE_AND_CLASS.fullmatch(name) or NAME_AND_OPTIONS.match(name)
+    return not plain and any(sign in name for sign in "*?[")
+
+
+def _matching(pattern: str, scenario: Scenario, parse: Callable[[Any], S]) -> list[S]:
+    """Return the `ready` strategies whose names match.
+
+    Raises: InputError if none does
+    """
+    known = ready(scenario, parse)
+    matching = [one for one in known if fnmatchcase(one.name, pattern)]
+    if not matching:
+        names = ", ".join(one.name for one in known)
+        problem = f"no controller here matches {pattern!r}; choose from {names}"
+        raise InputError(f"controllers: {problem}")
+    return matching
+
+
+def ready(scenario: Scenario, parse: Callable[[Any], S]) -> list[S]:
+    """Return the strategies that can be made for `scenario`.
+
+    These are the built-in ones, and those with tables or policies.
+    """
+    names = [*CONTROLLERS]
+    if scenario.folder is not None:
+        names += [file.stem for file in sorted(scenario.folder.glob("*+*.pt"))]
+    names += [table for table in scenario.controller_options if "+" in table]
     result = []
-    for name in dict.fromkeys([*CONTROLLERS, *(file.stem for file in files), *tables]):
+    for name in dict.fromkeys(names):
         try:
             strategy = parse(name)
             strategy.file(scenario)
@@ -412,76 +551,21 @@ def ready(scenario: Scenario) -> list[Strategy]:
 
 
 def check_tables(scenario: Scenario) -> None:
-    """Raise InputError for a wrong option in any table of [controllers], used or not."""
+    """Check the options in all tables of [controllers], used or not.
+
+    Raises: InputError
+    """
     planning = planning_model(scenario)
     for table, content in scenario.controller_options.items():
         if table == OWN:
             continue
+        first, _ = split(table)
         try:
-            kind = parse(table).controller
+            kind = _kind(table, first)
         except InputError as error:
-            raise config.error(planning.where, f"controllers.{table}", str(error)) from None
-        merged = {**scenario.controller_options.get(kind.name, {}), **content}
-        options(
-            kind.options,
-            replace(planning, controller_options={kind.name: merged}),
-            kind.name,
-            table,
-        )
-
-
-def city_words() -> list[tuple[str, str]]:
-    """Return every word for the city with its text."""
-    return [
-        *((f"+{word}", text) for word, (_, _, text) in CITY_WORDS.items()),
-        *((f"+{word}-N", text) for word, (*_, text) in CITY_NUMBERS.items()),
-    ]
-
-
-def _split(name: str) -> tuple[str, list[str]]:
-    """Return the controller and the words of a name; the path of a user's own controller may
-    contain +."""
-    head, dot, tail = name.rpartition(".py:")
-    cls, *words = tail.split("+")
-    return head + dot + cls, words
-
-
-def _city_setting(word: str) -> tuple[str, Any] | None:
-    """Return key and value of [sumo] for a word, None if there is no such word."""
-    if word in CITY_WORDS:
-        return CITY_WORDS[word][:2]
-    stem, _, digits = word.rpartition("-")
-    if stem in CITY_NUMBERS and digits.isdecimal() and digits == str(int(digits)):
-        key, least, largest, unit, _ = CITY_NUMBERS[stem]
-        if least <= int(digits) <= largest:
-            return key, int(digits) / 100 if unit == "percent" else float(digits)
-    return None
-
-
-def _own(name: str) -> ControllerType | None:
-    """Return the controller of the user's own with the name FILE.py:CLASS, else None."""
-    if custom.FILE_AND_CLASS.fullmatch(name) is None:
-        return None
-    make = partial(custom.OwnController, name)
-    return ControllerType(
-        name=name, text="controller of your own", make=make, guides=True, own=True
-    )
-
-
-def _unknown(name: str, word: str, *, controllers: bool) -> InputError:
-    if word.endswith(".py"):
-        return InputError(f"controller {word}: name its class, such as {word}:MyController")
-    where = f"controller {name!r}" if word == name else f"strategy {name!r}: {word!r}"
-    words = [*CITY_WORDS, *(f"{stem}-N" for stem in CITY_NUMBERS)]
-    hint = did_you_mean(word, [*(CONTROLLERS if controllers else ()), *words])
-    ranges = ", ".join(
-        f"{stem}-N from {low} to {high} {u}" for stem, (_, low, high, u, _) in CITY_NUMBERS.items()
-    )
-    first = (
-        f"{', '.join(CONTROLLERS)} or file.py:Class, with words joined by +: "
-        if controllers
-        else ""
-    )
-    return InputError(
-        f"{where} is unknown{hint}; choose from {first}{', '.join(words)} (whole numbers, {ranges})"
-    )
+            raise config.error(scenario.where, f"controllers.{table}", str(error)) from None
+        if isinstance(kind, BuiltIn):
+            merged = {**scenario.controller_options.get(kind.name, {}), **content}
+            prefix = f"controllers.{table}."
+            options = kind.of_table(merged, scenario.where, prefix)
+            check_fit(options, planning, f"{scenario.where}: {prefix}")

@@ -1,4 +1,6 @@
-"""A controller of your own. Try it, on the regional model and in SUMO, beside the others:
+"""A controller of your own.
+
+Try it on the regional model and in SUMO, beside the others:
 
     nmfd benchmark economic_mpc --controllers no-control,pi-gating,FILE:MyController
     cosim run grid7_peak --controller FILE:MyController --against no-control
@@ -14,8 +16,10 @@ from nmfd import Controls, Observation, PlanningModel
 
 
 class MyController:
-    """Proportional gating of the regions that the scenario protects, of every region if it names
-    none."""
+    """Proportional gating of the protected regions.
+
+    If the scenario protects none, every region is gated.
+    """
 
     # The name of its table of options in scenario.toml, if it has one:
     # [controllers.own.my-controller].
@@ -25,19 +29,23 @@ class MyController:
     files = ()
 
     def __init__(self, planning: PlanningModel):
-        """Called once. See help(nmfd.PlanningModel): .step [s], .forecast (T, R, R) [veh/s],
-        .network ..."""
+        """Called once. See help(nmfd.PlanningModel).
+
+        It has .step (s), .forecast (veh/s, (T, R, R)), .network, ...
+        """
         self.network = planning.network
         options = planning.controller_options.get(self.name, {})
         self.gain = options.get("gain", 5.0)  # [-]
         regions = np.arange(self.network.regions)
         self.gated = np.isin(regions, planning.protected or regions)
-        self.set_point = options.get("share", 0.9) * np.array(
-            [mfd.critical for mfd in self.network.mfds]
-        )  # [veh]
+        critical = [mfd.critical for mfd in self.network.mfds]  # [veh]
+        self.set_point = options.get("share", 0.9) * np.array(critical)
 
     def reset(self, seed: int = 0) -> None:
-        """Called before every run: forget the last one. Random numbers must follow from `seed`."""
+        """Called before every run: forget the last one.
+
+        Random numbers must follow from `seed`.
+        """
 
     def act(self, observation: Observation) -> Controls:
         """Called at every control interval.
@@ -54,9 +62,8 @@ class MyController:
         """
         inside = observation.accumulation.sum(axis=1)
         excess = np.maximum(inside - self.set_point, 0.0) / self.set_point
-        opening = np.clip(
-            self.network.u_max - self.gain * excess, self.network.u_min, self.network.u_max
-        )
+        opening = self.network.u_max - self.gain * excess
+        opening = np.clip(opening, self.network.u_min, self.network.u_max)
         opening = np.where(self.gated, opening, self.network.u_max)
         perimeter = np.where(self.network.adjacency, opening, 0.0)  # [i, h]: the opening of h
         return Controls(perimeter=perimeter, splits=None)

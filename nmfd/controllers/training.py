@@ -1,16 +1,14 @@
-"""Training of DPC policies: roll out the regional model under the policy and descend the total time
-spent.
+"""Training of DPC policies by gradient descent on the total time spent.
 
-Random initial states and demand keep gradients alive: a rollout that gridlocks has none.
+Every step rolls out the regional model under the policy. Rollouts start from random states and
+demands, because a rollout that ends in gridlock has no gradient.
 """
 
 import copy
-import io
 import math
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,20 +17,21 @@ import torch
 from torch import Generator, nn
 from torch.optim import Adam
 
+from nmfd.controllers.base import check_fit
 from nmfd.controllers.dpc.compact import CompactPolicy, Numbers
-from nmfd.controllers.dpc.options import Training
-from nmfd.controllers.dpc.policy import Architecture, ModuleController, Policy
-from nmfd.controllers.dpc.policy_file import checkpoint, new_policy, read_file
-from nmfd.controllers.dpc.rollout import Rollout, Trajectories, compiled_step
-from nmfd.controllers.rules import PiGating
+from nmfd.controllers.dpc.first_policy import begin_as_gate, begin_as_no_control, first_policy
+from nmfd.controllers.dpc.keepers import FileKeeper, Keeper, ModuleKeeper, State
+from nmfd.controllers.dpc.options import Dpc
+from nmfd.controllers.dpc.policy import ModuleController, Policy
+from nmfd.controllers.dpc.rollout import Demands, Rollout, States, Trajectories, compiled_step
 from nmfd.controllers.strategy import Strategy
 from nmfd.errors import InputError, RunFailed
 from nmfd.model.authority import NO_GATEWAY
-from nmfd.model.planning import PlanningModel, options, planning_model
+from nmfd.model.commands import admissible
+from nmfd.model.planning import PlanningModel
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs.config import error
-from nmfd.runs.files import atomic
 from nmfd.tensors import one_thread
 from nmfd.types import Observation
 
@@ -41,91 +40,90 @@ RANDOM_START_SHARE = 0.5  # of the rollouts start from a random state at a rando
 VALIDATION_PERIOD = 20  # Adam steps
 VALIDATION_ROLLOUTS = 16  # perturbed rollouts in a validation, if training perturbs demand or model
 WORTH_COMPILING = 200  # Adam steps
-# First policy from a gate: Adam steps, states in each, learning rate; width of the gate and largest
-# accumulation, as a share of the set point; opening without a gate.
-GATE_STEPS, GATE_BATCH, GATE_RATE, GATE_WIDTH, GATE_FULLEST, GATE_OPEN = (
-    1000,
-    256,
-    2e-3,
-    0.05,
-    2.5,
-    0.95,
-)
-# First policy from no control: factor of the weights, logit of u, least theta. Instead of it, a
-# policy that is open whatever happens is kept if none gains WORTH in validation.
-NO_CONTROL_WEIGHT, NO_CONTROL_LOGIT, NO_CONTROL_SPLIT = 0.1, 3.0, 1e-3
-OPEN_LOGIT, WORTH = 12.0, 0.03
+# A policy that begins as no control must gain WORTH in validation. Otherwise one is kept whose
+# gates have this logit, which is open in every state.
+WORTH = 0.03
+OPEN_LOGIT = 12.0
 
 
-def settings(scenario: Scenario, strategy: Strategy, steps: int | None = None) -> Training:
-    """Return the training settings of a strategy; `steps` overrides. Raise InputError."""
-    kind, table = strategy.controller, strategy.table(scenario)
-    if kind.options is not Training:
-        raise InputError(
-            f"--controller: {strategy.name!r} cannot be trained; choose dpc-pc or dpc-pcrg"
-        )
+def settings(scenario: Scenario, strategy: Strategy, steps: int | None = None) -> Dpc:
+    """Return the options of a policy to train; `steps` overrides. Raise InputError."""
+    setup = strategy.options(scenario)
+    table = strategy.table(scenario)
+    name = strategy.controller.name
+    if not isinstance(setup, Dpc):
+        problem = "cannot be trained; choose dpc-pc or dpc-pcrg"
+        raise InputError(f"--controller: {strategy.name!r} {problem}")
     if table != strategy.name:
-        needs = f'needs a table [controllers."{strategy.name}"] in {scenario.where} with its differences'
-        raise InputError(f"--controller: {strategy.name!r} {needs}; add one, or train {kind.name}")
-    planning = planning_model(scenario, kind.name, table)
-    setup = options(Training, planning, kind.name, table)
-    if setup.local and kind.guides:
-        raise error(
-            planning.where,
-            f"controllers.{table}.local",
-            "a local policy guides no routes; train dpc-pc",
-        )
-    if setup.prices and not kind.guides:
-        raise error(
-            planning.where, f"controllers.{table}.prices", "prices guide drivers; train dpc-pcrg"
-        )
+        needs = f'needs a table [controllers."{strategy.name}"] in {scenario.where}'
+        remedy = f"add one, or train {name}"
+        raise InputError(f"--controller: {strategy.name!r} {needs} with its differences; {remedy}")
+    prefix = f"controllers.{table}."
+    check_fit(setup, strategy.own_planning(scenario), f"{scenario.where}: {prefix}")
+    if setup.local and setup.guides:
+        problem = "a local policy guides no routes; train dpc-pc"
+        raise error(scenario.where, f"{prefix}local", problem)
+    if setup.prices and not setup.guides:
+        raise error(scenario.where, f"{prefix}prices", "prices guide drivers; train dpc-pcrg")
     return setup if steps is None else setup.changed(steps=steps)
 
 
 def check(scenario: Scenario, strategy: Strategy) -> None:
-    """Raise InputError without gateways, or for placeholder MFDs of the model to train on."""
-    city, believed = scenario.network, strategy.planning(scenario).network
+    """Check that a training is worth its time.
+
+    Raises: InputError without gateways, or for placeholder MFDs of the model to train on
+    """
+    city = scenario.network
+    believed = strategy.planning(scenario).network
     still = "nmfd.train(..., anyway=True) trains all the same"
     if city.controllable is not None and not city.controllable.any():
-        raise InputError(
-            f"{_file(city)}: controllable: is 0 at every boundary: {NO_GATEWAY}; {still}"
-        )
+        problem = f"controllable: is 0 at every boundary: {NO_GATEWAY}"
+        raise InputError(f"{_file(city)}: {problem}; {still}")
     if believed.placeholder:
-        guess = "is true: its MFDs are guesses from lanes and speed limits"
+        problem = "placeholder: is true: its MFDs are guesses from lanes and speed limits"
         remedy = f"run 'cosim identify {city.folder}' or put in your own"
-        raise InputError(f"{_file(believed)}: placeholder: {guess}; {remedy}; {still}")
+        raise InputError(f"{_file(believed)}: {problem}; {remedy}; {still}")
 
 
 def _file(network: RegionalModel) -> Path | str:
-    return network.name if network.folder is None else network.folder / "network.toml"
+    if network.folder is None:
+        return network.name
+    return network.folder / "network.toml"
 
 
 def available(device: str) -> str:
-    """Return "cpu" or "cuda"; "auto" is the GPU if there is one. Raise InputError for a missing
-    GPU."""
-    if device == "cuda" and not torch.cuda.is_available():
+    """Return "cpu" or "cuda"; "auto" is the GPU if there is one.
+
+    Raises: InputError for a missing GPU
+    """
+    if device == "cpu":
+        return "cpu"
+    if torch.cuda.is_available():
+        return "cuda"
+    if device == "cuda":
         raise InputError(
             "--device: cuda asked for, but PyTorch finds no GPU here; choose cpu or auto"
         )
-    return (
-        "cuda" if device == "auto" and torch.cuda.is_available() else device.replace("auto", "cpu")
-    )
+    return "cpu"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """Cost, sample and constraints of the user's own, as of nmfd.train; by default the total time
-    spent."""
+    """Cost, sample and constraints of the user's own; see nmfd.train.
+
+    By default the cost is the total time spent.
+    """
 
     cost: Callable[[Trajectories], torch.Tensor] | None = None
     sample: Callable[[Generator, int], tuple] | None = None
     constraints: Sequence[tuple[Callable[[Trajectories], torch.Tensor], float]] = ()
 
     def __post_init__(self) -> None:
-        if not all(map(callable, filter(None, (self.cost, self.sample)))):
-            raise InputError(
-                f"cost, sample: expected functions, got {self.cost!r} and {self.sample!r}; see nmfd.train"
-            )
+        parts: tuple[object, ...] = (self.cost, self.sample)
+        for part in parts:
+            if part is not None and not callable(part):
+                got = f"got {self.cost!r} and {self.sample!r}"
+                raise InputError(f"cost, sample: expected functions, {got}; see nmfd.train")
         for pair in self.constraints:
             if not (isinstance(pair, tuple) and len(pair) == 2 and callable(pair[0])):
                 raise InputError(
@@ -135,8 +133,9 @@ class Task:
     @property
     def own(self) -> str:
         """Names of its parts, "" for the default."""
-        parts = [self.cost, self.sample, *(part for part, _ in self.constraints)]
-        return ", ".join(getattr(part, "__qualname__", repr(part)) for part in parts if part)
+        parts = [self.cost, self.sample, *(penalty for penalty, _ in self.constraints)]
+        given = [part for part in parts if part is not None]
+        return ", ".join(getattr(part, "__qualname__", repr(part)) for part in given)
 
 
 @one_thread()
@@ -155,11 +154,12 @@ def train(
     anyway: bool = False,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> Any:
-    """Train the policy of `strategy` and write the best in validation to `out`; the same seed gives
-    the same weights.
+    """Train the policy of a strategy.
 
-    module: instead of the policy, trained in place and returned with its best weights, without a
-        file
+    The best in validation is written to `out`. The same seed gives the same weights.
+
+    module: trained in place instead of the policy and returned with its best weights; no file is
+        written
     resume: continue from the state in `out`.resume
     compiled: compile the step, about twice as fast after a minute or two; the weights differ by
         rounding
@@ -168,286 +168,271 @@ def train(
     """
     setup = settings(scenario, strategy, steps)
     if module is not None:
-        if not isinstance(module, nn.Module) or not any(
-            weights.requires_grad for weights in module.parameters()
-        ):
-            raise InputError(
-                f"policy: expected an nn.Module with weights to train, got {module!r:.60}; give one"
-            )
-        empty = np.zeros(scenario.network.adjacency.shape)
-        ModuleController(module, scenario).act(
-            Observation(step=0, time=0.0, accumulation=empty, backlog=empty)
-        )
+        _check_module(module, scenario)
     elif not anyway:
         check(scenario, strategy)
-    planning = planning_model(scenario, strategy.controller.name, strategy.table(scenario))
-    configuration = {
-        "controller": strategy.name,
-        "scenario": planning.name,
-        "seed": seed,
-        "compiled": compiled,
-    }
-    configuration |= vars(setup) | ({"task": task.own} if task.own else {})
+    planning = strategy.own_planning(scenario)
     torch.manual_seed(seed)
-    generator = Generator().manual_seed(seed)
-    recipe, steps, guidance = setup.recipe, setup.steps, strategy.controller.guides
-    policy = _first_policy(setup, planning, guidance=guidance) if module is None else module
-    device = "cpu" if isinstance(policy, CompactPolicy) else device
-    policy = policy.to(device).train()
-    costs = {
-        "detour_cost": setup.detour_cost,
-        "holding_cost": setup.holding_cost,
-        "process_std": recipe.process_std,
-    }
-    rollout = Rollout(planning, next(policy.parameters()).dtype, device, **costs)
-    if setup.from_gating and not resume and module is None:
-        begin_as_gate(policy, rollout, generator)
-    advance = compiled_step(rollout.step) if compiled else rollout.step
-    optimizer = Adam(policy.parameters(), lr=setup.learning_rate, weight_decay=recipe.weight_decay)
-    first, best, kept = 0, float("inf"), copy.deepcopy(policy.state_dict())
-    state_file = None if out is None else out.with_name(out.name + ".resume")
-    objective = partial(_loss, policy, rollout, setup, task)
-
-    def keep_the_better(best: float) -> float:
-        with torch.no_grad():
-            fixed = Generator().manual_seed(seed)
-            own = objective(fixed, VALIDATION_ROLLOUTS).item() if task.own else None
-        score = validate(policy, rollout, seed, setup) if own is None else own
-        if score < best and out is not None:
-            key = "validation" if task.own else "validation_veh_s"
-            write(checkpoint(policy, planning.network, {**configuration, key: score}), out)
-        elif score < best:
-            kept.update(copy.deepcopy(policy.state_dict()))
-        return min(best, score)
-
-    if resume and state_file is not None:
-        first, best = _restore(state_file, configuration, policy, optimizer, generator)
-    bar = None
-    if setup.from_no_control and not resume and module is None and not task.own:
-        initial = copy.deepcopy(policy.state_dict())
-        begin_as_no_control(policy, planning.network, weight=0.0, logit=OPEN_LOGIT)
-        bar = best = (1.0 - WORTH) * keep_the_better(best)
-        policy.load_state_dict(initial)
-    for step in range(first, steps):
-        cosine = 0.5 * (1.0 + math.cos(math.pi * (step / steps)))
-        for group in optimizer.param_groups:
-            group["lr"] = recipe.learning_rate or setup.learning_rate * (0.1 + 0.9 * cosine)
-        _descend(
-            policy, objective(generator, recipe.batch, advance), optimizer, setup, step, task.own
-        )
-        if (step + 1) % VALIDATION_PERIOD == 0 or step + 1 == steps:
-            best = keep_the_better(best)
-            state = {"configuration": configuration, "step": step + 1, "best": best}
-            state |= {"policy": policy.state_dict(), "optimizer": optimizer.state_dict()}
-            if state_file is not None:
-                write(state | {"generator": generator.get_state()}, state_file)
+    keeper: Keeper
+    if module is None:
+        assert out is not None
+        configuration = {
+            "controller": strategy.name,
+            "scenario": planning.name,
+            "seed": seed,
+            "compiled": compiled,
+            **setup.model_dump(exclude={"policy"}),
+        }
+        if task.own:
+            configuration["task"] = task.own
+        policy = first_policy(setup, planning, guidance=setup.guides)
+        keeper = FileKeeper(policy, planning.network, configuration, out)
+    else:
+        keeper = ModuleKeeper(module)
+        setup = setup.changed(from_gating=False, from_no_control=False)  # it begins as it is
+    run = TrainingRun(keeper, planning, setup, task, seed, device, compiled)
+    if resume:
+        keeper.resume(run.restore)
+    else:
+        run.prepare()
+    while run.done < setup.steps:
+        run.step()
+        if run.done % VALIDATION_PERIOD == 0 or run.done == setup.steps:
+            run.validate()
+            keeper.save(run.state())
         if progress:
-            progress(step + 1, steps, f"best {best:.4g}" + ("" if task.own else " veh s"))
-    if best == bar:
+            unit = "" if task.own else " veh s"
+            best = f"best {run.best:.4g}{unit}" if math.isfinite(run.best) else "no validation yet"
+            progress(run.done, setup.steps, best)
+    if run.best == run.bar:
         print(
             f"nmfd: no policy gained {WORTH:.0%} on the model: its gates stay open", file=sys.stderr
         )
-    if not math.isfinite(best):
+    if not math.isfinite(run.best):
         raise RunFailed(
-            f"{strategy.name}: every validation of {steps} steps diverged; lower the learning rate"
+            f"{strategy.name}: every validation of {setup.steps} steps diverged; "
+            "lower the learning rate"
         )
-    if state_file is not None:
-        state_file.unlink(missing_ok=True)
-        return out
-    policy.load_state_dict(kept)
-    return policy.cpu().eval()
+    return keeper.finish()
 
 
-def _first_policy(setup: Training, planning: PlanningModel, *, guidance: bool) -> Policy:
-    """Return the untrained policy that the settings describe."""
-    recipe = setup.recipe
-    architecture = Architecture(
-        guidance=guidance,
-        local=setup.local,
-        compact=planning.protected if setup.compact else (),
-        metering=setup.metering,
-        prices=setup.prices,
-        soft_exponential=recipe.activation != "gelu",
-        decoder_layers=recipe.decoder_layers,
-    )
-    policy = new_policy(planning.network, architecture)
-    if setup.numbers and isinstance(policy, CompactPolicy):
-        policy.numbers.data.copy_(torch.tensor(Numbers(*setup.numbers)))
-    if setup.from_no_control:
-        begin_as_no_control(policy, planning.network)
-    return policy
+def _check_module(module: nn.Module, scenario: Scenario) -> None:
+    """Check a module on an empty city.
 
-
-def _loss(
-    policy: nn.Module,
-    rollout: Rollout,
-    setup: Training,
-    task: Task,
-    generator: Generator,
-    batch: int,
-    advance: Callable | None = None,
-) -> torch.Tensor:
-    """Return the loss of `batch` rollouts under random models, from random states and demands or
-    those of the task."""
-    most, levels = setup.recipe.largest_start, (setup.demand_low, setup.demand_high)
-    rollout.draw_model(batch, setup.mfd_spread, generator, setup.mfd_scale)
-    if task.sample:
-        given = task.sample(generator, batch)
-        x, demand = (
-            torch.as_tensor(part, dtype=rollout.dtype, device=rollout.device) for part in given
-        )
-        if (
-            x.shape != (batch, *rollout.start.shape)
-            or demand.shape[1:] != x.shape
-            or len(demand) < 2
-        ):
-            wanted = f"start ({batch}, R, R) and demand (T, {batch}, R, R) with R = {len(rollout.start)} and T > 1"
-            raise InputError(
-                f"sample: expected {wanted}, got {tuple(x.shape)} and {tuple(demand.shape)}; return these"
-            )
-    else:
-        spread, share = (0.0, 0.0) if most else (DEMAND_SPREAD, RANDOM_START_SHARE)
-        x, demand = rollout.random_start(batch, spread, share, generator, levels)
-        x = x + most * torch.rand(x.shape, generator=generator).to(x) if most else x
-        demand = rollout.perturb(
-            demand, torch.rand(batch, generator=generator), setup.noise, generator
-        )
-    if not (task.cost or task.constraints):
-        total = rollout.total_time_spent(policy, x, demand, generator, advance)
-        # The logarithm, because a rollout that is heavily loaded must not count for more than the
-        # others.
-        return (
-            torch.log(total.clamp(min=1.0)).mean() if setup.recipe.loss == "log" else total.mean()
-        )
-    run = rollout.trajectories(policy, x, demand, generator, advance)
-    loss = torch.as_tensor(task.cost(run) if task.cost else run.total_time_spent).mean()
-    return loss + sum(weight * penalty(run).mean() for penalty, weight in task.constraints)
-
-
-def _descend(
-    policy: nn.Module, loss: torch.Tensor, optimizer: Adam, setup: Training, step: int, own: str
-) -> None:
-    if not loss.requires_grad:
+    Raises: InputError without weights, or for wrong controls
+    """
+    is_module = isinstance(module, nn.Module)
+    if not is_module or not any(weights.requires_grad for weights in module.parameters()):
         raise InputError(
-            "cost: has no gradient by the weights of the policy; compute it from the run with torch"
+            f"policy: expected an nn.Module with weights to train, got {module!r:.60}; give one"
         )
-    optimizer.zero_grad()
-    loss.backward()
-    if isinstance(policy, CompactPolicy):
-        policy.numbers.grad[[Numbers._fields.index(name) for name in setup.kept]] = 0.0
-    decoders = policy.decoders if isinstance(policy, Policy) else []
-    for n, decoder in enumerate(
-        decoders
-    ):  # in turn; not by requires_grad, which would compile the step once for each
-        for weights in (
-            decoder.parameters() if n != step // setup.recipe.epoch % len(decoders) else ()
-        ):
-            weights.grad = None
-    size = torch.nn.utils.clip_grad_norm_(policy.parameters(), setup.recipe.clip)
-    if own and not size.isfinite():
-        what = f"{own}: in step {step} the cost is {loss.item():.4g} and the norm of its gradient {size.item():.4g}"
-        raise InputError(f"{what}; look for 0 / 0, log(0) and sqrt(0) in your own functions")
-    optimizer.step()
-    if isinstance(policy, CompactPolicy):
-        policy.bound()
+    empty = np.zeros(scenario.network.adjacency.shape)
+    observation = Observation(step=0, time=0.0, accumulation=empty, backlog=empty)
+    controller = ModuleController(module, scenario)
+    admissible(controller.act(observation), scenario.network, f"{controller.name}: interval 0")
 
 
-def begin_as_no_control(
-    policy: Policy,
-    network: RegionalModel,
-    weight: float = NO_CONTROL_WEIGHT,
-    logit: float = NO_CONTROL_LOGIT,
-) -> None:
-    """Make `policy` nearly independent of the state, with open gateways, nominal split ratios or no
-    prices.
+class TrainingRun:
+    """Gradient descent of one policy, with validations and a state.
 
-    weight: factor of the weights; logit: of u
+    done: steps taken
+    best: lowest validation, total time spent (veh s) or cost of the task; infinite before the first
+    bar: what a validation must fall below; None if the policy does not begin as no control
     """
-    with torch.no_grad():
-        for decoder in policy.decoders:
-            decoder.weight.mul_(weight)
-        policy.perimeter_decoder.bias.fill_(logit)
-        if policy.architecture.guidance and not policy.architecture.prices:
-            own = torch.tensor(
-                network.nominal_splits[np.arange(network.regions)[:, None], policy.onward.numpy()]
+
+    def __init__(
+        self,
+        keeper: Keeper,
+        planning: PlanningModel,
+        setup: Dpc,
+        task: Task,
+        seed: int,
+        device: str,
+        compiled: bool,
+    ):
+        self.done = 0
+        self.best = math.inf
+        self.bar: float | None = None
+        self._keeper = keeper
+        self._setup = setup
+        self._recipe = setup.recipe
+        self._task = task
+        self._seed = seed
+        self._generator = Generator().manual_seed(seed)
+        if isinstance(keeper.policy, CompactPolicy):
+            device = "cpu"  # a few numbers
+        self._policy = keeper.policy.to(device).train()
+        self._rollout = Rollout(
+            planning,
+            next(self._policy.parameters()).dtype,
+            device,
+            detour_cost=setup.detour_cost,
+            holding_cost=setup.holding_cost,
+            process_std=self._recipe.process_std,
+        )
+        step = self._rollout.step
+        self._advance = compiled_step(step) if compiled else step
+        self._optimizer = Adam(
+            self._policy.parameters(),
+            lr=setup.learning_rate,
+            weight_decay=self._recipe.weight_decay,
+        )
+
+    def prepare(self) -> None:
+        """Begin like a gate or like no control if the settings say so."""
+        if self._setup.from_gating:
+            begin_as_gate(self._policy, self._rollout, self._generator)
+        if self._setup.from_no_control and not self._task.own:
+            # Keep a policy that is always open until one gains WORTH.
+            first = copy.deepcopy(self._policy.state_dict())
+            network = self._rollout.planning.network
+            begin_as_no_control(self._policy, network, weight=0.0, logit=OPEN_LOGIT)
+            self.validate()
+            self.best *= 1.0 - WORTH
+            self.bar = self.best
+            self._policy.load_state_dict(first)
+
+    def step(self) -> None:
+        """Take one step of Adam."""
+        cosine = 0.5 * (1.0 + math.cos(math.pi * (self.done / self._setup.steps)))
+        falling = self._setup.learning_rate * (0.1 + 0.9 * cosine)
+        for group in self._optimizer.param_groups:
+            group["lr"] = self._recipe.learning_rate or falling
+        loss = self._loss(self._generator, self._recipe.batch, self._advance)
+        if not loss.requires_grad:
+            raise InputError(
+                "cost: has no gradient by the weights of the policy; "
+                "compute it from the run with torch"
             )
-            policy.splits_decoder.bias.copy_(own.clamp(min=NO_CONTROL_SPLIT).log().flatten())
-
-
-def begin_as_gate(policy: Policy, rollout: Rollout, generator: Generator) -> None:
-    """Fit `policy` to gates that close the entries of protected regions as these fill, half at the
-    set point."""
-    network, gate = rollout.planning.network, PiGating(rollout.planning)
-    protected = gate.regions.tolist()
-    set_point = torch.tensor(gate.set_point, dtype=rollout.dtype, device=rollout.device)
-    counts = rollout.parameters.adjacency.expand(GATE_BATCH, -1, -1)
-    optimizer = Adam(policy.parameters(), lr=GATE_RATE)
-    for _ in range(GATE_STEPS):
-        x, _ = rollout.random_start(GATE_BATCH, 0.0, 1.0, generator)
-        full = (
-            torch.rand(GATE_BATCH, len(protected), generator=generator).to(x)
-            * GATE_FULLEST
-            * set_point
-        )
-        x[:, protected] *= (full / x[:, protected].sum(-1).clamp(min=1.0)).unsqueeze(-1)
-        wanted = torch.full_like(x, GATE_OPEN)
-        wanted[:, :, protected] = torch.sigmoid(
-            (set_point - full) / (GATE_WIDTH * set_point)
-        ).unsqueeze(1)
-        share = (policy(x)[0] - network.u_min) / (network.u_max - network.u_min)
-        loss = torch.nn.functional.binary_cross_entropy(
-            share.clamp(0.0, 1.0), wanted, weight=counts
-        )
-        optimizer.zero_grad()
+        self._optimizer.zero_grad()
         loss.backward()
-        optimizer.step()
+        self._clear_gradients()
+        norm = torch.nn.utils.clip_grad_norm_(self._policy.parameters(), self._recipe.clip)
+        if self._task.own and not norm.isfinite():
+            cost = f"the cost is {loss.item():.4g} and the norm of its gradient {norm.item():.4g}"
+            remedy = "look for 0 / 0, log(0) and sqrt(0) in your own functions"
+            raise InputError(f"{self._task.own}: in step {self.done} {cost}; {remedy}")
+        self._optimizer.step()
+        if isinstance(self._policy, CompactPolicy):
+            self._policy.bound()
+        self.done += 1
+
+    def _clear_gradients(self) -> None:
+        """Clear the gradients of all that this step leaves alone.
+
+        These are the kept numbers of a compact policy, and the decoders whose turn it is not.
+        """
+        policy = self._policy
+        if isinstance(policy, CompactPolicy):
+            kept = [Numbers._fields.index(name) for name in self._setup.kept]
+            policy.numbers.grad[kept] = 0.0
+        elif isinstance(policy, Policy):
+            # Not by requires_grad: torch would compile the step once for every decoder.
+            turn = self.done // self._recipe.epoch % len(policy.decoders)
+            for number, decoder in enumerate(policy.decoders):
+                if number != turn:
+                    decoder.zero_grad()
+
+    def _loss(
+        self, generator: Generator, batch: int, advance: Callable | None = None
+    ) -> torch.Tensor:
+        """Return the mean loss of `batch` rollouts, each under a random model."""
+        setup = self._setup
+        task = self._task
+        self._rollout.draw_model(batch, setup.mfd_spread, generator, setup.mfd_scale)
+        x, demand = self._start(generator, batch)
+        if task.cost is None and not task.constraints:
+            total = self._rollout.total_time_spent(self._policy, x, demand, generator, advance)
+            if self._recipe.loss == "log":
+                # So that a heavily loaded rollout does not count for more than the others.
+                total = torch.log(total.clamp(min=1.0))
+            return total.mean()
+        run = self._rollout.trajectories(self._policy, x, demand, generator, advance)
+        cost = run.total_time_spent if task.cost is None else task.cost(run)
+        loss = torch.as_tensor(cost).mean()
+        return loss + sum(weight * penalty(run).mean() for penalty, weight in task.constraints)
+
+    def _start(self, generator: Generator, batch: int) -> tuple[States, Demands]:
+        """Return random initial states and demands, or those of the task."""
+        rollout = self._rollout
+        if self._task.sample is not None:
+            sample = self._task.sample(generator, batch)
+            x, demand = (
+                torch.as_tensor(part, dtype=rollout.dtype, device=rollout.device) for part in sample
+            )
+            start_fits = x.shape == (batch, *rollout.start.shape)
+            if not start_fits or demand.shape[1:] != x.shape or len(demand) < 2:
+                wanted = f"start ({batch}, R, R) and demand (T, {batch}, R, R)"
+                where = f"R = {len(rollout.start)} and T > 1"
+                got = f"{tuple(x.shape)} and {tuple(demand.shape)}"
+                raise InputError(f"sample: expected {wanted} with {where}, got {got}; return these")
+            return x, demand
+        setup = self._setup
+        levels = (setup.demand_low, setup.demand_high)
+        largest = self._recipe.largest_start
+        if largest:
+            x, demand = rollout.random_start(batch, 0.0, 0.0, generator, levels)
+            x = x + largest * torch.rand(x.shape, generator=generator, dtype=torch.float32).to(x)
+        else:
+            x, demand = rollout.random_start(
+                batch, DEMAND_SPREAD, RANDOM_START_SHARE, generator, levels
+            )
+        noise_level = torch.rand(batch, generator=generator, dtype=torch.float32)
+        return x, rollout.perturb(demand, noise_level, setup.noise, generator)
+
+    def validate(self) -> None:
+        """Validate the policy, and keep it if it is the best so far."""
+        if self._task.own:
+            key = "validation"
+            fixed = Generator().manual_seed(self._seed)
+            with torch.no_grad():
+                score = self._loss(fixed, VALIDATION_ROLLOUTS).item()
+        else:
+            key = "validation_veh_s"
+            score = validate(self._policy, self._rollout, self._seed, self._setup)
+        if score < self.best:
+            self.best = score
+            self._keeper.keep({key: score})
+
+    def state(self) -> State:
+        """Return all that `restore` needs."""
+        return {
+            "step": self.done,
+            "best": self.best,
+            "policy": self._policy.state_dict(),
+            "optimizer": self._optimizer.state_dict(),
+            "generator": self._generator.get_state(),
+        }
+
+    def restore(self, state: State) -> None:
+        """Continue from the state of an interrupted training."""
+        self._policy.load_state_dict(state["policy"])
+        self._optimizer.load_state_dict(state["optimizer"])
+        self._generator.set_state(state["generator"])
+        self.done = int(state["step"])
+        self.best = float(state["best"])
 
 
-def validate(policy: Policy, rollout: Rollout, seed: int, setup: Training) -> float:
-    """Return the TTS (veh s) of the scenario itself, the geometric mean of two noise draws.
+def validate(policy: Policy, rollout: Rollout, seed: int, setup: Dpc) -> float:
+    """Return the total time spent (veh s) of the scenario itself.
 
-    If training perturbs demand or model, also of VALIDATION_ROLLOUTS perturbed rollouts of
-    increasing sigma.
+    It is a geometric mean over two draws of the noise. If training perturbs demand or model, there
+    are VALIDATION_ROLLOUTS more under increasing perturbations.
     """
-    generator, low, high = Generator().manual_seed(seed), setup.demand_low, setup.demand_high
-    count = 2 + (VALIDATION_ROLLOUTS if setup.noise or setup.mfd_spread or low < high else 0)
+    generator = Generator().manual_seed(seed)
+    low = setup.demand_low
+    high = setup.demand_high
+    count = 2
+    if setup.noise or setup.mfd_spread or low < high:
+        count += VALIDATION_ROLLOUTS
     rollout.draw_model(count, setup.mfd_spread, generator, setup.mfd_scale)
-    level = torch.linspace(0.0, 1.0, count // 2).repeat_interleave(2)
+    level = torch.linspace(0.0, 1.0, count // 2, dtype=torch.float32).repeat_interleave(2)
     nominal = rollout.demand.unsqueeze(1).expand(-1, count, -1, -1)
     demand = rollout.perturb(nominal, level, setup.noise, generator)
     if low < high:
         factor = low + (high - low) * level[torch.randperm(count, generator=generator)]
         demand = demand * factor.to(demand)[:, None, None]
+    start = rollout.start.expand_as(demand[0])
     with torch.no_grad():
-        total = rollout.total_time_spent(
-            policy, rollout.start.expand_as(demand[0]), demand, generator
-        )
+        total = rollout.total_time_spent(policy, start, demand, generator)
     return torch.log(total).mean().exp().item()
-
-
-def _restore(
-    state_file: Path,
-    configuration: Mapping[str, Any],
-    policy: Policy,
-    optimizer: Adam,
-    generator: Generator,
-) -> tuple[int, float]:
-    """Restore the state of a training; return the number of its next step and its best
-    validation."""
-    state = read_file(state_file, "nothing to resume; train without --resume")
-    for key, value in configuration.items():
-        if (before := state["configuration"].get(key)) != value:
-            remedy = "resume with the same settings or train without --resume"
-            raise InputError(f"{state_file}: {key}: was {before!r}, now {value!r}; {remedy}")
-    policy.load_state_dict(state["policy"])
-    optimizer.load_state_dict(state["optimizer"])
-    generator.set_state(state["generator"])
-    return int(state["step"]), float(state["best"])
-
-
-def write(content: dict, path: Path) -> None:
-    """Write a checkpoint or the state of a training; the same content gives the same bytes."""
-    buffer = io.BytesIO()  # given a path, torch would write its name into the file
-    torch.save(content, buffer)
-    with atomic(path) as temporary:
-        temporary.write_bytes(buffer.getvalue())

@@ -1,13 +1,14 @@
-"""Answer of guided drivers to prices in the regional model: a logit over the next regions.
+"""Answer of guided drivers to prices: a logit over the next regions.
 
-A price c_i multiplies the travel time through region i by 1 + c_i for guided drivers bound for
-elsewhere (nmfd.types.Controls). Around the nominal theta0, with the dispersion s of the regional
-model (RegionalModel),
+It is that of the regional model. A price c_i multiplies the travel time through region i by
+1 + c_i for guided drivers bound for elsewhere (nmfd.types.Controls). The split ratios lie around
+the nominal theta0, with the dispersion s (RegionalModel):
 
-    theta_ihj ~ theta0_ihj exp(-e_hj / s),    e_hj = c_h t_hj + sum_g theta0_hgj e_gj for h != j,
+    theta_ihj ~ theta0_ihj exp(-e_hj / s)
+    e_hj = c_h t_hj + sum_g theta0_hgj e_gj        for h != j, otherwise 0
 
-t_hj the mean time to leave h on the way to j, so that e_hj is what the prices add from h on. It is
-differentiable.
+t_hj is the mean time to leave h on the way to j, so that e_hj is what the prices add from h on. The
+answer is differentiable.
 """
 
 import torch
@@ -21,33 +22,45 @@ MAX_DELAY_FACTOR = 20.0  # largest time to leave a region, relative to free flow
 
 
 class Answer(nn.Module):
-    """Split ratios (-, (..., R, R, R)) in the states x (veh, (..., R, R)) under prices (-, (...,
-    R)); no weights."""
+    """Split ratios as a function of state and prices, without weights."""
 
     def __init__(self, network: RegionalModel):
         super().__init__()
         self.dispersion = network.dispersion
-        self.register_buffer(
-            "own", torch.tensor(network.nominal_splits, dtype=torch.float32), persistent=False
-        )
-        self._network, self._hops = network, int(network.hops.max())
+        nominal = torch.tensor(network.nominal_splits, dtype=torch.float32)
+        self.register_buffer("own", nominal, persistent=False)
+        self._network = network
+        self._hops = int(network.hops.max())
         self._model = dynamics.parameters(network, dtype=torch.float32)
 
     def forward(self, x: PerPair, prices: PerRegion) -> PerTurn:
-        if self._model.adjacency.device != self.own.device:
-            self._model = dynamics.parameters(
-                self._network, dtype=torch.float32, device=self.own.device
-            )
-        p = self._model
+        """Return split ratios (-, (..., R, R, R)).
+
+        x: accumulations (veh, (..., R, R))
+        prices: (-, (..., R))
+        """
+        p = self._on_own_device()
         free = p.mfd.rate_up_to_jam(torch.zeros_like(p.mfd.jam), torch)
         rate = torch.maximum(dynamics.rate(p, x.sum(-1)), free / MAX_DELAY_FACTOR)
-        leaving = rate.unsqueeze(-1) * (1.0 if p.exit_rates is None else p.exit_rates)
+        leaving = rate.unsqueeze(-1)
+        if p.exit_rates is not None:
+            leaving = leaving * p.exit_rates
         here = prices.unsqueeze(-1) / leaving * p.off_diagonal
+        # After as many rounds as the longest way has boundaries, e_hj holds every way to j.
         extra = here
         for _ in range(self._hops):
             extra = here + torch.einsum("hgj,...gj->...hj", self.own, extra) * p.off_diagonal
         costs = extra.unsqueeze(-3) + torch.zeros_like(self.own)
+        # Only differences matter: from the least one no exponential is too small.
         least = torch.where(self.own > 0, costs, torch.inf).amin(-2, keepdim=True)
-        more = (costs - torch.where(least.isfinite(), least, 0.0)).clamp(min=0.0)
+        least = torch.where(least.isfinite(), least, 0.0)
+        more = (costs - least).clamp(min=0.0)
         weight = self.own * torch.exp(-more / self.dispersion)
         return weight / weight.sum(-2, keepdim=True).clamp(min=1e-9)
+
+    def _on_own_device(self) -> dynamics.Parameters:
+        """Return the parameters on the device to which the module was moved."""
+        device = self.own.device
+        if self._model.adjacency.device != device:
+            self._model = dynamics.parameters(self._network, dtype=torch.float32, device=device)
+        return self._model

@@ -1,9 +1,9 @@
-"""The regional model (NMFD) in torch, batched and differentiable: the one definition of its
-equations.
+"""The regional model (NMFD) in torch, batched and differentiable.
 
-After Tumu, Shaw Cortez, Drgona, Vrabie and Glavaski, "Differentiable Predictive Control for
-Large-Scale Urban Road Networks", and the multi-region models with perimeter control of Geroliminis,
-Haddad and Ramezani (2013). Regions i, j, h; x_i = sum_j x_ij; N_i the regions adjacent to i:
+This is the one definition of its equations. They follow Tumu, Shaw Cortez, Drgona, Vrabie and
+Glavaski, "Differentiable Predictive Control for Large-Scale Urban Road Networks", and the
+multi-region models with perimeter control of Geroliminis, Haddad and Ramezani (2013). Regions i, j,
+h; x_i = sum_j x_ij; N_i the regions adjacent to i:
 
     q_i    = g_i(x_i) / x_i                            defined at x = 0 (nmfd.model.mfd)
     m_ii   = q_i x_ii                                  trips that end in i
@@ -12,12 +12,14 @@ Haddad and Ramezani (2013). Regions i, j, h; x_i = sum_j x_ij; N_i the regions a
     dx_ij/dt = d_ij - sum_{h in N_i} u_ih m_ihj + sum_{h in N_i, h != j} u_hi m_hij        j != i
 
 Twins: `acyclic` (no vehicle turns back), and in nmfd.controllers.mpc `ipopt` (in CasADi) and
-    `edge_model` (as edges,
-with adjoint gradients).
+`edge_model` (as edges, with adjoint gradients).
 
-Shapes: `...` is any batch. x (..., R, R) [veh], [i, j] in region i bound for j; demand (..., R, R)
-    [veh/s];
-perimeter (..., R, R) [-], [i, h]; splits (..., R, R, R) [-], [i, h, j].
+Shapes (`...` is any batch):
+
+    x          (..., R, R) [veh], [i, j] in region i bound for j
+    demand     (..., R, R) [veh/s]
+    perimeter  (..., R, R) [-], [i, h]
+    splits     (..., R, R, R) [-], [i, h, j]
 """
 
 from collections.abc import Callable
@@ -30,13 +32,19 @@ from nmfd.model.mfd import Mfd, stacked
 from nmfd.model.regional_model import LEAST_ROOM, RegionalModel, passing_share
 from nmfd.tensors import PerPair, PerRegion, PerRollout, PerTurn
 
+# Weights of the slopes, and the point of each slope in steps along the previous one.
+SCHEMES = {"euler": ((1.0,), (0.0,)), "rk4": ((1 / 6, 1 / 3, 1 / 3, 1 / 6), (0.0, 0.5, 0.5, 1.0))}
+
 
 @dataclass(frozen=True, kw_only=True)
 class Parameters:
-    """Network parameters as tensors. mfd: of all regions; adjacency, off_diagonal: (R, R), 0 or 1.
+    """Parameters of a network as tensors.
 
-    exit_rates: (R, R) [-] or None; capacity: (R, R) [veh/s] under u = 1, or None; storage: (R,)
-        [veh]
+    mfd: of all regions
+    adjacency, off_diagonal: 0 or 1 ((R, R))
+    exit_rates: (-, (R, R)), or None
+    capacity: under u = 1 (veh/s, (R, R)), or None
+    storage: (veh, (R,)), or None
     """
 
     mfd: Mfd
@@ -56,7 +64,9 @@ def parameters(
     """Return the parameters of `network` as tensors."""
 
     def tensor(values: Any) -> Any:
-        return None if values is None else torch.tensor(values, dtype=dtype, device=device)
+        if values is None:
+            return None
+        return torch.tensor(values, dtype=dtype, device=device)
 
     return Parameters(
         mfd=stacked(network.mfds, tensor),
@@ -69,38 +79,43 @@ def parameters(
 
 
 def rate(p: Parameters, accumulation: PerRegion) -> PerRegion:
-    """Return q_i = g_i(min(x_i, jam_i)) / x_i (..., R) [1/s] of accumulation (..., R) [veh]."""
+    """Return q_i = g_i(min(x_i, jam_i)) / x_i [1/s].
+
+    accumulation: x_i (veh, (..., R))
+    """
     return p.mfd.rate(accumulation, torch)
 
 
 def flows(
     p: Parameters, x: PerPair, perimeter: PerPair, splits: PerTurn
 ) -> tuple[PerRegion, PerTurn]:
-    """Return trip completions m_ii (..., R) and transfer flows (..., R, R, R) [veh/s].
+    """Return trip completions (..., R) and transfer flows (..., R, R, R).
 
-    As published, u_ih m_ihj. Extensions: exit rates k_ij multiply m_ihj and m_ii; with capacities,
-    `passing` replaces u_ih.
+    As published, they are m_ii and u_ih m_ihj [veh/s]. Extensions: exit rates k_ij multiply m_ihj
+    and m_ii; with capacities, `passing` replaces u_ih.
     """
     accumulation = x.sum(-1)
     leaving = rate(p, accumulation).unsqueeze(-1) * x
     if p.exit_rates is not None:
         leaving = leaving * p.exit_rates
     completions = torch.diagonal(leaving, dim1=-2, dim2=-1)
-    wishing = (leaving * p.off_diagonal).unsqueeze(-2)
+    onward = (leaving * p.off_diagonal).unsqueeze(-2)
     if p.capacity is None:
-        return completions, (perimeter * p.adjacency).unsqueeze(-1) * splits * wishing
-    transfers = splits * wishing
-    return completions, passing(p, transfers.sum(-1), perimeter, accumulation).unsqueeze(
-        -1
-    ) * transfers
+        share = (perimeter * p.adjacency).unsqueeze(-1)
+        return completions, share * splits * onward
+    wish = splits * onward
+    share = passing(p, wish.sum(-1), perimeter, accumulation).unsqueeze(-1)
+    return completions, share * wish
 
 
 def passing(p: Parameters, wish: PerPair, perimeter: PerPair, accumulation: PerRegion) -> PerPair:
-    """Return the share (..., R, R) [-] of the desired flow `wish` (..., R, R) [veh/s] that passes
-    each boundary.
+    """Return the share (..., R, R) [-] of the desired flow that passes.
 
-    The limit is u_ih times capacity times the room in h, 1 - x_h / storage_h (as in Geroliminis,
-    Haddad and Ramezani, 2013), accumulation (..., R) [veh].
+    The limit of a boundary is u_ih times capacity times the room in h, 1 - x_h / storage_h (as in
+    Geroliminis, Haddad and Ramezani, 2013).
+
+    wish: desired flow (veh/s, (..., R, R))
+    accumulation: (veh, (..., R))
     """
     room = (1.0 - accumulation / p.storage).clamp(min=LEAST_ROOM)
     return passing_share(wish, perimeter * p.capacity * room.unsqueeze(-2))
@@ -109,11 +124,12 @@ def passing(p: Parameters, wish: PerPair, perimeter: PerPair, accumulation: PerR
 def admitted(
     backlog: PerPair, demand: PerPair, metering: PerRegion | None, step: float
 ) -> tuple[PerPair, PerPair]:
-    """Return the demand (..., R, R) [veh/s] admitted within `step` [s], and the backlog (..., R, R)
-    [veh] after it.
+    """Return admitted demand (..., R, R) [veh/s] and the new backlog [veh].
 
-    metering: (..., R) [veh/s], largest departure rate of each region, shared in proportion; None:
+    backlog: vehicles that wait outside (veh, (..., R, R))
+    metering: largest departure rate of each region, shared in proportion (veh/s, (..., R)); None:
         no limit
+    step: time in which they are admitted (s)
     """
     if metering is None:
         return demand + backlog / step, torch.zeros_like(backlog)
@@ -127,9 +143,8 @@ def derivative(
 ) -> tuple[PerPair, PerRegion]:
     """Return dx_ij/dt (..., R, R) and trip completions (..., R) [veh/s]."""
     completions, transfers = flows(p, x, perimeter, splits)
-    return demand - torch.diag_embed(completions) - transfers.sum(-2) + transfers.sum(
-        -3
-    ), completions
+    change = demand - torch.diag_embed(completions) - transfers.sum(-2) + transfers.sum(-3)
+    return change, completions
 
 
 def integrated(
@@ -140,10 +155,13 @@ def integrated(
     integrator: str = "euler",
     substeps: int = 1,
 ) -> Any:
-    """Return x after `step` [s] of dx/dt = slope(x), in equal substeps of forward Euler or
-    classical Runge-Kutta.
+    """Return x after a step of dx/dt = slope(x).
 
     With Euler x stays >= 0 if step * q <= substeps and demand >= 0.
+
+    step: (s)
+    integrator: forward Euler ("euler") or classical Runge-Kutta ("rk4")
+    substeps: number of equal parts of the step
     """
     step = step / substeps
     for _ in range(substeps):
@@ -158,10 +176,6 @@ def integrated(
     return x
 
 
-# Weights of the slopes, and the point of each slope in steps along the previous one.
-SCHEMES = {"euler": ((1.0,), (0.0,)), "rk4": ((1 / 6, 1 / 3, 1 / 3, 1 / 6), (0.0, 0.5, 0.5, 1.0))}
-
-
 def counted(
     slope: Callable[[Any], tuple[Any, Any]],
     x: Any,
@@ -170,15 +184,22 @@ def counted(
     integrator: str = "euler",
     substeps: int = 1,
 ) -> tuple[Any, Any]:
-    """Return `integrated`, and the integral of the flow that `slope` gives beside dx/dt, for the
-    ledger."""
-    step, ended = step / substeps, 0.0
+    """Return `integrated` and the integral of a flow, for the ledger.
+
+    slope: returns dx/dt and the flow
+    """
+    step = step / substeps
+    ended = 0.0
     for _ in range(substeps):
-        change, total, completed = 0.0 * x, 0.0 * x, 0.0
+        change = 0.0 * x
+        mean_change = 0.0 * x
+        mean_flow = 0.0
         for weight, place in zip(*SCHEMES[integrator], strict=True):
             change, flow = slope(x + place * step * change)
-            total, completed = total + weight * change, completed + weight * flow
-        x, ended = x + step * total, ended + step * completed
+            mean_change = mean_change + weight * change
+            mean_flow = mean_flow + weight * flow
+        x = x + step * mean_change
+        ended = ended + step * mean_flow
     return x, ended
 
 
@@ -191,8 +212,11 @@ def advance(
     step: float,
     **scheme: Any,
 ) -> PerPair:
-    """Return x after one control interval of `step` [s] under constant inputs; scheme: see
-    `integrated`."""
+    """Return x after one control interval under constant inputs.
+
+    step: length of the interval (s)
+    scheme: integrator and substeps of `integrated`
+    """
     return integrated(lambda x: derivative(p, x, demand, perimeter, splits)[0], x, step, **scheme)
 
 

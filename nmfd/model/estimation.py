@@ -1,25 +1,25 @@
-"""Estimation of x_ij from loop detectors, boundary counts and probe vehicles: an extended Kalman
-filter on the NMFD.
+"""Estimation of x_ij from loop detectors, boundary counts and probes.
 
-After Saeedmanesh, Kouvelas and Geroliminis, "An extended Kalman filter approach for real-time state
-estimation in multi-region MFD urban networks", Transportation Research C 132 (2021); joint
-estimation of state and model parameters as in Wang and Papageorgiou, "Real-time freeway traffic
-state estimation based on extended Kalman filter", Transportation Research B 39 (2005).
+It is an extended Kalman filter on the NMFD, after Saeedmanesh, Kouvelas and Geroliminis, "An
+extended Kalman filter approach for real-time state estimation in multi-region MFD urban networks",
+Transportation Research C 132 (2021), with joint estimation of state and model parameters as in Wang
+and Papageorgiou, "Real-time freeway traffic state estimation based on extended Kalman filter",
+Transportation Research B 39 (2005).
 
 State: x (R, R) [veh] and, per region, three relative errors around zero: of the outflow of the MFD,
-    of the forecast
-demand, and of the expansion of the loop detectors. The readings of a control interval (mean
-accumulations, boundary counts, probes) are predicted together with the state at its end. The
-covariance follows from counting vehicles: every flow is Poisson, and a probe that moves is one of
-the vehicles that move.
+of the forecast demand, and of the expansion of the loop detectors. The readings of a control
+interval (mean accumulations, boundary counts, probes) are predicted together with the state at its
+end. The covariance follows from counting vehicles: every flow is Poisson, and a probe that moves is
+one of the vehicles that move.
 
 Bounds: no cell holds fewer vehicles than its probes (Simon, "Kalman filtering with state
-    constraints", IET Control
-Theory and Applications 4, 2010). Forward Euler in the scenario's substeps; the Jacobian by forward
-differences in one batch of R^2 rollouts: a few milliseconds for 7 regions, not meant for hundreds.
+constraints", IET Control Theory and Applications 4, 2010). Integration: forward Euler in the
+scenario's substeps. Jacobian: forward differences in one batch of R^2 rollouts, a few milliseconds
+for 7 regions, not meant for hundreds.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -30,35 +30,38 @@ from torch import Tensor
 from nmfd.arrays import PerPair, PerRegion, PerTurn
 from nmfd.model import dynamics
 from nmfd.model.planning import PlanningModel
+from nmfd.model.regional_model import RegionalModel
 from nmfd.types import Controls
 
 Vector = Float[np.ndarray, " N"]
 Square = Float[np.ndarray, "N N"]
-Inputs = tuple[
-    PerPair, PerPair, PerTurn
-]  # demand [veh/s], perimeter and splits [-] of a control interval
-# Relative errors: memory [s] and standard deviation [-] (of the expansion:
-# `Instruments.detector_error`).
-MEMORY, EXPANSION_MEMORY = 900.0, 3600.0
-OUTFLOW_ERROR, DEMAND_ERROR = 0.3, 0.3
+# Memory of the relative errors [s]: of outflow and demand, and of the expansion.
+MEMORY = 900.0
+EXPANSION_MEMORY = 3600.0
+# Their standard deviations [-]; that of the expansion is `Instruments.detector_error`.
+OUTFLOW_ERROR = 0.3
+DEMAND_ERROR = 0.3
 # Relative error of each flow, and of each turn as a share of what leaves the cell, with the memory
 # MEMORY: modelled as white noise with the same sum instead of a state each.
-FLOW_ERROR, STRAY = 0.2, 0.02
+FLOW_ERROR = 0.2
+STRAY = 0.02
 COUNT_ERROR = 0.3  # [-], of crossings expanded from one counted gateway to all
 FLOOR = 0.01  # [veh^2], variance of an exact reading
 DIFFERENCE = 1e-5  # of the Jacobian [veh] or [-]
+LEAST_ERROR = -0.95  # of the relative errors
+SAME_READINGS = 3  # of a detector, one after the other, show that it is stuck
 
 
 @dataclass(frozen=True, kw_only=True)
 class Instruments:
     """Coverage and errors of the instruments.
 
-    detector_share: (R,) [-], share of the lane length of each region covered by loop detectors
-    detector_error, detector_noise: (R,) [-], standard deviations of the lasting and of the white
-        relative error of the expanded accumulation
-    counted_share: (R, R) [-], [i, h]: share of the lanes over that boundary that are counted
-    counted_gateways: (R, R), their number
-    probe_share: share of all vehicles [-]
+    detector_share: share of the lane length of each region covered by loop detectors (-, (R,))
+    detector_error, detector_noise: standard deviations of the lasting and of the white relative
+        error of the expanded accumulation (-, (R,))
+    counted_share: [i, h]: share of the lanes over that boundary that are counted (-, (R, R))
+    counted_gateways: [i, h]: number of gateways that are counted ((R, R))
+    probe_share: share of all vehicles (-)
     """
 
     detector_share: PerRegion
@@ -73,10 +76,10 @@ class Instruments:
 class Readings:
     """Measurements of one control interval; NaN where there is none.
 
-    accumulation: (R,) [veh], mean over the interval, expanded from the detectors to the region
-    crossings: (R, R) [veh], [i, h], counted during the interval, expanded to all gateways
-    probes: (R, R) [veh], [i, j]: in region i bound for j at the end of the interval; not expanded
-    probe_departures: (R, R) [veh], [i, j]: departed during the interval; not expanded
+    accumulation: mean over the interval, expanded from the detectors to the region (veh, (R,))
+    crossings: [i, h] counted during the interval, expanded to all gateways (veh, (R, R))
+    probes: [i, j] in region i bound for j at the end of the interval, not expanded (veh, (R, R))
+    probe_departures: [i, j] departed during the interval, not expanded (veh, (R, R))
     """
 
     accumulation: PerRegion
@@ -89,8 +92,8 @@ class Readings:
 class Belief:
     """Mean and covariance of the state.
 
-    mean: (3 R + R^2,), relative errors of outflow, demand and expansion, and x by rows
-    probes: (R, R) [veh], at their last reading
+    mean: relative errors of outflow, demand and expansion, and x by rows ((3 R + R^2,))
+    probes: at their last reading (veh, (R, R))
     """
 
     mean: Vector
@@ -98,65 +101,121 @@ class Belief:
     probes: PerPair
 
 
+class _Inputs(NamedTuple):
+    """Demand [veh/s], perimeter and splits [-] of a control interval."""
+
+    demand: PerPair
+    perimeter: PerPair
+    splits: PerTurn
+
+
+class _Rollout(NamedTuple):
+    """Control interval of the regional model from several points.
+
+    outputs: Z without errors ((points, size - errors))
+    moves, of_probes: number of each event from the first point, and those of probes (veh)
+    """
+
+    outputs: Tensor
+    moves: Tensor
+    of_probes: Tensor
+
+
+class _Prediction(NamedTuple):
+    """Mean and covariance of Z, and the vehicles that leave each cell [veh]."""
+
+    z: np.ndarray
+    covariance: Tensor
+    leaving: np.ndarray
+
+
+class _Comparison(NamedTuple):
+    """Readings (m,), NaN if missing, their expectation and noise variance."""
+
+    reading: np.ndarray
+    expected: np.ndarray
+    noise: np.ndarray
+
+
+class _Product(NamedTuple):
+    """Matrices left and right' with events between them, as non-zeros.
+
+    places: row, column and event of each non-zero
+    values: product of the effects on row and column
+    """
+
+    shape: torch.Size
+    places: tuple[Tensor, Tensor, Tensor]
+    values: Tensor
+
+    def weighted(self, weight: Tensor) -> Tensor:
+        """Return left diag(weight) right'."""
+        row, column, event = self.places
+        matrix = torch.zeros(self.shape, dtype=weight.dtype)
+        return matrix.index_put_((row, column), self.values * weight[event], accumulate=True)
+
+
 class Estimator:
     """Filter along one run: call `step` once per control interval.
 
-    Z = (3 relative errors, x | mean accumulations (R,), crossings (E,), probes (R^2,), departures of probes (R^2,)):
-    state at the end of an interval and readings, jointly Gaussian. E: the boundaries (i, h).
-    Prediction and update are in torch, whose threads can be limited.
+    Z is the state at the end of an interval, then the readings, jointly Gaussian:
+
+        (3 relative errors, x | mean accumulations (R,), crossings (E,), probes (R^2,),
+        departures of probes (R^2,))
+
+    E: the boundaries (i, h). Prediction and update are in torch, whose threads can be limited.
     """
 
     def __init__(self, planning: PlanningModel, instruments: Instruments):
-        network, self._planning, self._instruments = planning.network, planning, instruments
-        self._step, self._substeps = planning.step, planning.substeps
-        self._parameters, self._probe_share = dynamics.parameters(network), instruments.probe_share
-        regions = self._regions = network.regions
-        cells = self._cells = regions**2
-        self._fastest = torch.tensor(
-            [m.rate(np.linspace(0.0, m.jam, 501)).max() for m in network.mfds]
-        )
-        if network.exit_rates is not None:
-            self._fastest *= torch.from_numpy(network.exit_rates.max(axis=1))
+        network = planning.network
+        regions = network.regions
+        cells = regions**2
+        self._planning = planning
+        self._instruments = instruments
+        self._step = planning.step
+        self._substeps = planning.substeps
+        self._parameters = dynamics.parameters(network)
+        self._probe_share = instruments.probe_share
+        self._regions = regions
+        self._cells = cells
+        self._fastest = _fastest(network)
         self._boundaries = np.argwhere(network.adjacency)
+        self._turns = np.argwhere(network.split_mask)
+        # The parts of Z, in its order.
         sizes = (2 * regions, regions, cells, regions, len(self._boundaries), cells, cells)
         ends = np.cumsum(sizes)
-        (
-            _,
-            self._expansion,
-            self._x,
-            self._mean,
-            self._crossings,
-            self._probes,
-            self._departures,
-        ) = (slice(int(end - size), int(end)) for end, size in zip(ends, sizes, strict=True))
-        self._states, self._size = int(ends[2]), int(ends[-1])
-        errors = (
-            np.full(regions, OUTFLOW_ERROR),
-            np.full(regions, DEMAND_ERROR),
-            instruments.detector_error,
-        )
-        self._spread = torch.from_numpy(np.concatenate(errors))
+        parts = [slice(int(end - size), int(end)) for end, size in zip(ends, sizes, strict=True)]
+        _, self._expansion, self._x, *of_readings = parts
+        self._mean, self._crossings, self._probes, self._departures = of_readings
+        self._states = self._x.stop
+        self._size = self._departures.stop
+        spread = [np.full(regions, OUTFLOW_ERROR), np.full(regions, DEMAND_ERROR)]
+        self._spread = torch.from_numpy(np.concatenate([*spread, instruments.detector_error]))
         memory = torch.tensor([MEMORY, MEMORY, EXPANSION_MEMORY], dtype=torch.float64)
         self._kept = torch.exp(-self._step / memory).repeat_interleave(regions)
         kept = np.exp(-self._step / MEMORY)
         self._lasting = float((1.0 + kept) / (1.0 - kept))  # variance of white over lasting noise
-        self._turns = np.argwhere(network.split_mask)
         # Cell of each event but departures.
-        left = self._turns[:, 0] * regions + self._turns[:, 2], np.arange(regions) * (regions + 1)
-        self._from = torch.from_numpy(np.concatenate(left))
-        vehicle, probe = (torch.from_numpy(part) for part in self._effects())
-        self._pairs = [_pairs(vehicle, vehicle), _pairs(vehicle, probe), _pairs(probe, probe)]
+        here, _, bound = self._turns.T
+        own = np.arange(regions) * (regions + 1)
+        self._from = torch.from_numpy(np.concatenate([here * regions + bound, own]))
+        vehicle, probe = self._effects()
+        self._products = (
+            _product(vehicle, vehicle),
+            _product(vehicle, probe),
+            _product(probe, probe),
+        )
         self._half = vehicle[cells : cells + regions]
         self.reset()
 
     def reset(self) -> None:
-        self._k, self._seen = 0, list[np.ndarray]()
-        variance = torch.cat(
-            [self._spread**2, torch.full((self._cells,), FLOOR, dtype=torch.float64)]
-        )
-        probes = np.zeros((self._regions, self._regions))
+        self._k = 0
+        self._seen: list[np.ndarray] = []
+        exact = torch.full((self._cells,), FLOOR, dtype=torch.float64)
         self.belief = Belief(
-            mean=np.zeros(self._states), covariance=torch.diag(variance).numpy(), probes=probes
+            mean=np.zeros(self._states),
+            covariance=torch.diag(torch.cat([self._spread**2, exact])).numpy(),
+            probes=np.zeros((self._regions, self._regions)),
         )
 
     @property
@@ -164,241 +223,279 @@ class Estimator:
         return self.belief.mean[self._x].reshape(self._regions, self._regions).copy()
 
     def step(self, controls: Controls, readings: Readings) -> PerPair:
-        """Return the estimate (R, R) [veh] at the end of the interval under `controls`."""
+        """Return the estimate (R, R) [veh] after an interval under `controls`."""
         demand = self._planning.forecast[min(self._k, self._planning.steps - 1)]
-        splits = (
-            self._planning.network.nominal_splits if controls.splits is None else controls.splits
-        )
-        # A detector with three identical readings is stuck.
-        self._seen = [*self._seen[-2:], readings.accumulation]
-        stuck = (
-            np.ptp(self._seen, axis=0) == 0
-            if len(self._seen) == 3
-            else np.zeros(len(demand), dtype=bool)
-        )
-        loops = np.where(stuck & (readings.accumulation > 0), np.nan, readings.accumulation)
-        self.belief = self._advanced(
-            self.belief, (demand, controls.perimeter, splits), readings, loops
-        )
+        splits = controls.splits
+        if splits is None:
+            splits = self._planning.network.nominal_splits
+        inputs = _Inputs(demand, controls.perimeter, splits)
+        loops = self._without_stuck(readings.accumulation)
+        self.belief = self._advanced(self.belief, inputs, readings, loops)
         self._k += 1
         return self.accumulation
 
-    def _effects(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return changes per event (rows, events): (x, mean accumulations, crossings) and (probes,
-        departures)."""
-        # Events: turns (i, h, j), completed trips in i, departures from i for j, in this order.
-        regions, cells = self._regions, np.arange(self._cells)
+    def _without_stuck(self, accumulation: PerRegion) -> PerRegion:
+        """Return the readings of the detectors, NaN for those that are stuck.
+
+        A detector that shows 0 is not: its street may be empty.
+        """
+        self._seen = [*self._seen, accumulation][-SAME_READINGS:]
+        if len(self._seen) < SAME_READINGS:
+            return accumulation
+        same = np.ptp(self._seen, axis=0) == 0
+        return np.where(same & (accumulation > 0), np.nan, accumulation)
+
+    def _effects(self) -> tuple[Tensor, Tensor]:
+        """Return the changes by each event (rows, events), in two matrices.
+
+        Rows: x, mean accumulations and crossings of vehicles; probes and departures of probes.
+        Events: turns (i, h, j), completed trips in i, departures from i for j, in this order.
+        """
+        regions = self._regions
+        cells = np.arange(self._cells)
         here, onward, bound = self._turns.T
-        number, turns = np.arange(len(here)), len(here)
-        place = np.zeros((self._cells, turns + regions + self._cells))
-        place[here * regions + bound, number] = -1.0
-        place[onward * regions + bound, number] = 1.0
-        place[np.arange(regions) * (regions + 1), turns + np.arange(regions)] = -1.0
-        place[cells, turns + regions + cells] = 1.0
-        crossing, departure = (
-            np.zeros((len(self._boundaries), place.shape[1])),
-            np.zeros_like(place),
-        )
-        crossing[:, :turns] = (self._turns[None, :, :2] == self._boundaries[:, None]).all(axis=2)
-        departure[cells, turns + regions + cells] = 1.0
+        turns = np.arange(len(self._turns))
+        completed = len(turns) + np.arange(regions)
+        departed = len(turns) + regions + cells
+        place = np.zeros((self._cells, len(turns) + regions + self._cells))
+        place[here * regions + bound, turns] = -1.0
+        place[onward * regions + bound, turns] = 1.0
+        place[np.arange(regions) * (regions + 1), completed] = -1.0
+        place[cells, departed] = 1.0
+        crossing = np.zeros((len(self._boundaries), place.shape[1]))
+        of_turn = (self._turns[None, :, :2] == self._boundaries[:, None]).all(axis=2)
+        crossing[:, : len(turns)] = of_turn
+        departure = np.zeros_like(place)
+        departure[cells, departed] = 1.0
         # An event in the middle of the interval, on average, counts half in the mean.
         half = 0.5 * place.reshape(regions, regions, -1).sum(axis=1)
-        return np.concatenate([place, half, crossing]), np.concatenate([place, departure])
+        vehicle = np.concatenate([place, half, crossing])
+        probe = np.concatenate([place, departure])
+        return torch.from_numpy(vehicle), torch.from_numpy(probe)
 
     def _advanced(
-        self, belief: Belief, inputs: Inputs, readings: Readings, loops: PerRegion
+        self, belief: Belief, inputs: _Inputs, readings: Readings, loops: PerRegion
     ) -> Belief:
-        """Return the belief one control interval later; loops: (R,) [veh], valid detector
-        readings."""
-        z, covariance, leaving = self._predicted(belief, inputs)
-        mean, posterior = z[: self._states], covariance[: self._states, : self._states]
-        reading, expected, noise = self._readings(z, leaving, readings, loops)
-        there = np.flatnonzero(np.isfinite(reading))
-        if len(there):
-            ahead = self._rows(z, covariance)[there]
-            spread = self._rows(z, ahead.T)[there] + torch.diag(torch.from_numpy(noise[there]))
-            towards = ahead[:, : self._states]
-            root = torch.linalg.cholesky(spread)
-            innovation = torch.from_numpy((reading - expected)[there])[:, None]
-            # With S = L L' the covariance of the readings: L^-1 of innovation and cross-covariance.
-            whitened = torch.linalg.solve_triangular(
-                root, torch.cat([towards, innovation], dim=1), upper=False
-            )
-            mean = mean + (whitened[:, :-1].T @ whitened[:, -1]).numpy()
-            posterior = posterior - whitened[:, :-1].T @ whitened[:, :-1]
-        posterior = (0.5 * (posterior + posterior.T)).numpy()
-        counted = np.isfinite(readings.probes)
-        probes = np.where(
-            counted, readings.probes, np.maximum(z[self._probes].reshape(counted.shape), 0.0)
-        )
-        lower = np.concatenate(
-            [np.full(self._x.start, -0.95), np.where(counted, probes, 0.0).ravel()]
-        )
-        mean = bounded(mean, posterior, lower)
-        probes = np.minimum(probes, mean[self._x].reshape(counted.shape))
-        return Belief(mean=mean, covariance=posterior, probes=probes)
+        """Return the belief one control interval later.
 
-    def _predicted(self, belief: Belief, inputs: Inputs) -> tuple[np.ndarray, Tensor, np.ndarray]:
-        """Return Z (size,), its covariance, and the vehicles that leave each cell (R^2,) [veh]."""
-        mean, errors, first = torch.from_numpy(belief.mean), self._x.start, self._expansion.start
+        loops: readings of detectors that are not stuck (veh, (R,))
+        """
+        prediction = self._predicted(belief, inputs)
+        comparison = self._compared(prediction, readings, loops)
+        mean, covariance = self._updated(prediction, comparison)
+        counted = np.isfinite(readings.probes)
+        expected = np.maximum(prediction.z[self._probes].reshape(counted.shape), 0.0)
+        probes = np.where(counted, readings.probes, expected)
+        least = np.where(counted, probes, 0.0).ravel()
+        lower = np.concatenate([np.full(self._x.start, LEAST_ERROR), least])
+        mean = bounded(mean, covariance, lower)
+        probes = np.minimum(probes, mean[self._x].reshape(counted.shape))
+        return Belief(mean=mean, covariance=covariance, probes=probes)
+
+    def _updated(
+        self, prediction: _Prediction, comparison: _Comparison
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return mean and covariance of the state, given the readings."""
+        z, covariance, _ = prediction
+        mean = z[: self._states]
+        posterior = covariance[: self._states, : self._states]
+        there = np.flatnonzero(np.isfinite(comparison.reading))
+        if len(there):
+            noise = torch.diag(torch.from_numpy(comparison.noise[there]))
+            ahead = self._rows(z, covariance)[there]
+            spread = self._rows(z, ahead.T)[there] + noise
+            innovation = torch.from_numpy((comparison.reading - comparison.expected)[there])
+            # With S = L L' the covariance of the readings: L^-1 of cross-covariance and innovation.
+            root = torch.linalg.cholesky(spread)
+            columns = torch.cat([ahead[:, : self._states], innovation[:, None]], dim=1)
+            whitened = torch.linalg.solve_triangular(root, columns, upper=False)
+            gain = whitened[:, :-1]
+            mean = mean + (gain.T @ whitened[:, -1]).numpy()
+            posterior = posterior - gain.T @ gain
+        return mean, (0.5 * (posterior + posterior.T)).numpy()
+
+    def _predicted(self, belief: Belief, inputs: _Inputs) -> _Prediction:
+        """Return Z at the end of the interval, before its readings."""
+        mean = torch.from_numpy(belief.mean)
+        errors = self._x.start
         # Flows depend on the whole state but the expansion.
-        varied = torch.cat([torch.arange(first), torch.arange(errors, self._states)])
+        without_expansion = torch.arange(self._expansion.start)
+        varied = torch.cat([without_expansion, torch.arange(errors, self._states)])
         points = mean[varied].repeat(len(varied) + 1, 1)
         points[1:] += DIFFERENCE * torch.eye(len(varied), dtype=torch.float64)
-        outputs, moves, of_probes = self._rollout(points, belief.probes, inputs)
+        rollout = self._rollout(points, belief.probes, inputs)
+        outputs = rollout.outputs
         jacobian = torch.zeros(self._size, self._states, dtype=torch.float64)
         jacobian[:errors, :errors] = torch.diag(self._kept)
         jacobian[errors:, varied] = (outputs[1:] - outputs[0]).T / DIFFERENCE
         covariance = jacobian @ torch.from_numpy(belief.covariance) @ jacobian.T
         covariance.diagonal()[:errors] += (1.0 - self._kept**2) * self._spread**2
         leaving = torch.zeros(self._cells, dtype=torch.float64)
-        leaving.index_add_(0, self._from, moves[: len(self._from)])  # turns and ends of trips
-        covariance[errors:, errors:] += self._flow_noise(belief, moves, of_probes, leaving)
-        return (
-            torch.cat([self._kept * mean[:errors], outputs[0]]).numpy(),
-            covariance,
-            leaving.numpy(),
-        )
+        leaving.index_add_(0, self._from, rollout.moves[: len(self._from)])
+        noise = self._flow_noise(belief, rollout.moves, rollout.of_probes, leaving)
+        covariance[errors:, errors:] += noise
+        z = torch.cat([self._kept * mean[:errors], outputs[0]])
+        return _Prediction(z.numpy(), covariance, leaving.numpy())
 
-    def _rollout(
-        self, points: Tensor, probes: PerPair, inputs: Inputs
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return Z without errors at `points` (B, 2 R + R^2), and the first one's events [veh], all
-        and of probes."""
-        regions, batch = self._regions, len(points)
+    def _rollout(self, points: Tensor, probes: PerPair, inputs: _Inputs) -> _Rollout:
+        """Return what happens in a control interval.
+
+        points: relative errors of outflow and demand, and x ((B, 2 R + R^2))
+        probes: at the begin of the interval (veh, (R, R))
+        """
+        regions = self._regions
+        batch = len(points)
         duration = self._step / self._substeps
-        demand, *controls = (torch.tensor(values, dtype=torch.float64) for values in inputs)
-        x = points[:, 2 * regions :].reshape(batch, regions, regions)
-        outflow, wish = (
-            (1.0 + points[:, : 2 * regions].reshape(batch, 2, regions)).clamp(min=0.0).unbind(1)
-        )
+        demand, perimeter, splits = (torch.tensor(part, dtype=torch.float64) for part in inputs)
+        factors = 1.0 + points[:, : 2 * regions].reshape(batch, 2, regions)
+        outflow, wish = factors.clamp(min=0.0).unbind(1)
         outflow = outflow.minimum(1.0 / (duration * self._fastest))  # at most all vehicles leave
         entering = duration * demand * wish[:, :, None]
+        x = points[:, 2 * regions :].reshape(batch, regions, regions)
         n = torch.from_numpy(probes).expand(batch, -1, -1)
-        mean, crossings = torch.zeros_like(outflow), torch.zeros_like(x)
-        moves = torch.zeros(2, regions, regions, regions, dtype=x.dtype)
-        ends = torch.zeros(2, regions, dtype=x.dtype)
+        mean = torch.zeros_like(outflow)
+        crossings = torch.zeros_like(x)
+        moves = torch.zeros(regions, regions, regions, dtype=x.dtype)
+        moves_of_probes = torch.zeros_like(moves)
+        ends = torch.zeros(regions, dtype=x.dtype)
+        ends_of_probes = torch.zeros_like(ends)
         for _ in range(self._substeps):
-            completions, transfers = dynamics.flows(self._parameters, x + 1e-9, *controls)
-            completions = duration * outflow * completions
-            transfers = duration * outflow[:, :, None, None] * transfers
-            share = n / (x + 1e-9)
-            for level, part in enumerate((torch.ones_like(share), share)):
-                moves[level] += (transfers * part.unsqueeze(2))[0]
-                ends[level] += (completions * torch.diagonal(part, dim1=1, dim2=2))[0]
-            crossings = crossings + transfers.sum(3)
-            before, arrived = x.sum(2), self._probe_share * entering
-            x = x + entering - torch.diag_embed(completions) - transfers.sum(2) + transfers.sum(1)
-            moved, ended = (
-                share.unsqueeze(2) * transfers,
-                torch.diagonal(share, dim1=1, dim2=2) * completions,
-            )
-            n = n + arrived + (moved.sum(1) - moved.sum(2) - torch.diag_embed(ended))
+            flows = dynamics.flows(self._parameters, x + 1e-9, perimeter, splits)
+            completed = duration * outflow * flows[0]
+            moved = duration * outflow[:, :, None, None] * flows[1]
+            share = n / (x + 1e-9)  # of probes
+            completed_probes = torch.diagonal(share, dim1=1, dim2=2) * completed
+            moved_probes = share.unsqueeze(2) * moved
+            moves += moved[0]
+            moves_of_probes += moved_probes[0]
+            ends += completed[0]
+            ends_of_probes += completed_probes[0]
+            crossings = crossings + moved.sum(3)
+            before = x.sum(2)
+            x = x + entering - torch.diag_embed(completed) - moved.sum(2) + moved.sum(1)
+            change = moved_probes.sum(1) - moved_probes.sum(2) - torch.diag_embed(completed_probes)
+            n = n + self._probe_share * entering + change
             mean = mean + 0.5 * (before + x.sum(2)) / self._substeps
         departed = self._substeps * self._probe_share * entering
         crossings = crossings[:, *self._boundaries.T]
-        outputs = torch.cat(
-            [part.reshape(batch, -1) for part in (x, mean, crossings, n, departed)], dim=1
-        )
+        parts = [part.reshape(batch, -1) for part in (x, mean, crossings, n, departed)]
         entered = (self._substeps * entering)[0].reshape(-1)
-        share = (1.0, self._probe_share)
-        here, onward, bound = self._turns.T
-        events = [
-            torch.cat([moves[k][here, onward, bound], ends[k], share[k] * entered]) for k in (0, 1)
-        ]
-        every = events[0].clamp(min=0.0)
-        return outputs, every, events[1].clamp(min=0.0).minimum(every)
+        turns = tuple(self._turns.T)
+        events = torch.cat([moves[turns], ends, entered])
+        of_probes = [moves_of_probes[turns], ends_of_probes, self._probe_share * entered]
+        events = events.clamp(min=0.0)
+        return _Rollout(
+            outputs=torch.cat(parts, dim=1),
+            moves=events,
+            of_probes=torch.cat(of_probes).clamp(min=0.0).minimum(events),
+        )
 
     def _flow_noise(
         self, belief: Belief, moves: Tensor, of_probes: Tensor, leaving: Tensor
     ) -> Tensor:
-        """Return the covariance of Z, without relative errors, due to Poisson counts and errors of
-        the flows [veh]."""
-        x, turns = torch.from_numpy(belief.mean[self._x]), len(self._turns)
+        """Return the covariance of Z, without relative errors, due to the flows.
+
+        Flows are Poisson counts, and have errors besides.
+
+        moves, of_probes: those of the rollout (veh)
+        leaving: vehicles that leave each cell (veh, (R^2,))
+        """
+        turns = len(self._turns)
         cell = self._from[:turns]
         error = FLOW_ERROR * moves
         error[:turns] += STRAY * leaving[cell]
-        share = of_probes / moves.clamp(min=1e-9)
-        in_cell = torch.from_numpy(belief.probes.ravel()) / x.clamp(min=1e-9)
-        share[:turns] = torch.where(
-            moves[:turns] > 1e-9, share[:turns], in_cell[cell].clamp(max=1.0)
-        )
         wrong = self._lasting * error**2
-        weights = moves + wrong, of_probes + share * wrong, of_probes + share**2 * wrong
-        parts = [
-            torch.zeros(shape, dtype=x.dtype).index_put_(
-                index[:2], value * weight[index[2]], accumulate=True
-            )
-            for (shape, index, value), weight in zip(self._pairs, weights, strict=True)
-        ]
+        # The share of probes among those that turn; where nobody does, among those in the cell.
+        x = torch.from_numpy(belief.mean[self._x])
+        in_cell = torch.from_numpy(belief.probes.ravel()) / x.clamp(min=1e-9)
+        share = of_probes / moves.clamp(min=1e-9)
+        turned = moves[:turns] > 1e-9
+        share[:turns] = torch.where(turned, share[:turns], in_cell[cell].clamp(max=1.0))
+        all_by_all, all_by_probes, probes_by_probes = self._products
+        of_all = all_by_all.weighted(moves + wrong)
+        mixed = all_by_probes.weighted(of_probes + share * wrong)
+        of_both = probes_by_probes.weighted(of_probes + share**2 * wrong)
         # The time of an event, uniform in the interval, adds 1/12 of its squared effect to the
         # mean.
-        parts[0].diagonal()[self._cells : self._cells + self._regions] += (
-            self._half**2 @ moves / 3.0
-        )
-        return torch.cat([torch.cat(parts[:2], dim=1), torch.cat([parts[1].T, parts[2]], dim=1)])
+        means = slice(self._cells, self._cells + self._regions)
+        of_all.diagonal()[means] += self._half**2 @ moves / 3.0
+        upper = torch.cat([of_all, mixed], dim=1)
+        lower = torch.cat([mixed.T, of_both], dim=1)
+        return torch.cat([upper, lower])
 
-    def _readings(
-        self, z: np.ndarray, leaving: np.ndarray, readings: Readings, loops: np.ndarray
-    ) -> tuple:
-        """Return the readings (m,), NaN where there is none, their expectation and their noise
-        variance (m,)."""
+    def _compared(
+        self, prediction: _Prediction, readings: Readings, loops: PerRegion
+    ) -> _Comparison:
+        """Return readings, what is expected of them, and their noise.
+
+        loops: readings of detectors that are not stuck (veh, (R,))
+        """
+        z = prediction.z
         instruments = self._instruments
-        here, to = self._boundaries.T
-        mean, expansion, counts = z[self._mean], z[self._expansion], z[self._crossings]
+        x = z[self._x]
+        probes = readings.probes.ravel()
+        # Detectors see a share of the lanes. The lasting part of their error is a state.
+        mean = z[self._mean]
         share = np.maximum(instruments.detector_share, 1e-6)
+        sampled = np.maximum(mean, 1.0) * (1.0 - share) / share
+        loops_noise = sampled + (instruments.detector_noise * mean) ** 2 + FLOOR
+        # Counts miss the lanes and gateways without a counter.
+        here, to = self._boundaries.T
+        counts = z[self._crossings]
         boundary = np.maximum(instruments.counted_share[here, to], 1e-6)
         gateways = np.maximum(instruments.counted_gateways[here, to], 1)
-        cells, p = np.full(self._cells, FLOOR), self._probe_share
-        there = np.maximum(z[self._x], 1.0)
+        uncounted = np.maximum(counts, 1.0) / boundary + COUNT_ERROR**2 * counts**2 / gateways
         # Pseudo-readings against model drift: probes are a fixed share of the vehicles. They count
         # less each time, because they stay until they leave, MEMORY at most.
-        kept = np.minimum(np.exp(-leaving / there), np.exp(-self._step / MEMORY))
+        p = self._probe_share
+        there = np.maximum(x, 1.0)
+        kept = np.minimum(np.exp(-prediction.leaving / there), np.exp(-self._step / MEMORY))
         thinning = p * (1.0 - p) * there * (1.0 + kept) / (1.0 - kept) + FLOOR
-        # The lasting part of the error of the detectors is a state.
-        loops_noise = (
-            np.maximum(mean, 1.0) * (1.0 - share) / share
-            + (instruments.detector_noise * mean) ** 2
-            + FLOOR
-        )
-        uncounted = np.maximum(counts, 1.0) / boundary + COUNT_ERROR**2 * counts**2 / gateways
-        probes = readings.probes.ravel()
+        exact = np.full(self._cells, FLOOR)
         parts = (
-            (loops, (1.0 + expansion) * mean, loops_noise),
-            (readings.crossings[here, to], counts, (1.0 - boundary) * uncounted + FLOOR),
-            (probes, z[self._probes], cells),
-            (readings.probe_departures.ravel(), z[self._departures], cells),
-            (0.0 * probes, z[self._probes] - p * z[self._x], thinning),
+            _Comparison(loops, (1.0 + z[self._expansion]) * mean, loops_noise),
+            _Comparison(readings.crossings[here, to], counts, (1.0 - boundary) * uncounted + FLOOR),
+            _Comparison(probes, z[self._probes], exact),
+            _Comparison(readings.probe_departures.ravel(), z[self._departures], exact),
+            _Comparison(0.0 * probes, z[self._probes] - p * x, thinning),
         )
-        return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
+        return _Comparison(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
     def _rows(self, z: np.ndarray, matrix: Tensor) -> Tensor:
-        """Return the Jacobian of the readings by Z times a matrix (size, n): (m, n)."""
-        expansion, mean = (
-            torch.from_numpy(z[part])[:, None] for part in (self._expansion, self._mean)
-        )
+        """Return the Jacobian (m, size) of the readings times a matrix (size, n)."""
+        expansion = torch.from_numpy(z[self._expansion])[:, None]
+        mean = torch.from_numpy(z[self._mean])[:, None]
         loops = (1.0 + expansion) * matrix[self._mean] + mean * matrix[self._expansion]
         share = matrix[self._probes] - self._probe_share * matrix[self._x]
         return torch.cat([loops, matrix[self._crossings.start :], share])
 
 
-def _pairs(left: Tensor, right: Tensor) -> tuple:
-    """Return shape, (row, column, event) and product of the non-zeros of left diag(w) right' (m,
-    n)."""
+def _fastest(network: RegionalModel) -> Tensor:
+    """Return the largest rate (R,) [1/s] at which vehicles leave each region."""
+    rates = [mfd.rate(np.linspace(0.0, mfd.jam, 501)).max() for mfd in network.mfds]
+    fastest = torch.tensor(rates)
+    if network.exit_rates is not None:
+        fastest *= torch.from_numpy(network.exit_rates.max(axis=1))
+    return fastest
+
+
+def _product(left: Tensor, right: Tensor) -> _Product:
+    """Return the products of effects (m, events) and (n, events)."""
     product = left[:, None] * right[None]
-    index = product.nonzero(as_tuple=True)
-    return product.shape[:2], index, product[index]
+    places = product.nonzero(as_tuple=True)
+    return _Product(shape=product.shape[:2], places=places, values=product[places])
 
 
 def bounded(mean: Vector, covariance: Square, lower: Vector) -> Vector:
-    """Return the point nearest to `mean` (n,) in the metric of `covariance` (n, n) that is >=
-    `lower` (n,).
+    """Return the point (n,) nearest to `mean` that is >= `lower`.
 
-    It is mean + C y with multipliers y >= 0: a non-negative least-squares problem in y.
+    Distances are in the metric of `covariance` C. The point is mean + C y with multipliers y >= 0:
+    a non-negative least-squares problem in y.
     """
     below = lower - mean
     if (below <= 0).all():
         return mean
-    root = np.linalg.cholesky(covariance + (1e-6 + 1e-9 * np.trace(covariance)) * np.eye(len(mean)))
+    jitter = 1e-6 + 1e-9 * np.trace(covariance)
+    root = np.linalg.cholesky(covariance + jitter * np.eye(len(mean)))
     multipliers, _ = nnls(root.T, np.linalg.solve(root, below), maxiter=30 * len(mean))
     return np.maximum(mean + covariance @ multipliers, lower)  # the jitter leaves small violations

@@ -1,23 +1,26 @@
-"""Identification of the regional model from observed runs: all parameters at once, by prediction
-error.
+"""Identification of the regional model from runs, by prediction error.
 
 MFDs fitted to outflow samples absorb what happens at the boundaries: a region that cannot send
-vehicles on looks collapsed. Here MFDs, exit rates, boundary capacities and storage minimise the
-error of rollouts over several control intervals, from each observed state under observed demand and
-controls (Ljung, System Identification, 1999, ch. 7).
+vehicles on looks collapsed. Here MFDs, exit rates, boundary capacities and storage are fitted
+together. They minimise the error of rollouts over several control intervals, from each observed
+state, under observed demand and controls (Ljung, System Identification, 1999, ch. 7).
+
+Steps of `fit`: `windows` cuts the runs into pieces, `_Model` holds the free numbers, `_rollout`
+predicts a piece, `_misfit` weighs the errors by region and by destination, and `_network` makes a
+RegionalModel of the result. `prediction_errors` tests a model on runs that the fit did not use.
 """
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float, Real
 from torch import Tensor
 
-from nmfd.arrays import PairsOverTime, StatesOverTime, TurnsOverTime
+from nmfd.arrays import PairsOverTime, PerRegion, StatesOverTime, TurnsOverTime
 from nmfd.metrics import largest_accumulation
 from nmfd.model import dynamics
 from nmfd.model.mfd import Cubic, of_numbers
@@ -27,12 +30,15 @@ from nmfd.tensors import one_thread
 HORIZON = 10  # control intervals
 ITERATIONS = 600
 BATCH = 256  # rollouts per Adam step
-LEARNING_RATE = 0.03
+LEARNING_RATE = 0.03  # of Adam; falls along a cosine
+LAST_LEARNING_SHARE = 0.05  # of it, at the end
+LARGEST_GRADIENT = 10.0  # norm beyond which a gradient is shortened
 OUTLIER = 0.3  # of the scale: beyond, an error counts linearly (Huber)
 BY_DESTINATION = 3.0  # weight of errors of x_ij, beside those of x_i
 LEAST_RATE = 0.01  # of the free rate, up to the jam accumulation
 EXIT_RATES = 8.0  # largest, and 1 / smallest
 FEWEST_CROSSINGS = 30.0  # vehicles for split ratios
+LEAST_SPLIT = 0.005  # smaller observed shares count as zero
 RIDGE = 1e-3  # weight of squared log changes: parameters that the data do not determine stay
 
 
@@ -40,9 +46,11 @@ RIDGE = 1e-3  # weight of squared log changes: parameters that the data do not d
 class Observed:
     """One run of T control intervals.
 
-    accumulation: (T+1, R, R) [veh]; demand: (T, R, R) [veh/s], entered vehicles; perimeter: (T, R,
-        R) [-];
-    splits: (T, R, R, R) [-]; crossings: (T, R, R) [veh], [i, h] from i to h
+    accumulation: (veh, (T+1, R, R))
+    demand: vehicles that entered (veh/s, (T, R, R))
+    perimeter: (-, (T, R, R))
+    splits: (-, (T, R, R, R))
+    crossings: [i, h] from i to h (veh, (T, R, R))
     """
 
     accumulation: StatesOverTime
@@ -52,47 +60,65 @@ class Observed:
     crossings: Real[np.ndarray, "T R R"]
 
 
+class Windows(NamedTuple):
+    """N pieces of runs, each of so many control intervals, `horizon`.
+
+    states: at the start, and after each interval (veh, (N, horizon + 1, R, R))
+    demand: (veh/s, (N, horizon, R, R))
+    perimeter: (-, (N, horizon, R, R))
+    splits: (-, (N, horizon, R, R, R))
+    """
+
+    states: Tensor
+    demand: Tensor
+    perimeter: Tensor
+    splits: Tensor
+
+    @property
+    def horizon(self) -> int:
+        return self.demand.shape[1]
+
+
 class _Model(torch.nn.Module):
-    """Parametrisation of `dynamics.Parameters` in which every choice of free numbers is a valid
-    network."""
+    """Parameters of the regional model as free numbers.
+
+    All numbers give a valid network.
+
+    fastest: largest rate of any vehicle, the inverse of the integration step (1/s)
+    """
 
     def __init__(
         self, network: RegionalModel, runs: Sequence[Observed], step: float, fastest: float
     ):
         super().__init__()
-
-        def free(values: Any) -> torch.nn.Parameter:
-            return torch.nn.Parameter(
-                torch.as_tensor(np.asarray(values), dtype=torch.float32).clone()
-            )
-
-        self.adjacency, self._fastest = (
-            torch.tensor(network.adjacency, dtype=torch.float32),
-            fastest,
-        )
+        self._fastest = fastest
         self._u_max = network.u_max
+        self.adjacency = torch.tensor(network.adjacency, dtype=torch.float32)
         largest = largest_accumulation(run.accumulation for run in runs)
         flow = np.max([run.crossings.max(axis=0) for run in runs], axis=0) / step
-        self.free_rate = free(
-            np.log([min(mfd.rate_up_to_jam(0.0), 0.5 * fastest) for mfd in network.mfds])
-        )
-        self.drop, self.bend = free(np.full(network.regions, 0.5)), free(np.zeros(network.regions))
-        self.jam = free(np.log(np.maximum(0.7 * largest, 1.0)))
-        self.exit_rates = free(np.zeros(network.adjacency.shape))
-        self._first_capacity = torch.tensor(
-            np.log(np.maximum(1.2 * flow, 0.05)), dtype=torch.float32
-        )
-        self.capacity = free(self._first_capacity)
-        self.storage = free(np.log(np.maximum(2.0 * largest, 1.0)))
+        free_rates = [min(mfd.rate_up_to_jam(0.0), 0.5 * fastest) for mfd in network.mfds]
+        capacity = np.log(np.maximum(1.2 * flow, 0.05))
+        self._first_capacity = torch.tensor(capacity, dtype=torch.float32)
+        # Shape of the rate q: its value at 0, how far it falls up to the jam, and how it bends.
+        self.free_rate = _free(np.log(free_rates))
+        self.drop = _free(np.full(network.regions, 0.5))
+        self.bend = _free(np.zeros(network.regions))
+        self.jam = _free(np.log(np.maximum(0.7 * largest, 1.0)))
+        self.exit_rates = _free(np.zeros(network.adjacency.shape))
+        self.capacity = _free(capacity)
+        self.storage = _free(np.log(np.maximum(2.0 * largest, 1.0)))
 
-    def shape(self) -> tuple[Tensor, ...]:
-        """Return c, first, second, jam of q = c (1 - first y - second y^2), y = x / jam, q(jam) >=
-        LEAST_RATE c."""
+    def shape(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return c, first, second and jam of q = c (1 - first y - second y^2).
+
+        y is x / jam. The rate q falls, and q(jam) >= LEAST_RATE c.
+        """
         drop = (1.0 - LEAST_RATE) * torch.sigmoid(self.drop)
         first = 2.0 * drop * torch.sigmoid(self.bend)
         return self.free_rate.exp(), first, drop - first, self.jam.exp()
 
     def regional(self) -> dynamics.Parameters:
+        """Return the parameters that the free numbers stand for."""
         c, first, second, jam = self.shape()
         rates = EXIT_RATES ** torch.tanh(self.exit_rates)
         rates = torch.minimum(rates, 0.999 * self._fastest / c.unsqueeze(-1))
@@ -111,19 +137,26 @@ class _Model(torch.nn.Module):
         return RIDGE * ((self.exit_rates**2).mean() + (moved**2).mean())
 
 
+def _free(values: Any) -> torch.nn.Parameter:
+    """Return numbers that a fit changes."""
+    return torch.nn.Parameter(torch.tensor(np.asarray(values), dtype=torch.float32))
+
+
 def observed_split_ratios(
     network: RegionalModel, crossings: Real[np.ndarray, "R R R"]
 ) -> dict[tuple[int, int], dict[int, float]]:
-    """Return (i, j) -> {h: share}, the observed next regions of vehicles in i bound for j.
+    """Return (i, j) -> {h: share}: next regions h from i on the way to j.
 
-    crossings: (R, R, R) [veh], [i, h, j] = from i to h, bound for j
+    crossings: [i, h, j] from i to h, bound for j (veh, (R, R, R))
     """
     crossings = crossings * network.split_mask
     ratios = {}
     for i, j in np.argwhere(crossings.sum(axis=1) >= FEWEST_CROSSINGS):
         shares = crossings[i, :, j] / crossings[i, :, j].sum()
-        kept = {int(h): round(float(shares[h]), 4) for h in np.flatnonzero(shares >= 0.005)}
-        ratios[int(i), int(j)] = {h: share / sum(kept.values()) for h, share in kept.items()}
+        next_regions = np.flatnonzero(shares >= LEAST_SPLIT)
+        kept = {int(h): round(float(shares[h]), 4) for h in next_regions}
+        total = sum(kept.values())
+        ratios[int(i), int(j)] = {h: share / total for h, share in kept.items()}
     return ratios
 
 
@@ -138,113 +171,136 @@ def fit(
     seed: int = 0,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> RegionalModel:
-    """Return `network` with the MFDs, exit rates, capacities and storage that predict `runs` best.
+    """Return `network` with the parameters that predict `runs` best.
 
-    Its MFDs are the initial guess and their critical accumulations the scale of the errors. The
-    rate q of each region falls and stays positive up to the jam accumulation, and step * q * exit
-    rate <= 1 for the integration step.
+    Fitted are MFDs, exit rates, capacities and storage. The rate q of each region falls and stays
+    positive up to the jam accumulation, and step * q * exit rate <= 1 for the integration step.
+
+    network: its MFDs are the initial guess, their critical accumulations the scale of the errors
+    step: control interval (s)
+    substeps, integrator: of the integration (nmfd.model.dynamics.integrated)
+    seed: of the batches
+    progress: takes iterations done, all, and a note
     """
     with one_thread():  # the same order of sums everywhere
-        torch.manual_seed(seed)
         generator = torch.Generator().manual_seed(seed)
-        model = _Model(network, runs, step, substeps / step)
+        model = _Model(network, runs, step, fastest=substeps / step)
         horizon = min(HORIZON, max(len(run.demand) for run in runs))
-        data, scheme = (
-            windows(runs, horizon),
-            {"step": step, "substeps": substeps, "integrator": integrator},
-        )
+        data = windows(runs, horizon)
+        count = len(data.states)
+        scheme = {"step": step, "substeps": substeps, "integrator": integrator}
         scale = torch.tensor(network.critical, dtype=torch.float32)
         optimizer = torch.optim.Adam(model.parameters(), lr=LEARNING_RATE)
         for iteration in range(iterations):
             for group in optimizer.param_groups:
-                group["lr"] = LEARNING_RATE * (
-                    0.05 + 0.95 * 0.5 * (1.0 + math.cos(math.pi * iteration / iterations))
-                )
-            batch = torch.randint(len(data[0]), (min(BATCH, len(data[0])),), generator=generator)
-            loss = _misfit(model.regional(), [part[batch] for part in data], scale, scheme)
+                group["lr"] = _learning_rate(iteration, iterations)
+            drawn = torch.randint(count, (min(BATCH, count),), generator=generator)
+            batch = Windows(*(part[drawn] for part in data))
+            misfit = _misfit(model.regional(), batch, scale, scheme)
+            loss = misfit + model.penalty()
             optimizer.zero_grad()
-            (loss + model.penalty()).backward()
-            torch.nn.utils.clip_grad_norm_(model.parameters(), 10.0)
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(model.parameters(), LARGEST_GRADIENT)
             optimizer.step()
             if progress:
-                progress(iteration + 1, iterations, f"misfit {loss.item():.3f}")
+                progress(iteration + 1, iterations, f"misfit {misfit.item():.3f}")
         return _network(network, model, runs)
 
 
-def windows(runs: Sequence[Observed], horizon: int) -> list[Tensor]:
-    """Return states (N, horizon + 1, R, R), demands, perimeters and splits (N, horizon, ...) of all
-    windows."""
+def _learning_rate(iteration: int, iterations: int) -> float:
+    """Return the learning rate of an iteration: it falls along half a cosine."""
+    cosine = 1.0 + math.cos(math.pi * iteration / iterations)
+    return LEARNING_RATE * (LAST_LEARNING_SHARE + (1.0 - LAST_LEARNING_SHARE) * 0.5 * cosine)
 
-    cut, long = (
-        np.lib.stride_tricks.sliding_window_view,
-        [run for run in runs if len(run.demand) >= horizon],
+
+def windows(runs: Sequence[Observed], horizon: int) -> Windows:
+    """Return all pieces of `horizon` control intervals of all runs."""
+    long = [run for run in runs if len(run.demand) >= horizon]
+
+    def stack(series: Sequence[np.ndarray], length: int) -> Tensor:
+        """Return the windows of arrays over time, one of each run."""
+        cut = np.lib.stride_tricks.sliding_window_view
+        parts = np.concatenate([cut(values, length, axis=0) for values in series])
+        return torch.tensor(np.moveaxis(parts, -1, 1), dtype=torch.float32)
+
+    return Windows(
+        states=stack([run.accumulation for run in long], horizon + 1),
+        demand=stack([run.demand for run in long], horizon),
+        perimeter=stack([run.perimeter for run in long], horizon),
+        splits=stack([run.splits for run in long], horizon),
     )
-
-    def stack(name: str, length: int) -> Tensor:
-        parts = [cut(getattr(run, name), length, axis=0) for run in long]
-        return torch.tensor(np.moveaxis(np.concatenate(parts), -1, 1), dtype=torch.float32)
-
-    return [
-        stack("accumulation", horizon + 1),
-        *(stack(name, horizon) for name in ("demand", "perimeter", "splits")),
-    ]
 
 
 def _misfit(
-    p: dynamics.Parameters, data: Sequence[Tensor], scale: Tensor, scheme: Mapping[str, Any]
+    p: dynamics.Parameters, data: Windows, scale: Tensor, scheme: Mapping[str, Any]
 ) -> Tensor:
-    """Return the mean Huber loss of x_i and x_ij over the horizon, in units of `scale` (R,)
-    [veh]."""
-    total, horizon, huber = torch.zeros(()), data[1].shape[1], torch.nn.SmoothL1Loss(beta=OUTLIER)
+    """Return the mean Huber loss of x_i and x_ij over the horizon.
+
+    scale: unit of the errors (veh, (R,))
+    scheme: step [s], substeps, integrator
+    """
+    total = torch.zeros(())
+    huber = torch.nn.SmoothL1Loss(beta=OUTLIER)
     for k, x in enumerate(_rollout(p, data, scheme), start=1):
-        error = (x - data[0][:, k]) / scale.unsqueeze(-1)
-        for off, weight in ((error.sum(-1), 1.0), (error, BY_DESTINATION)):
-            total = total + weight * huber(off, torch.zeros_like(off))
-    return total / horizon
+        by_destination = (x - data.states[:, k]) / scale.unsqueeze(-1)
+        by_region = by_destination.sum(-1)
+        total = total + huber(by_region, torch.zeros_like(by_region))
+        zero = torch.zeros_like(by_destination)
+        total = total + BY_DESTINATION * huber(by_destination, zero)
+    return total / data.horizon
 
 
-def _rollout(
-    p: dynamics.Parameters, data: Sequence[Tensor], scheme: Mapping[str, Any]
-) -> Iterator[Tensor]:
-    """Yield the states (N, R, R) [veh] after each interval, from the first states of `windows`."""
-    observed, demand, perimeter, splits = data
-    x = observed[:, 0]
-    for k in range(demand.shape[1]):
-        x = dynamics.advance(p, x, demand[:, k], perimeter[:, k], splits[:, k], **scheme)
+def _rollout(p: dynamics.Parameters, data: Windows, scheme: Mapping[str, Any]) -> Iterator[Tensor]:
+    """Yield the predicted states (N, R, R) [veh] after each interval."""
+    x = data.states[:, 0]
+    for k in range(data.horizon):
+        inputs = data.demand[:, k], data.perimeter[:, k], data.splits[:, k]
+        x = dynamics.advance(p, x, *inputs, **scheme)
         yield x
 
 
 def _network(network: RegionalModel, model: _Model, runs: Sequence[Observed]) -> RegionalModel:
-    """Return the fitted network, with exit rates scaled to 1 on the average of a region's
-    vehicles."""
+    """Return `network` with the fitted parameters.
+
+    Exit rates are scaled to 1 on the average of a region's vehicles; the MFDs take the rest.
+    """
     with torch.no_grad():
         p = model.regional()
     assert p.exit_rates is not None
     assert p.capacity is not None
     assert p.storage is not None
     rates = p.exit_rates.double().numpy()
-    weight = sum(run.accumulation.sum(axis=0) for run in runs)
-    weight[weight.sum(axis=1) == 0] = 1.0  # empty in all runs
-    mean = (weight * rates).sum(axis=1) / weight.sum(axis=1)
-    curves = zip(*(part.tolist() for part in vars(p.mfd).values()), mean, strict=True)
+    mean = _mean_exit_rates(rates, runs)
+    curves = [vars(p.mfd)[name].tolist() for name in ("a", "b", "c", "jam")]
+    mfds = []
+    for a, b, c, jam, factor in zip(*curves, mean, strict=True):
+        mfds.append(Cubic(a=a * factor, b=b * factor, c=c * factor, jam=jam))
     return replace(
         network,
-        mfds=tuple(Cubic(a=a * m, b=b * m, c=c * m, jam=jam) for a, b, c, jam, m in curves),
+        mfds=tuple(mfds),
         exit_rates=rates / mean[:, None],
         capacity=p.capacity.double().numpy() * network.u_max * network.adjacency,
         storage=p.storage.double().numpy(),
     )
 
 
+def _mean_exit_rates(rates: Float[np.ndarray, "R R"], runs: Sequence[Observed]) -> PerRegion:
+    """Return the exit rate (R,) [-] of the average vehicle in each region."""
+    weight = sum(run.accumulation.sum(axis=0) for run in runs)
+    weight[weight.sum(axis=1) == 0] = 1.0  # empty in all runs
+    return (weight * rates).sum(axis=1) / weight.sum(axis=1)
+
+
 def prediction_errors(
     network: RegionalModel, runs: Sequence[Observed], intervals: int, **scheme: Any
 ) -> Float[np.ndarray, "N R"]:
-    """Return predicted minus observed accumulation (N, R) [veh], `intervals` ahead of each observed
-    state.
+    """Return predicted minus observed accumulation (N, R) [veh].
 
+    intervals: how far ahead of each observed state
     scheme: step [s], substeps, integrator
     """
     data = windows(runs, intervals)
+    p = dynamics.parameters(network, dtype=torch.float32)
     with torch.no_grad():
-        *_, last = _rollout(dynamics.parameters(network, dtype=torch.float32), data, scheme)
-    return (last - data[0][:, -1]).sum(-1).numpy()
+        *_, last = _rollout(p, data, scheme)
+    return (last - data.states[:, -1]).sum(-1).numpy()

@@ -1,4 +1,4 @@
-"""Outflow MFDs: the published cubic, piecewise linear ones, and the protocol of any other.
+"""Outflow MFDs: the published cubic, piecewise linear ones, and others.
 
 Beyond the jam accumulation the outflow is constant. This tail is not published. The benchmark's
 cubic rises again beyond 10,019 vehicles: a jammed region would recover by itself. With g(jam)
@@ -15,14 +15,17 @@ from jaxtyping import Real
 from nmfd.errors import InputError
 
 Samples = Real[np.ndarray, " N"]
-# Geometric guess of a curve: the shape of the published one, g = c (ALPHA y^2 + BETA y + 1) x with
-# y = x / jam.
-ALPHA, BETA = 0.98405, -1.97190
+# Shape of the published curve, for guesses: g = c (ALPHA y^2 + BETA y + 1) x with y = x / jam.
+ALPHA = 0.98405
+BETA = -1.97190
 JAM_DENSITY = 80.0  # veh per lane-km: 60 % of the lanes full of standing vehicles
 
 
 def of_numbers(kind: "type[Mfd]", **numbers: Any) -> Any:
-    """Return a curve of this kind whose numbers are arrays, which need no check."""
+    """Return a curve of this kind whose numbers are arrays.
+
+    They come from curves that were checked, and are not checked again.
+    """
     curve = object.__new__(kind)
     vars(curve).update(numbers)
     return curve
@@ -30,37 +33,39 @@ def of_numbers(kind: "type[Mfd]", **numbers: Any) -> Any:
 
 @runtime_checkable
 class Mfd(Protocol):
-    """Outflow of one region against its accumulation; or of R regions, if its numbers are arrays
-    (R,).
+    """Outflow of a region as a function of its accumulation.
 
-    A kind of curve is a frozen dataclass of floats, or tuples of floats, with `jam` [veh] and
-    `rate_up_to_jam`. One formula serves all plants, training and MPC: it takes the functions of
-    NumPy, torch or CasADi from `xp`, under NumPy's names (minimum, maximum, exp, ...).
+    With arrays (R,) for its numbers it is that of R regions. A kind of curve is a frozen dataclass
+    of floats, or tuples of floats, with `jam` [veh] and `rate_up_to_jam`. One formula serves all
+    plants, training and MPC: it takes the functions of NumPy, torch or CasADi from `xp`, under
+    NumPy's names (minimum, maximum, exp, ...).
     """
 
     jam: Any
 
     def rate_up_to_jam(self, accumulation: Any, xp: Any = np) -> Any:
-        """Return the outflow per vehicle q(n) = g(n)/n [1/s] for n [veh] up to the jam, falling and
-        finite at 0."""
+        """Return the rate q(n) = g(n)/n [1/s], falling and finite at 0.
+
+        accumulation: n, up to the jam accumulation (veh)
+        """
         ...
 
     def slope_up_to_jam(self, accumulation: Any) -> Any:
-        """Return dq/dn [1/(veh s)] of NumPy's arrays; by finite differences unless a kind states
-        it."""
+        """Return dq/dn [1/(veh s)] of NumPy's arrays.
+
+        It comes from finite differences unless a kind of curve states it.
+        """
         step = 1e-6 * self.jam
-        above, below = (
-            self.rate_up_to_jam(accumulation + step),
-            self.rate_up_to_jam(accumulation - step),
-        )
+        above = self.rate_up_to_jam(accumulation + step)
+        below = self.rate_up_to_jam(accumulation - step)
         return (above - below) / (2.0 * step)
 
     def scaled(self, wide: Any, high: Any) -> "Mfd":
-        """Return the curve with its accumulation axis times `wide` and its rate times `high`."""
+        """Return the curve with accumulation times `wide`, rate times `high`."""
         return _Scaled(self, wide, high)
 
     def rate(self, accumulation: Any, xp: Any = np) -> Any:
-        """Return q(n) [1/s] of any accumulation [veh]: beyond the jam the outflow stays g(jam)."""
+        """Return q(n) [1/s] for any n [veh]; beyond the jam it is g(jam) / n."""
         body = xp.minimum(accumulation, self.jam)
         return self.rate_up_to_jam(body, xp) * self.jam / xp.maximum(accumulation, self.jam)
 
@@ -70,7 +75,7 @@ class Mfd(Protocol):
 
     @property
     def critical(self) -> float:
-        """Accumulation of maximum outflow [veh], the smallest if there are several."""
+        """Accumulation of maximum outflow [veh], the smallest of several."""
         if np.ndim(self.jam):
             raise AttributeError("critical: only the curve of one region has it")
         grid = np.linspace(0.0, self.jam, 20001)
@@ -78,9 +83,10 @@ class Mfd(Protocol):
         return float(grid[np.argmax(outflow >= outflow.max() * (1.0 - 1e-13))])
 
     def reaching(self, share: float) -> float:
-        """Return the smallest accumulation [veh] with `share` of the maximum outflow."""
+        """Return the smallest n [veh] with `share` of the maximum outflow."""
         grid = np.linspace(0.0, self.critical, 20001)
-        return float(grid[np.argmax(self.outflow(grid) >= share * self.capacity * (1.0 - 1e-12))])
+        reached = self.outflow(grid) >= share * self.capacity * (1.0 - 1e-12)
+        return float(grid[np.argmax(reached)])
 
     @property
     def capacity(self) -> float:
@@ -88,20 +94,26 @@ class Mfd(Protocol):
         return float(self.outflow(self.critical))
 
     def problem(self) -> str | None:
-        """Return why this is no MFD, or None: the outflow must be positive up to the jam."""
+        """Return why this is no MFD, or None.
+
+        The outflow must be positive up to the jam.
+        """
         grid = np.linspace(0.0, self.jam, 2001)
         rate = self.rate_up_to_jam(grid)
         if not rate.min() > 0:
-            return f"the outflow is not positive at {grid[rate.argmin()]:.0f} veh, below jam = {self.jam:g}"
+            where = f"{grid[rate.argmin()]:.0f} veh, below jam = {self.jam:g}"
+            return f"the outflow is not positive at {where}"
         return None
 
 
 @dataclass(frozen=True, kw_only=True)
 class Cubic(Mfd):
-    """Outflow g(n) = a n^3 + b n^2 + c n, constant beyond the jam accumulation.
+    """Outflow g(n) = a n^3 + b n^2 + c n, constant beyond the jam.
 
-    a [veh^-2 s^-1], b [veh^-1 s^-1], c [s^-1]: coefficients; jam [veh]
-    Raises InputError for a number that is not finite, and for jam <= 0.
+    a, b, c: coefficients (veh^-2 s^-1, veh^-1 s^-1, s^-1)
+    jam: jam accumulation (veh)
+
+    Raises: InputError for a number that is not finite, and for jam <= 0
 
         >>> curve = Cubic(a=4.133e-11, b=-8.282e-7, c=0.0042, jam=10000.0)  # the benchmark's
         >>> round(curve.critical), round(curve.capacity, 2)
@@ -117,8 +129,12 @@ class Cubic(Mfd):
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if not np.isfinite(value) or (name == "jam" and value <= 0):
-                allowed = "a number above 0" if name == "jam" else "a number"
+            allowed = "a number"
+            valid = np.isfinite(value)
+            if name == "jam":
+                allowed = "a number above 0"
+                valid = valid and value > 0
+            if not valid:
                 raise InputError(
                     f"Mfd: {name}: expected {allowed}, got {value:g} instead; give a finite one"
                 )
@@ -136,9 +152,10 @@ class Cubic(Mfd):
 
 @dataclass(frozen=True, kw_only=True)
 class PiecewiseLinear(Mfd):
-    """Outflow along straight lines from (0, 0) through points, the last at the jam accumulation.
+    """Outflow along straight lines from (0, 0) through points.
 
-    accumulations [veh], rising from above 0; outflows [veh/s]
+    accumulations: rising from above 0, the last is the jam accumulation (veh)
+    outflows: (veh/s)
 
         >>> trapezoid(free=0.004, capacity=6.0, wave=0.001, jam=8000.0).accumulations
         (1500.0, 2000.0, 7700.0)
@@ -148,9 +165,11 @@ class PiecewiseLinear(Mfd):
     outflows: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        n, count = np.array([0.0, *self.accumulations]), len(self.outflows)
-        rising = len(n) == count + 1 > 1 and (np.diff(n) > 0).all()
-        if not (rising and np.isfinite([*n, *self.outflows]).all()):
+        n = np.array([0.0, *self.accumulations])
+        alike = len(self.outflows) == len(self.accumulations) > 0
+        rising = (np.diff(n) > 0).all()
+        finite = np.isfinite([*n, *self.outflows]).all()
+        if not (alike and rising and finite):
             wanted = "as many finite outflows as accumulations, which rise from above 0"
             raise InputError(
                 f"PiecewiseLinear: expected {wanted}, got {self.accumulations} and {self.outflows}"
@@ -162,32 +181,36 @@ class PiecewiseLinear(Mfd):
 
     def rate_up_to_jam(self, accumulation: Any, xp: Any = np) -> Any:
         kinks = self._kinks()
-        q = next(kinks)[1] + 0.0 * accumulation
-        for (
-            kink,
-            change,
-        ) in kinks:  # beyond n_k the outflow changes by (n - n_k) times the change of slope
+        _, first_slope = next(kinks)
+        q = first_slope + 0.0 * accumulation
+        # Beyond a kink n_k the outflow changes by (n - n_k) times the change of slope.
+        for kink, change in kinks:
             q = q + change * (1.0 - kink / xp.maximum(accumulation, kink))
         return q
 
     def _kinks(self) -> Iterator[tuple[Any, Any]]:
-        """Yield the accumulations at which the slope of the outflow changes, from 0, and these
-        changes [1/s]."""
-        left, low, before = 0.0, 0.0, 0.0
+        """Yield accumulations from 0, and the change of slope there [1/s]."""
+        left = 0.0
+        low = 0.0
+        before = 0.0
         for right, high in zip(self.accumulations, self.outflows, strict=True):
             slope = (high - low) / (right - left)
             yield left, slope - before
-            left, low, before = right, high, slope
+            left = right
+            low = high
+            before = slope
 
 
 def trapezoid(
     *, free: float, capacity: float, wave: float, jam: float, least: float = 0.05
 ) -> PiecewiseLinear:
-    """Return g(n) = min(free n, capacity, wave (jam - n)), constant below `least` times the
-    capacity.
+    """Return the curve g(n) = min(free n, capacity, wave (jam - n)).
 
-    free, wave: outflow per vehicle of an empty region, and by which it falls before the jam [1/s];
-        capacity [veh/s]
+    free: outflow per vehicle of an empty region (1/s)
+    capacity: largest outflow (veh/s)
+    wave: loss of outflow per further vehicle before the jam (1/s)
+    jam: accumulation at which the last line would reach zero (veh)
+    least: share of the capacity below which the outflow is constant (-)
     """
     last = jam - least * capacity / wave
     return PiecewiseLinear(
@@ -197,51 +220,66 @@ def trapezoid(
 
 
 class _Scaled(Mfd):
-    """Any curve with other axes."""
+    """Curve with other axes than `curve`."""
 
     def __init__(self, curve: Mfd, wide: Any, high: Any):
-        self.curve, self.wide, self.high, self.jam = curve, wide, high, wide * curve.jam
+        self.curve = curve
+        self.wide = wide
+        self.high = high
+        self.jam = wide * curve.jam
 
     def rate_up_to_jam(self, accumulation: Any, xp: Any = np) -> Any:
         return self.high * self.curve.rate_up_to_jam(accumulation / self.wide, xp)
 
 
 class _Several(Mfd):
-    """Regions with curves of different kinds, each an array over all regions with weights 0 and
-    1."""
+    """Curves of regions of different kinds.
+
+    kinds: a pair for each kind: weights, 1 in its regions and 0 elsewhere, and a curve over all
+        regions
+    """
 
     def __init__(self, kinds: list[tuple[Any, Mfd]]):
-        self.kinds, self.jam = kinds, sum(weight * curve.jam for weight, curve in kinds)
+        self.kinds = kinds
+        self.jam = sum(weight * curve.jam for weight, curve in kinds)
 
     def rate_up_to_jam(self, accumulation: Any, xp: Any = np) -> Any:
-        return sum(
-            w * curve.rate_up_to_jam(xp.minimum(accumulation, curve.jam), xp)
-            for w, curve in self.kinds
-        )
+        rate = 0.0
+        for weight, curve in self.kinds:
+            body = xp.minimum(accumulation, curve.jam)
+            rate = rate + weight * curve.rate_up_to_jam(body, xp)
+        return rate
 
 
 def stacked(mfds: Sequence[Mfd], array: Callable[[Sequence[float]], Any]) -> Mfd:
-    """Return the curves of R regions as one, whose numbers are arrays (R,), made by `array`, such
-    as np.array."""
-    keys = [(type(m), *map(np.shape, vars(m).values())) for m in mfds]
-    kinds: dict[tuple, tuple[Any, Mfd]] = {}
-    for key, first in zip(keys, mfds, strict=True):
-        if key in kinds:
-            continue
-        alike = [
-            m if k == key else first for m, k in zip(mfds, keys, strict=True)
-        ]  # the others get any numbers
-        columns = {name: [vars(m)[name] for m in alike] for name in vars(first)}
-        numbers = {
-            name: tuple(map(array, zip(*column, strict=True)))
-            if isinstance(column[0], tuple)
-            else stacked(column, array)  # of a scaled curve
-            if hasattr(column[0], "rate_up_to_jam")
-            else array(column)
-            for name, column in columns.items()
-        }
-        kinds[key] = array([float(k == key) for k in keys]), of_numbers(type(first), **numbers)
-    return next(iter(kinds.values()))[1] if len(kinds) == 1 else _Several(list(kinds.values()))
+    """Return the curves of R regions as one, whose numbers are arrays (R,).
+
+    array: makes these arrays, such as np.array
+    """
+    kinds = [(type(curve), *map(np.shape, vars(curve).values())) for curve in mfds]
+    groups = []
+    for kind in dict.fromkeys(kinds):
+        first = mfds[kinds.index(kind)]
+        # Regions of another kind have weight 0 and get any numbers.
+        alike = [curve if own == kind else first for curve, own in zip(mfds, kinds, strict=True)]
+        numbers = {}
+        for name in vars(first):
+            numbers[name] = _stacked_numbers([vars(curve)[name] for curve in alike], array)
+        weight = array([float(own == kind) for own in kinds])
+        groups.append((weight, of_numbers(type(first), **numbers)))
+    if len(groups) == 1:
+        return groups[0][1]
+    return _Several(groups)
+
+
+def _stacked_numbers(values: Sequence[Any], array: Callable[[Sequence[float]], Any]) -> Any:
+    """Return one attribute of R curves with arrays instead of numbers."""
+    first = values[0]
+    if isinstance(first, tuple):
+        return tuple(array(numbers) for numbers in zip(*values, strict=True))
+    if hasattr(first, "rate_up_to_jam"):  # the curve inside a scaled one
+        return stacked(values, array)
+    return array(values)
 
 
 def guess(rate: float, jam: float) -> Cubic:
@@ -250,47 +288,64 @@ def guess(rate: float, jam: float) -> Cubic:
 
 
 def guess_beyond(curve: Mfd, jam: float, seen: float, *, max_rate: float = np.inf) -> Cubic:
-    """Return the guess with the outflow of `curve`, fitted to data without a falling branch, at
-    their end `seen` [veh].
+    """Return the guess for a region whose data show no falling branch.
 
-    jam: of the region's lanes [veh], raised so that the critical accumulation is above `seen`;
-        max_rate: [1/s]
+    It has the outflow of `curve` at the end of the data.
+
+    curve: fitted to the data
+    jam: of the region's lanes, raised so that the critical accumulation is above `seen` (veh)
+    seen: largest accumulation of the data (veh)
+    max_rate: limit of q(0) (1/s)
     """
     jam *= max(1.0, 1.0001 * seen / guess(1.0, jam).critical)
-    return guess(float(min(curve.outflow(seen) / guess(1.0, jam).outflow(seen), max_rate)), jam)
+    rate = curve.outflow(seen) / guess(1.0, jam).outflow(seen)
+    return guess(float(min(rate, max_rate)), jam)
 
 
 def fit(
     accumulation: Samples, outflow: Samples, *, max_rate: float = np.inf, bins: int = 24
 ) -> Cubic:
-    """Fit a curve to samples (n,) [veh], (n,) [veh/s] by least squares over the medians of bins of
-    accumulation.
+    """Fit a curve to samples by least squares over the medians of bins.
 
     The rate q(x) = a x^2 + b x + c is positive, falling up to the jam accumulation and at most
-    `max_rate` [1/s] (the inverse of the integration step). The jam accumulation is at most the
-    largest sample: beyond the data the outflow is constant. Raises ValueError without samples.
+    `max_rate`. The jam accumulation is at most the largest sample: beyond the data the outflow is
+    constant.
+
+    accumulation: (veh, (N,))
+    outflow: (veh/s, (N,))
+    max_rate: inverse of the integration step (1/s)
+    bins: number of bins of accumulation
+
+    Raises: ValueError without samples
     """
-    x, g = np.asarray(accumulation, dtype=float), np.asarray(outflow, dtype=float)
+    x = np.asarray(accumulation, dtype=float)
+    g = np.asarray(outflow, dtype=float)
     good = np.isfinite(x) & np.isfinite(g) & (x > 0)
     if not good.any():
         raise ValueError("no samples to fit an MFD to")
-    x, g = x[good], g[good]
+    x = x[good]
+    g = g[good]
     number = np.minimum((bins * x / x.max()).astype(int), bins - 1)
     used = np.unique(number)
-    middle_x, middle_g = (
-        np.array([np.median(values[number == n]) for n in used]) for values in (x, g)
-    )
-    jams = (float(share * x.max()) for share in np.linspace(0.2, 1.0, 17))
-    candidates = (_fit_cubic(middle_x, middle_g, jam, max_rate) for jam in jams)
-    return min(candidates, key=lambda curve: ((curve.outflow(middle_x) - middle_g) ** 2).sum())
+    middle_x = np.array([np.median(x[number == n]) for n in used])
+    middle_g = np.array([np.median(g[number == n]) for n in used])
+
+    def misfit(curve: Cubic) -> float:
+        return ((curve.outflow(middle_x) - middle_g) ** 2).sum()
+
+    jams = [float(share * x.max()) for share in np.linspace(0.2, 1.0, 17)]
+    return min((_fit_cubic(middle_x, middle_g, jam, max_rate) for jam in jams), key=misfit)
 
 
 def _fit_cubic(x: np.ndarray, g: np.ndarray, jam: float, max_rate: float) -> Cubic:
+    """Return the curve with this jam accumulation that fits points best."""
     from scipy.optimize import minimize  # slow to import
 
     # Scaled: g = (A y^2 + B y + C) y with y = x / jam, at most 1. Falling: B <= 0 and 2 A + B <= 0
-    # (q' is linear). Positive at the jam: A + B + C >= floor.
-    y, scale = np.minimum(x / jam, 1.0), g.max()
+    # (q' is linear). Positive at the jam: A + B + C >= floor. Each row of `limits` times (A, B, C)
+    # is at least the entry of `least`.
+    y = np.minimum(x / jam, 1.0)
+    scale = g.max()
     design = np.stack([y**3, y**2, y], axis=1)
     limits = np.array([[0, -1, 0], [-2, -1, 0], [1, 1, 1], [0, 0, 1], [0, 0, -1]], dtype=float)
     least = np.array([0.0, 0.0, 0.01, 0.01, -min(max_rate * jam / scale, 1e3)])

@@ -1,4 +1,4 @@
-"""Regional plants: the NMFD and its acyclic variant, in float64 (nmfd.types.Plant)."""
+"""Regional plants: the NMFD and its acyclic variant, in float64."""
 
 import numpy as np
 import torch
@@ -9,10 +9,13 @@ from nmfd.model import acyclic, dynamics
 from nmfd.model.scenario import Scenario
 from nmfd.types import Controls, Observation, State
 
+PROCESS_STREAM = 0x70726F63  # random numbers of the process noise
+
 
 class NmfdPlant:
-    """The regional model as a plant; deterministic but for `process_std`, so that without it seeds
-    change nothing.
+    """The regional model as a plant.
+
+    It is deterministic but for `process_std`; without that, seeds change nothing.
 
     >>> scenario = nmfd.load_scenario("economic_mpc")
     >>> plant, network = nmfd.NmfdPlant(scenario), scenario.network
@@ -27,37 +30,40 @@ class NmfdPlant:
         self._build()
 
     def reset(self, seed: int) -> State:
-        self._k, self._entered, self._ended = 0, float(self._scenario.start.sum()), 0.0
-        self._random = np.random.default_rng([seed, 0x70726F63])
+        self._k = 0
+        self._entered = float(self._scenario.start.sum())
+        self._ended = 0.0
+        self._random = np.random.default_rng([seed, PROCESS_STREAM])
         self._backlog = torch.zeros(self._scenario.demand.shape[1:], dtype=torch.float64)
         self._begin(self._scenario.start)
         return self._state()
 
     def step(self, controls: Controls) -> State:
-        """Advance by one control interval. Raises LedgerError if vehicles appear or vanish."""
-        metering = None if controls.metering is None else torch.from_numpy(controls.metering)
-        demand, self._backlog = dynamics.admitted(
-            self._backlog,
-            torch.from_numpy(self._scenario.demand[self._k]),
-            metering,
-            self._scenario.step,
-        )
-        splits = (
-            self._scenario.network.nominal_splits if controls.splits is None else controls.splits
-        )
+        """Advance by one control interval.
+
+        Raises: LedgerError if vehicles appear or vanish
+        """
+        step = self._scenario.step
+        due = torch.from_numpy(self._scenario.demand[self._k])
+        metering = controls.metering
+        if metering is not None:
+            metering = torch.from_numpy(metering)
+        demand, self._backlog = dynamics.admitted(self._backlog, due, metering, step)
+        splits = controls.splits
+        if splits is None:
+            splits = self._scenario.network.nominal_splits
         ended = self._advance(demand.numpy(), controls.perimeter, splits)
-        self._entered += float(demand.sum()) * self._scenario.step + self._disturb()
+        self._entered += float(demand.sum()) * step + self._disturb()
         self._ended += ended
         self._k += 1
         state = self._state()
-        inside, least = float(self._x.sum()), float(self._x.min())
         ledger.check(
             state.step,
             state.time,
             entered=self._entered,
             ended=self._ended,
-            inside=inside,
-            least=least,
+            inside=float(self._x.sum()),
+            least=float(self._x.min()),
         )
         return state
 
@@ -65,8 +71,7 @@ class NmfdPlant:
         """Return None: controllers observe the state with noise."""
 
     def _disturb(self) -> float:
-        """Add the process noise to each x_ij that is not empty; return the vehicles that it adds in
-        all [veh]."""
+        """Add process noise to each x_ij above 0; return the vehicles added."""
         if not self._scenario.process_std:
             return 0.0
         before = self._accumulation()
@@ -98,10 +103,13 @@ class NmfdPlant:
 
     def _advance(self, demand: PerPair, perimeter: PerPair, splits: PerTurn) -> float:
         """Advance `_x` by one control interval; return the completed trips [veh]."""
-        inflow, u, theta = (torch.from_numpy(values) for values in (demand, perimeter, splits))
-        scheme = self._scenario.scheme
         self._x, ended = dynamics.advance_counted(
-            self._parameters, self._x, inflow, u, theta, **scheme
+            self._parameters,
+            self._x,
+            torch.from_numpy(demand),
+            torch.from_numpy(perimeter),
+            torch.from_numpy(splits),
+            **self._scenario.scheme,
         )
         return float(ended)
 
@@ -109,8 +117,8 @@ class NmfdPlant:
 class AcyclicPlant(NmfdPlant):
     """The acyclic regional model as a plant.
 
-    forced_moves: vehicles since the reset [veh] without an allowed next region, sent to the
-        least-bad one, counted at the rate at the beginning of each control interval
+    forced_moves: vehicles since the reset that had no allowed next region and were sent to the
+        least-bad one, counted at the rate at the beginning of each control interval (veh)
     """
 
     forced_moves: float
@@ -119,13 +127,15 @@ class AcyclicPlant(NmfdPlant):
         self._model = acyclic.build(self._scenario.network)
 
     def _begin(self, start: PerPair) -> None:
-        self._x, self.forced_moves = np.zeros(len(self._model.region)), 0.0
+        self.forced_moves = 0.0
+        self._x = np.zeros(len(self._model.region))
         self._x[self._model.start] = start
 
     def _accumulation(self) -> PerPair:
-        model, regions = self._model, len(self._model.start)
-        cells = model.region * regions + model.destination
-        return np.bincount(cells, self._x, minlength=regions**2).reshape(regions, regions)
+        model = self._model
+        regions = len(model.start)
+        pair = model.region * regions + model.destination
+        return np.bincount(pair, self._x, minlength=regions**2).reshape(regions, regions)
 
     def _scale(self, factor: PerPair) -> None:
         self._x = self._x * factor[self._model.region, self._model.destination]
@@ -134,10 +144,10 @@ class AcyclicPlant(NmfdPlant):
         model = self._model
         theta, forced = acyclic.shares(model, splits)
         if forced.any():
-            passing = acyclic.transfers(
-                model, self._x, acyclic.outflow(model, self._x), perimeter, theta
-            )
-            self.forced_moves += self._scenario.step * float(passing[model.fallback[forced]].sum())
+            leaving = acyclic.outflow(model, self._x)
+            passing = acyclic.transfers(model, self._x, leaving, perimeter, theta)
+            moved = float(passing[model.fallback[forced]].sum())
+            self.forced_moves += self._scenario.step * moved
         self._x, ended = acyclic.advance_counted(
             model, self._x, demand, perimeter, theta, **self._scenario.scheme
         )

@@ -1,8 +1,8 @@
-"""Regions, their adjacency, control bounds and MFDs, and the network.toml that declares them."""
+"""Regional model of a city, and the network.toml that holds it."""
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -27,17 +27,14 @@ LEAST_LIMIT = 1e-6  # veh/s, against a division by zero
 
 MOST_VEHICLES = 1e9  # in a region
 DISPERSION_S = 60.0  # of the travel times that drivers perceive; assumed
-FOR_ALL = (
-    "exit_rates",
-    "capacity",
-    "storage",
-    "controllable",
-)  # given for every region or for none
+FOR_ALL = ("exit_rates", "capacity", "storage", "controllable")  # for every region or for none
 
 
 def passing_share(wish: Any, limit: Any) -> Any:
-    """Return the share [-] of a desired flow that passes a boundary of this limit [veh/s]; any
-    library's arrays."""
+    """Return the share [-] of a desired flow that passes a boundary.
+
+    wish, limit: desired flow and limit of the boundary, arrays of any library (veh/s)
+    """
     return (1.0 + (wish / (limit + LEAST_LIMIT)) ** SHARPNESS) ** (-1.0 / SHARPNESS)
 
 
@@ -46,23 +43,23 @@ class RegionalModel:
     """R regions, numbered from 0.
 
     region_names: R names
-    positions: (R, 2), place on the map [any unit]
-    adjacency: (R, R) bool, [i, h]: roads lead from i to h; false on the diagonal
+    positions: place on the map ((R, 2), any unit)
+    adjacency: [i, h]: roads lead from i to h (bool, (R, R)); False on the diagonal
     mfds: R outflow MFDs
-    u_min, u_max: bounds of the perimeter control [-]
+    u_min, u_max: bounds of the perimeter control (-)
     observed_split_ratios: {(i, j): {h: share}}, measured; elsewhere vehicles cross the fewest
         boundaries
-    exit_rates: (R, R) [-], [i, j]: rate of vehicles in i bound for j relative to g_i(x_i)/x_i;
+    exit_rates: [i, j]: rate of vehicles in i bound for j relative to g_i(x_i)/x_i (-, (R, R));
         None: 1
-    capacity: (R, R) [veh/s], [i, h]: largest flow from i into an empty region h under u_max; None:
+    capacity: [i, h]: largest flow from i into an empty region h under u_max (veh/s, (R, R)); None:
         u_ih is a share of the desired flow
-    storage: (R,) [veh], accumulation that leaves no room for vehicles from other regions; with
+    storage: accumulation that leaves no room for vehicles from other regions (veh, (R,)); with
         `capacity`
-    controllable: (R, R) [-], [i, h]: share of the flow that passes signals under control; None if
+    controllable: [i, h]: share of the flow that passes signals under control (-, (R, R)); None if
         unknown
     critical_above: {region: largest accumulation [veh]} where data show no falling branch; the MFD
         is a guess beyond
-    dispersion: of the logit by which guided drivers answer prices (nmfd.model.answer) [s]
+    dispersion: of the logit by which guided drivers answer prices, see nmfd.model.answer (s)
     placeholder: the MFDs are guesses that no run has measured
     doubts: warnings about the fit of each region; () if unknown
     folder: of network.toml, or None
@@ -94,11 +91,14 @@ class RegionalModel:
 
     @property
     def titles(self) -> tuple[str, ...]:
-        """Number and name of each region, such as "3 centre"; "region 3" if that is the name."""
-        return tuple(
-            f"region {n}" if name == str(n) else f"{n} {name}"
-            for n, name in enumerate(self.region_names)
-        )
+        """Number and name of each region: "3 centre", or "region 3" without."""
+        titles = []
+        for number, name in enumerate(self.region_names):
+            if name == str(number):
+                titles.append(f"region {number}")
+            else:
+                titles.append(f"{number} {name}")
+        return tuple(titles)
 
     @property
     def critical(self) -> PerRegion:
@@ -107,10 +107,10 @@ class RegionalModel:
 
     @property
     def seen_critical(self) -> PerRegion:
-        """Critical accumulations (R,) [veh], NaN where data show no falling branch."""
-        return np.where(
-            [r in self.critical_above for r in range(self.regions)], np.nan, self.critical
-        )
+        """Critical accumulations (R,) [veh], NaN where they were not seen."""
+        critical = self.critical
+        critical[list(self.critical_above)] = np.nan
+        return critical
 
     @cached_property
     def hops(self) -> Hops:
@@ -120,19 +120,25 @@ class RegionalModel:
 
     @cached_property
     def split_mask(self) -> TurnMask:
-        """Turns with theta_ihj > 0 allowed (R, R, R) bool: h adjacent to i, and j reachable from h
-        without i."""
+        """Turns with theta_ihj > 0 allowed (R, R, R) bool.
+
+        Region h is adjacent to i, and j is reachable from h without i.
+        """
         mask = np.zeros((self.regions,) * 3, dtype=bool)
         roads = csr_array(self.adjacency)
         for i in range(self.regions):
-            others, onward = np.arange(self.regions) != i, self.adjacency[i]
-            mask[np.ix_([i], onward, others)] = _reachable(roads[others][:, others])[onward[others]]
+            others = np.arange(self.regions) != i
+            onward = self.adjacency[i]
+            without_i = _reachable(roads[others][:, others])
+            mask[np.ix_([i], onward, others)] = without_i[onward[others]]
         return mask
 
     @cached_property
     def nominal_splits(self) -> PerTurn:
-        """Theta without guidance (R, R, R) [-], [i, h, j]: observed, otherwise equal shares of
-        shortest paths."""
+        """Theta without guidance (R, R, R) [-], [i, h, j].
+
+        It is observed, or equal shares of the shortest paths.
+        """
         closer = self.hops[None, :, :] == self.hops[:, None, :] - 1
         theta = (self.adjacency[:, :, None] & closer & self.split_mask).astype(float)
         for (i, j), shares in self.observed_split_ratios.items():
@@ -144,38 +150,43 @@ class RegionalModel:
 
     @property
     def open_perimeter(self) -> PerPair:
-        """Perimeter control without a closed gate (R, R) [-]: u_max at every boundary."""
+        """Perimeter control (R, R) [-] with u_max at every boundary."""
         return np.where(self.adjacency, self.u_max, 0.0)
 
     @property
     def open_capacity(self) -> PerPair | None:
         """`capacity` for u = 1 (R, R) [veh/s]."""
-        return None if self.capacity is None else self.capacity / self.u_max
+        if self.capacity is None:
+            return None
+        return self.capacity / self.u_max
 
     @cached_property
     def hash(self) -> str:
-        """Hash of all that the dynamics depend on; a policy is valid for one network only."""
-        mfds = [
-            [*([] if isinstance(m, Cubic) else [type(m).__name__]), *vars(m).values()]
-            for m in self.mfds
-        ]
-        content = [self.adjacency.astype(int).tolist(), mfds, self.u_min, self.u_max]
-        content += [self.nominal_splits.round(12).tolist()]
-        options = {
-            "exit_rates": self.exit_rates,
-            "capacity": self.capacity,
-            "storage": self.storage,
-        }
-        content += [
-            [name, option.tolist()] for name, option in options.items() if option is not None
-        ]
-        content += [["dispersion", self.dispersion]] if self.dispersion != DISPERSION_S else []
+        """Hash of all that the dynamics depend on.
+
+        A policy carries it: it is valid for one network only.
+        """
+        mfds = []
+        for curve in self.mfds:
+            numbers = list(vars(curve).values())
+            if isinstance(curve, Cubic):  # the default, which has no name in the hash
+                mfds.append(numbers)
+            else:
+                mfds.append([type(curve).__name__, *numbers])
+        splits = self.nominal_splits.round(12).tolist()
+        content = [self.adjacency.astype(int).tolist(), mfds, self.u_min, self.u_max, splits]
+        for name in ("exit_rates", "capacity", "storage"):
+            numbers = getattr(self, name)
+            if numbers is not None:
+                content.append([name, numbers.tolist()])
+        if self.dispersion != DISPERSION_S:
+            content.append(["dispersion", self.dispersion])
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
 
 def _reachable(roads: csr_array) -> Adjacency:
-    """Return (R, R) bool, [h, j]: j is reachable from h; by components where possible, which is
-    much faster."""
+    """Return (R, R) bool, [h, j]: j is reachable from h."""
+    # If as many parts are strongly as weakly connected, they are the same: much faster.
     parts, label = csgraph.connected_components(roads, connection="weak")
     if parts == csgraph.connected_components(roads, connection="strong", return_labels=False):
         return label[:, None] == label
@@ -209,7 +220,8 @@ class MfdTable(Settings):
 
     @model_validator(mode="after")
     def _valid(self) -> "MfdTable":
-        if problem := self.mfd.problem():
+        problem = self.mfd.problem()
+        if problem:
             raise Problem("jam", problem)
         return self
 
@@ -228,13 +240,14 @@ class RegionTable(Settings):
     adjacent: Regions = setting("regions into which roads lead from here")
     mfd: MfdTable | None = setting("own MFD instead of [mfd]", None)
     exit_rates: config.PositiveNumbers | None = setting(
-        "rate at which vehicles leave, relative to the MFD, per destination; for all regions or none",
+        "rate at which vehicles leave, relative to the MFD, per destination; for all regions or "
+        "none",
         None,
         unit="-",
     )
     capacity: config.PositiveNumbers | None = setting(
-        "largest flow into each adjacent region while that is empty, at the largest u, in the order of adjacent; with "
-        "storage, for all regions or none",
+        "largest flow into each adjacent region while that is empty, at the largest u, in the "
+        "order of adjacent; with storage, for all regions or none",
         None,
         unit="veh/s",
     )
@@ -246,8 +259,8 @@ class RegionTable(Settings):
         le=MOST_VEHICLES,
     )
     controllable: Annotated[tuple[Share, ...], Field(strict=False)] | None = setting(
-        "share of the flow into each adjacent region that passes signals under control, in the order of adjacent; for "
-        "all regions or none",
+        "share of the flow into each adjacent region that passes signals under control, in the "
+        "order of adjacent; for all regions or none",
         None,
         unit="-",
     )
@@ -259,8 +272,8 @@ class RegionTable(Settings):
     )
     doubts: config.Texts = setting("warnings of cosim identify about the fit", ())
     observed_split_ratios: dict[str, dict[str, Share]] = setting(
-        "measured shares: destination region = { next region = share }, sum 1; elsewhere vehicles cross the fewest "
-        "boundaries",
+        "measured shares: destination region = { next region = share }, sum 1; elsewhere vehicles "
+        "cross the fewest boundaries",
         {},
     )
 
@@ -286,136 +299,161 @@ class NetworkTable(Settings):
 
     @model_validator(mode="after")
     def _consistent(self) -> "NetworkTable":
-        count = len(self.regions)
         for i, row in enumerate(self.regions):
-            where = f"regions[{i}]"
-            if max(row.adjacent, default=0) >= count or i in row.adjacent:
-                allowed = f"a list of distinct whole numbers from 0 to {count - 1} without {i}, the region itself"
-                raise Problem(f"{where}.adjacent", got(allowed, list(row.adjacent)))
-            if row.mfd is None and self.mfd is None:
-                raise Problem(
-                    f"{where}.mfd", "missing; add a table [regions.mfd], or [mfd] for all regions"
-                )
-            if (row.storage is None) != (row.capacity is None):
-                raise Problem(
-                    f"{where}.capacity", "capacity and storage belong together; add or remove one"
-                )
-            for key in FOR_ALL:
-                if getattr(row, key) is None and any(
-                    getattr(other, key) is not None for other in self.regions
-                ):
-                    raise Problem(f"{where}.{key}", "missing; give it for every region or for none")
-            lengths = {
-                "exit_rates": count,
-                "capacity": len(row.adjacent),
-                "controllable": len(row.adjacent),
-            }
-            for key, length in lengths.items():
-                if (values := getattr(row, key)) is not None and len(values) != length:
-                    raise Problem(
-                        f"{where}.{key}", got(f"a list of {length} numbers", list(values))
-                    )
-            for destination, shares in row.observed_split_ratios.items():
-                known = destination in map(str, range(count)) and set(shares) <= set(
-                    map(str, row.adjacent)
-                )
-                if not known or abs(sum(shares.values()) - 1.0) > 1e-3:
-                    allowed = (
-                        f"destination = {{ one of {list(row.adjacent)} = share, ... }} with sum 1"
-                    )
-                    raise Problem(
-                        f"{where}.observed_split_ratios.{destination}", got(allowed, shares)
-                    )
+            self._check_region(i, row)
         return self
+
+    def _check_region(self, i: int, row: RegionTable) -> None:
+        """Check the table of region i against the others.
+
+        Raises: Problem
+        """
+        count = len(self.regions)
+        where = f"regions[{i}]"
+        if max(row.adjacent, default=0) >= count or i in row.adjacent:
+            allowed = f"a list of distinct whole numbers from 0 to {count - 1}"
+            allowed += f" without {i}, the region itself"
+            raise Problem(f"{where}.adjacent", got(allowed, list(row.adjacent)))
+        if row.mfd is None and self.mfd is None:
+            remedy = "missing; add a table [regions.mfd], or [mfd] for all regions"
+            raise Problem(f"{where}.mfd", remedy)
+        if (row.storage is None) != (row.capacity is None):
+            remedy = "capacity and storage belong together; add or remove one"
+            raise Problem(f"{where}.capacity", remedy)
+        for key in FOR_ALL:
+            given = [getattr(other, key) is not None for other in self.regions]
+            if any(given) and not given[i]:
+                raise Problem(f"{where}.{key}", "missing; give it for every region or for none")
+        neighbours = len(row.adjacent)
+        lengths = {"exit_rates": count, "capacity": neighbours, "controllable": neighbours}
+        for key, length in lengths.items():
+            values = getattr(row, key)
+            if values is not None and len(values) != length:
+                allowed = f"a list of {length} numbers"
+                raise Problem(f"{where}.{key}", got(allowed, list(values)))
+        for destination, shares in row.observed_split_ratios.items():
+            there = destination in map(str, range(count))
+            adjacent = set(shares) <= set(map(str, row.adjacent))
+            complete = abs(sum(shares.values()) - 1.0) <= 1e-3
+            if not (there and adjacent and complete):
+                allowed = f"destination = {{ one of {list(row.adjacent)} = share, ... }} with sum 1"
+                key = f"{where}.observed_split_ratios.{destination}"
+                raise Problem(key, got(allowed, shares))
 
 
 def load_network(folder: Path | str) -> RegionalModel:
-    """Read `folder`/network.toml, or a shipped network by its name. Raises InputError.
+    """Read `folder`/network.toml, or a shipped network by its name.
 
     >>> network = load_network("hexagon7")
     >>> network.regions, network.u_min, network.u_max
     (7, 0.1, 0.9)
     >>> network.nominal_splits[2, :, 4]  # from west to east through the centre
     array([0., 0., 0., 1., 0., 0., 0.])
+
+    Raises: InputError
     """
     folder = shipped.found(folder, shipped.NETWORK)
     path = folder / "network.toml"
     table = config.checked(NetworkTable, config.read(path), path)
-    rows = table.regions
-    adjacency = np.zeros((len(rows), len(rows)), dtype=bool)
-    for i, row in enumerate(rows):
-        adjacency[i, list(row.adjacent)] = True
-
-    def numbers(key: str, *, by_pair: bool = False) -> Any:
-        values = [getattr(row, key) for row in rows]
-        if values[0] is None or not by_pair:
-            return None if values[0] is None else np.array(values)
-        matrix = np.zeros(adjacency.shape)
-        for i, row in enumerate(rows):
-            matrix[i, list(row.adjacent)] = values[i]
-        return matrix
-
-    network = RegionalModel(
-        name=table.name,
-        region_names=tuple(row.name or str(number) for number, row in enumerate(rows)),
-        positions=np.array([row.position for row in rows]),
-        adjacency=adjacency,
-        mfds=tuple((row.mfd or table.mfd).mfd for row in rows),  # type: ignore[union-attr]  # `_consistent`
-        u_min=table.perimeter.min,
-        u_max=table.perimeter.max,
-        observed_split_ratios={
-            (i, int(j)): {int(h): share for h, share in shares.items()}
-            for i, row in enumerate(rows)
-            for j, shares in row.observed_split_ratios.items()
-        },
-        exit_rates=numbers("exit_rates"),
-        capacity=numbers("capacity", by_pair=True),
-        storage=numbers("storage"),
-        controllable=numbers("controllable", by_pair=True),
-        critical_above={
-            i: row.critical_above for i, row in enumerate(rows) if row.critical_above is not None
-        },
-        dispersion=table.dispersion,
-        placeholder=table.placeholder,
-        folder=folder,
-        doubts=tuple(row.doubts for row in rows) if any(row.doubts for row in rows) else (),
-    )
+    network = _network(table, folder)
     if (network.hops < 0).any():
         i, j = np.argwhere(network.hops < 0)[0]
-        raise config.error(
-            path,
-            "regions",
-            f"region {j} cannot be reached from region {i}; connect them with adjacent",
-        )
-    for (i, j), observed in network.observed_split_ratios.items():
-        for h in observed:
+        problem = f"region {j} cannot be reached from region {i}; connect them with adjacent"
+        raise config.error(path, "regions", problem)
+    for (i, j), shares in network.observed_split_ratios.items():
+        for h in shares:
             if not network.split_mask[i, h, j]:
                 key = f"regions[{i}].observed_split_ratios.{j}"
                 raise config.error(path, key, f"region {h} leads back into {i}; remove it")
     return network
 
 
+def _network(table: NetworkTable, folder: Path) -> RegionalModel:
+    """Return the regional model of a checked network.toml."""
+    rows = table.regions
+    adjacency = np.zeros((len(rows), len(rows)), dtype=bool)
+    ratios = {}
+    critical_above = {}
+    for i, row in enumerate(rows):
+        adjacency[i, list(row.adjacent)] = True
+        for j, shares in row.observed_split_ratios.items():
+            ratios[i, int(j)] = {int(h): share for h, share in shares.items()}
+        if row.critical_above is not None:
+            critical_above[i] = row.critical_above
+    curves = [row.mfd or table.mfd for row in rows]
+    doubts = tuple(row.doubts for row in rows)
+    if not any(doubts):
+        doubts = ()
+    return RegionalModel(
+        name=table.name,
+        region_names=tuple(row.name or str(i) for i, row in enumerate(rows)),
+        positions=np.array([row.position for row in rows]),
+        adjacency=adjacency,
+        mfds=tuple(curve.mfd for curve in curves),  # type: ignore[union-attr]  # `_check_region`
+        u_min=table.perimeter.min,
+        u_max=table.perimeter.max,
+        observed_split_ratios=ratios,
+        exit_rates=_by_region(rows, "exit_rates"),
+        capacity=_by_boundary(rows, "capacity"),
+        storage=_by_region(rows, "storage"),
+        controllable=_by_boundary(rows, "controllable"),
+        critical_above=critical_above,
+        dispersion=table.dispersion,
+        placeholder=table.placeholder,
+        doubts=doubts,
+        folder=folder,
+    )
+
+
+def _by_region(rows: Sequence[RegionTable], key: str) -> Any:
+    """Return the values of a key as an array, a row per region, or None."""
+    values = [getattr(row, key) for row in rows]
+    if values[0] is None:
+        return None
+    return np.array(values)
+
+
+def _by_boundary(rows: Sequence[RegionTable], key: str) -> PerPair | None:
+    """Return the values of a key as a matrix, or None.
+
+    A row of the table has them in the order of `adjacent`.
+    """
+    if getattr(rows[0], key) is None:
+        return None
+    matrix = np.zeros((len(rows), len(rows)))
+    for i, row in enumerate(rows):
+        matrix[i, list(row.adjacent)] = getattr(row, key)
+    return matrix
+
+
 def check_step(network: RegionalModel, step: float, where: str) -> None:
-    """Raise InputError unless forward Euler with `step` [s] keeps accumulations non-negative (step
-    * q <= 1)."""
+    """Check that Euler keeps accumulations non-negative: step * q <= 1.
+
+    step: integration step (s)
+    where: what the message of an error begins with
+
+    Raises: InputError
+    """
     for region, mfd in enumerate(network.mfds):
         fastest = float(mfd.rate(np.linspace(0.0, mfd.jam, 2001)).max())
         if network.exit_rates is not None:
             fastest *= float(network.exit_rates[region].max())
         if step * fastest > 1.0:
-            problem = f"an integration step of {step:g} s is too long for region {region} of network {network.name}"
-            allowed = f"allowed is at most {1.0 / fastest:.3g} s: raise substeps or shorten step"
             raise InputError(
-                f"{where}: step: {problem}, whose vehicles leave at {fastest:.3g} 1/s; {allowed}"
+                f"{where}: step: an integration step of {step:g} s is too long for region {region} "
+                f"of network {network.name}, whose vehicles leave at {fastest:.3g} 1/s; allowed is "
+                f"at most {1.0 / fastest:.3g} s: raise substeps or shorten step"
             )
 
 
 def network_toml(network: RegionalModel, sumo: Mapping[str, str], comment: str) -> str:
-    """Return network.toml of `network` with this table [sumo]."""
-    ratios = sorted(network.observed_split_ratios.items())
-    observed = [
-        [(j, shares) for (i, j), shares in ratios if i == region]
-        for region in range(network.regions)
-    ]
+    """Return the text of a network.toml.
+
+    sumo: table [sumo], the simulated city
+    comment: first lines of the file, without the first "# "
+    """
+    observed: list[list] = [[] for _ in range(network.regions)]
+    for (i, j), shares in sorted(network.observed_split_ratios.items()):
+        observed[i].append((j, shares))
     values = {"network": network, "sumo": sumo, "comment": comment, "observed": observed}
     return filled(Path(__file__).with_name("network.toml.j2"), **values)

@@ -1,4 +1,4 @@
-"""Demand, noise and horizon of a run, and the scenario.toml that declares them."""
+"""Demand, noise and horizon of a run, and their scenario.toml."""
 
 import hashlib
 import json
@@ -10,13 +10,19 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
+import tomli_w
 from jaxtyping import Bool
 from pydantic import Field, model_validator
 
 from nmfd.arrays import Intervals, PairsOverTime, PerPair
 from nmfd.errors import InputError
 from nmfd.faults import Fault, parse
-from nmfd.model.regional_model import RegionalModel, check_step, load_network
+from nmfd.model.regional_model import (
+    RegionalModel,
+    check_step,
+    load_network,
+    network_toml,
+)
 from nmfd.runs import config, files, shipped
 from nmfd.runs.config import (
     Name,
@@ -31,16 +37,24 @@ from nmfd.runs.config import (
     whole,
 )
 
+SHORTEST_STEP_S = 0.1
 LONGEST_STEP_S = 86_400.0
 MOST_STEPS = 10**6
 MOST_FLOW_VEH_S = 1e6
+# Options of controllers that name a file or folder -> kind of the folder that it may be found in.
+CONTROLLER_FILES = {
+    "model": shipped.NETWORK,
+    "policy": shipped.SCENARIO,
+    "plan": shipped.SCENARIO,
+}
 KINDS = ("demand", "demand-total", "mfd-scale", "mfd-axis", "trip-lengths")  # of `perturbed`
 
 
 @dataclass(frozen=True, kw_only=True)
 class Horizon:
-    """Network, control intervals and options, which a scenario shares with the planning models of
-    its controllers.
+    """Network, control intervals and options.
+
+    A scenario shares them with the planning models of its controllers.
 
     name: of the scenario
     step: control interval [s]
@@ -95,10 +109,29 @@ class Scenario(Horizon):
     faults: tuple[str, ...] = ()
     sumo: Mapping[str, Any] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        """Check shape and values of the demand and the initial state.
+
+        Raises: InputError
+        """
+        regions = self.network.regions
+        shapes = {"demand": (self.steps, regions, regions), "initial": (regions, regions)}
+        for name, shape in shapes.items():
+            values = getattr(self, name)
+            if values is None:
+                continue
+            if np.shape(values) != shape:
+                expected = f"shape {shape} for {self.steps} intervals and {regions} regions"
+                raise config.error(self.where, name, config.got(expected, np.shape(values)))
+            if not (np.isfinite(values) & (np.asarray(values) >= 0.0)).all():
+                raise config.error(self.where, name, "expected finite numbers from 0 up")
+
     @property
     def start(self) -> PerPair:
         """A copy of `initial` (R, R) [veh]; zeros if the network is empty."""
-        return np.zeros(self.demand.shape[1:]) if self.initial is None else self.initial.copy()
+        if self.initial is None:
+            return np.zeros(self.demand.shape[1:])
+        return self.initial.copy()
 
     @cached_property
     def hash(self) -> str:
@@ -110,30 +143,96 @@ class Scenario(Horizon):
             self.measurement_std,
             self.integrator,
             self.substeps,
+            self.protected,
+            self.controller_options,
         ]
-        content += [self.protected, self.controller_options]
-        content += [self.faults] if self.faults else []
-        content += [["process_std", self.process_std]] if self.process_std else []
-        content += [self.initial.tolist()] if self.initial is not None else []
+        # What is not used does not count: hashes of finished runs stay valid.
+        if self.faults:
+            content.append(self.faults)
+        if self.process_std:
+            content.append(["process_std", self.process_std])
+        if self.initial is not None:
+            content.append(self.initial.tolist())
         text = json.dumps(content, sort_keys=True, default=str)
-        return hashlib.sha256(
-            text.encode() + np.ascontiguousarray(self.demand).tobytes()
-        ).hexdigest()[:16]
+        flows = np.ascontiguousarray(self.demand).tobytes()
+        return hashlib.sha256(text.encode() + flows).hexdigest()[:16]
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Settings of a run besides network and demand, as in scenario.toml."""
+        content = {
+            "name": self.name,
+            "step": self.step,
+            "steps": self.steps,
+            "integrator": self.integrator,
+            "substeps": self.substeps,
+            "protected": list(self.protected),
+            "demand_factor": self.demand_factor,
+            "measurement_std": self.measurement_std,
+            "process_std": self.process_std,
+            "faults": list(self.faults),
+            "controllers": self.controller_options,
+            "sumo": self.sumo,
+        }
+        if self.initial is not None:
+            content["initial"] = self.initial.tolist()
+        return json.loads(json.dumps(content))
+
+    def save(self, folder: Path | str) -> Path:
+        """Write the scenario to a folder that nmfd.load_scenario reads; return it.
+
+        Trained policies are not copied. The network is named if it lies in a folder, else written.
+        Raises: InputError if the folder holds a scenario already
+        """
+        folder = Path(folder)
+        file = folder / "scenario.toml"
+        if file.exists():
+            raise InputError(f"{file}: exists; choose another folder")
+        folder.mkdir(parents=True, exist_ok=True)
+        content = self.settings
+        if self.folder is not None:
+            _relocate(content, self.folder, folder)
+        content["network"] = self._saved_network(folder)
+        content["demand_file"] = "demand.csv"
+        rows = ["interval,from,to,veh_s"]
+        for k, i, j in np.argwhere(self.demand > 0.0).tolist():
+            rows.append(f"{k},{i},{j},{float(self.demand[k, i, j]) / self.demand_factor!r}")
+        files.write_text(folder / "demand.csv", "\n".join(rows) + "\n")
+        files.write_text(file, tomli_w.dumps(content))
+        return folder
+
+    def _saved_network(self, folder: Path) -> str:
+        """Return the folder of the network, seen from `folder`.
+
+        A network without a folder is written there.
+        """
+        own = self.network.folder
+        if own is not None and load_network(own).hash == self.network.hash:
+            return files.relative(own, folder)
+        (folder / "network").mkdir(exist_ok=True)
+        text = network_toml(self.network, {}, f"Network of the scenario {self.name}")
+        files.write_text(folder / "network" / "network.toml", text)
+        return "network"
 
     @cached_property
     def ordered_faults(self) -> tuple[Fault, ...]:
         """`faults`, parsed. Raises InputError."""
-        return tuple(
-            parse(text, f"{self.where}: faults", self.network.regions) for text in self.faults
-        )
+        where = f"{self.where}: faults"
+        return tuple(parse(text, where, self.network.regions) for text in self.faults)
 
 
 def with_demand(scenario: Scenario, *, steps: int | None = None, factor: float = 1.0) -> Scenario:
-    """Return at most the first `steps` control intervals of `scenario`, with `factor` times its
-    demand."""
-    if steps is not None and steps < 1:
+    """Return the beginning of a scenario, with another demand.
+
+    steps: most control intervals; all if None
+    factor: of the demand
+    Raises: InputError
+    """
+    if steps is None:
+        steps = scenario.steps
+    if steps < 1:
         raise InputError(f"steps: expected 1 or more control intervals, got {steps} instead")
-    steps = scenario.steps if steps is None else min(steps, scenario.steps)
+    steps = min(steps, scenario.steps)
     return replace(
         scenario,
         steps=steps,
@@ -143,14 +242,19 @@ def with_demand(scenario: Scenario, *, steps: int | None = None, factor: float =
 
 
 def pairs_with_demand(demand: PairsOverTime) -> Bool[np.ndarray, "R R"]:
-    """Return the pairs of regions with demand (T, R, R) at any time: noise perturbs these, all the
-    time."""
+    """Return the pairs of regions with demand at any time.
+
+    Noise perturbs these pairs, all the time.
+
+    demand: (veh/s, (T, R, R))
+    """
     return (demand > 0).any(axis=0)
 
 
 def perturbed(scenario: Scenario, sigma: float, seed: int, kind: str = "demand") -> Scenario:
-    """Return `scenario` with another demand or other MFDs; n are standard normal draws. Raise
-    InputError.
+    """Return `scenario` with another demand or other MFDs.
+
+    The kinds are, with standard normal draws n:
 
     demand: max(0, d_ij(k) + sigma n_ij(k)) [veh/s]. Clipping passes only the positive half of the
         noise while no demand is planned, which adds 0.4 sigma veh/s per pair.
@@ -160,40 +264,46 @@ def perturbed(scenario: Scenario, sigma: float, seed: int, kind: str = "demand")
     trip-lengths: exit rates times exp(sigma n_ij), as if trips were longer or shorter
 
     The same seed gives the same n for every sigma (common random numbers). No outflow rises above
-    the largest that the integration step allows.
+    the largest that the integration step allows. Raises: InputError
     """
     if kind not in KINDS:
         raise InputError(f"kind: expected one of {', '.join(KINDS)}, got {kind!r}; correct it")
-    random, network = np.random.default_rng([seed, 0x64656D]), scenario.network
+    random = np.random.default_rng([seed, 0x64656D])
+    network = scenario.network
     if kind.startswith("demand"):
         noise = random.standard_normal(scenario.demand.shape) * pairs_with_demand(scenario.demand)
         demand = np.maximum(scenario.demand + sigma * noise, 0.0)
         if kind == "demand-total":
             demand *= scenario.demand.sum(axis=0) / np.maximum(demand.sum(axis=0), 1e-9)
         return replace(scenario, demand=demand)
-    rates = np.ones(network.adjacency.shape) if network.exit_rates is None else network.exit_rates
-    highest = (
-        scenario.substeps
-        / scenario.step
-        / np.array([mfd.rate_up_to_jam(0.0) for mfd in network.mfds])
-    )
+    rates = network.exit_rates
+    if rates is None:
+        rates = np.ones(network.adjacency.shape)
+    rates_up_to_jam = np.array([mfd.rate_up_to_jam(0.0) for mfd in network.mfds])
+    highest = scenario.substeps / scenario.step / rates_up_to_jam
     if kind == "trip-lengths":
-        rates = np.minimum(
-            rates * np.exp(sigma * random.standard_normal(rates.shape)), highest[:, None]
-        )
+        factors = np.exp(sigma * random.standard_normal(rates.shape))
+        rates = np.minimum(rates * factors, highest[:, None])
         return replace(scenario, network=replace(network, exit_rates=rates))
     factor = np.exp(sigma * random.standard_normal(network.regions))
-    high = np.minimum(factor if kind == "mfd-scale" else 1.0, highest / rates.max(axis=1)).tolist()
-    wide = factor if kind == "mfd-axis" else np.ones_like(factor)
-    mfds = tuple(
-        mfd.scaled(*by) for mfd, *by in zip(network.mfds, wide.tolist(), high, strict=True)
-    )
+    wide = high = np.ones_like(factor)
+    if kind == "mfd-axis":
+        wide = factor
+    else:
+        high = factor
+    high = np.minimum(high, highest / rates.max(axis=1))
+    mfds = []
+    for mfd, width, height in zip(network.mfds, wide.tolist(), high.tolist(), strict=True):
+        mfds.append(mfd.scaled(width, height))
     storage = None if network.storage is None else wide * network.storage
-    return replace(scenario, network=replace(network, mfds=mfds, storage=storage))
+    return replace(scenario, network=replace(network, mfds=tuple(mfds), storage=storage))
 
 
 class DemandTable(Settings):
-    """One flow, a trapezoid over time; flows of the same pair of regions add up."""
+    """One flow, a trapezoid over time.
+
+    Flows of the same pair of regions add up.
+    """
 
     origin: config.Region = setting("origin region", alias="from")
     to: config.Region = setting("destination region")
@@ -206,14 +316,12 @@ class DemandTable(Settings):
     def rate(self, time: Intervals) -> Intervals:
         """Return the flow [veh/s] at `time` (T,) [s]."""
         end = self.start + self.ramp_up + self.flat + self.ramp_down
-        rising = (
-            (time - self.start) / self.ramp_up
-            if self.ramp_up > 0
-            else np.where(time >= self.start, 1.0, 0.0)
-        )
-        falling = (
-            (end - time) / self.ramp_down if self.ramp_down > 0 else np.where(time < end, 1.0, 0.0)
-        )
+        rising = np.where(time >= self.start, 1.0, 0.0)
+        if self.ramp_up > 0:
+            rising = (time - self.start) / self.ramp_up
+        falling = np.where(time < end, 1.0, 0.0)
+        if self.ramp_down > 0:
+            falling = (end - time) / self.ramp_down
         return self.peak * np.clip(np.minimum(rising, falling), 0.0, 1.0)
 
 
@@ -225,7 +333,7 @@ class ScenarioTable(Settings):
         "folder or shipped name of a scenario that gives the keys omitted here", None
     )
     network: Text = setting("folder or shipped name of the network")
-    step: float = setting("control interval", unit="s", gt=0.0, le=LONGEST_STEP_S)
+    step: float = setting("control interval", unit="s", ge=SHORTEST_STEP_S, le=LONGEST_STEP_S)
     steps: int = whole("control intervals", low=1, high=MOST_STEPS)
     integrator: Literal["euler", "rk4"] = setting(
         "integration scheme of the regional model", "euler"
@@ -272,74 +380,79 @@ class ScenarioTable(Settings):
 
 
 def read_scenario(folder: Path | str, settings: Mapping[str, Any] | None = None) -> Scenario:
-    """Read `folder`/scenario.toml and its network, or a shipped scenario by its name. Raises
-    InputError.
+    """Read a scenario and its network.
 
+    folder: folder of scenario.toml, or the name of a shipped scenario
     settings: dotted key -> value, which replace those of the file, such as {"sumo.compliance": 0.5}
+    Raises: InputError
     """
     folder = shipped.found(folder, shipped.SCENARIO)
     path = folder / "scenario.toml"
     tables = read_tables(folder)
     for key, value in (settings or {}).items():
-        for part in reversed(
-            re.findall(r'"[^"]*"|[^.]+', key)
-        ):  # parts with dots stand in double quotes
+        parts = re.findall(r'"[^"]*"|[^.]+', key)  # parts with dots stand in double quotes
+        for part in reversed(parts):
             value = {part.strip('"'): value}
         tables = _completed(value, tables)
     table = config.checked(ScenarioTable, tables, path)
     network = load_network(folder / table.network)
     check_step(network, table.step / table.substeps, str(path))
-    values = {
-        key: value for key, value in vars(table).items() if key in Scenario.__dataclass_fields__
-    }
-    values |= {
-        "network": network,
-        "demand": table.demand_factor * _demand(table, network, folder),
-        "folder": folder,
-    }
-    values |= {
-        "controller_options": table.controllers,
-        "initial": np.array(table.initial) if table.initial else None,
-    }
-    scenario = Scenario(**values)
+    values = {}
+    for key, value in vars(table).items():
+        if key in Scenario.__dataclass_fields__:
+            values[key] = value
+    values["network"] = network
+    values["demand"] = table.demand_factor * _demand(table, network, folder)
+    values["folder"] = folder
+    values["controller_options"] = table.controllers
+    values["initial"] = np.array(table.initial) if table.initial else None
     if max(table.protected, default=0) >= network.regions:
         allowed = f"a list of distinct whole numbers from 0 to {network.regions - 1}"
         raise config.error(path, "protected", config.got(allowed, list(table.protected)))
-    lengths = {len(row) for row in table.initial} | {len(table.initial)}
-    if table.initial and (lengths != {network.regions} or scenario.start.min() < 0):
-        allowed = f"{network.regions} lists of {network.regions} numbers from 0 up"
-        raise config.error(
-            path, "initial", config.got(allowed, [list(row) for row in table.initial])
-        )
+    _check_initial(table.initial, network.regions, path)
+    scenario = Scenario(**values)
     _ = scenario.ordered_faults
     return scenario
 
 
+def _check_initial(rows: tuple[Numbers, ...], regions: int, path: Path) -> None:
+    """Raise InputError unless there are no rows, or R of R numbers from 0 up."""
+    if not rows:
+        return
+    lengths = {len(rows), *map(len, rows)}
+    if lengths != {regions} or min(map(min, rows)) < 0:
+        allowed = f"{regions} lists of {regions} numbers from 0 up"
+        raise config.error(path, "initial", config.got(allowed, [list(row) for row in rows]))
+
+
 def read_tables(folder: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
-    """Return `folder`/scenario.toml, completed by the scenario that it names as `base`. Raises
-    InputError.
+    """Return `folder`/scenario.toml, completed by its `base`.
 
     above: folders of the scenarios based on this one
+    Raises: InputError
     """
-    file, folders = folder / "scenario.toml", (*above, folder)
+    file = folder / "scenario.toml"
+    folders = (*above, folder)
     own = config.read(file)
     base = own.pop("base", None)
     _relocate(own, folder, folders[0])
     if folder.resolve() in (other.resolve() for other in above):
-        raise config.error(
-            file, "base", "the scenarios are each other's base; remove one of the keys"
-        )
+        problem = "the scenarios are each other's base; remove one of the keys"
+        raise config.error(file, "base", problem)
     if base is None:
         return own
     if not isinstance(base, str) or not base.isprintable():
         raise config.error(file, "base", config.got("the folder of a scenario in quotes", base))
-    return _completed(
-        own, read_tables(shipped.found(base, shipped.SCENARIO, beside=folder), folders)
-    )
+    place = shipped.found(base, shipped.SCENARIO, beside=folder)
+    return _completed(own, read_tables(place, folders))
 
 
 def _relocate(own: dict, folder: Path, here: Path) -> None:
-    """Rewrite the paths in a scenario.toml in `folder` relative to the folder `here`."""
+    """Rewrite the paths of a scenario.toml, so that they begin elsewhere.
+
+    folder: where they begin now
+    here: where they shall begin
+    """
 
     def seen(name: str, *kinds: str) -> str:
         return files.relative(shipped.found(name, *kinds, beside=folder), here)
@@ -353,43 +466,54 @@ def _relocate(own: dict, folder: Path, here: Path) -> None:
             if isinstance(sumo.get(key), list) and all(isinstance(name, str) for name in sumo[key]):
                 sumo[key] = [seen(name) for name in sumo[key]]
     controllers = own.get("controllers")
-    for options in controllers.values() if isinstance(controllers, dict) else ():
-        if isinstance(options, dict) and isinstance(options.get("model"), str):
-            options["model"] = seen(options["model"], shipped.NETWORK)
+    if not isinstance(controllers, dict):
+        return
+    for options in controllers.values():
+        if not isinstance(options, dict):
+            continue
+        for key, kind in CONTROLLER_FILES.items():
+            if isinstance(options.get(key), str):
+                options[key] = seen(options[key], kind)
 
 
 def _completed(content: dict, base: dict) -> dict:
     """Return `content` with what only `base` has, table by table."""
-    both = {
-        key: _completed(content[key], base[key])
-        for key in content
-        if isinstance(content[key], dict) and isinstance(base.get(key), dict)
-    }
-    return {**base, **content, **both}
+    result = {**base, **content}
+    for key in content:
+        if isinstance(content[key], dict) and isinstance(base.get(key), dict):
+            result[key] = _completed(content[key], base[key])
+    return result
 
 
 def _demand(table: ScenarioTable, network: RegionalModel, folder: Path) -> PairsOverTime:
-    """Return the demand (T, R, R) [veh/s] of [[demand]] and demand_file. Raises InputError."""
+    """Return the demand of [[demand]] and demand_file (veh/s, (T, R, R)).
+
+    Raises: InputError
+    """
     demand = np.zeros((table.steps, network.regions, network.regions))
     time = table.step * np.arange(table.steps)
     for n, row in enumerate(table.demand or ()):
         for key, region in (("from", row.origin), ("to", row.to)):
             if region >= network.regions:
-                known = f"region {region} is unknown; network {network.name} has 0 to {network.regions - 1}"
-                raise config.error(folder / "scenario.toml", f"demand[{n}].{key}", known)
+                known = f"network {network.name} has 0 to {network.regions - 1}"
+                problem = f"region {region} is unknown; {known}"
+                raise config.error(folder / "scenario.toml", f"demand[{n}].{key}", problem)
         demand[:, row.origin, row.to] += row.rate(time)
     if table.demand_file is not None:
         from_file = np.zeros_like(demand)
-        interval, origin, to, rate = _demand_rows(folder / table.demand_file, network.regions)
-        inside = interval < table.steps
-        np.add.at(from_file, (interval[inside], origin[inside], to[inside]), rate[inside])
+        rows = _demand_rows(folder / table.demand_file, network.regions)
+        rows = rows[rows[:, 0] < table.steps]
+        interval, origin, to = rows[:, :3].astype(int).T
+        np.add.at(from_file, (interval, origin, to), rows[:, 3])
         demand += from_file
     return demand
 
 
-def _demand_rows(path: Path, regions: int) -> tuple[np.ndarray, ...]:
-    """Return interval, origin, destination (N,) and flow (N,) [veh/s] of a csv file. Raises
-    InputError."""
+def _demand_rows(path: Path, regions: int) -> np.ndarray:
+    """Return the rows of a csv file of demand.
+
+    They hold interval, origin, destination and flow (veh/s). Raises: InputError
+    """
     files.check_file(path, "give a csv file")
     try:
         text = path.read_text(encoding="utf-8").splitlines()
@@ -398,20 +522,15 @@ def _demand_rows(path: Path, regions: int) -> tuple[np.ndarray, ...]:
         rows = np.loadtxt(text[1:], delimiter=",", ndmin=2).reshape(-1, 4)
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read as demand ({error}); give a csv file") from None
-    interval, origin, to, rate = rows.T
-    whole_numbers = (rows[:, :3] == np.floor(rows[:, :3])).all(axis=1) & (rows[:, :3] >= 0).all(
-        axis=1
-    )
-    good = (
-        whole_numbers
-        & (np.maximum(origin, to) < regions)
-        & (rate >= 0.0)
-        & (rate <= MOST_FLOW_VEH_S)
-    )
+    numbers = rows[:, :3]
+    rate = rows[:, 3]
+    whole_numbers = ((numbers == np.floor(numbers)) & (numbers >= 0)).all(axis=1)
+    known = (rows[:, 1:3] < regions).all(axis=1)
+    good = whole_numbers & known & (rate >= 0.0) & (rate <= MOST_FLOW_VEH_S)
     if not good.all():
-        line = int(np.argmin(good))
+        line = int(np.argmin(good)) + 1
         raise InputError(
-            f"{path}: line {line + 2}: expected an interval from 0 up, two regions from 0 to {regions - 1} and "
-            f"veh/s from 0 to {MOST_FLOW_VEH_S:g}, got {text[line + 1]} instead"
+            f"{path}: line {line + 1}: expected an interval from 0 up, two regions from 0 to "
+            f"{regions - 1} and veh/s from 0 to {MOST_FLOW_VEH_S:g}, got {text[line]} instead"
         )
-    return interval.astype(int), origin.astype(int), to.astype(int), rate
+    return rows

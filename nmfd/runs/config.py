@@ -1,5 +1,7 @@
-"""Settings: pydantic models whose fields carry text and unit, and the validation of TOML files
-against them."""
+"""Settings: pydantic models whose fields carry text and unit.
+
+TOML files are validated against them.
+"""
 
 import re
 import tomllib
@@ -16,8 +18,10 @@ S = TypeVar("S", bound="Settings")
 
 
 def setting(text: str, default: Any = ..., *, unit: str = "", **limits: Any) -> Any:
-    """Return the field of a setting; limits: ge, gt, le, lt, min_length, max_length, alias of
-    pydantic.Field."""
+    """Return the field of a setting.
+
+    limits: ge, gt, le, lt, min_length, max_length, alias of pydantic.Field
+    """
     if unit:
         limits["json_schema_extra"] = {"unit": unit}
     return Field(default, description=text, **limits)
@@ -29,7 +33,10 @@ def whole(text: str, default: Any = ..., *, low: int = 0, high: int = 10**9, **m
 
 
 class Problem(ValueError):
-    """Error of a validator about `key` of its table; the text ends in the remedy."""
+    """Error of a validator about `key` of its table.
+
+    The text ends in the remedy.
+    """
 
     def __init__(self, key: str, text: str):
         super().__init__(text)
@@ -37,21 +44,24 @@ class Problem(ValueError):
 
 
 class Settings(BaseModel):
-    """Table of settings; unknown keys, texts for numbers and numbers that are not finite are
-    errors."""
+    """Table of settings.
+
+    Unknown keys, texts for numbers and numbers that are not finite are errors.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     @model_validator(mode="before")
     @classmethod
     def _known_keys(cls, values: Any) -> Any:
+        if not isinstance(values, Mapping):
+            return values
         keys = [field.alias or name for name, field in cls.model_fields.items()]
-        for key in values if isinstance(values, Mapping) else ():
+        for key in values:
             if key not in keys:
                 hint = did_you_mean(str(key), keys)
-                raise Problem(
-                    key, f"unknown key{hint}; allowed here: {', '.join(keys)}; remove or correct it"
-                )
+                allowed = f"allowed here: {', '.join(keys)}"
+                raise Problem(key, f"unknown key{hint}; {allowed}; remove or correct it")
         return values
 
     def changed(self: S, **changes: Any) -> S:
@@ -71,11 +81,10 @@ def _distinct(values: tuple) -> tuple:
     return values
 
 
-DISTINCT = AfterValidator(_distinct), Field(strict=False)
+DISTINCT = (AfterValidator(_distinct), Field(strict=False))
 Text = Annotated[str, Field(min_length=1, max_length=1000), AfterValidator(_printable)]
-Name = Annotated[
-    str, Field(min_length=1, max_length=100), AfterValidator(_printable)
-]  # names become file names
+# Names become file names.
+Name = Annotated[str, Field(min_length=1, max_length=100), AfterValidator(_printable)]
 Texts = Annotated[tuple[Text, ...], *DISTINCT]
 Region = Annotated[int, Field(ge=0)]
 Regions = Annotated[tuple[Region, ...], *DISTINCT]
@@ -96,9 +105,8 @@ def read(path: Path) -> dict[str, Any]:
         hint = did_you_mean(path.parent.name, near)
         raise InputError(f"{path}: no such file{hint}; give the path of an existing one") from None
     except OSError as problem:
-        raise InputError(
-            f"{path}: cannot be read ({problem.strerror}); give a readable file"
-        ) from None
+        reason = problem.strerror
+        raise InputError(f"{path}: cannot be read ({reason}); give a readable file") from None
     except (ValueError, RecursionError) as problem:  # also text in another encoding
         raise InputError(f"{path}: is not valid TOML: {problem}; correct it") from None
 
@@ -106,7 +114,10 @@ def read(path: Path) -> dict[str, Any]:
 def checked(
     declaration: type[S], values: Mapping[str, Any], where: Path | str, prefix: str = ""
 ) -> S:
-    """Validate a table. Raise InputError that begins with "where: prefix + key: "."""
+    """Return validated settings.
+
+    Raises: InputError that begins with "where: prefix + key: "
+    """
     try:
         return declaration.model_validate(values)
     except ValidationError as invalid:
@@ -119,7 +130,7 @@ def error(where: Path | str, key: str, problem: str) -> InputError:
 
 
 def got(allowed: str, value: Any) -> str:
-    """Return what a value should have been and what it is."""
+    """Return the sentence that says what a value should be and is."""
     return f"expected {allowed}, got {repr(value)[:SHOWN_CHARACTERS]} instead"
 
 
@@ -129,8 +140,10 @@ def quoted(text: str) -> str:
 
 
 def filled(template: Path, **values: Any) -> str:
-    """Return the TOML file that a template of Jinja makes of `values`; its filters are `quoted` and
-    numbers(form)."""
+    """Return the TOML file that a template of Jinja makes of `values`.
+
+    Its filters are `quoted` and numbers(form).
+    """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined  # few commands write a file
 
     loader = FileSystemLoader(template.parent)
@@ -145,12 +158,14 @@ def filled(template: Path, **values: Any) -> str:
 
 def _first_problem(invalid: ValidationError) -> str:
     first = invalid.errors(include_url=False)[0]
-    path = "".join(
-        f"[{place}]" if isinstance(place, int) else f".{place}" for place in first["loc"]
-    ).lstrip(".")
+    path = ""
+    for place in first["loc"]:
+        path += f"[{place}]" if isinstance(place, int) else f".{place}"
+    path = path.lstrip(".")
     problem = first.get("ctx", {}).get("error")
     if isinstance(problem, Problem):
-        return f"{'.'.join(filter(None, (path, problem.key)))}: {problem}"
+        parts = [part for part in (path, problem.key) if part]
+        return f"{'.'.join(parts)}: {problem}"
     if first["type"] == "missing":
         return f"{path}: missing; add it"
     text = re.sub(r"^(Value error, |(Input|String|Tuple|List|Value) (?=should))", "", first["msg"])

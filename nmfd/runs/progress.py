@@ -1,5 +1,7 @@
-"""Progress as a bar of tqdm, on a terminal and in a notebook, and how long it still takes as a line
-anywhere."""
+"""Progress of long computations.
+
+It is a bar of tqdm on a terminal and in a notebook, and a line about the time left anywhere.
+"""
 
 import math
 import sys
@@ -8,9 +10,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-with warnings.catch_warnings(
-    action="ignore"
-):  # of a notebook without ipywidgets, which gets no bar
+with warnings.catch_warnings(action="ignore"):  # a notebook without ipywidgets gets no bar
     from tqdm.auto import tqdm
 
 Progress = Callable[..., None] | bool | None
@@ -34,7 +34,8 @@ def watched(
         yield progress
     else:
         with tqdm(desc=label, leave=False, dynamic_ncols=True, smoothing=0.0, disable=None) as bar:
-            first, begun = math.inf, math.nan  # NaN: nothing is to be said
+            first = math.inf
+            begun = math.nan  # NaN: nothing is to be said
 
             def show(done: int, total: int, note: str = "") -> None:
                 nonlocal first, begun
@@ -43,13 +44,12 @@ def watched(
                 bar.update(done - bar.n)
                 now = time.monotonic()
                 if done <= first:
-                    first, begun = done, math.nan if said else now
+                    first = done
+                    begun = math.nan if said else now
                 left = (total - done) * (now - begun) / max(done - first, 1)
                 if now - begun > MEASURED_S and left > LONG_S:
                     begun = math.nan
-                    tqdm.write(
-                        f"{label}{note and ', '}{note}: about {left / 60:.0f} min left",
-                        file=sys.stderr,
-                    )
+                    stage = f"{label}, {note}" if note else label
+                    tqdm.write(f"{stage}: about {left / 60:.0f} min left", file=sys.stderr)
 
             yield show

@@ -1,60 +1,62 @@
-"""Many independent runs in a folder: finished ones are skipped, each result is written whole or not
-at all.
+"""Many independent runs in a folder.
 
-<folder>/manifest.json                       keys of all runs; commands, commits, versions and seeds of all sessions
-<folder>/runs.csv                            one row per run (nmfd.metrics.summary), the reason of a failure in the last
-                                             column
-<folder>/[<subfolder>/]<controller>-<seed>.nc    the Dataset of a run (nmfd.types.Result)
+Finished ones are skipped. Each result is written whole or not at all.
+
+<folder>/manifest.json    keys of all runs; commands, commits, versions and seeds of all sessions
+<folder>/runs.csv         one row per run (nmfd.metrics.summary), the reason of a failure last
+<folder>/[<subfolder>/]<controller>-<seed>.nc    Dataset of a run (nmfd.types.Result)
 """
 
-import atexit
 import json
-import multiprocessing
 import os
 import platform
+import re
 import shlex
 import shutil
-import signal
 import subprocess
 import sys
-import threading
-import traceback
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, as_completed
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cache
 from importlib import metadata
-from multiprocessing import connection, forkserver, resource_tracker
-from multiprocessing.process import BaseProcess
 from pathlib import Path
-from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 from urllib.parse import unquote
 
 from filelock import FileLock, Timeout
+from pydantic import BaseModel, Field
 
 from nmfd import __version__
-from nmfd.errors import InputError, RunFailed, need, uninterrupted
+from nmfd.errors import InputError, RunFailed, need
 from nmfd.metrics import summary
-from nmfd.runs.files import write_table, write_text
+from nmfd.runs.files import check_file, check_name, write_table, write_text
+from nmfd.runs.pool import attempt, in_processes, in_subprocess
 from nmfd.runs.progress import Progress, watched
 from nmfd.types import Result
 
 if TYPE_CHECKING:
-    import pandas as pd
+    from nmfd.runs.frame import Table
 
-MANIFEST, TABLE, LOCK = "manifest.json", "runs.csv", ".lock"
+MANIFEST = "manifest.json"
+TABLE = "runs.csv"
+LOCK = ".lock"
 DASK_PATIENCE_S = 10.0  # for the scheduler to answer
-POLL_S, EXIT_S = (
-    0.2,
-    5.0,
-)  # longest wait: Windows lets Ctrl-C through after it; for a process to end after its outcome
-PRELOADED = "xarray", "dask.array"  # which a Result imports, if they are there
-STARTING = threading.Lock()  # held while a process starts
-SERVED: set[str] = set()  # modules of the jobs that the server has imported
+RUN_FILE = re.compile(r"((?P<folder>.+)/)?(?P<controller>[^/]+)-(?P<seed>\d+)\.nc")
+LONGEST_NAME = 200  # of a run (bytes); systems allow 255, some of which temporary files need
+LONGER = 10.0  # time limit of a run, in expected times
+LEAST_LIMIT_S = 600.0
 PACKAGES = ("numpy", "torch", "casadi", "libsumo")  # whose versions are in the manifest
+
+
+class Place(NamedTuple):
+    """Folder below that of all runs, controller and seed of a run."""
+
+    folder: str
+    controller: str
+    seed: int
 
 
 @dataclass(frozen=True)
@@ -65,9 +67,10 @@ class Run:
     key: everything the result depends on, as JSON types: hashes, settings, versions. Its item
         "controller" holds what only runs of this controller depend on; all else is the same for all
         runs of a folder
-    job: a picklable function without arguments that returns the Result, or the reason why there is
-        none; `processes` takes any outcome for a Result
-    folder: below that of all runs; expected: wall time [s], 0 if unknown
+    job: function without arguments that returns the Result, or the reason why there is none; it
+        can be pickled, by value if it is the user's
+    folder: folder below that of all runs
+    expected: wall time (s), 0 if unknown
     """
 
     name: str
@@ -75,6 +78,21 @@ class Run:
     job: Callable[[], Any]
     folder: str = ""
     expected: float = 0.0
+
+    @property
+    def limit(self) -> float:
+        """Time after which the run is ended (s)."""
+        return max(LONGER * self.expected, LEAST_LIMIT_S)
+
+    @property
+    def place(self) -> Place:
+        """Folder, controller and seed."""
+        return place_of(self.file)
+
+    @property
+    def json_key(self) -> dict[str, Any]:
+        """The key as it is read from a file."""
+        return json.loads(json.dumps(self.key))
 
     @property
     def file(self) -> str:
@@ -88,9 +106,11 @@ def run_many(
     *,
     workers: int = 1,
     scheduler: str | None = None,
+    time_limit: float | None = None,
+    overwrite: bool = False,
     progress: Progress = None,
-) -> "pd.DataFrame":
-    """Do the `runs` whose files are not in the folder `out`, and return one row per run.
+) -> "Table":
+    """Do the runs whose files are not in a folder; return one row per run.
 
     Columns are those of `nmfd.metrics.summary`, `folder` if there are several, and `failure`: "" of
     a finished run, else the reason with file and line. Finished runs of earlier calls that share
@@ -99,31 +119,42 @@ def run_many(
     workers: runs at a time, each in a process of its own; 0: one after the other in this process
     scheduler: address of a Dask scheduler, whose workers do the runs; it takes TLS certificates
         from Dask's own configuration
+    time_limit: wall time after which the process of a run is ended (s); if None, ten times the
+        expected time, at least ten minutes. Runs in this process have none
+    overwrite: do finished runs again whose keys have changed
     progress: None for a bar, False for none, or a function of done, total and the name of a run
-    Raises: InputError if another process has the folder, or it is not a folder of runs
+    Raises: InputError if another process has the folder, it is not a folder of runs, or finished
+        runs in it have other keys, without `overwrite`
     """
     out = Path(out)
     with locked(out):
-        keys = _write_manifest(out, runs, workers)
-        rows = {
-            file: _row(file, result)
-            for file, key in keys.items()
-            if (result := _finished(out / file, key))
-        }
+        check_names(runs)
+        kept = _kept_runs(out, runs)
+        if not overwrite:
+            _check_kept(out, runs, kept)
+        keys = _write_manifest(out, runs, workers, kept)
+        rows = {}
+        for file, key in keys.items():
+            if file not in kept:
+                continue
+            changed = _differing(kept[file].key, key)
+            if changed:
+                _say(f"{out / file}: out of date, {changed} changed")
+            else:
+                rows[file] = kept[file].row
         todo = [run for run in runs if run.file not in rows]
         minutes = sum(run.expected for run in todo) / max(workers, 1) / 60.0
-        if said := minutes > 0.5 and scheduler is None:
-            print(
-                f"{len(todo)} runs take about {minutes:.0f} min, {workers} at a time",
-                file=sys.stderr,
-            )
+        said = minutes > 0.5 and scheduler is None
+        if said:
+            text = f"{len(todo)} runs take about {minutes:.0f} min, {workers} at a time"
+            print(text, file=sys.stderr)
         try:
             with (
                 watched("runs", progress, said=said) as show,
-                closing(_outcomes(todo, workers, scheduler)) as ended,
+                closing(_outcomes(todo, workers, scheduler, time_limit)) as ended,
             ):
                 if show and todo:
-                    show(0, len(todo))
+                    show(0, len(todo), "")
                 for done, (run, outcome) in enumerate(ended, 1):
                     if isinstance(outcome, Result):
                         outcome = outcome.assign(key=json.dumps(keys[run.file]))
@@ -133,172 +164,64 @@ def run_many(
                     if show:
                         show(done, len(todo), run.name)
         except KeyboardInterrupt:
-            raise KeyboardInterrupt(
-                f"finished runs are in {out}; the same command with --out {out} goes on"
-            ) from None
+            left = f"finished runs are in {out}; the same command with --out {out} goes on"
+            raise KeyboardInterrupt(left) from None
         finally:
             table = _table([rows[file] for file in keys if file in rows])
             write_table(out / TABLE, table)
     return table
 
 
-def raise_failures(rows: "pd.DataFrame") -> None:
+def check_names(runs: Sequence[Run]) -> None:
+    """Raise InputError for a run whose name is too long for a file."""
+    for run in runs:
+        if len(run.name.encode()) > LONGEST_NAME:
+            problem = f"its name is longer than the {LONGEST_NAME} bytes that a file may have"
+            raise InputError(f"controller {run.place.controller}: {problem}; shorten it")
+
+
+def raise_failures(rows: "Table") -> None:
     """Raise RunFailed that names all failed runs in the rows of `run_many`."""
     failed = rows[rows["failure"] != ""]
     if len(failed):
-        labels = failed["controller"] + ", seed " + failed["seed"].astype(str)
-        raise RunFailed(
-            "; ".join(
-                f"{label}: {why}" for label, why in zip(labels, failed["failure"], strict=True)
-            )
-        )
-
-
-def attempt(job: Callable[[], Result | str]) -> Result | str:
-    """Return the outcome of `job`, or why there is none, with file and line."""
-    try:
-        return job()
-    except InputError as error:
-        return str(error)
-    except (Exception, SystemExit) as error:
-        last = traceback.extract_tb(error.__traceback__)[-1]
-        return f"{type(error).__name__}: {error} ({Path(last.filename).name}:{last.lineno})"
+        runs = failed["controller"] + ", seed " + failed["seed"].astype(str)
+        raise RunFailed("; ".join(runs + ": " + failed["failure"]))
 
 
 def _outcomes(
-    todo: Sequence[Run], workers: int, scheduler: str | None
-) -> Generator[tuple[Run, Result | str]]:
-    """Yield every run with its result or the reason of its failure, as they end."""
+    todo: Sequence[Run], workers: int, scheduler: str | None, time_limit: float | None
+) -> Generator[tuple[Run, Any]]:
+    """Yield runs as they end, with their result or reason of failure."""
     if scheduler is not None and todo:
         with _dask(scheduler) as executor:
-            futures = {executor.submit(_alone, run.job, os.getcwd()): run for run in todo}
+            futures = {executor.submit(in_subprocess, run.job, os.getcwd()): run for run in todo}
             for future in as_completed(list(futures)):
                 run = futures.pop(future)  # with its result, which may be large
                 yield run, attempt(future.result)
     elif workers == 0:
-        yield from ((run, attempt(run.job)) for run in todo)
+        for run in todo:
+            yield run, attempt(run.job)
     else:
-        yield from processes(todo, workers)
-
-
-def _alone(job: Callable[[], Result | str], folder: str) -> Result | str:
-    """Do `job` in a new process in `folder`, from a worker of Dask."""
-    multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]  # may have a child
-    return list(processes([Run("", {}, job)], 1, folder))[0][1]
-
-
-def processes(todo: Sequence[Run], workers: int, folder: str = "") -> Generator[tuple[Run, Any]]:
-    """Yield every run with its outcome from a process of its own in `folder`, `workers` at a
-    time."""
-    waiting, live = list(reversed(todo)), dict[connection.Connection, tuple[Run, BaseProcess]]()
-    try:
-        while waiting or live:
-            while waiting and len(live) < workers:
-                channel, process = _start(waiting[-1].job, os.path.abspath(folder))
-                live[channel] = waiting.pop(), process
-                with suppress(BrokenPipeError):  # it has died, which is an outcome
-                    channel.send(live[channel][0].job)
-            ready = connection.wait(live, POLL_S)
-            for channel in [one for one in live if one in ready]:
-                outcome = _outcome(channel, live[channel][1])
-                yield live.pop(channel)[0], outcome
-    finally:  # after Ctrl-C there are some
-        for _, process in live.values():
-            process.kill()
-            process.join()
-
-
-def _start(
-    job: Callable[[], Result | str], folder: str
-) -> tuple[connection.Connection, BaseProcess]:
-    """Start a process, and return it behind the channel for a job and its outcome.
-
-    Where the system can, it is forked from a server that has imported the module of `job`, and that
-    later jobs of this module use, too.
-    """
-    method, environment = "forkserver" if hasattr(os, "fork") else "spawn", dict(os.environ)
-    context: Any = multiprocessing.get_context(method)
-    module = getattr(job, "func", job).__module__
-    # Without the user's script, which would do everything again; the server shows a traceback of a
-    # request cut short.
-    with STARTING, uninterrupted():
-        if method == "forkserver":
-            if module not in SERVED:
-                _stop_server()
-                SERVED.add(module)
-            context.set_forkserver_preload([__name__, *PRELOADED, *sorted(SERVED)])
-            resource_tracker.ensure_running()  # first, as it lets Ctrl-C through
-            blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-            os.environ |= {
-                "PYTHONSAFEPATH": "1",
-                "PYTHONPATH": os.pathsep.join(sys.path),
-            }  # to find the same modules
-            try:
-                forkserver.ensure_running()
-            finally:
-                os.environ.clear()
-                os.environ |= environment
-                signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
-        ours, theirs = context.Pipe()
-        process = context.Process(target=_work, args=(theirs, folder, environment), daemon=True)
-        main, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
-        try:
-            process.start()
-        finally:
-            sys.modules["__main__"] = main
-    theirs.close()
-    return ours, process
-
-
-@atexit.register
-def _stop_server() -> None:
-    server: Any = forkserver._forkserver
-    if server._forkserver_pid is not None:  # it may still import
-        os.kill(server._forkserver_pid, signal.SIGTERM)
-        server._stop()
-
-
-def _work(channel: connection.Connection, folder: str, environment: Mapping[str, str]) -> None:
-    """Send back the outcome of the job that comes through `channel`, as long as its other end is
-    there."""
-
-    def end_with_parent() -> None:
-        multiprocessing.parent_process().join()  # type: ignore[union-attr]
-        os._exit(1)
-
-    threading.Thread(target=end_with_parent, daemon=True).start()
-    os.environ.clear()
-    os.environ.update(environment)
-    os.chdir(folder)
-    with suppress(OSError):
-        channel.send(attempt(lambda: channel.recv()()))
-
-
-def _outcome(channel: connection.Connection, process: BaseProcess) -> Result | str:
-    """Return what comes through `channel`, or why nothing does; wait for the end of the process."""
-    try:
-        return channel.recv()
-    except (EOFError, OSError):
-        process.join(EXIT_S)
-        status = process.exitcode or 0
-        return f"its process died (status {status}{f', {signal.strsignal(-status)}' if status < 0 else ''})"
-    finally:
-        process.join(EXIT_S)
-        channel.close()
+        limits = [time_limit or run.limit for run in todo]
+        for number, outcome in in_processes([run.job for run in todo], workers, limits):
+            yield todo[number], outcome
 
 
 @contextmanager
 def _dask(address: str) -> Iterator[Executor]:
-    """Connect to a Dask scheduler; its workers see the same files under the same paths. Raises
-    InputError."""
+    """Connect to a Dask scheduler.
+
+    Its workers see the same files under the same paths. Raises: InputError
+    """
     need("--scheduler", "dask", "distributed")
     from distributed import Client  # of an extra
 
     try:
         client = Client(address, timeout=DASK_PATIENCE_S, set_as_default=False)
     except (OSError, ValueError, TypeError, RuntimeError) as error:
+        reason = " ".join(str(error).split())
         raise InputError(
-            f"--scheduler: no Dask scheduler answers at {address!r} ({' '.join(str(error).split())}); start one with "
+            f"--scheduler: no Dask scheduler answers at {address!r} ({reason}); start one with "
             "'dask scheduler' and give its address, such as tcp://host:8786"
         ) from None
     executor = client.get_executor(pure=False)
@@ -311,12 +234,15 @@ def _dask(address: str) -> Iterator[Executor]:
 
 @contextmanager
 def locked(out: Path, mark: str = MANIFEST) -> Iterator[None]:
-    """Make the folder, hold it against other processes, and remove it if nothing comes into it.
-    Raises InputError.
+    """Make a folder and hold it against other processes.
 
-    mark: file that a folder with other files must hold. A command holds its folder around its runs,
-        tables and figures
+    It is removed if nothing comes into it. A command holds its folder around its runs, tables and
+    figures.
+
+    mark: file that a folder with other files must hold
+    Raises: InputError
     """
+    check_name(out)
     remedy = "choose another folder with --out"
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file; {remedy}")
@@ -331,95 +257,169 @@ def locked(out: Path, mark: str = MANIFEST) -> Iterator[None]:
                 if [path.name for path in out.glob("*")] == [LOCK]:
                     shutil.rmtree(out, ignore_errors=True)
     except Timeout:
-        raise InputError(
-            f"{out}: another process is writing to it; wait for its end, or {remedy}"
-        ) from None
+        problem = "another process is writing to it; wait for its end"
+        raise InputError(f"{out}: {problem}, or {remedy}") from None
+
+
+class FolderOfRuns(BaseModel):
+    """Entry of a manifest: what all runs of a folder depend on, and what those of a controller."""
+
+    key: dict[str, Any]
+    controllers: dict[str, Any]
+
+
+class Manifest(BaseModel):
+    """Content of manifest.json."""
+
+    folders: dict[str, FolderOfRuns]
+    sessions: Annotated[list[dict[str, Any]], Field(min_length=1)]
 
 
 def read_manifest(folder: Path) -> dict:
-    """Return manifest.json of a folder of runs: its folders and sessions. Raises InputError."""
+    """Return manifest.json of a folder of runs: its folders and sessions.
+
+    Raises: InputError
+    """
+    file = folder / MANIFEST
+    check_file(file)
     try:
-        content = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
-        content["folders"].items(), content["sessions"][0]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError):
-        raise InputError(
-            f"{folder / MANIFEST}: is no manifest of runs; choose another folder with --out"
-        ) from None
-    return content
+        manifest = Manifest.model_validate_json(file.read_bytes())
+    except (OSError, ValueError):
+        remedy = "choose another folder with --out"
+        raise InputError(f"{file}: is no manifest of runs, or damaged; {remedy}") from None
+    return manifest.model_dump()
 
 
-def _write_manifest(out: Path, runs: Sequence[Run], workers: int) -> dict[str, dict]:
-    """Add `runs` and this session to the manifest; return file -> key of these runs, then of others
-    in the folders."""
-    manifest = read_manifest(out) if (out / MANIFEST).is_file() else {"folders": {}, "sessions": []}
+def _write_manifest(
+    out: Path, runs: Sequence[Run], workers: int, kept: Iterable[str]
+) -> dict[str, dict]:
+    """Add `runs` and this session to the manifest.
+
+    kept: files of finished runs
+    Return file -> key of these runs, then of others in the folders.
+    """
+    manifest = _manifest(out)
     folders = manifest["folders"]
     for run in runs:
-        key = json.loads(json.dumps(run.key))
+        key = dict(run.json_key)
         own = key.pop("controller", None)
         if folders.get(run.folder, {}).get("key") != key:
             folders[run.folder] = {"key": key, "controllers": {}}
-        folders[run.folder]["controllers"][_place(run.file)[1]] = own
-    seeds = sorted({_place(run.file)[2] for run in runs})
+        folders[run.folder]["controllers"][run.place.controller] = own
+    seeds = sorted({run.place.seed for run in runs})
     manifest["sessions"].append({**provenance(), "seeds": seeds, "workers": workers})
     write_text(out / MANIFEST, json.dumps(manifest, indent=2) + "\n")
-    there = [
-        path.relative_to(out).as_posix()
-        for name in folders
-        for path in sorted((out / name).glob("[!.]*-*.nc"))
-    ]
     keys = {}
-    for file in (*(run.file for run in runs), *there):
-        folder, controller, _ = _place(file)
-        if controller in folders[folder]["controllers"]:
-            keys[file] = {
-                **folders[folder]["key"],
-                "controller": folders[folder]["controllers"][controller],
-            }
+    for name in (*(run.file for run in runs), *kept):
+        folder, controller, _ = place_of(name)
+        entry = folders[folder]
+        if controller in entry["controllers"]:
+            keys[name] = {**entry["key"], "controller": entry["controllers"][controller]}
     return keys
 
 
-def _finished(path: Path, key: Mapping) -> Result | None:
-    """Return the result in `path`; None if there is none, or its key is another one."""
+def _manifest(out: Path) -> dict[str, Any]:
+    """Return the manifest of a folder, an empty one if there is none. Raise InputError."""
+    if (out / MANIFEST).exists():
+        return read_manifest(out)
+    return {"folders": {}, "sessions": []}
+
+
+class Kept(NamedTuple):
+    """A finished run: its row of the table, and everything that it depends on."""
+
+    row: dict[str, Any]
+    key: dict[str, Any]
+
+
+def _kept_runs(out: Path, runs: Sequence[Run]) -> dict[str, Kept]:
+    """Return the finished runs in the folder: those of `runs`, then others."""
+    names = [run.file for run in runs]
+    for folder in _manifest(out)["folders"]:
+        for path in sorted((out / folder).glob("[!.]*-*.nc")):
+            names.append(path.relative_to(out).as_posix())
+    found = {}
+    for name in dict.fromkeys(names):
+        kept = _kept(out / name, name)
+        if kept is not None:
+            found[name] = kept
+    return found
+
+
+def _kept(path: Path, name: str) -> Kept | None:
+    """Return the finished run in `path`.
+
+    None if there is none, or one of another controller or seed than its name says.
+    """
+    if not path.is_file() or not RUN_FILE.fullmatch(name):
+        return None
     try:
         result = Result.read(path)
-        kept = json.loads(result.key)
-    except (InputError, AttributeError, ValueError):  # missing, cut off, or not of this package
+        key = json.loads(result.data.attrs["key"])
+        found = result.controller, result.seed
+    except (InputError, KeyError, ValueError):  # cut off, or not of this package
         return None
-    if changed := sorted(name for name in {**kept, **key} if kept.get(name) != key.get(name)):
-        with suppress(BrokenPipeError):  # perhaps nobody reads on
-            print(f"{path}: out of date, {', '.join(changed)} changed", file=sys.stderr)
+    if found != place_of(name)[1:]:
+        _say(f"{path}: is the run of {found[0]} with seed {found[1]}, not that of its name")
         return None
-    return result
+    return Kept(_row(name, result), key)
+
+
+def _check_kept(out: Path, runs: Sequence[Run], kept: Mapping[str, Kept]) -> None:
+    """Raise InputError if a finished run with another key would be replaced."""
+    for run in runs:
+        if run.file not in kept:
+            continue
+        changed = _differing(kept[run.file].key, run.json_key)
+        if changed:
+            remedy = "choose another folder with --out, or add --overwrite to do it again"
+            problem = f"is a run with other settings ({changed} changed)"
+            raise InputError(f"{out / run.file}: {problem}; {remedy}")
+
+
+def _differing(one: Mapping, other: Mapping) -> str:
+    """Return the names of the items in which two keys differ."""
+    names = [name for name in {**one, **other} if one.get(name) != other.get(name)]
+    return ", ".join(sorted(names))
+
+
+def _say(text: str) -> None:
+    with suppress(BrokenPipeError):  # perhaps nobody reads on
+        print(text, file=sys.stderr)
 
 
 def _row(file: str, outcome: Result | str) -> dict:
-    row = dict(zip(("folder", "controller", "seed"), _place(file), strict=True))
-    return (
-        {**row, "failure": outcome}
-        if isinstance(outcome, str)
-        else {**row, **summary(outcome), "failure": ""}
-    )
+    row = place_of(file)._asdict()
+    if isinstance(outcome, str):
+        return {**row, "failure": outcome}
+    return {**row, **summary(outcome), "failure": ""}
 
 
-def _place(file: str) -> tuple[str, str, int]:
-    """Return folder, controller and seed of the file of a run."""
-    folder, _, name = file.rpartition("/")
-    controller, _, seed = name.removesuffix(".nc").rpartition("-")
-    return folder, unquote(controller), int(seed)
+def place_of(file: str) -> Place:
+    """Return the place of the file of a run. Raise ValueError for another name."""
+    match = RUN_FILE.fullmatch(file)
+    if match is None:
+        raise ValueError(f"{file}: is not the name of a run")
+    return Place(match["folder"] or "", unquote(match["controller"]), int(match["seed"]))
 
 
-def _table(rows: Sequence[dict]) -> "pd.DataFrame":
-    import pandas as pd
+def _table(rows: Sequence[dict]) -> "Table":
+    from nmfd.runs.frame import Table  # pandas takes half a second
 
     if not rows:
-        return pd.DataFrame(columns=["controller", "seed", "failure"])
-    table = pd.DataFrame(rows)
+        return Table(columns=["controller", "seed", "failure"])
+    table = Table(rows)
     table.insert(len(table.columns) - 1, "failure", table.pop("failure"))
-    return table if any(table["folder"]) else table.drop(columns="folder")
+    if not any(table["folder"]):
+        del table["folder"]
+    return table
 
 
 def provenance() -> dict:
-    """Return date, command, versions, and the commit of the checkout, None outside one."""
+    """Return date, command, versions, and the commit of the checkout.
+
+    The commit is None outside a checkout.
+    """
     commit, dirty = _checkout()
     versions = {"python": platform.python_version(), "perimeter-cosim": __version__}
     for package in PACKAGES:
@@ -436,22 +436,22 @@ def provenance() -> dict:
 
 @cache
 def _checkout() -> tuple[str | None, bool | None]:
-    """Return the commit of this package, and whether files differ from it, at the first call."""
+    """Return the commit of this package, and True if files differ from it.
+
+    Both are those at the first call.
+    """
+    here = Path(__file__).resolve()
 
     def git(*arguments: str) -> str:
-        command = [
-            "git",
-            "--no-optional-locks",
-            "-C",
-            str(Path(__file__).resolve().parent),
-            *arguments,
-        ]
-        return subprocess.run(
-            command, capture_output=True, text=True, timeout=10, check=True
-        ).stdout.strip()
+        command = ["git", "--no-optional-locks", *arguments]
+        done = subprocess.run(
+            command, cwd=here.parent, capture_output=True, text=True, timeout=10, check=True
+        )
+        return done.stdout.strip()
 
-    try:  # an installed copy may lie inside another checkout: the commit counts only if this file is tracked
-        git("ls-files", "--error-unmatch", Path(__file__).name)
+    try:
+        # An installed copy may lie inside another checkout, which does not track this file.
+        git("ls-files", "--error-unmatch", here.name)
         return git("rev-parse", "HEAD"), bool(git("status", "--porcelain", "--untracked-files=no"))
     except (OSError, subprocess.SubprocessError):
         return None, None

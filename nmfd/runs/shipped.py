@@ -1,4 +1,6 @@
-"""Scenarios and networks of the package: found by name from any folder, never written to.
+"""Scenarios and networks of the package.
+
+They are found by name from any folder and never written to.
 
 In a checkout they are its folders scenarios and networks, in an installed package those in
 nmfd/data; the same relative paths lead from one to another in both.
@@ -11,10 +13,9 @@ from pathlib import Path
 
 from nmfd.errors import InputError, did_you_mean
 
-SCENARIO, NETWORK = (
-    "scenario",
-    "network",
-)  # kinds of folders: in folders of that name + "s", with NAME.toml in each
+# Kinds of folders: they lie in folders of that name + "s", with NAME.toml in each.
+SCENARIO = "scenario"
+NETWORK = "network"
 _HERE = Path(str(resources.files("nmfd")))
 _DATA = _HERE / "data"  # as pyproject.toml maps it
 
@@ -37,57 +38,59 @@ def found(name: Path | str, *kinds: str, beside: Path | None = None) -> Path:
         (grid7_peak/dpc-pc.pt). A path to nothing is returned unchanged
     Raises: InputError for a single word that names nothing
     """
-    path, word = Path(name) if beside is None else beside / name, Path(name)
+    word = Path(name)
+    path = word if beside is None else beside / word
     if os.path.isfile(path) or any(os.path.exists(path / f"{kind}.toml") for kind in kinds):
         return path
     if word.is_absolute() or ".." in word.parts:
         return path
-    here = Path.cwd()
-    for place, kind in itertools.product(
-        (root(), *([here, *here.parents] if beside is None else [])), kinds
-    ):
-        short = word.relative_to(f"{kind}s") if word.parts[:1] == (f"{kind}s",) else word
+    places = [root()]
+    if beside is None:
+        here = Path.cwd()
+        places += [here, *here.parents]
+    for place, kind in itertools.product(places, kinds):
+        short = word
+        if word.parts[:1] == (f"{kind}s",):
+            short = word.relative_to(f"{kind}s")
         folder = place / f"{kind}s" / short
-        if short.parts and os.path.exists(
-            folder / f"{kind}.toml" if len(short.parts) == 1 else folder
-        ):
+        mark = folder / f"{kind}.toml" if len(short.parts) == 1 else folder
+        if short.parts and os.path.exists(mark):
             return folder
-    if (
-        beside is not None
-        or not kinds
-        or len(word.parts) != 1
-        or word.suffix
-        or os.path.exists(path)
-    ):
+    single_word = len(word.parts) == 1 and not word.suffix
+    if beside is not None or not kinds or not single_word or os.path.exists(path):
         return path
-    places = [(place, kind) for kind in kinds for place in (root() / f"{kind}s", Path())]
-    near = [file.parent.name for place, kind in places for file in place.glob(f"*/{kind}.toml")]
-    raise InputError(
-        f"{name}: no such folder here, and no {' or '.join(kinds)} of that name comes with the package"
-        f"{did_you_mean(str(name), near)}; `nmfd show` lists them"
+    near = []
+    for kind in kinds:
+        for place in (root() / f"{kind}s", Path()):
+            near += [file.parent.name for file in place.glob(f"*/{kind}.toml")]
+    problem = (
+        f"no such folder here, and no {' or '.join(kinds)} of that name comes with the package"
     )
+    raise InputError(f"{name}: {problem}{did_you_mean(str(name), near)}; `nmfd show` lists them")
 
 
 def installed(path: Path) -> bool:
-    """Return True if `path` lies in the data of an installed package, which the user may not write
-    to."""
+    """Return True if `path` lies in an installed package.
+
+    The user may not write there.
+    """
     return path.resolve().is_relative_to(_DATA.resolve())
 
 
 def beside(folder: Path, file: str, option: str, *, scenario: bool = False) -> Path:
     """Return the path of `file` in `folder`.
 
-    option: names another place; scenario: True if the user's own scenario may be based on `folder`
-        instead
+    option: names another place
+    scenario: True if the user's own scenario may be based on `folder` instead
     Raises: InputError if the folder cannot be written to, or is of the installed package
     """
     remedy = f"give {option}"
     if scenario:
-        remedy += f', or make a folder of your own whose scenario.toml has name = "..." and base = "{folder.name}"'
+        content = f'name = "..." and base = "{folder.name}"'
+        remedy += f", or make a folder of your own whose scenario.toml has {content}"
     if installed(folder):
-        raise InputError(
-            f"{folder.name}: came with the package, where nothing is written; {remedy}"
-        )
+        problem = "came with the package, where nothing is written"
+        raise InputError(f"{folder.name}: {problem}; {remedy}")
     if folder.is_dir() and not os.access(folder, os.W_OK):
         raise InputError(f"{folder}: cannot be written to; {remedy}")
     return folder / file

@@ -1,2 +1,1 @@
-"""Studies on the regional model: benchmark, robustness, bound, measured MFDs, and their
-pictures."""
+"""Studies on the regional model, and their pictures."""

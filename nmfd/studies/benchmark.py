@@ -1,5 +1,6 @@
-"""The benchmark: controllers x seeds on a regional plant, with a table and the paper's figures; its
-robustness.
+"""Benchmark of controllers x seeds on a regional plant, and robustness.
+
+The benchmark has a table and the paper's figures.
 
 For robustness every controller is made for the nominal scenario (MPC has its forecast, the policies
 their training) and meets another demand, or other MFDs (nmfd.model.scenario.perturbed); its
@@ -22,6 +23,7 @@ from nmfd.errors import InputError
 from nmfd.metrics import COUNTED, decision_ms, percent_change, summary
 from nmfd.model.plant import AcyclicPlant, NmfdPlant
 from nmfd.model.scenario import Scenario, perturbed
+from nmfd.runs.files import run_name
 from nmfd.runs.tables import text_columns, text_table
 from nmfd.studies import plots
 from nmfd.types import Plant, Result
@@ -29,18 +31,26 @@ from nmfd.types import Plant, Result
 if TYPE_CHECKING:
     import pandas as pd
 
+    from nmfd.runs.frame import Table
+
 PLANTS: dict[str, Callable[[Scenario], Plant]] = {"nmfd": NmfdPlant, "acyclic": AcyclicPlant}
 REFERENCE = "no-control"
 CAPTION = (
-    "TTS: total time spent, mean over seeds ± 95 % interval; change: of TTS against {against}; control: processor "
-    "time of all decisions of a run; step: first / median / longest decision; decisions of all seeds: "
-    + "; ".join(f"{heading}: {what}" for heading, what in COUNTED.values())
-)
+    "TTS: total time spent, mean over seeds ± 95 % interval; change: of TTS against {against}; "
+    "control: processor time of all decisions of a run; step: first / median / longest decision; "
+    "decisions of all seeds: "
+) + "; ".join(f"{heading}: {what}" for heading, what in COUNTED.values())
 BOUND_CAPTION = (
     "; above the optimum: at most, by the lower bound with the same controls (nmfd bound)"
 )
+IMPOSSIBLE = "impossible"
+IMPOSSIBLE_CAPTION = (
+    "; impossible: a run falls below the lower bound for its controls, so its plant or commands "
+    "are wrong"
+)
 SIGMAS_VEH_S = (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0)  # of the noise on the demand
 SPREADS = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4)  # of the MFDs and trip lengths
+BOUND_TOLERANCE = 1e-6  # of the solver of the bound
 PERTURBED_PLANT = "acyclic"
 KEPT = (
     "controller",
@@ -51,14 +61,16 @@ KEPT = (
     "fallbacks",
 )
 ROBUSTNESS_CAPTION = (
-    "improvement of total time spent over no-control in the same perturbed scenario [%], mean ± 95 % interval; "
-    "trips: mean of all perturbed scenarios [veh]; sigma of {kind}: {meaning}"
+    "improvement of total time spent over no-control in the same perturbed scenario [%], mean "
+    "± 95 % interval; trips: mean of all perturbed scenarios [veh]; sigma of {kind}: {meaning}"
 )
 
 
 def compared_with(controllers: Iterable[str]) -> str:
-    """Return the controller that others are compared with: no control, or the first if that is not
-    among them."""
+    """Return the controller that others are compared with.
+
+    It is no control, or the first controller if no control is not among them.
+    """
     names = list(controllers)
     return REFERENCE if REFERENCE in names else names[0]
 
@@ -70,60 +82,72 @@ def closed_loop_of(
     scenario: Scenario,
     plant: str,
     policy: Path | None = None,
+    demand: float = 1.0,
     actual: Scenario | None = None,
 ) -> Result:
-    """Run the controller of `strategy`, which is made for `scenario`, in this one or the perturbed
-    one `actual`."""
-    controller, actual = strategy.make(scenario, policy), actual or scenario
+    """Run the controller that `strategy` makes for `scenario`.
+
+    demand: factor of the demand that the scenario already has, to be noted in the result
+    actual: perturbed scenario that it meets, the same if None
+    """
+    controller = strategy.make(scenario, policy)
+    actual = actual or scenario
     result = closed_loop.run(PLANTS[plant](actual), controller, actual, seed=seed)
-    return result.assign(controller=strategy.name, plant=plant)
+    return result.assign(controller=strategy.name, plant=plant, demand=demand)
 
 
 def workers_for(strategies: Sequence[Strategy], workers: int) -> int:
-    """Return `workers` for `run_many`: 0, this process, for one, unless the user's own controllers
-    may crash."""
-    own = any(strategy.controller.own for strategy in strategies)
+    """Return `workers` for `run_many`.
+
+    A single worker is this process (0), unless controllers of the user's own may crash it.
+    """
+    own = any(strategy.own for strategy in strategies)
     return workers if own or workers > 1 else 0
 
 
 def key_of(
     scenario: Scenario, strategies: Sequence[Strategy], plant: str, policies: Mapping[str, Path]
 ) -> Callable[[str], dict]:
-    """Return the function that gives everything the runs of a controller depend on.
+    """Return the function of a controller's name that returns its key.
+
+    The key holds everything that its runs depend on.
 
     Raises: InputError if a controller cannot be made, or the regional model has no such fault
     """
     for fault in scenario.ordered_faults:
         if fault.kind in faults.CITY:
-            raise InputError(
-                f"{scenario.name}: faults: {fault.kind} is a fault of a city in SUMO; omit it"
-            )
+            problem = f"{fault.kind} is a fault of a city in SUMO; omit it"
+            raise InputError(f"{scenario.name}: faults: {problem}")
     own = {}
     for strategy in strategies:
         policy = policies.get(strategy.name)
         strategy.make(scenario, policy)
         own[strategy.name] = strategy.fingerprint(scenario, policy)
-    network, shared = scenario.network, {"scenario": scenario.name, "scenario_hash": scenario.hash}
-    shared |= {"network": network.name, "network_hash": network.hash, "plant": plant}
+    shared = {
+        "scenario": scenario.name,
+        "scenario_hash": scenario.hash,
+        "network": scenario.network.name,
+        "network_hash": scenario.network.hash,
+        "plant": plant,
+    }
     return lambda name: {**shared, "controller": own[name]}
 
 
 def lower_bound(scenario: Scenario, strategy: Strategy, plant: str) -> float:
-    """Return the lower bound [veh s] in the plan file of the scenario for the controls of
-    `strategy`; NaN without.
+    """Return the lower bound (veh s) in the scenario's plan file; NaN without.
 
-    Controllers of the user's own may meter, and plants of the user's own are other models.
+    It is for the controls of `strategy`. Controllers of the user's own may meter, and plants of the
+    user's own are other models.
     """
-    metered = scenario.controller_options.get(strategy.table(scenario), {}).get("metering", False)
-    file = (scenario.folder or Path()) / f"bound-{'pcrg' if strategy.guides else 'pc'}.npz"
-    renormalised = plant == "acyclic" and bool(scenario.network.observed_split_ratios)
-    if (
-        strategy.controller.own
-        or metered
-        or plant not in PLANTS
-        or renormalised
-        or not file.is_file()
-    ):
+    if strategy.own or plant not in PLANTS:
+        return math.nan
+    if getattr(strategy.options(scenario), "metering", False):
+        return math.nan
+    if plant == "acyclic" and scenario.network.observed_split_ratios:  # which it renormalises
+        return math.nan
+    name = "bound-pcrg" if strategy.guides else "bound-pc"
+    file = (scenario.folder or Path()) / f"{name}.npz"
+    if not file.is_file():
         return math.nan
     try:
         return open_loop.read(file, scenario, guidance=strategy.guides).lower
@@ -131,37 +155,106 @@ def lower_bound(scenario: Scenario, strategy: Strategy, plant: str) -> float:
         return math.nan
 
 
+def with_bounds(rows: "Table", lower: Mapping[tuple[str, float], float], level: float) -> "Table":
+    """Return the rows with columns `lower_bound_veh_s` and `impossible`.
+
+    A row is impossible if it falls below the bound.
+
+    lower: (controller, factor of the demand) -> lower bound (veh s)
+    level: factor of rows that do not say theirs
+    """
+    bounds = []
+    for row in rows.to_dict("records"):
+        factor = row.get("demand", level)
+        if math.isnan(factor):
+            factor = level
+        bounds.append(lower.get((row["controller"], factor), math.nan))
+    rows["lower_bound_veh_s"] = bounds
+    spent = rows.get("total_time_spent_veh_s", math.nan)
+    rows["impossible"] = spent < rows["lower_bound_veh_s"] * (1.0 - BOUND_TOLERANCE)
+    return rows
+
+
+def draw(folder: Path, scenarios: Mapping[float, Scenario], rows: "pd.DataFrame") -> None:
+    """Draw the finished runs of a benchmark, and its scenario."""
+    done = rows[rows["failure"] == ""]
+    if done.empty:
+        return
+    several = len(scenarios) > 1
+    for level, scenario in scenarios.items():
+        below = f"demand-{level:g}" if several else ""
+        results = []
+        for row in done.to_dict("records"):
+            if row.get("folder", "") == below:
+                name = run_name(row["controller"], row["seed"])
+                results.append(Result.read(folder / below / f"{name}.nc"))
+        if results:
+            draw_accumulations(folder, scenario, results, prefix=f"{below}-" if below else "")
+    draw_scenario(folder, next(iter(scenarios.values())))
+
+
 def summary_table(rows: "pd.DataFrame") -> str:
-    """Return one line per controller as text: means over seeds, TTS with its 95 % interval."""
-    groups = dict(list(rows[rows["failure"] == ""].groupby("controller", sort=False)))
-    tts = {name: group["total_time_spent_veh_s"].tolist() for name, group in groups.items()}
-    if not groups:
+    """Return a table with a line per controller, for every demand level.
+
+    Total time spent (TTS) is the mean over seeds with its 95 % interval. Controllers with an
+    impossible run come last, without a rank.
+    """
+    done = rows[rows["failure"] == ""]
+    if done.empty:
         return "no run is finished"
-    against = compared_with(tts)
-    with_bound = "lower_bound_veh_s" in rows and bool(rows["lower_bound_veh_s"].notna().any())
+    levels = done["demand"].unique() if "demand" in done else [1.0]
+    if len(levels) == 1:
+        return _level_table(done)
+    tables = []
+    for level in levels:
+        tables.append(f"demand x {level:g}\n{_level_table(done[done['demand'] == level])}")
+    return "\n\n".join(tables)
+
+
+def _level_table(done: "pd.DataFrame") -> str:
+    groups = dict(list(done.groupby("controller", sort=False)))
+    against = compared_with(groups)
+    reference = groups[against]["total_time_spent_veh_s"].tolist()
+    with_bound = "lower_bound_veh_s" in done and bool(done["lower_bound_veh_s"].notna().any())
     lines = []
+    impossible = []
     for name, group in groups.items():
-        mean, spread = group.mean(numeric_only=True).to_dict(), interval(tts[name])
-        above = _percent(tts[name], [mean["lower_bound_veh_s"]]) if with_bound else ""
-        lines.append(
-            {
-                "controller": name,
-                "seeds": len(group),
-                "TTS [veh s]": _scientific(statistics.fmean(tts[name]))
-                + ("" if math.isnan(spread) else f" ± {_scientific(spread, 1)}"),
-                "change": _percent(tts[name], tts[against]) if name != against else "",
-                **({"above the optimum": above.replace("+", "≤ ")} if with_bound else {}),
-                "final [veh]": f"{mean['final_accumulation_veh']:,.0f}",
-                "max [veh]": f"{mean['max_accumulation_veh']:,.0f}",
-                "completed [veh]": f"{mean['completed_veh']:,.0f}",
-                "control [s]": f"{mean['evaluation_time_s']:.3g}",
-                "step [ms]": decision_ms(
-                    mean | {"control_step_ms_max": group["control_step_ms_max"].max()}
-                ),
-                **{heading: int(group[column].sum()) for column, (heading, _) in COUNTED.items()},
-            }
-        )
-    return text_table(lines, CAPTION.format(against=against) + BOUND_CAPTION * with_bound)
+        spent = group["total_time_spent_veh_s"].tolist()
+        mean = group.mean(numeric_only=True).to_dict()
+        line = {
+            "controller": name,
+            "seeds": len(group),
+            "TTS [veh s]": _with_interval(spent),
+            "change": "" if name == against else _percent(spent, reference),
+        }
+        if with_bound:
+            above = _percent(spent, [mean["lower_bound_veh_s"]])
+            line["above the optimum"] = above.replace("+", "≤ ")
+        line["final [veh]"] = f"{mean['final_accumulation_veh']:,.0f}"
+        line["max [veh]"] = f"{mean['max_accumulation_veh']:,.0f}"
+        line["completed [veh]"] = f"{mean['completed_veh']:,.0f}"
+        line["control [s]"] = f"{mean['evaluation_time_s']:.3g}"
+        longest = group["control_step_ms_max"].max()
+        line["step [ms]"] = decision_ms(mean | {"control_step_ms_max": longest})
+        for column, (heading, _) in COUNTED.items():
+            line[heading] = int(group[column].sum())
+        if "impossible" in group and group["impossible"].any():
+            line["change"] = IMPOSSIBLE
+            impossible.append(line)
+        else:
+            lines.append(line)
+    caption = CAPTION.format(against=against)
+    if with_bound:
+        caption += BOUND_CAPTION
+    if impossible:
+        caption += IMPOSSIBLE_CAPTION
+    return text_table(lines + impossible, caption)
+
+
+def _with_interval(values: Sequence[float]) -> str:
+    mean = _scientific(statistics.fmean(values))
+    spread = interval(values)
+    return mean if math.isnan(spread) else f"{mean} ± {_scientific(spread, 1)}"
 
 
 def _percent(values: Sequence[float], reference: Sequence[float]) -> str:
@@ -184,9 +277,11 @@ def draw_accumulations(
     title: str | None = None,
     prefix: str = "",
 ) -> None:
-    """Draw total and regional accumulation over time, as png files in `folder`.
+    """Draw total and regional accumulation over time as png files.
 
-    seed: shown instead of the mean over seeds; title: above both pictures; prefix: of their names
+    seed: shown instead of the mean over seeds
+    title: text above both pictures
+    prefix: begins the names of the files
     """
     network = scenario.network
     drawing = plots.figure(8.0, 4.6)
@@ -203,7 +298,7 @@ def draw_accumulations(
 
 
 def draw_scenario(folder: Path, scenario: Scenario) -> list[Path]:
-    """Draw spawn matrix, region map and MFDs of `scenario`; return the png files in `folder`."""
+    """Draw spawn matrix, region map and MFDs; return the png files."""
     demand = plots.figure(11.0, 4.8)
     left, right = demand.subplots(1, 2)
     plots.spawn_matrix(left, scenario)
@@ -219,46 +314,47 @@ def draw_scenario(folder: Path, scenario: Scenario) -> list[Path]:
 
 
 def interval(values: Sequence[float]) -> float:
-    """Half of the 95 % interval of the mean of `values` (Student's t); NaN of a single one, or
-    where one is NaN."""
-    if len(values) < 2 or any(map(math.isnan, values)):
+    """Return half of the 95 % interval of a mean (Student's t).
+
+    It is NaN of a single value, or if a value is NaN.
+    """
+    count = len(values)
+    if count < 2 or any(map(math.isnan, values)):
         return math.nan
-    return (
-        float(stdtrit(len(values) - 1, 0.975)) * statistics.stdev(values) / math.sqrt(len(values))
-    )
+    return float(stdtrit(count - 1, 0.975)) * statistics.stdev(values) / math.sqrt(count)
 
 
 def run_perturbed(
     strategy: Strategy, seed: int, *, scenario: Scenario, sigma: float, kind: str
 ) -> Result:
-    """Run one closed loop in a perturbed scenario; return its figures, without arrays.
+    """Run one closed loop in a perturbed scenario; return its figures.
 
-    seed: number of the draw of the perturbation and of the noise on measurements; sigma, kind: see
-        `perturbed`
+    seed: number of the draw of the perturbation and of the noise on measurements
+    sigma, kind: see `perturbed`
     """
     import xarray
 
     actual = perturbed(scenario, sigma, seed, kind)
-    row = summary(
-        closed_loop_of(strategy, seed, scenario=scenario, plant=PERTURBED_PLANT, actual=actual)
-    )
+    result = closed_loop_of(strategy, seed, scenario=scenario, plant=PERTURBED_PLANT, actual=actual)
+    row = summary(result)
     facts = {"kind": kind, "sigma": sigma, "trips_veh": scenario.step * float(actual.demand.sum())}
     return Result(xarray.Dataset(attrs=facts | {column: row[column] for column in KEPT}))
 
 
 def improvements(rows: "pd.DataFrame", controller: str) -> dict[float, tuple[float, float]]:
-    """Return sigma -> mean and 95 % half interval of the improvement of `controller` over no
-    control [%]."""
+    """Return sigma -> mean and half interval of the improvement (%).
+
+    The improvement is over no control, the interval one of 95 %.
+    """
     totals = _finished(rows).pivot_table("total_time_spent_veh_s", ["sigma", "seed"], "controller")
+    pairs = totals.reindex(columns=[controller, REFERENCE]).dropna()
     gains: dict[float, list[float]] = {}
-    for (sigma, _), own, reference in (
-        totals.reindex(columns=[controller, REFERENCE]).dropna().itertuples()
-    ):
+    for (sigma, _), own, reference in pairs.itertuples():
         gains.setdefault(sigma, []).append(-percent_change(own, reference))
-    return {
-        sigma: (math.fsum(values) / len(values), interval(values))
-        for sigma, values in gains.items()
-    }
+    result = {}
+    for sigma, values in gains.items():
+        result[sigma] = (math.fsum(values) / len(values), interval(values))
+    return result
 
 
 def draw_robustness(folder: Path, rows: "pd.DataFrame") -> None:
@@ -274,37 +370,32 @@ def draw_robustness(folder: Path, rows: "pd.DataFrame") -> None:
 
 
 def improvement_table(rows: "pd.DataFrame") -> str:
-    """Return the improvements as text: one line per controller, one column per sigma."""
+    """Return the improvements: a line per controller, a column per sigma."""
     done = _finished(rows)
     if done.empty:
         return "no run is finished"
-    kind, trips = (
-        done["kind"].iloc[0],
-        done[done["controller"] == REFERENCE].groupby("sigma")["trips_veh"].mean(),
-    )
+    kind = done["kind"].iloc[0]
+    trips = done[done["controller"] == REFERENCE].groupby("sigma")["trips_veh"].mean()
     lines = [["trips", *(f"{total:,.0f}" for total in trips)]]
     for name in _compared(rows):
         gains = improvements(rows, name)
-        cells = {
-            sigma: f"{mean:.1f} ± {half:.1f}"
-            for sigma, (mean, half) in gains.items()
-            if not math.isnan(mean)
-        }
-        lines.append([name, *(cells.get(sigma, "-") for sigma in trips.index)])
+        cells = [name]
+        for sigma in trips.index:
+            mean, half = gains.get(sigma, (math.nan, math.nan))
+            cells.append("-" if math.isnan(mean) else f"{mean:.1f} ± {half:.1f}")
+        lines.append(cells)
     caption = ROBUSTNESS_CAPTION.format(kind=kind, meaning=_meaning(kind))
     return text_columns(["sigma", *(f"{sigma:g}" for sigma in trips.index)], lines, caption)
 
 
 def _meaning(kind: str) -> str:
-    return (
-        "noise on the demand [veh/s]"
-        if kind.startswith("demand")
-        else "spread of the logarithm [-]"
-    )
+    if kind.startswith("demand"):
+        return "noise on the demand [veh/s]"
+    return "spread of the logarithm [-]"
 
 
 def _finished(rows: "pd.DataFrame") -> "pd.DataFrame":
-    """Return the finished runs of the kind that was run last, whose rows come first."""
+    """Return the finished runs of the last kind, whose rows come first."""
     done = rows[rows["failure"] == ""]
     return done[done["kind"] == done["kind"].iloc[0]] if len(done) else done
 

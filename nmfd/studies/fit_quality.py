@@ -1,4 +1,4 @@
-"""Quality of the fit of each region, and doubts about it, as tables and files."""
+"""Quality of the fit of each region, and doubts about it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -15,40 +15,38 @@ from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import files
 from nmfd.runs.tables import text_table, wrapped
 
-Samples = Sequence[
-    Mapping[str, Points]
-]  # by region, label -> (n, 2) of accumulation [veh] and outflow [veh/s]
+# By region: label -> samples (n, 2) of accumulation [veh] and outflow [veh/s].
+Samples = Sequence[Mapping[str, Points]]
 States = Sequence[StatesOverTime]  # accumulations of each run
 SPILLBACK = "held up by a neighbour"  # label of samples that the region's own MFD does not explain
 SAMPLES = 10  # of a region: with fewer it keeps its MFD
 HYSTERESIS_BINS = 12  # of accumulation
+FEWEST_IN_BIN = 3  # samples of either branch
 EXPLAINED = 0.3  # R2 below which the curve explains hardly more than the mean outflow
-FALL = (
-    0.05  # of the largest outflow: a smaller fall up to the jam accumulation is no falling branch
-)
+FALL = 0.05  # share of the largest outflow: a smaller fall up to the jam is no falling branch
 AHEAD_S = 900.0  # of the longer prediction
 CRITICAL_DENSITIES = 8.0, 60.0  # veh per lane-km, of cities
-FEW, POOR, ENDLESS, ODD, ALONE = (
-    "few samples",
-    "R2",
-    "no falling branch",
-    "critical density",
-    "one seed",
-)
+
+# Beginnings of the doubts about a region.
+FEW = "few samples"
+POOR = "R2"
+ENDLESS = "no falling branch"
+ODD = "critical density"
+ALONE = "one seed"
 MEANINGS = {  # beginning of a doubt -> meaning and remedy
-    FEW: f"fewer than {SAMPLES} samples, the MFD is unchanged; give a higher demand (cosim: --levels)",
-    POOR: f"below {EXPLAINED:g} the curve explains hardly anything of the outflow and misleads controllers; give more "
-    "data (cosim: --levels, --seeds), or other regions",
-    ENDLESS: "the critical accumulation is above and was not seen; controllers use a guess from lanes; give a higher "
-    "demand (cosim: --levels)",
-    ODD: "outside {:g} to {:g} veh per lane-km, as no city has it; check regions, lanes and data".format(
-        *CRITICAL_DENSITIES
-    ),
+    FEW: f"fewer than {SAMPLES} samples, the MFD is unchanged; give a higher demand (cosim: "
+    "--levels)",
+    POOR: f"below {EXPLAINED:g} the curve explains hardly anything of the outflow and misleads "
+    "controllers; give more data (cosim: --levels, --seeds), or other regions",
+    ENDLESS: "the critical accumulation is above and was not seen; controllers use a guess from "
+    "lanes; give a higher demand (cosim: --levels)",
+    ODD: f"outside {CRITICAL_DENSITIES[0]:g} to {CRITICAL_DENSITIES[1]:g} veh per lane-km, as no "
+    "city has it; check regions, lanes and data",
     ALONE: "there is no held-out error; give --seeds 2 or more",
 }
 HELD_OUT = (
-    "RMSE of accumulations, in percent of critical ones (where these were not seen, of the largest), in runs of the "
-    "last seed, by a fit without them: "
+    "RMSE of accumulations, in percent of critical ones (where these were not seen, of the "
+    "largest), in runs of the last seed, by a fit without them: "
 )
 
 
@@ -60,42 +58,48 @@ def with_guesses(
     *,
     fastest: float = np.inf,
 ) -> RegionalModel:
-    """Return `model` with `critical_above` where its curve hardly falls up to the largest
-    accumulation.
+    """Return `model` with guesses where the data show no falling branch.
 
-    The curve is a guess from lanes (R,) [km] there, unless the region is nearly empty. fastest:
-    largest rate of any vehicle [1/s]
+    Such a region has `critical_above`, and a curve from its lanes unless it is nearly empty.
+
+    lane_km: lane-kilometres (km, (R,))
+    accumulations: of each run (veh, (T+1, R, R)); without them the samples have the largest ones
+    fastest: largest rate of any vehicle (1/s)
     """
-    empty, most, above, mfds = (
-        nearly_empty(samples),
-        _largest(samples, accumulations),
-        {},
-        list(model.mfds),
-    )
+    empty = nearly_empty(samples)
+    most = _largest(samples, accumulations)
+    above = {}
+    mfds = list(model.mfds)
     for n, curve in enumerate(model.mfds):
-        if (
-            n in empty
-            or most[n] <= curve.critical
-            or curve.outflow(most[n]) > (1.0 - FALL) * curve.capacity
-        ):
-            above[n] = float(most[n])
-            if n not in empty:
-                rate = fastest if model.exit_rates is None else fastest / model.exit_rates[n].max()
-                mfds[n] = mfd.guess_beyond(
-                    curve, mfd.JAM_DENSITY * lane_km[n], above[n], max_rate=rate
-                )
-    storage = (
-        None if model.storage is None else np.maximum(model.storage, [curve.jam for curve in mfds])
-    )
+        if n not in empty and _falls(curve, most[n]):
+            continue
+        above[n] = float(most[n])
+        if n in empty:
+            continue
+        rate = fastest
+        if model.exit_rates is not None:
+            rate = fastest / model.exit_rates[n].max()
+        jam = mfd.JAM_DENSITY * lane_km[n]
+        mfds[n] = mfd.guess_beyond(curve, jam, above[n], max_rate=rate)
+    storage = model.storage
+    if storage is not None:
+        storage = np.maximum(storage, [curve.jam for curve in mfds])
     return replace(model, mfds=tuple(mfds), storage=storage, critical_above=above)
 
 
+def _falls(curve: mfd.Mfd, most: float) -> bool:
+    """Return True if the outflow has fallen at `most` [veh]."""
+    if most <= curve.critical:
+        return False
+    return curve.outflow(most) <= (1.0 - FALL) * curve.capacity
+
+
 def _largest(samples: Samples, accumulations: States) -> PerRegion:
+    """Return the largest accumulations (R,) [veh] in runs, or in samples."""
     if len(accumulations):
         return largest_accumulation(accumulations)
-    return np.array(
-        [np.concatenate(list(cloud.values()))[:, 0].max(initial=0.0) for cloud in samples]
-    )
+    largest = [np.concatenate(list(cloud.values()))[:, 0].max(initial=0.0) for cloud in samples]
+    return np.array(largest)
 
 
 def region_fits(
@@ -105,52 +109,76 @@ def region_fits(
     seeds: int = 2,
     lane_km: PerRegion | float = np.nan,
 ) -> pd.DataFrame:
-    """Return the fit of each region, a row each.
+    """Return the fit of each region, a row each; NaN where unknown.
 
-    Columns: region, name; critical_veh or critical_above_veh, jam_veh, storage_veh,
-        max_outflow_veh_s of the model;
-    samples; r2; spread of samples around the curve, as a share of its maximum; hysteresis [-];
-    most_share, the largest accumulation in any run over the critical one [-]; doubts, each of which
-    begins with a key of MEANINGS. NaN where unknown.
+    accumulations: of each run (veh, (T+1, R, R))
+    seeds: number of seeds of the loading runs
+    lane_km: lane-kilometres (km, (R,))
 
-    accumulations: (T+1, R, R) [veh]; seeds: of the loading runs; lane_km: (R,)
+    Columns:
+
+        region, name, critical_veh, critical_above_veh, jam_veh, storage_veh and
+            max_outflow_veh_s: those of the model
+        samples: their number
+        r2: share of their variance that the curve explains
+        spread: of samples around the curve, as a share of its maximum
+        hysteresis: `hysteresis` (-)
+        most_share: largest accumulation in any run over the critical one (-)
+        doubts: texts, each of which begins with a key of MEANINGS
     """
-    most, critical, rows = _largest(samples, accumulations), network.seen_critical, []
-    density, dense = critical / lane_km, CRITICAL_DENSITIES
+    most = _largest(samples, accumulations)
+    critical = network.seen_critical
+    density = critical / lane_km
+    rows = []
     for region, (curve, cloud) in enumerate(zip(network.mfds, samples, strict=True)):
-        points, above = own_points(cloud), network.critical_above.get(region, np.nan)
-        residuals, r2 = points[:, 1] - curve.outflow(points[:, 0]), np.nan
+        points = own_points(cloud)
+        residuals = points[:, 1] - curve.outflow(points[:, 0])
+        r2 = np.nan
         if len(points) >= SAMPLES and points[:, 1].var() > 0:
             r2 = 1.0 - (residuals**2).mean() / points[:, 1].var()
-        doubts = {
-            f"{FEW} ({len(points)})": len(points) < SAMPLES,
-            f"{POOR} {r2:.2f}": len(points) >= SAMPLES and not r2 >= EXPLAINED,  # NaN too
-            f"{ENDLESS} (critical above {above:.0f} veh, not seen)": region
-            in network.critical_above,
-            f"{ODD} {density[region]:.3g} veh per lane-km": density[region] < dense[0]
-            or density[region] > dense[1],
-            ALONE: seeds < 2,
+        spread = np.nan
+        if len(points):
+            spread = np.sqrt((residuals**2).mean()) / curve.capacity
+        above = network.critical_above.get(region, np.nan)
+        storage = np.inf if network.storage is None else network.storage[region]
+        row = {
+            "region": region,
+            "name": network.region_names[region],
+            "critical_veh": critical[region],
+            "critical_above_veh": above,
+            "jam_veh": curve.jam,
+            "storage_veh": storage,
+            "max_outflow_veh_s": curve.capacity,
+            "samples": len(points),
+            "r2": r2,
+            "spread": spread,
+            "hysteresis": hysteresis(cloud),
+            "most_share": most[region] / critical[region],
+            "doubts": _doubts(len(points), r2, above, density[region], seeds),
         }
-        rows.append(
-            {
-                "region": region,
-                "name": network.region_names[region],
-                "critical_veh": critical[region],
-                "critical_above_veh": above,
-                "jam_veh": curve.jam,
-                "storage_veh": np.inf if network.storage is None else network.storage[region],
-                "max_outflow_veh_s": curve.capacity,
-                "samples": len(points),
-                "r2": r2,
-                "spread": np.sqrt((residuals**2).mean()) / curve.capacity
-                if len(points)
-                else np.nan,
-                "hysteresis": hysteresis(cloud),
-                "most_share": most[region] / critical[region],
-                "doubts": tuple(text for text, there in doubts.items() if there),
-            }
-        )
+        rows.append(row)
     return pd.DataFrame(rows)
+
+
+def _doubts(samples: int, r2: float, above: float, density: float, seeds: int) -> tuple[str, ...]:
+    """Return the doubts about a region.
+
+    samples: number of samples
+    above: accumulation above which the critical one is (veh), NaN if that was seen
+    density: critical density (veh/lane-km), NaN if unknown
+    """
+    doubts = []
+    if samples < SAMPLES:
+        doubts.append(f"{FEW} ({samples})")
+    elif not r2 >= EXPLAINED:  # NaN too
+        doubts.append(f"{POOR} {r2:.2f}")
+    if not np.isnan(above):
+        doubts.append(f"{ENDLESS} (critical above {above:.0f} veh, not seen)")
+    if density < CRITICAL_DENSITIES[0] or density > CRITICAL_DENSITIES[1]:
+        doubts.append(f"{ODD} {density:.3g} veh per lane-km")
+    if seeds < 2:
+        doubts.append(ALONE)
+    return tuple(doubts)
 
 
 def own_points(cloud: Mapping[str, Points]) -> Points:
@@ -164,102 +192,122 @@ def nearly_empty(samples: Samples) -> list[int]:
 
 
 def hysteresis(cloud: Mapping[str, Points]) -> float:
-    """Return the excess of outflow while loading over unloading at the same accumulation, as a
-    share of it [-].
+    """Return the excess of outflow while loading over unloading [-].
 
-    Mean over bins of accumulation with both, weighted by outflow; NaN without such bins.
+    It is a share of the outflow: the mean over bins of accumulation with samples of both, weighted
+    by outflow; NaN without such bins.
     """
-    parts = [cloud.get(label, np.empty((0, 2))) for label in ("loading", "unloading")]
-    most = np.concatenate(parts)[:, 0].max(initial=1e-9)
-    numbers = [
-        np.minimum((HYSTERESIS_BINS * part[:, 0] / most).astype(int), HYSTERESIS_BINS - 1)
-        for part in parts
-    ]
-    bins = [
-        n for n in range(HYSTERESIS_BINS) if all((number == n).sum() >= 3 for number in numbers)
-    ]
-    both = np.array(
-        [
-            [part[number == n, 1].mean() for n in bins]
-            for part, number in zip(parts, numbers, strict=True)
-        ]
-    )
-    return float((both[0] - both[1]).sum() / both.mean(axis=0).sum()) if bins else float("nan")
+    nothing = np.empty((0, 2))
+    loading = cloud.get("loading", nothing)
+    unloading = cloud.get("unloading", nothing)
+    most = np.concatenate([loading, unloading])[:, 0].max(initial=1e-9)
+    loading_bin = _bin_numbers(loading[:, 0], most)
+    unloading_bin = _bin_numbers(unloading[:, 0], most)
+    pairs = []
+    for n in range(HYSTERESIS_BINS):
+        up = loading[loading_bin == n, 1]
+        down = unloading[unloading_bin == n, 1]
+        if min(len(up), len(down)) >= FEWEST_IN_BIN:
+            pairs.append((up.mean(), down.mean()))
+    if not pairs:
+        return float("nan")
+    both = np.array(pairs).T
+    return float((both[0] - both[1]).sum() / both.mean(axis=0).sum())
+
+
+def _bin_numbers(accumulation: np.ndarray, most: float) -> np.ndarray:
+    """Return the numbers of bins of accumulation up to `most` [veh]."""
+    numbers = (HYSTERESIS_BINS * accumulation / most).astype(int)
+    return np.minimum(numbers, HYSTERESIS_BINS - 1)
 
 
 def fit_table(
     network: RegionalModel, fits: pd.DataFrame, known: Mapping[str, str] = MEANINGS
 ) -> str:
     """Return the fits as text, followed by the meanings of the doubts."""
-    table = text_table(
-        [
-            {
-                "region": f"{fit.region} {fit.name}",
-                "critical [veh]": f"above {fit.critical_above_veh:.0f}"
-                if np.isnan(fit.critical_veh)
-                else f"{fit.critical_veh:.0f}",
-                "jam [veh]": f"{fit.jam_veh:.0f}",
-                **({} if network.storage is None else {"storage [veh]": f"{fit.storage_veh:.0f}"}),
-                "max outflow [veh/s]": f"{fit.max_outflow_veh_s:.3f}",
-                "samples": fit.samples,
-                "R2": f"{fit.r2:.2f}",
-                "spread": f"{100 * fit.spread:.0f} %",
-                "hysteresis": "-" if np.isnan(fit.hysteresis) else f"{100 * fit.hysteresis:.0f} %",
-                "most / critical": "-" if np.isnan(fit.most_share) else f"{fit.most_share:.2f}",
-                "WARNINGS": "; ".join(fit.doubts) or "none",
-            }
-            for fit in fits.itertuples(index=False)
-        ]
-    )
-    doubts = [doubt for doubts in fits["doubts"] for doubt in doubts]
-    lines = [
-        f"WARNING, {kind}: {text}"
-        for kind, text in known.items()
-        if any(d.startswith(kind) for d in doubts)
-    ]
-    return "\n".join([table, *wrapped("\n".join(lines))])
+    rows = []
+    for fit in fits.itertuples(index=False):
+        critical = f"{fit.critical_veh:.0f}"
+        if np.isnan(fit.critical_veh):
+            critical = f"above {fit.critical_above_veh:.0f}"
+        row = {
+            "region": f"{fit.region} {fit.name}",
+            "critical [veh]": critical,
+            "jam [veh]": f"{fit.jam_veh:.0f}",
+        }
+        if network.storage is not None:
+            row["storage [veh]"] = f"{fit.storage_veh:.0f}"
+        row |= {
+            "max outflow [veh/s]": f"{fit.max_outflow_veh_s:.3f}",
+            "samples": fit.samples,
+            "R2": f"{fit.r2:.2f}",
+            "spread": f"{100 * fit.spread:.0f} %",
+            "hysteresis": "-" if np.isnan(fit.hysteresis) else f"{100 * fit.hysteresis:.0f} %",
+            "most / critical": "-" if np.isnan(fit.most_share) else f"{fit.most_share:.2f}",
+            "WARNINGS": "; ".join(fit.doubts) or "none",
+        }
+        rows.append(row)
+    lines = []
+    for kind, meaning in known.items():
+        if any(doubt.startswith(kind) for doubts in fits["doubts"] for doubt in doubts):
+            lines.append(f"WARNING, {kind}: {meaning}")
+    return "\n".join([text_table(rows), *wrapped("\n".join(lines))])
 
 
 def predictions(network: RegionalModel, runs: Sequence[Observed], scheme: dict) -> pd.DataFrame:
-    """Return the RMSE of predicted accumulations as shares of the critical ones [-], a row per
-    region.
+    """Return the RMSE of predicted accumulations, a row per region.
 
-    Where a critical accumulation was not seen, it is the largest one that was.
-
-    Columns: next_interval_rmse_share and ahead_rmse_share, of the regional model one interval and
-        ahead_s [s] ahead;
-    next_interval_persistence_rmse_share and ahead_persistence_rmse_share, of the prediction that
-    nothing changes.
+    They are shares of the critical accumulation, or where that was not seen, of the largest [-].
 
     scheme: step [s], substeps and integrator
+
+    Columns:
+
+        next_interval_rmse_share, ahead_rmse_share: errors of the regional model, one control
+            interval and ahead_s [s] ahead
+        next_interval_persistence_rmse_share, ahead_persistence_rmse_share: errors of the
+            prediction that nothing changes
     """
-    largest = np.array(
-        [network.critical_above.get(r, one) for r, one in enumerate(network.critical)]
-    )
-    ahead = min(max(1, round(AHEAD_S / scheme["step"])), max(len(run.demand) for run in runs))
+    largest = network.critical
+    for region, above in network.critical_above.items():
+        largest[region] = above
+    longest = max(len(run.demand) for run in runs)
+    ahead = min(max(1, round(AHEAD_S / scheme["step"])), longest)
     columns = {}
     for when, intervals in (("next_interval", 1), ("ahead", ahead)):
         errors = identification.prediction_errors(network, runs, intervals, **scheme)
         states = [run.accumulation.sum(axis=2) for run in runs]
         unchanged = np.concatenate([state[:-intervals] - state[intervals:] for state in states])
-        for name, part in (("rmse_share", errors), ("persistence_rmse_share", unchanged)):
-            columns[f"{when}_{name}"] = np.sqrt((part**2).mean(axis=0)) / largest
+        columns[f"{when}_rmse_share"] = _rmse(errors) / largest
+        columns[f"{when}_persistence_rmse_share"] = _rmse(unchanged) / largest
     return pd.DataFrame({**columns, "ahead_s": ahead * scheme["step"]})
 
 
+def _rmse(errors: np.ndarray) -> PerRegion:
+    """Return the root mean square of errors (n, R) of each region."""
+    return np.sqrt((errors**2).mean(axis=0))
+
+
 def prediction_text(errors: pd.DataFrame, step: float) -> str:
-    """Return the means of `predictions` in runs that the fit did not use, as text; step: control
-    interval [s]."""
-    means = (100.0 * errors.filter(like="rmse_share").mean()).map("{:.1f} %".format)
-    whens = zip((step, errors["ahead_s"][0]), means[::2], means[1::2], strict=True)
-    return HELD_OUT + ", ".join(
-        f"{model} {when:g} s ahead (unchanged: {same})" for when, model, same in whens
-    )
+    """Return the means of `predictions` as text.
+
+    errors: in runs that the fit did not use
+    step: control interval (s)
+    """
+    texts = []
+    for when, seconds in (("next_interval", step), ("ahead", errors["ahead_s"][0])):
+        model = 100.0 * errors[f"{when}_rmse_share"].mean()
+        same = 100.0 * errors[f"{when}_persistence_rmse_share"].mean()
+        texts.append(f"{model:.1f} % {seconds:g} s ahead (unchanged: {same:.1f} %)")
+    return HELD_OUT + ", ".join(texts)
 
 
 def write_fits(path: Path, fits: pd.DataFrame, held_out: pd.DataFrame | None = None) -> None:
-    """Write fit.csv, a row per region; held_out: `predictions` in runs that the fit did not use."""
-    errors = pd.DataFrame() if held_out is None else held_out.add_prefix("held_out_")
-    files.write_table(
-        path, fits.assign(doubts=fits["doubts"].map("; ".join)).join(errors), float_format="%.6g"
-    )
+    """Write fit.csv, a row per region.
+
+    held_out: `predictions` in runs that the fit did not use
+    """
+    table = fits.assign(doubts=fits["doubts"].map("; ".join))
+    if held_out is not None:
+        table = table.join(held_out.add_prefix("held_out_"))
+    files.write_table(path, table, float_format="%.6g")

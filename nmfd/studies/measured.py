@@ -1,11 +1,13 @@
-"""Identification of MFDs per region from counts and occupancies of real detectors, as network.toml.
+"""Identification of MFDs per region from real detectors.
+
+They give counts and occupancies. `load` reads their tables, `fit` fits a network, and
+`Identified.write` writes its network.toml.
 
 Density of a region and interval: occupancy of its detectors over the length of a vehicle and a
-loop; flow: their mean flow; both weighted by the lane-kilometres of each detector (Edie's
-definitions). Times the lane-kilometres of the
-region: accumulation [veh] and production [veh km/h]; production over the mean trip length within
-    the region: outflow
-(Geroliminis and Daganzo, Transportation Research B 42, 2008).
+loop. Flow: their mean flow. Both are weighted by the lane-kilometres of each detector (Edie's
+definitions). Times the lane-kilometres of the region they give accumulation [veh] and production
+[veh km/h]; production over the mean trip length within the region is the outflow (Geroliminis and
+Daganzo, Transportation Research B 42, 2008).
 """
 
 import tomllib
@@ -21,51 +23,107 @@ from scipy.spatial import ConvexHull, Delaunay, QhullError
 from nmfd.arrays import Adjacency, Points
 from nmfd.errors import InputError
 from nmfd.model import detector_tables, mfd
-from nmfd.model.detector_tables import VEHICLE_LENGTH_M
+from nmfd.model.detector_tables import SPEEDS_M_S, VEHICLE_LENGTH_M
 from nmfd.model.regional_model import NetworkTable, RegionalModel, network_toml
 from nmfd.runs import config, files
 from nmfd.runs.tables import wrapped
 from nmfd.studies import fit_quality, plots
 
-U_MIN, U_MAX = 0.1, 0.9  # bounds of the control
-LEAST_REPORTING = (
-    0.5  # share of a region's detectors, by lane-kilometres, that must report in an interval
-)
+# Bounds of the control.
+U_MIN = 0.1
+U_MAX = 0.9
+# Share of a region's detectors, by lane-kilometres, that must report in an interval.
+LEAST_REPORTING = 0.5
 STOP_LINE_KM = 0.03  # before a junction, where queues stand
 FAR = 3.0  # times the median distance between neighbouring detectors: no boundary lies between
-LEAST_COVERAGE, BIASED_SHARE, LEAST_DAYS = 0.3, 0.5, 3
-UNKNOWN, SMALL, LOOPS = "coverage unknown", "low coverage", "loops at stop lines"
-ASSUMED, SINGLE, LEFT = "trip length assumed", "days", "detectors left out"
-MEANINGS = {
+LEAST_COVERAGE = 0.3
+BIASED_SHARE = 0.5
+LEAST_DAYS = 3
+
+# Beginnings of the doubts about a region.
+UNKNOWN = "coverage unknown"
+SMALL = "low coverage"
+LOOPS = "loops at stop lines"
+ASSUMED = "trip length assumed"
+SINGLE = "days"
+LEFT = "detectors left out"
+MEANINGS = {  # beginning of a doubt -> meaning and remedy
     **fit_quality.MEANINGS,
-    UNKNOWN: "accumulation and outflow are those of links with detectors; give lane_km with --about",
-    SMALL: f"detectors stand for less than {100 * LEAST_COVERAGE:g} % of the lane-kilometres, usually the main roads",
-    LOOPS: f"most loops lie within {1000 * STOP_LINE_KM:g} m of a junction, where standing queues bias the density",
-    ASSUMED: "two thirds of the side of a square as large as the region; give it with --trip-length or --about",
-    LEFT: "their counts cannot be right, see below; lane-kilometres stand for the links of the others",
+    UNKNOWN: "accumulation and outflow are those of links with detectors; give lane_km with "
+    "--about",
+    SMALL: f"detectors stand for less than {100 * LEAST_COVERAGE:g} % of the lane-kilometres, "
+    "usually the main roads",
+    LOOPS: f"most loops lie within {1000 * STOP_LINE_KM:g} m of a junction, where standing queues "
+    "bias the density",
+    ASSUMED: "two thirds of the side of a square as large as the region; give it with "
+    "--trip-length or --about",
+    LEFT: "their counts cannot be right, see below; lane-kilometres stand for the links of the "
+    "others",
     SINGLE: f"fewer than {LEAST_DAYS} days: the difference between days is unknown",
 }
 UNKNOWN_PARTS = (
-    "Not in such data: which trips end in a region; vehicles on links without detectors; split ratios (vehicles cross "
-    "the fewest boundaries); capacities of boundaries; controlled signals; anything beyond the largest accumulation, "
-    "where the outflow is constant or a guess. Demand belongs into a scenario.toml."
+    "Not in such data: which trips end in a region; vehicles on links without detectors; split "
+    "ratios (vehicles cross the fewest boundaries); capacities of boundaries; controlled signals; "
+    "anything beyond the largest accumulation, where the outflow is constant or a guess. Demand "
+    "belongs into a scenario.toml."
 )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measured:
+    """Tables of real detectors.
+
+    counts: file of the counts
+    read: numbers of rows, detectors and days in it, as text
+    days: number of days
+    left: lines about detectors whose counts cannot be right
+    detectors: region, lane_km, pos_km, x_m, y_m and used (False if left out), by detid
+    regions: lane_km, coverage (share of lane_km with detectors in use, NaN if unknown), trip_km,
+        assumed (True if trip_km is), x and y (NaN where not given), by name
+    intervals: those of Identified
+    """
+
+    counts: Path
+    read: str
+    days: int
+    left: list[str]
+    detectors: pd.DataFrame
+    regions: pd.DataFrame
+    intervals: pd.DataFrame
 
 
 @dataclass(frozen=True, kw_only=True)
 class Identified:
     """Identified network and the data behind it.
 
-    fits: a row per region (fit_quality.region_fits); text: report
+    fits: a row per region (fit_quality.region_fits)
     intervals: a row per region, day and interval, with density_veh_km, flow_veh_h (per lane),
         reporting (share of the monitored lane-km), accumulation_veh, production_veh_km_h and
         outflow_veh_s
+    text: report
     """
 
     network: RegionalModel
     fits: pd.DataFrame
     intervals: pd.DataFrame
     text: str
+
+    def write(self, out: Path, source: str) -> None:
+        """Write network.toml, mfd.png, samples.csv, fit.csv and identify.txt.
+
+        out: folder of the network
+        source: name of the file of counts
+        """
+        comment = f"Regional model: written by nmfd identify from {source}; see identify.txt."
+        text = network_toml(self.network, {}, comment)
+        config.checked(NetworkTable, tomllib.loads(text), out / "network.toml")
+        out.mkdir(parents=True, exist_ok=True)
+        samples = _samples(self.intervals, self.network.region_names)
+        plots.draw_mfds(out / "mfd.png", self.network, samples)
+        files.write_table(out / "samples.csv", self.intervals, float_format="%.6g")
+        fit_quality.write_fits(out / "fit.csv", self.fits)
+        files.write_text(out / "identify.txt", self.text + "\n")
+        files.write_text(out / "network.toml", text)
 
 
 def identify(
@@ -80,11 +138,12 @@ def identify(
     skip_bad: bool = False,
     trip_length: float | None = None,
 ) -> Identified:
-    """Fit an MFD to each region; write network.toml, mfd.png, samples.csv, fit.csv and
-    identify.txt.
+    """Fit an MFD to each region; write network.toml and a report.
 
-        >>> identified = nmfd.identify("counts.csv", detectors="detectors.csv", trip_length=1500.0, out="mine")
-        >>> (len(identified.fits), identified.intervals["region"].nunique()) == (identified.network.regions,) * 2
+        >>> identified = nmfd.identify(
+        ...     "counts.csv", detectors="detectors.csv", trip_length=1500.0, out="mine"
+        ... )
+        >>> len(identified.fits) == identified.network.regions
         True
 
     counts, detectors, regions, about: tables (nmfd.model.detector_tables)
@@ -92,248 +151,342 @@ def identify(
     adjacency: csv file region,neighbour; None: by the detectors' positions
     city: of several in the tables
     skip_bad: leave out doubled rows and those with missing or impossible numbers
-    trip_length: mean trip length within a region [m]; None: assumed from the size of the region
+    trip_length: mean trip length within a region (m); None: assumed from the size of the region
 
-    Raises InputError, before anything is written.
+    Raises: InputError, before anything is written
     """
-    out, counts = Path(out), Path(counts)
-    paths = [
-        None if file is None else Path(file) for file in (detectors, regions, about, adjacency)
-    ]
+    out = Path(out)
     if trip_length is not None and not 10.0 <= trip_length <= 1e5:
         raise InputError(f"--trip-length: {config.got('a number from 10 to 100000', trip_length)}")
     if (out / "network.toml").exists():
         raise InputError(f"{out / 'network.toml'}: exists; choose another --out")
-    rows, left = detector_tables.read_counts(counts, city=city, skip_bad=skip_bad)
-    stations = detector_tables.read_detectors(paths[0], paths[1], rows, counts, city=city)
-    names = sorted(
-        set(stations["region"]), key=lambda name: name.rjust(9) if name.isdecimal() else name
+    data = load(
+        Path(counts),
+        detectors=_path(detectors),
+        regions=_path(regions),
+        about=_path(about),
+        city=city,
+        skip_bad=skip_bad,
+        trip_length=trip_length,
     )
-    speed = rows["flow"].sum() * VEHICLE_LENGTH_M / 3600.0 / max(rows["occ"].sum(), 1e-9)
-    if not detector_tables.SPEEDS_M_S[0] <= speed <= detector_tables.SPEEDS_M_S[1]:
-        what = f"a mean speed of {speed:.3g} m/s, with {VEHICLE_LENGTH_M:g} m for a vehicle over a loop"
-        expected = "flow in veh/h per lane, not per interval, and occ as a share, not percent"
-        raise InputError(f"{counts}: flow and occ give {what}; expected {expected}")
-    read, days, count = len(rows), rows["day"].nunique(), rows["detid"].nunique()
+    identified = fit(data, name=out.absolute().name, adjacency=_path(adjacency))
+    identified.write(out, data.counts.name)
+    return identified
+
+
+def _path(file: Path | str | None) -> Path | None:
+    return None if file is None else Path(file)
+
+
+def load(
+    counts: Path,
+    *,
+    detectors: Path | None = None,
+    regions: Path | None = None,
+    about: Path | None = None,
+    city: str | None = None,
+    skip_bad: bool = False,
+    trip_length: float | None = None,
+) -> Measured:
+    """Read the tables of `identify`, without detectors that cannot be right.
+
+    Raises: InputError
+    """
+    rows, omitted = detector_tables.read_counts(counts, city=city, skip_bad=skip_bad)
+    stations = detector_tables.read_detectors(detectors, regions, rows, counts, city=city)
+    names = sorted(set(stations["region"]), key=_order)
+    _check_units(rows, counts)
+    days = rows["day"].nunique()
+    read = f"{len(rows):,} rows of {rows['detid'].nunique()} detectors on {days} days; "
+    read += f"left out: {detector_tables.omitted(omitted)}"
     rows, faulty = detector_tables.screened(rows, stations["region"])
-    stations = stations.drop(
-        list(faulty.get(detector_tables.SUM, ()))
-    )  # its lanes are those of the others
-    used = stations[stations.index.isin(rows["detid"])]
-    broken = [
-        f"detectors left out, {reason}: "
-        + ", ".join(
-            name if name not in used.index else f"{name} ({n} of {days} days)"
-            for name, n in of.items()
-        )
-        for reason, of in faulty.items()
-    ]
-    table = detector_tables.read_about(paths[2], names)
-    lane_km, coverage = _lane_km(stations, used, table, paths[2] or counts)
+    # Lanes that are counted twice are those of the other detectors.
+    stations = stations.drop(list(faulty.get(detector_tables.SUM, ())))
+    stations["used"] = stations.index.isin(rows["detid"])
+    used = stations[stations["used"]]
+    table = detector_tables.read_about(about, names)
+    lane_km, coverage = _lane_km(stations, table, about or counts)
     trip_km, assumed = _trip_lengths(stations, table, trip_length)
-    intervals = _intervals(rows, used)
-    number = intervals["region"].map(names.index)
-    intervals["accumulation_veh"] = intervals["density_veh_km"] * lane_km[number]
-    intervals["production_veh_km_h"] = intervals["flow_veh_h"] * lane_km[number]
-    intervals["outflow_veh_s"] = intervals["production_veh_km_h"] / trip_km[number] / 3600.0
-    samples = [_cloud(intervals[intervals["region"] == region]) for region in names]
-    for region in fit_quality.nearly_empty(samples):
+    table = table.assign(lane_km=lane_km, coverage=coverage, trip_km=trip_km, assumed=assumed)
+    return Measured(
+        counts=counts,
+        read=read,
+        days=days,
+        left=_left_lines(faulty, used, days),
+        detectors=stations,
+        regions=table,
+        intervals=_intervals(rows, used, table),
+    )
+
+
+def _order(name: str) -> str:
+    """Return the key by which regions are sorted: numbers by their value."""
+    return name.rjust(9) if name.isdecimal() else name
+
+
+def _check_units(rows: pd.DataFrame, counts: Path) -> None:
+    """Check that flow and occupancy give a plausible mean speed.
+
+    Raises: InputError
+    """
+    speed = rows["flow"].sum() * VEHICLE_LENGTH_M / 3600.0 / max(rows["occ"].sum(), 1e-9)
+    if not SPEEDS_M_S[0] <= speed <= SPEEDS_M_S[1]:
         raise InputError(
-            f"{counts}: region {names[region]} was measured in fewer than {fit_quality.SAMPLES} intervals with "
-            f"{100 * LEAST_REPORTING:g} % of its detectors reporting; give more data, or join it to another region"
-            + "".join(f"; {line}" for line in broken)
+            f"{counts}: flow and occ give a mean speed of {speed:.3g} m/s, with "
+            f"{VEHICLE_LENGTH_M:g} m for a vehicle over a loop; expected flow in veh/h per lane, "
+            "not per interval, and occ as a share, not percent"
         )
-    network = RegionalModel(
-        name=out.absolute().name,
-        region_names=tuple(names),
-        positions=_positions(stations, table),
-        adjacency=_adjacency(paths[3], stations, names),
-        mfds=tuple(mfd.fit(*fit_quality.own_points(cloud).T) for cloud in samples),
-        u_min=U_MIN,
-        u_max=U_MAX,
-    )
-    if (network.hops < 0).any():
-        i, j = np.argwhere(network.hops < 0)[0]
-        remedy = "give all pairs of neighbours, region,neighbour, with --adjacency"
-        raise InputError(
-            f"{adjacency or counts}: region {names[j]} cannot be reached from {names[i]}; {remedy}"
-        )
-    network = fit_quality.with_guesses(network, samples, lane_km)
-    fits = fit_quality.region_fits(network, samples, lane_km=lane_km)
-    lengths = np.where(assumed, trip_km, np.nan)
-    fits["doubts"] = [
-        (
-            *doubts,
-            *_doubts(stations[stations["region"] == region], used, coverage[n], lengths[n], days),
-        )
-        for n, (region, doubts) in enumerate(zip(names, fits["doubts"], strict=True))
-    ]
-    network = replace(network, doubts=tuple(fits["doubts"]))
-    share = (
-        "unknown"
-        if np.isnan(coverage).all()
-        else f"{np.nanmin(coverage):.0%} to {np.nanmax(coverage):.0%}"
-    )
-    facts = f"{read:,} rows of {count} detectors on {days} days; left out: {detector_tables.omitted(left)}; "
-    facts += f"share of the lane-km with detectors: {share}; trip length within a region: "
-    facts += f"{1000 * trip_km.min():,.0f} to {1000 * trip_km.max():,.0f} m"
-    notes = wrapped("\n".join([*(f"WARNING, {line}" for line in broken), facts, UNKNOWN_PARTS]))
-    report = "\n".join([fit_quality.fit_table(network, fits, MEANINGS), *notes])
-    text = network_toml(
-        network,
-        {},
-        f"Regional model: written by nmfd identify from {counts.name}; see identify.txt.",
-    )
-    config.checked(NetworkTable, tomllib.loads(text), out / "network.toml")
-    out.mkdir(parents=True, exist_ok=True)
-    plots.draw_mfds(out / "mfd.png", network, samples)
-    files.write_table(out / "samples.csv", intervals, float_format="%.6g")
-    fit_quality.write_fits(out / "fit.csv", fits)
-    files.write_text(out / "identify.txt", report + "\n")
-    files.write_text(out / "network.toml", text)
-    return Identified(network=network, fits=fits, intervals=intervals, text=report)
 
 
-def _intervals(rows: pd.DataFrame, detectors: pd.DataFrame) -> pd.DataFrame:
-    """Return density_veh_km, flow_veh_h (per lane) and reporting [-] by region, day and
-    interval."""
-    weights = detectors["lane_km"].fillna(1.0)
-    rows = rows.assign(
-        region=rows["detid"].map(detectors["region"]), weight=rows["detid"].map(weights)
-    )
-    rows = rows.assign(flow=rows["flow"] * rows["weight"], occ=rows["occ"] * rows["weight"])
-    table = (
-        rows.groupby(["region", "day", "interval"])[["flow", "occ", "weight"]].sum().reset_index()
-    )
-    table["reporting"] = table["weight"] / table["region"].map(
-        weights.groupby(detectors["region"]).sum()
-    )
-    table["density_veh_km"] = table["occ"] / table["weight"] * 1000.0 / VEHICLE_LENGTH_M
-    table["flow_veh_h"] = table["flow"] / table["weight"]
-    table = table[table["reporting"] >= LEAST_REPORTING].sort_values(
-        ["region", "day", "interval"], ignore_index=True
-    )
-    return table[["region", "day", "interval", "density_veh_km", "flow_veh_h", "reporting"]]
+def _left_lines(
+    faulty: Mapping[str, Mapping[str, int]], used: pd.DataFrame, days: int
+) -> list[str]:
+    """Return a line for each reason for which detectors were left out.
 
-
-def _cloud(part: pd.DataFrame) -> dict[str, Points]:
-    """Return "loading" and "unloading" -> (n, 2) of accumulation [veh] and outflow [veh/s] of a
-    region, by days."""
-    rising = part.groupby("day")["accumulation_veh"].diff().fillna(0.0) >= 0
-    points, occupied = (
-        part[["accumulation_veh", "outflow_veh_s"]].to_numpy(dtype=float),
-        part["accumulation_veh"] > 0,
-    )
-    return {"loading": points[occupied & rising], "unloading": points[occupied & ~rising]}
-
-
-def _positions(detectors: pd.DataFrame, about: pd.DataFrame) -> np.ndarray:
-    """Return (R, 2) [m]: given, or the middle of the detectors; on a circle if neither is known."""
-    middle = detectors.groupby("region")[["x_m", "y_m"]].mean().reindex(about.index).to_numpy()
-    places = np.where(np.isnan(about[["x", "y"]].to_numpy()), middle, about[["x", "y"]].to_numpy())
-    angle = 2.0 * np.pi * np.arange(len(about)) / len(about)
-    return (
-        places
-        if not np.isnan(places).any()
-        else 1000.0 * np.stack([np.sin(angle), np.cos(angle)], axis=1)
-    )
+    faulty: reason -> detector -> number of days
+    used: detectors that are left on other days
+    """
+    lines = []
+    for reason, bad_days in faulty.items():
+        names = []
+        for name, number in bad_days.items():
+            if name in used.index:
+                name = f"{name} ({number} of {days} days)"
+            names.append(name)
+        lines.append(f"detectors left out, {reason}: {', '.join(names)}")
+    return lines
 
 
 def _lane_km(
-    detectors: pd.DataFrame, used: pd.DataFrame, about: pd.DataFrame, where: Path
+    detectors: pd.DataFrame, about: pd.DataFrame, where: Path
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return lane-kilometres (R,) and the share of them with detectors in use (R,), NaN where
-    unknown."""
-    in_use = (
-        used["lane_km"]
-        .groupby(used["region"])
-        .sum()
-        .reindex(about.index, fill_value=0.0)
-        .to_numpy()
-    )
-    covered = (
-        detectors["lane_km"]
-        .groupby(detectors["region"])
-        .sum(min_count=1)
-        .reindex(about.index)
-        .to_numpy()
-    )
+    """Return lane-kilometres (R,) and their share with detectors (R,).
+
+    The detectors are those in use. The share is NaN where it is unknown.
+
+    Raises: InputError if lane-kilometres are unknown or contradict one another
+    """
+    used = detectors[detectors["used"]].groupby("region")["lane_km"].sum()
+    in_use = used.reindex(about.index, fill_value=0.0).to_numpy()
+    known = detectors.groupby("region")["lane_km"].sum(min_count=1)
+    covered = known.reindex(about.index).to_numpy()
     total = about["lane_km"].to_numpy()
-    if (unknown := np.isnan(covered) & np.isnan(total)).any():
-        remedy = "give the length of the detectors' links with --detectors, or lane_km of every region with --about"
+    unknown = np.isnan(covered) & np.isnan(total)
+    if unknown.any():
         raise InputError(
-            f"{where}: the lane-kilometres of region {about.index[unknown][0]} are unknown; {remedy}"
+            f"{where}: the lane-kilometres of region {about.index[unknown][0]} are unknown; give "
+            "the length of the detectors' links with --detectors, or lane_km of every region with "
+            "--about"
         )
     if (covered > 1.05 * total).any():
         n = int(np.nanargmax(covered / total))
-        what = f"lane_km: {total[n]:g} is less than the {covered[n]:.4g} km of its detectors"
-        remedy = "correct it, or length and lanes in the detectors' table"
-        raise InputError(f"{where}: region {about.index[n]}: {what}; {remedy}")
+        raise InputError(
+            f"{where}: region {about.index[n]}: lane_km: {total[n]:g} is less than the "
+            f"{covered[n]:.4g} km of its detectors; correct it, or length and lanes in the "
+            "detectors' table"
+        )
     return np.where(np.isnan(total), covered, total), in_use / total
 
 
 def _trip_lengths(
     detectors: pd.DataFrame, about: pd.DataFrame, trip_length: float | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean trip lengths within the regions (R,) [km], and which are assumed (R,)."""
-    lengths = (
-        about["trip_length"]
-        .fillna(np.nan if trip_length is None else trip_length)
-        .to_numpy(dtype=float)
-        / 1000.0
-    )
+    """Return mean trip lengths (R,) [km], and which are assumed (R,).
+
+    They are those within the regions. An assumed one is two thirds of the side of a square as large
+    as the detectors' convex hull.
+
+    trip_length: of regions whose own is not given (m)
+
+    Raises: InputError for a region without a trip length and without positions
+    """
+    given = about["trip_length"]
+    if trip_length is not None:
+        given = given.fillna(trip_length)
+    lengths = given.to_numpy(dtype=float) / 1000.0
     assumed = np.isnan(lengths)
     for n in np.flatnonzero(assumed):
-        points = (
-            detectors.loc[detectors["region"] == about.index[n], ["x_m", "y_m"]].dropna().to_numpy()
-        )
+        own = detectors[detectors["region"] == about.index[n]]
+        points = own[["x_m", "y_m"]].dropna().to_numpy()
         try:
-            lengths[n] = (
-                2.0 / 3.0 * np.sqrt(ConvexHull(points).volume) / 1000.0
-            )  # volume of a plane hull: its area
+            area = ConvexHull(points).volume  # its name in two dimensions
         except (QhullError, ValueError):
-            what = "the mean trip length is unknown and cannot be assumed without positions"
-            remedy = "give --trip-length METRES, or a column trip_length with --about"
-            raise InputError(f"region {about.index[n]}: {what}; {remedy}") from None
+            raise InputError(
+                f"region {about.index[n]}: the mean trip length is unknown and cannot be assumed "
+                "without positions; give --trip-length METRES, or a column trip_length with --about"
+            ) from None
+        lengths[n] = 2.0 / 3.0 * np.sqrt(area) / 1000.0
     return lengths, assumed
 
 
+def _intervals(rows: pd.DataFrame, detectors: pd.DataFrame, regions: pd.DataFrame) -> pd.DataFrame:
+    """Return the intervals of Identified.
+
+    They are those in which enough detectors report.
+
+    rows: counts
+    detectors: those in use
+    """
+    weights = detectors["lane_km"].fillna(1.0)
+    weight = rows["detid"].map(weights)
+    weighted = pd.DataFrame(
+        {
+            "region": rows["detid"].map(detectors["region"]),
+            "day": rows["day"],
+            "interval": rows["interval"],
+            "flow": rows["flow"] * weight,
+            "occ": rows["occ"] * weight,
+            "weight": weight,
+        }
+    )
+    table = weighted.groupby(["region", "day", "interval"]).sum().reset_index()
+    all_weights = weights.groupby(detectors["region"]).sum()
+    table["density_veh_km"] = table["occ"] / table["weight"] * 1000.0 / VEHICLE_LENGTH_M
+    table["flow_veh_h"] = table["flow"] / table["weight"]
+    table["reporting"] = table["weight"] / table["region"].map(all_weights)
+    table = table[table["reporting"] >= LEAST_REPORTING]
+    table = table.sort_values(["region", "day", "interval"], ignore_index=True)
+    table = table.drop(columns=["flow", "occ", "weight"])
+    lane_km = table["region"].map(regions["lane_km"])
+    trip_km = table["region"].map(regions["trip_km"])
+    table["accumulation_veh"] = table["density_veh_km"] * lane_km
+    table["production_veh_km_h"] = table["flow_veh_h"] * lane_km
+    table["outflow_veh_s"] = table["production_veh_km_h"] / trip_km / 3600.0
+    return table
+
+
+def fit(data: Measured, *, name: str, adjacency: Path | None = None) -> Identified:
+    """Return the network with the MFDs that fit the intervals best.
+
+    name: of the network
+    adjacency: csv file region,neighbour; None: by the detectors' positions
+
+    Raises: InputError for a region with too few intervals, or that cannot be reached
+    """
+    names = tuple(data.regions.index)
+    samples = _samples(data.intervals, names)
+    for region in fit_quality.nearly_empty(samples):
+        left = "".join(f"; {line}" for line in data.left)
+        raise InputError(
+            f"{data.counts}: region {names[region]} was measured in fewer than "
+            f"{fit_quality.SAMPLES} intervals with {100 * LEAST_REPORTING:g} % of its detectors "
+            f"reporting; give more data, or join it to another region{left}"
+        )
+    lane_km = data.regions["lane_km"].to_numpy()
+    network = RegionalModel(
+        name=name,
+        region_names=names,
+        positions=_positions(data.detectors, data.regions),
+        adjacency=_adjacency(adjacency, data.detectors, names),
+        mfds=tuple(mfd.fit(*fit_quality.own_points(cloud).T) for cloud in samples),
+        u_min=U_MIN,
+        u_max=U_MAX,
+    )
+    if (network.hops < 0).any():
+        i, j = np.argwhere(network.hops < 0)[0]
+        raise InputError(
+            f"{adjacency or data.counts}: region {names[j]} cannot be reached from {names[i]}; "
+            "give all pairs of neighbours, region,neighbour, with --adjacency"
+        )
+    network = fit_quality.with_guesses(network, samples, lane_km)
+    fits = fit_quality.region_fits(network, samples, lane_km=lane_km)
+    own = [_doubts(data, region) for region in names]
+    fits["doubts"] = [(*of_fit, *more) for of_fit, more in zip(fits["doubts"], own, strict=True)]
+    network = replace(network, doubts=tuple(fits["doubts"]))
+    text = _report(data, network, fits)
+    return Identified(network=network, fits=fits, intervals=data.intervals, text=text)
+
+
+def _samples(intervals: pd.DataFrame, regions: Sequence[str]) -> list[dict[str, Points]]:
+    """Return fit_quality.Samples with labels "loading" and "unloading"."""
+    samples = []
+    for region in regions:
+        part = intervals[intervals["region"] == region]
+        rising = part.groupby("day")["accumulation_veh"].diff().fillna(0.0) >= 0
+        occupied = part["accumulation_veh"] > 0
+        points = part[["accumulation_veh", "outflow_veh_s"]].to_numpy(dtype=float)
+        cloud = {"loading": points[occupied & rising], "unloading": points[occupied & ~rising]}
+        samples.append(cloud)
+    return samples
+
+
+def _positions(detectors: pd.DataFrame, regions: pd.DataFrame) -> np.ndarray:
+    """Return (R, 2) [m]: given, or the middle of the detectors.
+
+    If one is unknown, all regions lie on a circle.
+    """
+    given = regions[["x", "y"]].to_numpy()
+    middle = detectors.groupby("region")[["x_m", "y_m"]].mean().reindex(regions.index).to_numpy()
+    places = np.where(np.isnan(given), middle, given)
+    if not np.isnan(places).any():
+        return places
+    angle = 2.0 * np.pi * np.arange(len(regions)) / len(regions)
+    return 1000.0 * np.stack([np.sin(angle), np.cos(angle)], axis=1)
+
+
 def _adjacency(path: Path | None, detectors: pd.DataFrame, regions: Sequence[str]) -> Adjacency:
-    """Return (R, R) bool: given, or regions with detectors that are neighbours in the plane
-    (Delaunay)."""
+    """Return (R, R) bool: given, or regions with neighbouring detectors.
+
+    Neighbours are joined by a side of a triangle (Delaunay) and not far apart.
+
+    Raises: InputError if there are no positions
+    """
     if path is not None:
         return detector_tables.read_pairs(path, regions)
     adjacency = np.zeros((len(regions),) * 2, dtype=bool)
     if len(regions) == 1:
         return adjacency
     placed = detectors.dropna(subset=["x_m", "y_m"]).drop_duplicates(["x_m", "y_m"])
-    points, own = placed[["x_m", "y_m"]].to_numpy(), pd.Index(regions).get_indexer(placed["region"])
+    points = placed[["x_m", "y_m"]].to_numpy()
     try:
-        corners = Delaunay(points).simplices
+        triangles = Delaunay(points).simplices
     except (QhullError, ValueError):
-        what = "adjacency is unknown without detector positions (long, lat or x, y)"
-        raise InputError(f"{what}; give a table region,neighbour with --adjacency") from None
-    edges = np.unique(
-        np.sort([pair for corner in corners for pair in combinations(corner, 2)], axis=1), axis=0
-    )
-    distance = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
-    for i, h in own[edges[distance <= FAR * np.median(distance)]]:
-        adjacency[i, h] = adjacency[h, i] = i != h
+        raise InputError(
+            "adjacency is unknown without detector positions (long, lat or x, y); give a table "
+            "region,neighbour with --adjacency"
+        ) from None
+    sides = np.concatenate([triangles[:, pair] for pair in combinations(range(3), 2)])
+    sides = np.unique(np.sort(sides, axis=1), axis=0)
+    distance = np.linalg.norm(points[sides[:, 0]] - points[sides[:, 1]], axis=1)
+    near = sides[distance <= FAR * np.median(distance)]
+    region = pd.Index(regions).get_indexer(placed["region"])
+    for i, h in region[near]:
+        adjacency[i, h] = i != h
+        adjacency[h, i] = i != h
     return adjacency
 
 
-def _doubts(
-    detectors: pd.DataFrame, used: pd.DataFrame, coverage: float, assumed_km: float, days: int
-) -> list[str]:
-    """Return the doubts about a region beside those of its fit; assumed_km: NaN unless assumed."""
-    broken = (~detectors.index.isin(used.index)).sum()
-    near = (detectors["pos_km"] <= STOP_LINE_KM).mean()
-    doubts: Mapping[str, bool] = {
-        UNKNOWN: np.isnan(coverage),
-        f"{SMALL} {100 * coverage:.0f} %": coverage < LEAST_COVERAGE,
-        f"{LOOPS} ({100 * near:.0f} %)": near > BIASED_SHARE,
-        f"{ASSUMED} ({1000 * assumed_km:,.0f} m)": not np.isnan(assumed_km),
-        f"{SINGLE}: {days}": days < LEAST_DAYS,
-        f"{LEFT}: {broken} of {len(detectors)}": broken > 0,
-    }
-    return [text for text, there in doubts.items() if there]
+def _doubts(data: Measured, name: str) -> list[str]:
+    """Return the doubts about a region beside those of its fit."""
+    region = data.regions.loc[name]
+    detectors = data.detectors[data.detectors["region"] == name]
+    at_stop_line = (detectors["pos_km"] <= STOP_LINE_KM).mean()
+    left = (~detectors["used"]).sum()
+    doubts = []
+    if np.isnan(region["coverage"]):
+        doubts.append(UNKNOWN)
+    elif region["coverage"] < LEAST_COVERAGE:
+        doubts.append(f"{SMALL} {100 * region['coverage']:.0f} %")
+    if at_stop_line > BIASED_SHARE:
+        doubts.append(f"{LOOPS} ({100 * at_stop_line:.0f} %)")
+    if region["assumed"]:
+        doubts.append(f"{ASSUMED} ({1000 * region['trip_km']:,.0f} m)")
+    if data.days < LEAST_DAYS:
+        doubts.append(f"{SINGLE}: {data.days}")
+    if left:
+        doubts.append(f"{LEFT}: {left} of {len(detectors)}")
+    return doubts
+
+
+def _report(data: Measured, network: RegionalModel, fits: pd.DataFrame) -> str:
+    """Return the fits, doubts and data as text."""
+    coverage = data.regions["coverage"]
+    trip_m = 1000 * data.regions["trip_km"]
+    share = "unknown"
+    if coverage.notna().any():
+        share = f"{coverage.min():.0%} to {coverage.max():.0%}"
+    facts = f"{data.read}; share of the lane-km with detectors: {share}; "
+    facts += f"trip length within a region: {trip_m.min():,.0f} to {trip_m.max():,.0f} m"
+    lines = [f"WARNING, {line}" for line in data.left]
+    notes = wrapped("\n".join([*lines, facts, UNKNOWN_PARTS]))
+    return "\n".join([fit_quality.fit_table(network, fits, MEANINGS), *notes])

@@ -27,11 +27,11 @@ from nmfd.arrays import StatesOverTime
 from nmfd.controllers.dpc.policy import DpcController, Policy
 from nmfd.controllers.dpc.policy_file import load_policy
 from nmfd.controllers.dpc.rollout import Demands, Rollout
-from nmfd.controllers.mpc.controller import EconomicMpc
+from nmfd.controllers.mpc.controller import EconomicMpc, MpcController
 from nmfd.controllers.mpc.terminal import LATE, OFFSET, WEIGHTS, Terminal, clock
 from nmfd.controllers.rules import NoControl, PiGating
 from nmfd.controllers.strategy import parse
-from nmfd.model.planning import PlanningModel, planning_model
+from nmfd.model.planning import PlanningModel
 from nmfd.model.plant import NmfdPlant
 from nmfd.model.scenario import Scenario
 from nmfd.runs.files import atomic
@@ -73,7 +73,7 @@ def learn(
     horizon, the scenario's own if None
     """
     follows, guidance = parse(TERMINAL[controller]), parse(controller).guides
-    planning = planning_model(scenario, controller)
+    planning = parse(controller).own_planning(scenario)
     file = follows.file(scenario, policy)
     assert file is not None  # every DPC controller has one
     with one_thread():
@@ -85,9 +85,10 @@ def learn(
         city, total = replace(scenario, network=planning.network), rounds * (samples + steps)
 
         def driven(driver: Controller) -> StatesOverTime:
-            return closed_loop.run(NmfdPlant(city), driver, city, seed=seed).accumulation[:-1]
+            return closed_loop.run(NmfdPlant(city), driver, city, seed=seed)["accumulation"][:-1]
 
-        both = [driven(DpcController(after)), driven(EconomicMpc(planning, guidance=guidance))]
+        mpc = EconomicMpc(guidance=guidance)
+        both = [driven(DpcController(after)), driven(mpc.make(planning))]
         for number in range(rounds):
             begin = number * (samples + steps)
 
@@ -96,11 +97,11 @@ def learn(
                     progress(begin + done, total, f"round {number + 1} of {rounds}: {note}")
 
             if terminal is not None:  # twice as often as the others
-                own = 2 * [driven(EconomicMpc(planning, guidance=guidance, terminal=terminal))]
+                own = 2 * [driven(MpcController(planning, mpc, terminal=terminal))]
             else:
                 own = [
-                    driven(NoControl(planning)),
-                    *([driven(PiGating(planning))] if planning.protected else []),
+                    driven(NoControl().make(planning)),
+                    *([driven(PiGating().make(planning))] if planning.protected else []),
                 ]
             visited = torch.tensor(np.stack(both + own), dtype=rollout.dtype)
             seen = 0

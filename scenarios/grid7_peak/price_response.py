@@ -17,8 +17,9 @@ import torch
 import cosim
 import nmfd
 from nmfd import Controls, Observation, Result
+from nmfd.controllers.strategy import parse
 from nmfd.model.answer import Answer
-from nmfd.model.planning import PlanningModel, planning_model
+from nmfd.model.planning import PlanningModel
 
 MOST_PRICE, HOLD = 4.0, 4  # -, control intervals
 CITY = "max-pressure+guidance-period-60+metering"
@@ -66,7 +67,7 @@ def main(folder: Path) -> None:
     """Do the runs that are not in `folder` yet, and print the likelihood of several dispersions."""
     scenario = nmfd.load_scenario("grid7_peak")
     table = "dpc-pcrg+max-pressure+guidance-period-60+metering"
-    answer = Answer(planning_model(scenario, "dpc-pcrg", table).network)
+    answer = Answer(parse(table).own_planning(scenario).network)
     strategy = f"{__file__}:RandomPrices+{CITY}"
     cosim.evaluate("grid7_peak", [strategy], seeds=SEEDS, levels=LEVELS, workers=1, out=folder)
     runs = [Result.read(file) for file in sorted(folder.glob("**/*.nc"))]

@@ -92,7 +92,7 @@ def measure(family: str, load: str, regions: int, name: str) -> dict:
         Architecture(guidance=GUIDES[name], sparse=True),
     )
     if name.startswith("mpc"):
-        controller = EconomicMpc(planning, guidance=GUIDES[name])
+        controller = EconomicMpc(guidance=GUIDES[name]).make(planning)
     else:
         controller = DpcController(Policy(city, small if name.endswith("local") else sparse))
     controller.reset()

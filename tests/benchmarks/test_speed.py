@@ -4,7 +4,6 @@ What is compared must agree; that part runs with the other tests.
 """
 
 import runpy
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,16 +11,15 @@ import plain
 import pytest
 import torch
 
+from nmfd import api
 from nmfd.api import controller as make_controller
 from nmfd.api import load_scenario
 from nmfd.closed_loop import run
 from nmfd.controllers.dpc.policy_file import load_policy
-from nmfd.controllers.mpc.controller import EconomicMpc
 from nmfd.controllers.mpc.ipopt import Ipopt
-from nmfd.controllers.rules import NoControl
 from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
-from nmfd.model.scenario import Scenario
+from nmfd.model.scenario import Scenario, with_demand
 from nmfd.types import Observation, Status
 
 SCALING = runpy.run_path(
@@ -44,9 +42,12 @@ def one_thread():
 @pytest.fixture(scope="module")
 def seen():
     """Measurements of a run without control."""
-    controller, short = NoControl(planning_model(SCENARIO)), replace(SCENARIO, steps=WHEN[-1] + 1)
+    controller, short = (
+        api.controller("no-control", SCENARIO),
+        with_demand(SCENARIO, steps=WHEN[-1] + 1),
+    )
     trajectory = run(NmfdPlant(SCENARIO), controller, short, seed=0)
-    return [measurement(trajectory.accumulation[k], k) for k in WHEN]
+    return [measurement(trajectory["accumulation"][k], k) for k in WHEN]
 
 
 def measurement(x, k=0):
@@ -71,7 +72,7 @@ def random_city(family, regions):
 
 def compare(scenario, measured, guidance):
     """Vehicles over the horizon by our MPC, by plain IPOPT, and whether that converged."""
-    controller, k = EconomicMpc(planning_model(scenario), guidance=guidance), measured.step
+    controller, k = api.controller("mpc-pcrg" if guidance else "mpc-pc", scenario), measured.step
     assert controller.act(measured).status == Status.OK
     ipopt = Ipopt(
         planning_model(scenario), guidance=guidance, horizon=HORIZON, limits={"max_iter": 200}
@@ -115,21 +116,21 @@ def test_mpc_has_the_optimum_of_plain_ipopt_in_random_cities(family, regions, gu
 def test_the_plain_model_is_the_model():
     trajectory = run(
         NmfdPlant(SCENARIO),
-        NoControl(planning_model(SCENARIO)),
-        replace(SCENARIO, steps=30),
+        api.controller("no-control", SCENARIO),
+        with_demand(SCENARIO, steps=30),
         seed=0,
     )
-    x = trajectory.accumulation[0]
+    x = trajectory["accumulation"][0]
     for k in range(30):
         x = plain.euler(
             SCENARIO.network,
             x,
             SCENARIO.demand[k],
-            trajectory.perimeter[k],
-            trajectory.splits[k],
+            trajectory["perimeter"][k],
+            trajectory["splits"][k],
             30.0,
         )
-        np.testing.assert_allclose(x, trajectory.accumulation[k + 1], atol=1e-9)
+        np.testing.assert_allclose(x, trajectory["accumulation"][k + 1], atol=1e-9)
 
 
 @KINDS
@@ -153,7 +154,7 @@ class TestMpc:
         benchmark(lambda: [ipopt.solve(m.accumulation, forecast(SCENARIO, m.step)) for m in seen])
 
     def test_ours(self, benchmark, seen, guidance):
-        controller = EconomicMpc(planning_model(SCENARIO), guidance=guidance)
+        controller = api.controller("mpc-pcrg" if guidance else "mpc-pc", SCENARIO)
 
         def decide():
             for measured in seen:

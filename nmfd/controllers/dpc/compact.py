@@ -1,47 +1,59 @@
-"""Gates, prices and metering by a few readable numbers: compact DPC policies, and rules.
+"""Compact DPC policies and rules: control by a few readable numbers.
 
 A compact policy is trained through the regional model (dpc-pc, dpc-pcrg with `compact`). A rule,
 gating-rule or, with prices, pricing-rule, has numbers that were tuned in SUMO (`cosim tune`) or
-chosen by hand; it reads them from scenario.toml.
+chosen by hand. It reads them from scenario.toml.
 
-With z_i = n_i / n_cr,i, the entries h -> p of every protected region p, and the prices of all ways
-through p, are
+p is a protected region, h -> p one of its entries, z_i = n_i / n_cr,i, s(x) = 1 / (1 + e^-x):
 
-    u_hp = u_min + (u_max - u_min) s(4 (v_p + relief max(z_h - 1, 0))),    v_p = gain e_p,    e_p = set_point - z_p
-    c_p  = price max(z_p - price_from, 0)                                  s(x) = 1 / (1 + e^-x)
+    e_p  = set_point - z_p
+    v_p  = gain e_p
+    u_hp = u_min + (u_max - u_min) s(4 (v_p + relief max(z_h - 1, 0)))
+    c_p  = price max(z_p - price_from, 0)
+    c_i  = elsewhere max(z_i - elsewhere_from, 0)    for other regions i
 
-All other entries are open; the prices of the other regions are elsewhere max(z_i - elsewhere_from,
-0). `relief` opens a gate for a region beyond its own critical accumulation. With metering,
+All other entries are open. `relief` opens a gate for a region beyond its own critical accumulation.
+With metering,
 
-    r_i = n_cr,i max(min(metering - z_i, metering_gain (metering_protected - max_p z_p)), 0) / FILL_TIME_S
+    r_i = n_cr,i max(min(a_i, b), 0) / FILL_TIME_S
+    a_i = metering - z_i
+    b   = metering_gain (metering_protected - max_p z_p)
 
-trips may begin in region i per second; `metering_protected` = 0 omits the second term. A gate moves
-a queue into the regions around the protected one, which may lock instead; trips that have not begun
-block no vehicle.
+trips may begin in region i per second. `metering_protected` = 0 omits b. A gate moves a queue into
+the regions around the protected one, which may lock instead; trips that have not begun block no
+vehicle.
 
 With `integral` the gate is PI gating (nmfd.controllers.rules), initially open, v_p = 1/2, with
 relief on top:
 
     v_p(k) = clip(v_p(k-1) + gain (e_p(k) - e_p(k-1)) + integral e_p(k), -1/2, 1/2)
-    u_hp = u_min + (u_max - u_min) clip(1/2 + v_p + relief max(z_h - 1, 0), 0, 1).
+    u_hp   = u_min + (u_max - u_min) clip(1/2 + v_p + relief max(z_h - 1, 0), 0, 1)
 
-It corrects errors of the regional model, so that rollouts of that model do not use it: `integral`
-is tuned in SUMO (`cosim tune`), not trained. The straight line closes earlier than s as the region
+It corrects errors of the regional model, so rollouts of that model do not use it: `integral` is
+tuned in SUMO (`cosim tune`), not trained. The straight line closes earlier than s as the region
 fills.
 
-The regional model answers prices by a logit (nmfd.model.answer); the policy is trained like a
+The regional model answers prices by a logit (nmfd.model.answer). The policy is trained like a
 network.
 """
 
-from typing import Annotated, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
 import torch
 from pydantic import Field
 from torch import nn
 
-from nmfd.controllers.dpc.policy import FILL_TIME_S, Architecture, DpcController, Memory, Policy
-from nmfd.model.planning import Options, PlanningModel, options
+from nmfd.controllers.base import Options
+from nmfd.controllers.dpc.policy import (
+    DTYPE,
+    FILL_TIME_S,
+    Architecture,
+    DpcController,
+    Memory,
+    Policy,
+)
+from nmfd.model.planning import PlanningModel
 from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import config
 from nmfd.runs.config import Problem, setting
@@ -49,7 +61,10 @@ from nmfd.tensors import PerPair, PerRegion
 
 
 class Numbers(NamedTuple):
-    """Parameters of a compact policy (-); the last three may be omitted in scenario.toml."""
+    """Parameters of a compact policy (-).
+
+    The last three may be omitted in scenario.toml.
+    """
 
     set_point: float = 1.0
     gain: float = 2.0
@@ -66,63 +81,79 @@ class Numbers(NamedTuple):
 
 NumbersOption = Annotated[config.Numbers, Field(min_length=8, max_length=11)]
 MEANING = (
-    "set_point, gain, relief, price, price_from, elsewhere, elsewhere_from, metering, integral (0), "
-    "metering_protected (0), metering_gain (1); see nmfd/controllers/dpc/compact.py"
+    "set_point, gain, relief, price, price_from, elsewhere, elsewhere_from, metering, "
+    "integral (0), metering_protected (0), metering_gain (1); see nmfd/controllers/dpc/compact.py"
 )
 
 
 class CompactPolicy(Policy):
-    """Policy with the parameters `numbers` (11,) for the protected regions
-    `architecture.compact`."""
+    """Policy with a few numbers for its protected regions.
+
+    numbers: a tensor of Numbers (11,)
+    held: True for a protected region (R,)
+    """
 
     def _build(self, network: RegionalModel) -> None:
-        self.numbers = nn.Parameter(torch.tensor(Numbers()))
+        self.numbers = nn.Parameter(torch.tensor(Numbers(), dtype=DTYPE))
         held = np.isin(np.arange(network.regions), self.architecture.compact)
         self.register_buffer("held", torch.tensor(held), persistent=False)
 
-    def listed(self, x: PerPair, memory: Memory | None = None) -> tuple[PerPair, None]:
-        """Return the perimeter in the states x, and None; memory: what `remember` returned for
-        them."""
-        numbers, full = self._read(), self._full(x)
-        gate = numbers.gain * (numbers.set_point - full) if memory is None else memory[..., 0, :]
-        want = gate.unsqueeze(-2) + numbers.relief * (full - 1.0).clamp(min=0.0).unsqueeze(-1)
-        share = torch.sigmoid(4.0 * want) if memory is None else (0.5 + want).clamp(0.0, 1.0)
-        share = torch.where(self.held, share, torch.ones_like(want))
-        return (self.box.low + (self.box.high - self.box.low) * share) * self.box.allowed, None
+    def outputs(self, x: PerPair, memory: Memory | None = None) -> tuple[PerPair, None]:
+        """Return the perimeter in the states x, and None.
+
+        memory: result of `remember` for x, v in its first row; None without integral action
+        """
+        numbers = self._read()
+        full = self._full(x)
+        relief = numbers.relief * (full - 1.0).clamp(min=0.0).unsqueeze(-1)
+        if memory is None:
+            gate = numbers.gain * (numbers.set_point - full)
+            share = torch.sigmoid(4.0 * (gate.unsqueeze(-2) + relief))
+        else:
+            gate = memory[..., 0, :]
+            share = (0.5 + (gate.unsqueeze(-2) + relief)).clamp(0.0, 1.0)
+        share = torch.where(self.held, share, torch.ones_like(share))
+        perimeter = self.box.low + (self.box.high - self.box.low) * share
+        return perimeter * self.box.allowed, None
 
     def remember(self, x: PerPair, memory: Memory | None) -> Memory | None:
-        """Return v and e after states x, from `memory` before them; None without integral
-        action."""
+        """Return v and e after the states x; None without integral action.
+
+        memory: the one before x, None at the beginning
+        """
         numbers = self._read()
         if not numbers.integral:
             return None
         error = numbers.set_point - self._full(x)
-        v, before = (torch.full_like(error, 0.5), error) if memory is None else memory.unbind(-2)
+        if memory is None:
+            v = torch.full_like(error, 0.5)
+            before = error
+        else:
+            v, before = memory.unbind(-2)
         v = v + numbers.gain * (error - before) + numbers.integral * error
         return torch.stack([v.clamp(-0.5, 0.5), error], dim=-2)
 
     def prices(self, x: PerPair) -> PerRegion | None:
-        """Return the prices of the ways through each region (-, (..., R))."""
+        """Return the price of each region (-, (..., R)), or None."""
         if not self.architecture.guidance:
             return None
-        numbers, full = self._read(), self._full(x)
+        numbers = self._read()
+        full = self._full(x)
         elsewhere = numbers.elsewhere * (full - numbers.elsewhere_from).clamp(min=0.0)
-        return torch.where(
-            self.held, numbers.price * (full - numbers.price_from).clamp(min=0.0), elsewhere
-        )
+        protected = numbers.price * (full - numbers.price_from).clamp(min=0.0)
+        return torch.where(self.held, protected, elsewhere)
 
     def metering(self, x: PerPair) -> PerRegion | None:
-        """Return the largest rates of departures in each region (veh/s, (..., R)); None without
-        metering."""
+        """Return the largest departure rates (veh/s, (..., R)), or None."""
         if not self.architecture.metering:
             return None
-        numbers, full = self._read(), self._full(x)
+        numbers = self._read()
+        full = self._full(x)
         room = numbers.metering - full
         if numbers.metering_protected:
             fullest = torch.where(self.held, full, torch.zeros_like(full)).amax(-1, keepdim=True)
-            room = torch.minimum(
-                room, numbers.metering_gain * (numbers.metering_protected - fullest)
-            )
+            left = numbers.metering_gain * (numbers.metering_protected - fullest)
+            room = torch.minimum(room, left)
         return self.scale.squeeze(-1) * room.clamp(min=0.0) / FILL_TIME_S
 
     def bound(self) -> None:
@@ -134,11 +165,18 @@ class CompactPolicy(Policy):
         return Numbers(*self.numbers.clamp(min=0.0))
 
 
-class Rule(Options):
-    """Options of a rule."""
+class GatingRule(Options):
+    """Gates by numbers that were tuned in SUMO."""
+
+    guidance: ClassVar[bool] = False
+    name: ClassVar[str] = "gating-rule"
 
     numbers: NumbersOption = setting(MEANING, Numbers(), unit="-")
     metering: bool = setting("trips wait while regions are full; for +metering", False)
+
+    @property
+    def guides(self) -> bool:
+        return self.guidance
 
     def misfit(self, planning: PlanningModel) -> Problem | None:
         """Return negative numbers, or no protected region, as a problem."""
@@ -148,16 +186,19 @@ class Rule(Options):
             return Problem("numbers", "expected a scenario with protected regions; name them")
         return None
 
+    def make(self, planning: PlanningModel) -> DpcController:
+        architecture = Architecture(
+            guidance=self.guidance, compact=planning.protected, metering=self.metering
+        )
+        policy = CompactPolicy(planning.network, architecture)
+        policy.numbers.data.copy_(torch.tensor(Numbers(*self.numbers), dtype=DTYPE))
+        controller = DpcController(policy)
+        controller.name = self.name
+        return controller
 
-def rule(planning: PlanningModel, *, guidance: bool) -> DpcController:
-    """Return the pricing rule or, without guidance, the gating rule. Raise InputError."""
-    name = "pricing-rule" if guidance else "gating-rule"
-    setup = options(Rule, planning, name)
-    architecture = Architecture(
-        guidance=guidance, compact=planning.protected, metering=setup.metering
-    )
-    policy = CompactPolicy(planning.network, architecture)
-    policy.numbers.data.copy_(torch.tensor(Numbers(*setup.numbers)))
-    controller = DpcController(policy)
-    controller.name = name
-    return controller
+
+class PricingRule(GatingRule):
+    """Prices of the ways through regions, and gates, by numbers that were tuned in SUMO."""
+
+    guidance: ClassVar[bool] = True
+    name: ClassVar[str] = "pricing-rule"

@@ -2,13 +2,21 @@
 
 import math
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Literal
 
 from pydantic import model_validator
 
+from nmfd.controllers.base import FileKind, Options
 from nmfd.controllers.dpc.compact import MEANING, Numbers, NumbersOption
-from nmfd.model.planning import Options, PlanningModel
-from nmfd.runs.config import Flow, Problem, Share, Texts, got, setting, whole
+from nmfd.controllers.dpc.policy import DpcController
+from nmfd.controllers.dpc.policy_file import guided_by, load, read_file
+from nmfd.model.planning import PlanningModel
+from nmfd.model.scenario import Scenario
+from nmfd.runs import shipped
+from nmfd.runs.config import Flow, Problem, Share, Text, Texts, got, setting, whole
+
+POLICY = FileKind("policy", ".pt", "nmfd train {folder} --controller {name}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,9 +66,19 @@ PUBLISHED = Recipe(
 )
 
 
-class Training(Options):
-    """Options of a DPC policy and of its training, `nmfd train SCENARIO --controller NAME`."""
+class Dpc(Options):
+    """Policy trained by differentiable predictive control, and the options of its training.
 
+    >>> nmfd.run("economic_mpc", nmfd.Dpc(policy="economic_mpc/dpc-pc.pt"), steps=1).controller
+    'dpc-pc(policy="economic_mpc/dpc-pc.pt")'
+    """
+
+    guidance: bool | None = setting(
+        "route guidance besides perimeter control; by default as the policy has it", None
+    )
+    policy: Text | Path | None = setting(
+        "policy file; by default SCENARIO/NAME.pt, as `nmfd train` writes it", None
+    )
     local: bool = setting(
         "one small network for every boundary, which fits other cities; perimeter control", False
     )
@@ -120,7 +138,7 @@ class Training(Options):
     )
 
     @model_validator(mode="after")
-    def _fits_together(self) -> "Training":
+    def _fits_together(self) -> "Dpc":
         if self.from_gating and self.from_no_control:
             raise Problem(
                 "from_gating", "a policy cannot begin as a gate and as no control; omit one"
@@ -158,6 +176,24 @@ class Training(Options):
             )
             raise Problem("preset_without", f"{problem}; correct them or add preset")
         return self
+
+    @property
+    def guides(self) -> bool:
+        if self.guidance is not None or self.policy is None:
+            return self.guidance is not False
+        file = read_file(shipped.found(self.policy, shipped.SCENARIO))
+        return guided_by(file)
+
+    @property
+    def reads(self) -> FileKind:
+        return POLICY
+
+    @property
+    def file(self) -> str | Path | None:
+        return self.policy
+
+    def load(self, file: Path, planning: PlanningModel, scenario: Scenario) -> DpcController:
+        return load(file, planning, guidance=self.guides)
 
     @property
     def recipe(self) -> Recipe:

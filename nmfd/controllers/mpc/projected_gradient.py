@@ -1,4 +1,6 @@
-"""Spectral projected gradients with a certificate, for smooth functions on simple convex sets.
+"""Spectral projected gradients with a certificate.
+
+They minimise smooth functions on simple convex sets.
 
 Birgin, Martinez and Raydan, "Nonmonotone spectral projected gradient methods on convex sets", SIAM
 J. Optim. 10 (2000).
@@ -8,6 +10,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -17,6 +20,7 @@ MIN_STEP_SHARE = 1e-10  # below which the line search ends
 MAX_STEP = 1e10  # spectral step length
 AT_REST = "no further descent"
 TIME_LIMIT = "time limit"
+Function: TypeAlias = Callable[[np.ndarray], tuple[float, np.ndarray]]
 
 
 class Late(Exception):
@@ -39,8 +43,14 @@ class Minimum:
     reason: str | None
 
 
+class _Evaluated(NamedTuple):
+    point: np.ndarray
+    value: float
+    gradient: np.ndarray
+
+
 def minimise(
-    function: Callable[[np.ndarray], tuple[float, np.ndarray]],
+    function: Function,
     project: Callable[[np.ndarray], np.ndarray],
     gap: Callable[[np.ndarray, np.ndarray], float],
     start: np.ndarray,
@@ -62,53 +72,67 @@ def minimise(
     seconds: time limit, checked after every evaluation (s)
     """
     deadline = time.perf_counter() + seconds
-    point = start
     try:
-        value, gradient = function(point)
+        here = _Evaluated(start, *function(start))
     except Late:
         return Minimum(point=start, value=np.inf, gap=np.inf, reason=TIME_LIMIT)
-    if not (np.isfinite(value) and np.isfinite(gradient).all()):
-        return Minimum(point=start, value=value, gap=np.inf, reason="not a number")
-    recent = deque([value], MEMORY)
-    length = 1.0 / max(np.abs(gradient / metric).max(initial=0.0), 1.0 / MAX_STEP)
-    best, least = (point, np.inf), np.inf
-
-    def stopped(reason: str) -> Minimum:
-        return Minimum(point=best[0], value=best[1], gap=least, reason=reason)
-
+    if not (np.isfinite(here.value) and np.isfinite(here.gradient).all()):
+        return Minimum(point=start, value=here.value, gap=np.inf, reason="not a number")
+    best = here
+    least = np.inf
+    recent = deque([here.value], MEMORY)
+    length = 1.0 / max(np.abs(here.gradient / metric).max(initial=0.0), 1.0 / MAX_STEP)
     for iteration in range(iterations + 1):
-        if (now := gap(point, gradient)) <= tolerance * abs(value):
-            return Minimum(point=point, value=value, gap=now, reason=None)
+        now = gap(here.point, here.gradient)
+        if now <= tolerance * abs(here.value):
+            return Minimum(point=here.point, value=here.value, gap=now, reason=None)
         least = min(least, now)
-        if value < best[1]:
-            best = point, value
-        reason = "iteration limit" if iteration == iterations else TIME_LIMIT
-        if iteration == iterations or time.perf_counter() > deadline:
+        if here.value < best.value:
+            best = here
+        if iteration == iterations:
+            reason = "iteration limit"
             break
-        direction = project(point - length * gradient / metric) - point
-        slope, share, limit = float((gradient * direction).sum()), 1.0, max(recent)
-        while True:
-            other = point + share * direction
-            try:
-                other_value, other_gradient = function(other)
-            except Late:
-                return stopped(TIME_LIMIT)
-            if other_value <= limit + SUFFICIENT_DECREASE * share * slope:
-                break
-            if time.perf_counter() > deadline:
-                return stopped(TIME_LIMIT)
-            if share < MIN_STEP_SHARE:
-                return stopped(AT_REST)
-            lowest = (
-                -0.5 * share**2 * slope / (other_value - value - share * slope)
-            )  # of the parabola through both
-            share = lowest if 0.1 * share <= lowest <= 0.5 * share else 0.5 * share
-        moved, turned = other - point, other_gradient - gradient
-        curvature = float((moved * turned).sum())
-        length = min(
-            float((metric * moved**2).sum()) / curvature if curvature > 0 else 4.0 * length,
-            MAX_STEP,
-        )
-        point, value, gradient = other, other_value, other_gradient
-        recent.append(value)
-    return stopped(reason)
+        if time.perf_counter() > deadline:
+            reason = TIME_LIMIT
+            break
+        direction = project(here.point - length * here.gradient / metric) - here.point
+        there = _line_search(function, here, direction, max(recent), deadline)
+        if isinstance(there, str):
+            reason = there
+            break
+        moved = there.point - here.point
+        curvature = float((moved * (there.gradient - here.gradient)).sum())
+        length = 4.0 * length
+        if curvature > 0:
+            length = float((metric * moved**2).sum()) / curvature
+        length = min(length, MAX_STEP)
+        here = there
+        recent.append(here.value)
+    return Minimum(point=best.point, value=best.value, gap=least, reason=reason)
+
+
+def _line_search(
+    function: Function, here: _Evaluated, direction: np.ndarray, limit: float, deadline: float
+) -> _Evaluated | str:
+    """Return the first point with sufficient decrease, or why there is none.
+
+    limit: value that the decrease counts from
+    """
+    slope = float((here.gradient * direction).sum())
+    share = 1.0
+    while True:
+        point = here.point + share * direction
+        try:
+            there = _Evaluated(point, *function(point))
+        except Late:
+            return TIME_LIMIT
+        if there.value <= limit + SUFFICIENT_DECREASE * share * slope:
+            return there
+        if time.perf_counter() > deadline:
+            return TIME_LIMIT
+        if share < MIN_STEP_SHARE:
+            return AT_REST
+        # Lowest point of the parabola through both values.
+        lowest = -0.5 * share**2 * slope / (there.value - here.value - share * slope)
+        trusted = 0.1 * share <= lowest <= 0.5 * share
+        share = lowest if trusted else 0.5 * share

@@ -1,0 +1,85 @@
+"""Check of the commands of a controller before a plant sees them."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from nmfd.errors import InputError
+from nmfd.model.regional_model import RegionalModel
+from nmfd.types import Controls
+
+TOLERANCE = 1e-5  # of bounds: rounding errors of float32
+SUM_TOLERANCE = 1e-3  # of the sums of splits
+ROUNDING = 1e-12  # of sums in float64, which are left as they are
+LARGEST_PRICE = 100.0  # -
+LARGEST_RATE_VEH_S = 1e6  # of metering: as good as no limit
+
+
+def admissible(controls: object, network: RegionalModel, where: str) -> Controls:
+    """Return a copy of `controls` as float64, without rounding errors.
+
+    controls: command of a controller, not yet checked
+    where: begins the error, such as "pi-gating: interval 3"
+    Raises: InputError for a wrong type, shape or value, with entry and bounds
+    """
+    if not isinstance(controls, Controls):
+        got = type(controls).__name__
+        problem = f"expected nmfd.Controls, got {got} instead"
+        raise InputError(f"{where}: {problem}; return nmfd.Controls(perimeter=u)")
+    gates = network.adjacency
+    low = np.where(gates, network.u_min, -np.inf)
+    high = np.where(gates, network.u_max, np.inf)
+    perimeter = within(controls.perimeter, low, high, f"{where}: perimeter")
+    return replace(
+        controls,
+        perimeter=np.where(gates, perimeter, 0.0),
+        splits=_splits(controls.splits, network, f"{where}: splits"),
+        prices=_up_to(controls.prices, LARGEST_PRICE, network, f"{where}: prices"),
+        metering=_up_to(controls.metering, LARGEST_RATE_VEH_S, network, f"{where}: metering"),
+    )
+
+
+def _splits(splits: ArrayLike | None, network: RegionalModel, where: str) -> np.ndarray | None:
+    if splits is None:
+        return None
+    allowed = network.split_mask
+    shares = within(splits, np.zeros(allowed.shape), allowed.astype(float), where)
+    sums = shares.sum(axis=1)
+    needed = allowed.any(axis=1)
+    wrong = np.argwhere(needed & (abs(sums - 1.0) > SUM_TOLERANCE))
+    if len(wrong):
+        i, j = wrong[0].tolist()
+        found = f"{sums[i, j]:g} for [i, j] = [{i}, {j}]"
+        raise InputError(f"{where}: expected a sum of 1 over h, got {found} instead")
+    scale = np.where(needed & (abs(sums - 1.0) > ROUNDING), sums, 1.0)
+    return shares / scale[:, None, :]
+
+
+def _up_to(
+    values: ArrayLike | None, most: float, network: RegionalModel, where: str
+) -> np.ndarray | None:
+    if values is None:
+        return None
+    zeros = np.zeros(network.regions)
+    return within(values, zeros, zeros + most, where)
+
+
+def within(values: ArrayLike, low: np.ndarray, high: np.ndarray, where: str) -> np.ndarray:
+    """Return `values` as an array clipped to `low` and `high`.
+
+    Raises: InputError if the shape is another, or if bounds are missed by more than rounding errors
+    """
+    try:
+        array = np.array(values, dtype=float)
+    except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError: a tensor with a gradient
+        raise InputError(f"{where}: expected numbers of shape {low.shape} ({error})") from None
+    if array.shape != low.shape:
+        raise InputError(f"{where}: expected numbers of shape {low.shape}, got shape {array.shape}")
+    finite = np.isfinite(array)
+    inside = (array >= low - TOLERANCE) & (array <= high + TOLERANCE) & finite
+    if not inside.all():
+        entry = tuple(np.argwhere(~inside)[0].tolist())
+        allowed = f"{low[entry]:g} to {high[entry]:g}" if finite[entry] else "a finite number"
+        raise InputError(f"{where}{list(entry)}: expected {allowed}, got {array[entry]:g} instead")
+    return np.clip(array, low, high)

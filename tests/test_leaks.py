@@ -1,0 +1,239 @@
+"""Gates that cannot hold: told as uncontrolled in tables, verdict, pictures and results, and never
+commanded."""
+
+import re
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+import tiny_city
+from commands import cosim
+from test_responsive import CARS, CONFIG
+
+from cosim.api import run_controllers
+from cosim.evaluation.simulate import leaking_share
+from cosim.report.city import City
+from cosim.sumo.signals import free_light
+from cosim.sumo.xml_files import read_xml
+from cosim.view.picture import CityPicture
+from nmfd.api import load_scenario
+
+SIGNALS = ("B1", "B2", "C1", "C2")
+USUAL = ("--tls.set", ",".join(SIGNALS))
+ARROWS = ("--default-junction-type", "traffic_light_right_on_red")
+CLOSED, OPEN = 0.1, 0.9
+
+
+def programme(net, signal, change, about='programID="more"'):
+    """A <tlLogic> with the phases of a signal after change(state)."""
+    logic = next(one for one in read_xml(net).iter("tlLogic") if one.get("id") == signal)
+    rows = "".join(
+        f'<phase duration="{row.get("duration")}" state="{change(row.get("state"))}"/>'
+        for row in logic.iter("phase")
+    )
+    return f'<tlLogic id="{signal}" type="static" {about} offset="0">{rows}</tlLogic>'
+
+
+def everywhere(light):
+    """A function of a net file: programmes whose lights are all the same."""
+    return lambda net: "".join(
+        programme(net, signal, lambda state: light * len(state)) for signal in SIGNALS
+    )
+
+
+def arrows(net):
+    """Programmes with turns on red instead of red."""
+    return "".join(
+        programme(net, signal, lambda state: state.replace("r", "s")) for signal in SIGNALS
+    )
+
+
+def one_phase(net):
+    return re.sub(r"(<phase [^>]*>)+", r"\1", everywhere("G")(net))
+
+
+def red_and_yellow(net):
+    return "".join(
+        programme(net, signal, lambda state: state.replace("y", "u")) for signal in SIGNALS
+    )
+
+
+def off(net):
+    return "".join(f'<tlLogic id="{name}" type="static" programID="off"/>' for name in SIGNALS)
+
+
+def timetable(net):
+    switches = "".join(f'<wautJunction wautID="w" junctionID="{name}"/>' for name in SIGNALS)
+    table = '<WAUT refTime="0" id="w" startProg="0"><wautSwitch time="99" to="more"/></WAUT>'
+    return everywhere("G")(net) + table + switches
+
+
+def ordinary_at_last(net):
+    """Turns on red, and the ordinary programme after them."""
+    last = (programme(net, name, str, 'programID="last"') for name in SIGNALS)
+    return arrows(net) + "".join(last)
+
+
+def nothing(net):
+    return ""
+
+
+def one_lane_free(text):
+    """A network in which one of the two lanes of every movement straight on has no signal."""
+    return re.sub(r'(<connection [^>]*fromLane="1"[^>]*) tl="\w+" linkIndex="\d+"', r"\1", text)
+
+
+def plain(text):
+    return text
+
+
+def imported(folder, contents=nothing, network=plain, options="", signals=USUAL):
+    """The scenario of a city of two regions, left and right, with other signals."""
+    net = tiny_city.network(folder, *signals)
+    net.write_text(network(net.read_text()))
+    (folder / "cars.rou.xml").write_text(CARS)
+    (folder / "more.add.xml").write_text(f"<additional>{contents(net)}</additional>")
+    more = f'<additional-files value="more.add.xml"/>{options}'
+    (folder / "city.sumocfg").write_text(CONFIG.replace("</input>", f"{more}</input>"))
+    own = "\n".join(f"{edge},{int(edge[0] in 'CD')}" for edge in edges_of(net))
+    (folder / "own.csv").write_text(f"edge,region\n{own}\n")
+    out = folder / "networks" / "x"
+    done = cosim(
+        "import",
+        folder / "city.sumocfg",
+        "--regions",
+        folder / "own.csv",
+        "--out",
+        out,
+        "--seeds",
+        1,
+    )
+    assert done.exit_code == 0, done.output + str(done.exception)
+    return folder / "scenarios" / "x"
+
+
+def edges_of(net):
+    return [edge.get("id") for edge in read_xml(net).iter("edge") if edge.get("function") is None]
+
+
+def told(folder):
+    """Everything that tells which gateways a command can hold, after two intervals."""
+    scenario = load_scenario(folder)
+    table = pd.read_csv(scenario.network.folder / "gateways.csv", keep_default_na=False)
+    with tiny_city.played(scenario, 2, CLOSED, chain_limit=0.0) as (plant, _, record):
+        leaks = plant.actuation.leaks()
+        return SimpleNamespace(
+            table=table,
+            controlled=(table["control"] == "controlled").to_numpy(),
+            loaded=(City(scenario).gateways["control"] == "controlled").to_numpy(),
+            commanded=~np.isnan(record.gateway_green[0]),
+            leaks=[gateway in leaks for gateway in plant.city.gateways],
+            flow=record.gateway_flow.sum(axis=0),
+            share=leaking_share(record, plant.city, leaks),
+            drawn=[gate.signal for gate in CityPicture.of(scenario, plant.city).gates],
+            verdict=scenario.network.controllable,
+        )
+
+
+CASES = {
+    "all alike": (nothing, plain, "", {"controlled"}),
+    "turn on red": (arrows, plain, "", {"turn on red"}),
+    "blinking": (everywhere("o"), plain, "", {"blinking"}),
+    "switched off": (everywhere("O"), plain, "", {"switched off"}),
+    "off programme": (off, plain, "", {"switched off"}),
+    "off option": (nothing, plain, '<tls.all-off value="true"/>', {"switched off"}),
+    "timetable": (timetable, plain, "", {"programme follows a timetable"}),
+    "last programme": (ordinary_at_last, plain, "", {"controlled"}),
+    "one lane free": (nothing, one_lane_free, "", {"controlled", "no signal on some lanes"}),
+    "queue model": (
+        nothing,
+        plain,
+        '<mesosim value="true"/>',
+        {"mesoscopic model without junction control"},
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_one_word_for_every_gateway(tmp_path, case):
+    """Table, verdict, map and run agree on which gateways a command can hold."""
+    contents, network, options, expected = CASES[case]
+    seen = told(imported(tmp_path, contents, network, options))
+    at_signals = seen.table["control"] != "no signal"
+    assert set(seen.table["control"][at_signals]) == expected
+    assert (seen.loaded == seen.controlled).all()
+    assert (seen.commanded == seen.controlled).all()
+    assert (np.array(seen.leaks) == ~seen.controlled).all()
+    assert any(seen.drawn) == seen.controlled.any() == seen.verdict.any()
+    free = seen.flow[~seen.controlled].sum() / seen.flow.sum()
+    assert seen.share == pytest.approx(free)
+    assert (seen.share > 0.5) == (case not in ("all alike", "last programme"))
+
+
+def test_turns_on_red_leak_and_the_other_gates_hold(tmp_path):
+    """SUMO's own signals with turns on red: right turns pass closed gates, all others are held."""
+    folder = imported(tmp_path, signals=ARROWS)
+    seen = told(folder)
+    kinds = set(seen.table["control"])
+    assert kinds == {"controlled", "turn on red"}
+    scenario = load_scenario(folder)
+    with tiny_city.played(scenario, 2, OPEN, chain_limit=0.0) as (_, _, record):
+        free = record.gateway_flow.sum(axis=0)
+    assert seen.flow[seen.controlled].sum() < 0.5 * free[seen.controlled].sum()
+
+
+@pytest.mark.parametrize("contents", [arrows, off, timetable, everywhere("o")])
+def test_a_whole_run(tmp_path, contents):
+    """Without words about broken rules; a timetable may cut the green of a programme short."""
+    scenario, out = imported(tmp_path, contents), tmp_path / "out"
+    text = run_controllers(scenario, ["no-control"], steps=3, out=out)
+    assert "break their rules" not in text
+    row = pd.read_csv(out / "runs.csv").iloc[0]
+    assert row.signal_violations == 0
+    assert row.leaking_share > 0.5
+
+
+def test_max_pressure_runs_signals_with_turns_on_red(tmp_path):
+    scenario = load_scenario(imported(tmp_path, signals=ARROWS))
+    with tiny_city.played(scenario, 2, OPEN, signals="max-pressure") as (plant, _, record):
+        assert len(plant.steered) == 12  # without those at the corners
+        assert record.gateway_flow.sum() > 0.0
+
+
+@pytest.mark.parametrize(
+    "contents, reason",
+    [
+        (everywhere("o"), "(blinking: 4)"),
+        (off, "(switched off: 4)"),
+        (one_phase, "(fewer than two green phases: 4)"),
+        (red_and_yellow, "(light u: 4)"),
+    ],
+)
+def test_max_pressure_says_why_it_cannot_run(tmp_path, contents, reason):
+    done = cosim(
+        *("run", imported(tmp_path, contents), "--controller", "max-pressure", "--steps", 1),
+        *("--out", tmp_path / "out"),
+    )
+    assert done.exit_code != 0
+    assert f"none of the 4 signals here is one {reason}; choose fixed" in done.stderr
+
+
+@pytest.mark.parametrize(
+    "states, links, expected",
+    [
+        (("Gr", "yr", "rG"), (0,), ""),
+        (("Gr", "yr", "ug"), (0, 1), ""),
+        (("Gr", "sr", "rG"), (0,), "turn on red"),
+        (("Gr", "sr", "rG"), (1,), ""),
+        (("GG", "Gs"), (0, 1), "turn on red"),
+        (("Gr", "or"), (0,), "blinking"),
+        (("OG", "Or"), (0,), "switched off"),
+        (("rG", "rr"), (0,), "never green"),
+        (("rG", "rr"), (0, 1), ""),
+        (("XG", "rr"), (0,), "light X"),
+        ((), (0,), "never green"),
+    ],
+)
+def test_the_lights_that_a_command_can_hold(states, links, expected):
+    assert free_light(states, links) == expected

@@ -1,0 +1,88 @@
+"""The next region of drivers, by shares and travel times worked out by hand."""
+
+import math
+
+import numpy as np
+import pytest
+
+from cosim.plant.routes import Choice
+from cosim.plant.shares import MEMORY, SHARE_PENALTY_S, Shares, assigned, shifted
+
+HALF = (0.5, 0.5)
+
+
+@pytest.mark.parametrize(
+    "wish, own, theta, expected",
+    [
+        ((0.9, 0.1), HALF, HALF, (0.9, 0.1)),
+        ((1.0, 0.0), HALF, (0.25, 0.75), (0.5, 0.5)),
+        ((0.2, 0.8), HALF, (1.0, 0.0), (1.0, 0.0)),
+        ((0.6, 0.4, 0.0), (0.5, 0.3, 0.2), (0.0, 0.4, 0.6), (0.0, 0.52, 0.48)),
+    ],
+    ids=["as they are", "half of them", "all of them", "freed by how much theta raises"],
+)
+def test_theta_shifts_wishes(wish, own, theta, expected):
+    assert shifted(wish, own, theta) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    "times, shares, given, expected",
+    [
+        ((100.0, 110.0), HALF, (0.0, 0.0), 0),
+        ((100.0, 110.0), HALF, (1.0, 0.0), 1),
+        ((100.0, 100.0 + SHARE_PENALTY_S), HALF, (1.0, 0.0), 0),
+        ((100.0, 110.0), (0.0, 1.0), (0.0, 0.0), 1),
+        ((math.inf, 110.0), HALF, (0.0, 9.0), 1),
+        ((math.inf, 110.0), (1.0, 0.0), (0.0, 0.0), 1),
+        ((100.0, 100.0), HALF, (0.0, 0.0), 0),
+    ],
+    ids=[
+        "fastest",
+        "behind",
+        "not far behind",
+        "no share",
+        "too long",
+        "only share too long",
+        "tie",
+    ],
+)
+def test_the_cheapest_next_region_is_assigned(times, shares, given, expected):
+    assert assigned(times, shares, given) == expected
+
+
+def shares_of(theta):
+    """Return shares of drivers from region 0 to 3, half of whom go by 1 without guidance."""
+    own, splits = np.zeros((2, 4, 4, 4))
+    own[0, 1:3, 3] = HALF
+    splits[0, 1:3, 3] = theta
+    shares = Shares(own)
+    shares.command(splits)
+    return shares
+
+
+def next_region(shares, *times, exists=(True, True), limit=math.inf):
+    choices = [Choice(time, there, list) for time, there in zip(times, exists, strict=True)]
+    return shares.next_region(0, np.array([1, 2]), 3, choices, limit)
+
+
+def test_a_region_without_a_route_leaves_its_share_to_others():
+    assert next_region(shares_of((0.25, 0.75)), 100.0, math.inf, exists=(True, False)) == 0
+    assert next_region(shares_of(HALF), math.inf, math.inf, exists=(False, False)) is None
+
+
+def test_a_region_beyond_the_limit_gets_nobody_although_theta_says_so():
+    assert next_region(shares_of((0.0, 1.0)), 100.0, 150.0, limit=160.0) == 1
+    assert next_region(shares_of((0.0, 1.0)), 100.0, 150.0, limit=140.0) == 0
+
+
+def test_a_driver_who_is_assigned_anew_counts_no_more_for_the_region_before():
+    shares = shares_of((0.25, 0.75))  # all wish to go by 1, half of them shall
+    shares.assign((0, 1, 3))
+    interval = shares.interval
+    assert next_region(shares, 100.0, 101.0) == 1
+    shares.command(shares._theta)
+    assert shares._given[0, 1, 3] == MEMORY
+    shares.withdraw((0, 1, 3), interval)
+    assert shares._given[0, 1, 3] == pytest.approx(0.0)
+    assert shares.realised.sum() == 0
+    assert next_region(shares, 100.0, 101.0) == 0
