@@ -14,8 +14,10 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from cosim.plant.gates import MIN_GREEN_S, least_times
-from cosim.plant.max_pressure import MAX_GREEN_S, Roads, stages_of, transition
+from cosim.plant.max_pressure import MAX_GREEN_S
+from cosim.plant.pressure import Roads
 from cosim.plant.settings import Settings, own_files, settings
+from cosim.plant.stages import stages_of, transition
 from cosim.sumo import recorded_trips as recorded
 from cosim.sumo.net import City, city_of
 from cosim.sumo.session import Phase
