@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from cosim.evaluation import evaluate as evaluation
 from cosim.evaluation import model_validation, results
 from cosim.evaluation.identify import identify as identify
+from cosim.evaluation.links import write_links
 from cosim.evaluation.runs import runs_of
 from cosim.evaluation.signal_proof import sheets
 from cosim.evaluation.simulate import Simulation, simulate
@@ -422,6 +423,14 @@ def get(name: str | None, out: Path | str | None = None) -> str:
     if name is None:
         return cities.listed()
     return cities.get(name, Path("cities", name) if out is None else Path(out))
+
+
+def links(scenario: ScenarioLike, out: Path | str | None = None) -> Path:
+    """Write the streets of a city for nmfd.LinkPlant; return the file.
+
+    out: file, SCENARIO/links.npz if None
+    """
+    return write_links(loaded(scenario), None if out is None else Path(out))
 
 
 def catalogue() -> dict[str, dict[str, str]]:

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from nmfd.metrics import summary, total_time_spent
     from nmfd.model.mfd import Cubic, Mfd, PiecewiseLinear, trapezoid
     from nmfd.model.planning import PlanningModel
+    from nmfd.model.links.plant import LinkPlant
     from nmfd.model.plant import AcyclicPlant, NmfdPlant
     from nmfd.model.regional_model import RegionalModel, load_network
     from nmfd.model.scenario import Scenario
@@ -66,6 +67,7 @@ _MODULES = {
     "controllers.rules": ("Greedy", "NoControl", "PiGating", "Probing", "RouteGuidance"),
     "errors": ("InputError",),
     "metrics": ("summary", "total_time_spent"),
+    "model.links.plant": ("LinkPlant",),
     "model.mfd": ("Cubic", "Mfd", "PiecewiseLinear", "trapezoid"),
     "model.planning": ("PlanningModel",),
     "model.plant": ("AcyclicPlant", "NmfdPlant"),

@@ -1,8 +1,7 @@
-"""The network of the link model (nmfd.model.links) from a SUMO network, static routes and signal
-programmes.
+"""Network of the link model (nmfd.model.links), from a SUMO network and static routes.
 
-A link has the lanes of a street that share movements. Shares of turns, origins and ends of trips are
-counted on the static routes.
+A link has the lanes of a street that share movements. Shares of turns, origins and ends of trips
+are counted on the static routes. Lights follow the signal programmes.
 """
 
 import itertools
@@ -14,7 +13,6 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from cosim.plant.gates import MIN_GREEN_S, least_times
-from cosim.plant.max_pressure import MAX_GREEN_S
 from cosim.plant.pressure import Roads
 from cosim.plant.settings import Settings, own_files, settings
 from cosim.plant.stages import stages_of, transition
@@ -27,12 +25,14 @@ from cosim.sumo.xml_files import attribute, network_root, read_xml
 from nmfd.errors import InputError
 from nmfd.model.links.network import FILE, LinkNetwork
 from nmfd.model.scenario import Scenario
+from nmfd.runs import shipped
 
 Route: TypeAlias = tuple[str, ...]
 Movement: TypeAlias = tuple[str, str]  # street, next street
 Turn: TypeAlias = tuple[Movement, int]  # and the link entered
 Lanes: TypeAlias = frozenset[int]
-CAPACITY = {"G": 1.0, "g": 1.0, "o": 1.0, "O": 1.0, "s": 0.5}  # light -> share of the saturation flow
+# Light -> share of the saturation flow.
+CAPACITY = {"G": 1.0, "g": 1.0, "o": 1.0, "O": 1.0, "s": 0.5}
 GIVES_WAY = frozenset("gso")  # lights
 MINOR = frozenset("m=so")  # states of connections without a signal that must give way
 
@@ -40,13 +40,14 @@ MINOR = frozenset("m=so")  # states of connections without a signal that must gi
 class Connection(NamedTuple):
     """A lane of a movement, and the lane that it leads to.
 
-    signal: None without one; index: in the signal's state
+    signal: None without one
+    place: in the signal's state
     """
 
     lane: int
     entered: int
     signal: str | None
-    index: int
+    place: int
     state: str
 
 
@@ -69,7 +70,9 @@ def write_links(scenario: Scenario, path: Path | None = None) -> Path:
 
     Raises: InputError if a route leads where no connection is
     """
-    path = path or (scenario.folder or Path()) / FILE
+    if path is None:
+        folder = scenario.folder or Path()
+        path = shipped.beside(folder, FILE, "--out FILE", scenario=True)
     link_network(scenario).write(path)
     return path
 
@@ -129,7 +132,7 @@ def _read_connections(city: City) -> dict[Movement, list[Connection]]:
                     lane=int(lane),
                     entered=int(entered),
                     signal=element.get("tl"),
-                    index=int(element.get("linkIndex", "-1")),
+                    place=int(element.get("linkIndex", "-1")),
                     state=element.get("state", "M"),
                 )
                 connections[source, target].append(connection)
@@ -148,15 +151,20 @@ def _programmes(city: City, additional: Iterable[Path]) -> dict[str, Programme]:
 
 def _foes(city: City) -> set[tuple[Movement, Movement]]:
     """Return pairs of movements of which the first gives way to the second."""
-    movement_over = {edge: move for move, way in city.over.items() for edge in way}
+    movement_over = {}
+    for movement, way in city.over.items():
+        for edge in way:
+            movement_over[edge] = movement
     pairs = set()
     with network_root(city.net_file) as root:
         for junction in root.iterfind("junction"):
             inner = [lane.rpartition("_")[0] for lane in (junction.get("intLanes") or "").split()]
             movements = [movement_over.get(edge) for edge in inner]
             for request in junction.iterfind("request"):
+                own = None
                 number = int(attribute(request, "index"))
-                own = movements[number] if number < len(movements) else None
+                if number < len(movements):
+                    own = movements[number]
                 # The last bit is that of the first movement.
                 bits = reversed(attribute(request, "response"))
                 for other, bit in zip(movements, bits, strict=False):
@@ -168,8 +176,10 @@ def _foes(city: City) -> set[tuple[Movement, Movement]]:
 class _Streets:
     """Links of the streets on some routes.
 
-    movements: sorted; connections: of each
-    links: street and lanes of each, shortest first; link_of: movement -> its link
+    movements: sorted
+    connections: of each
+    links: street and lanes of each, shortest first
+    link_of: movement -> its link
     """
 
     def __init__(
@@ -180,27 +190,32 @@ class _Streets:
         where: str,
     ):
         """where: file that errors name. Raises InputError if a connection is missing."""
-        self.city, self.connections = city, connections
+        self.city = city
+        self.connections = connections
         movements = {pair for route in routes for pair in itertools.pairwise(route)}
         for movement in sorted(movements.difference(connections)):
             problem = "no connection leads from {} to {}".format(*movement)
             raise InputError(f"{where}: sumo.routes: {problem}; give routes of this network")
         self.movements = sorted(movements)
-        groups = defaultdict[str, list[Lanes]](list)
+        groups: dict[str, list[Lanes]] = {}
         for street in sorted({street for route in routes for street in route}):
             groups[street] = [frozenset({lane}) for lane in _lanes(city, street)]
         for street, onward in self.movements:
             lanes = {connection.lane for connection in connections[street, onward]}
-            joined = [group for group in groups[street] if group & lanes]
-            groups[street] = [group for group in groups[street] if not group & lanes]
-            groups[street].append(frozenset().union(*joined))
-        links = [(street, lanes) for street, some in groups.items() for lanes in some]
+            joined = frozenset[int]()
+            apart = []
+            for group in groups[street]:
+                if group & lanes:
+                    joined |= group
+                else:
+                    apart.append(group)
+            groups[street] = [*apart, joined]
+        links = [(street, group) for street, some in groups.items() for group in some]
         self.links = sorted(links, key=lambda link: (city.length[link[0]], link[0], min(link[1])))
-        self._number = {
-            (street, lane): number
-            for number, (street, lanes) in enumerate(self.links)
-            for lane in lanes
-        }
+        self._number = {}
+        for number, (street, group) in enumerate(self.links):
+            for lane in group:
+                self._number[street, lane] = number
         self.link_of = {
             (street, onward): self._number[street, connections[street, onward][0].lane]
             for street, onward in self.movements
@@ -216,8 +231,10 @@ class _Streets:
         return {link: len(self.links[link][1]) / total for link in sorted(entered)}
 
     def lanes(self, turn: Turn) -> list[int]:
-        """Return the lanes of a movement that lead to a link, or all if none does: then vehicles
-        change lanes behind the junction."""
+        """Return the lanes of a movement that lead to a link.
+
+        They are all its lanes if none leads there: vehicles change lanes behind the junction.
+        """
         movement, link = turn
         connections = self.connections[movement]
         lanes = {one.lane for one in connections if one.entered in self.links[link][1]}
@@ -231,16 +248,18 @@ def _lanes(city: City, street: str) -> list[int]:
 class _Counts:
     """Vehicles on the routes.
 
-    cells: by (turn, destination); flows: by movement
+    cells: by (turn, destination)
+    flows: by movement
     entering, ending: by (link, destination), those that do not begin there, and that end there
-    beginning: by (link, destination), trips that begin there; trips: by (region, destination)
+    beginning: by (link, destination), trips that begin there
+    trips: by (region, destination)
     """
 
     def __init__(self, streets: _Streets, routes: Iterable[Route]):
-        self.cells = Counter[tuple[Turn, int]]()
+        self.cells = defaultdict[tuple[Turn, int], float](float)
         self.flows = Counter[Movement]()
-        self.entering = Counter[tuple[int, int]]()
-        self.ending = Counter[tuple[int, int]]()
+        self.entering = defaultdict[tuple[int, int], float](float)
+        self.ending = defaultdict[tuple[int, int], float](float)
         self.beginning = Counter[tuple[int, int]]()
         self.trips = Counter[tuple[int, int]]()
         region_of = streets.city.region_of
@@ -268,9 +287,7 @@ def _link_arrays(streets: _Streets) -> dict[str, np.ndarray]:
     for movement, link in streets.link_of.items():
         length = sum(city.inside.get(edge, 0.0) for edge in city.over.get(movement, ()))
         behind[link].append((city.turn_time[movement], length))
-    over = np.array(
-        [np.mean(behind.get(link, [(0.0, 0.0)]), axis=0) for link in range(len(names))]
-    )
+    over = np.array([np.mean(behind.get(link, [(0.0, 0.0)]), axis=0) for link in range(len(names))])
     length = np.array([city.length[street] for street in names])
     return {
         "street": np.array(names),
@@ -291,7 +308,8 @@ def _movement_arrays(
     """Return the arrays of movements, their lights from `begin` (s) on, and right of way."""
     city = streets.city
     number = {movement: n for n, movement in enumerate(streets.movements)}
-    speeds, lights = [], []
+    speeds = []
+    lights = []
     for movement in streets.movements:
         first = next(iter(city.over.get(movement, ())), "")
         speed = city.speed[movement[0]]
@@ -301,12 +319,12 @@ def _movement_arrays(
         shown = [_shown(one, programmes, begin) for one in streets.connections[movement]]
         cycle = max(len(one.light) for one in shown)
         light = np.mean([np.resize(one.light, cycle) for one in shown], axis=0)
-        lights.append(Lights(light, np.mean([np.resize(one.yields, cycle) for one in shown], axis=0)))
-    pairs = [
-        (number[movement], number[foe])
-        for movement, foe in sorted(_foes(city))
-        if movement in number and foe in number
-    ]
+        yields = np.mean([np.resize(one.yields, cycle) for one in shown], axis=0)
+        lights.append(Lights(light, yields))
+    pairs = []
+    for movement, foe in sorted(_foes(city)):
+        if movement in number and foe in number:
+            pairs.append((number[movement], number[foe]))
     cycles = [len(one.light) for one in lights]
     yielding, foe_of = np.array(pairs, dtype=int).reshape(-1, 2).T
     return {
@@ -322,18 +340,17 @@ def _movement_arrays(
     }
 
 
-def _shown(
-    connection: Connection, programmes: Mapping[str, Programme], begin: float
-) -> Lights:
+def _shown(connection: Connection, programmes: Mapping[str, Programme], begin: float) -> Lights:
     """Return the lights of a connection; one second if it has no signal."""
-    if connection.signal not in programmes:
+    programme = programmes.get(connection.signal or "")
+    if programme is None:
         return Lights(np.ones(1), np.array([float(connection.state in MINOR)]))
-    offset, phases = programmes[connection.signal]
+    offset, phases = programme
     ends = np.cumsum([phase.duration for phase in phases])
     cycle = max(round(ends[-1]), 1)
     clock = (begin - offset + np.arange(cycle) + 0.5) % ends[-1]
     number = np.searchsorted(ends, clock, side="right")
-    states = [phases[n].state[connection.index] for n in number]
+    states = [phases[n].state[connection.place] for n in number]
     light = np.array([CAPACITY.get(state, 0.0) for state in states])
     return Lights(light, np.array([float(state in GIVES_WAY) for state in states]))
 
@@ -342,23 +359,24 @@ def _vehicle_arrays(streets: _Streets, counts: _Counts) -> dict[str, np.ndarray]
     """Return the arrays of turns, entries and cells."""
     region_of = streets.city.region_of
     free_time = _link_arrays(streets)["free_time"]
-    lane_number, number_of = {}, {movement: n for n, movement in enumerate(streets.movements)}
+    number_of = {movement: number for number, movement in enumerate(streets.movements)}
+    lane_number: dict[tuple[str, int], int] = {}
     for street, lanes in streets.links:
         for lane in sorted(lanes):
             lane_number[street, lane] = len(lane_number)
     turns = sorted({turn for turn, _ in counts.cells})
     turn_number = {turn: number for number, turn in enumerate(turns)}
-    serving = [
-        (number, lane_number[turn[0][0], lane])
-        for number, turn in enumerate(turns)
-        for lane in streets.lanes(turn)
-    ]
+    serving = []
+    for number, turn in enumerate(turns):
+        street, _ = turn[0]
+        serving += [(number, lane_number[street, lane]) for lane in streets.lanes(turn)]
     served, server = np.array(serving).T
     entries = sorted(
         {*counts.entering, *counts.beginning}, key=lambda entry: (free_time[entry[0]], entry)
     )
     entry_number = {entry: number for number, entry in enumerate(entries)}
-    origin, ending = [], []
+    origin = []
+    ending = []
     for link, destination in entries:
         trips = counts.trips[region_of[streets.links[link][0]], destination]
         origin.append(counts.beginning[link, destination] / max(trips, 1))
@@ -390,24 +408,27 @@ def _stage_arrays(
     """Return the arrays of the signals that can choose their stages."""
     number_of = {signal.id: number for number, signal in enumerate(signals)}
     phases = [stages_of(signal) for signal in signals]
-    count, most = len(signals), max(map(len, phases), default=1)
+    count = len(signals)
+    most = max(map(len, phases), default=1)
     own = np.full(len(streets.movements), -1)
-    light, yields = np.zeros((2, len(streets.movements), most))
+    light = np.zeros((len(streets.movements), most))
+    yields = np.zeros_like(light)
     for row, movement in enumerate(streets.movements):
         here = streets.connections[movement]
-        own[row] = number = number_of.get(here[0].signal or "", -1)
-        for stage, phase in enumerate(phases[number] if number >= 0 else ()):
-            states = [signals[number].phases[phase].state[one.index] for one in here]
+        number = number_of.get(here[0].signal or "", -1)
+        if number < 0:
+            continue
+        own[row] = number
+        for stage, phase in enumerate(phases[number]):
+            states = [signals[number].phases[phase].state[one.place] for one in here]
             light[row, stage] = np.mean([CAPACITY.get(state, 0.0) for state in states])
             yields[row, stage] = np.mean([state in GIVES_WAY for state in states])
     loss = np.zeros((count, most, most))
-    low, high = np.full((count, most), MIN_GREEN_S), np.full((count, most), MAX_GREEN_S)
+    low = np.full((count, most), MIN_GREEN_S)
     for row, (signal, numbers) in enumerate(zip(signals, phases, strict=True)):
         least = least_times(signal.phases)
         for stage, phase in enumerate(numbers):
             low[row, stage] = max(least[phase], MIN_GREEN_S)
-            planned = min(1.5 * signal.phases[phase].duration, MAX_GREEN_S)
-            high[row, stage] = max(planned, low[row, stage])
             for other, coming in enumerate(numbers):
                 if other != stage:
                     between = transition(signal.phases, phase, coming)
@@ -419,7 +440,6 @@ def _stage_arrays(
         "stage_yields": yields,
         "stage_loss": loss,
         "stage_least": low,
-        "stage_most": high,
         **_pressure_arrays(streets, Roads(streets.city, signals, counts.flows), phases),
     }
 
@@ -432,15 +452,20 @@ def _pressure_arrays(
     part = np.zeros(len(roads.lanes))
     for link, (street, lanes) in enumerate(streets.links):
         for lane in lanes:
-            place = roads.lane_number[f"{street}_{lane}"]
-            link_of_lane[place], part[place] = link, 1.0 / len(lanes)
+            number = roads.lane_number[f"{street}_{lane}"]
+            link_of_lane[number] = link
+            part[number] = 1.0 / len(lanes)
     row_of = np.full(len(roads.movements), -1)
     for row, movement in enumerate(streets.movements):
         if movement in roads.movements:
             row_of[roads.movements[movement]] = row
     most = max(map(len, phases), default=1)
-    place = [number * most + n for number, some in enumerate(phases) for n in range(len(some))]
-    weights, gain = roads.weights.tocoo(), roads.gain.tocoo()
+    place: list[int] = []
+    for number, some in enumerate(phases):
+        first = number * most
+        place += range(first, first + len(some))
+    weights = roads.weights.tocoo()
+    gain = roads.gain.tocoo()
     weighed = (row_of[weights.row] >= 0) & (link_of_lane[weights.col] >= 0)
     gained = row_of[gain.col] >= 0
     return {

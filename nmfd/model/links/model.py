@@ -1,53 +1,55 @@
 """The link model of a city: B rollouts under commands by control interval, differentiable."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from nmfd.model.links.flows import LEAST, Flows, Numbers, Tensor, Traffic
+from nmfd.arrays import PerTurn
+from nmfd.model.links.choices import Choices
+from nmfd.model.links.drivers import Drivers
+from nmfd.model.links.flows import LEAST, Flows, Numbers, Traffic
 from nmfd.model.links.network import LinkNetwork
-from nmfd.model.links.signals import FIXED, MAX_PRESSURE, Gates, Lights, Programmes, Stages, StageSignals
+from nmfd.model.links.signals import (
+    MAX_PRESSURE,
+    Gates,
+    Lights,
+    MaxPressure,
+    Programmes,
+    Stages,
+)
 from nmfd.tensors import PerPair, PerRegion
+from nmfd.tensors import PerTurn as Turns
 
 OPEN_SHARE = 0.95  # of what a boundary can let through; above it a gate is open
 
 
-@dataclass(frozen=True, kw_only=True)
-class Choices:
-    """What the model takes from the table [sumo] of a scenario, with its names.
-
-    signals: "fixed", "actuated" or "max-pressure"; lookahead: of max-pressure (s)
-    gateways_fixed: signals with gates stay fixed if the others are actuated
-    chain_limit: share of a link's room beyond which no gate holds vehicles there; 0: no limit (-)
-    """
-
-    signals: str = FIXED
-    lookahead: float = 1.0
-    gateways_fixed: bool = False
-    chain_limit: float = 0.6
-
-
 class Commands(NamedTuple):
-    """Commands of one control interval; None: no limit.
+    """Commands of one control interval; None: no limit, and drivers on their own ways.
 
     gates: share of what each boundary can let through (-, (B, R, R), [i, h] from i to h)
     metering: largest rate of trips that may begin in each region (veh/s, (B, R))
+    splits: share of the vehicles in i bound for j that head for h (-, (B, R, R, R), [i, h, j])
+    prices: added share of the travel time through each region (-, (B, R))
     """
 
     gates: PerPair | None = None
     metering: PerRegion | None = None
+    splits: Turns | None = None
+    prices: PerRegion | None = None
 
 
 class LinkState(NamedTuple):
     """State of B rollouts at the beginning of a control interval.
 
-    interval: its number; spent: time spent so far (veh s, (B,))
-    used: of the gates' windows; stages: of signals that choose their stages
-    realised: share of green that each boundary was given in the last interval (-, (B, R, R))
+    interval: its number
+    used: of the gates' windows; stages: of max-pressure
+    spent: time spent so far (veh s, (B,))
+    present: vehicles on each link, summed over the last interval (veh s, (B, L))
+    gone: vehicles that left each link in it (veh, (B, L))
+    realised: share of green that each boundary was given in it (-, (B, R, R))
     """
 
     interval: int
@@ -55,6 +57,8 @@ class LinkState(NamedTuple):
     used: Tensor
     stages: Stages | None
     spent: Tensor
+    present: Tensor
+    gone: Tensor
     realised: Tensor
 
 
@@ -66,40 +70,52 @@ class LinkModel:
         network: LinkNetwork,
         step: float,
         *,
-        numbers: Numbers = Numbers(),
-        choices: Choices = Choices(),
+        nominal: PerTurn | None = None,
+        numbers: Numbers | None = None,
+        choices: Choices | None = None,
         dt: float = 3.0,
         dtype: torch.dtype = torch.float32,
         device: str = "cpu",
     ):
-        """step: control interval (s), a multiple of dt (s), which is a whole number"""
-        self.network, self.choices, self.step = network, choices, step
-        self.flows = flows = Flows(network, numbers, dt=dt, dtype=dtype, device=device)
+        """step: control interval (s), a multiple of dt (s), which is a whole number
+        nominal: split ratios without guidance (-, (R, R, R))
+        """
+        self.network = network
+        self.step = step
+        self._choices = choices or Choices()
+        self.flows = Flows(network, numbers or Numbers(), dt=dt, dtype=dtype, device=device)
         self._steps = round(step / dt)
-        self.gates = Gates(flows, by_cycle=choices.signals == MAX_PRESSURE)
-        self._programmes = Programmes(flows, self.gates.opens)
-        self._stages = None
-        if choices.signals != FIXED:
-            self._stages = StageSignals(
-                flows, choices.signals, choices.lookahead, gateways_fixed=choices.gateways_fixed
-            )
-        regions, region = network.regions, network.region
+        by_pressure = self._choices.signals == MAX_PRESSURE
+        self._gates = Gates(self.flows, by_cycle=by_pressure)
+        self._programmes = Programmes(self.flows, self._gates.opens)
+        self._pressure = None
+        if by_pressure:
+            self._pressure = MaxPressure(self.flows, self._choices.lookahead)
+        self._drivers = Drivers(self.flows, nominal)
+        self._number()
+
+    def _number(self) -> None:
+        """Set regions and boundaries of entries, links and gates."""
+        flows = self.flows
+        network = self.network
+        regions = network.regions
+        region = network.region
         self._origin = flows.values(network.origin)
         entry_region = region[network.entry_link]
         self._pair_of_entry = flows.places(entry_region * regions + network.destination)
         self._region_of_entry = flows.places(entry_region)
         self._region_of_link = flows.places(region)
-        entered = np.zeros(len(network.cycle), dtype=int)
+        entered = np.zeros(flows.movements, dtype=int)
         entered[network.turn_movement] = region[network.turn_link]
-        gated = self.gates.movements
-        boundary = region[network.movement_link[gated]] * regions + entered[gated]
+        gated = self._gates.movements
+        link = network.movement_link[gated]
+        boundary = region[link] * regions + entered[gated]
         self._boundary_of_gate = flows.places(boundary)
-        self._link_of_gate = flows.places(network.movement_link[gated])
-        lanes_of = np.bincount(network.turn_movement[network.served], minlength=len(network.cycle))
-        capacity = lanes_of[gated]
-        total = np.bincount(boundary, capacity, regions**2)[boundary]
-        self._weight_of_gate = flows.values(capacity / total)
-        self._share = flows.values(network.cell_share).unsqueeze(0)
+        self._link_of_gate = flows.places(link)
+        served = network.turn_movement[network.served]
+        lanes = np.bincount(served, minlength=flows.movements)[gated]
+        total = np.bincount(boundary, lanes, regions**2)[boundary]
+        self._weight_of_gate = flows.values(lanes / total)
 
     def start(self, batch: int) -> LinkState:
         """Return the empty city at the beginning of interval 0."""
@@ -108,72 +124,107 @@ class LinkModel:
         return LinkState(
             interval=0,
             traffic=traffic,
-            used=self.gates.start(batch),
-            stages=None if self._stages is None else self._stages.start(batch),
-            spent=torch.zeros_like(traffic.completed),
-            realised=self._share.new_ones(batch, regions, regions),
+            used=self._gates.start(batch),
+            stages=None if self._pressure is None else self._pressure.start(batch),
+            spent=traffic.inside.new_zeros(batch),
+            present=torch.zeros_like(traffic.inside),
+            gone=torch.zeros_like(traffic.inside),
+            realised=traffic.inside.new_ones(batch, regions, regions),
         )
 
     def advance(self, state: LinkState, demand: PerPair, commands: Commands) -> LinkState:
-        """Return the state one control interval later; demand: trips that are due (veh/s, (B, R, R))"""
+        """Return the state one control interval later.
+
+        demand: trips that are due (veh/s, (B, R, R))
+        """
         if torch.is_grad_enabled():
             return checkpoint(self._advance, state, demand, commands, use_reentrant=False)
         return self._advance(state, demand, commands)
 
     def _advance(self, state: LinkState, demand: PerPair, commands: Commands) -> LinkState:
-        flows, dt = self.flows, self.flows.dt
-        traffic, used, stages, spent = state.traffic, state.used, state.stages, state.spent
-        due = demand.reshape(len(demand), -1).index_select(1, self._pair_of_entry) * self._origin * dt
-        begin = state.interval * self.step
-        light, yields, opens = self._programmes.read(begin, self._steps)
-        opens = opens[:, self.gates.movements]
-        share, mean_share = None, 0.0
+        flows = self.flows
+        dt = flows.dt
+        traffic = state.traffic
+        used = state.used
+        stages = state.stages
+        due = demand.flatten(1).index_select(1, self._pair_of_entry) * self._origin * dt
+        light, yields, opens = self._programmes.read(state.interval * self.step, self._steps)
+        opens = opens[:, self._gates.movements]
+        ways = self._ways(state, commands)
+        share = None
+        mean_share = torch.zeros_like(used)
+        present = torch.zeros_like(traffic.inside)
+        outside = torch.zeros_like(traffic.due)
         for n in range(self._steps):
-            held, released = self._metered(traffic.held, due, commands.metering)
-            traffic = traffic._replace(held=held)
+            traffic, released = self._metered(traffic, due, commands.metering)
             lights = Lights(light[n : n + 1], yields[n : n + 1])
+            if self._pressure is not None and stages is not None:
+                number = state.interval * self._steps + n
+                stages, lights = self._pressure.step(number, stages, traffic.inside, lights)
+            shown = lights.light
             if commands.gates is not None:
                 share = self._gate_shares(commands.gates, traffic.inside)
                 mean_share = mean_share + share / self._steps
-            if self._stages is not None and stages is not None:
-                number = state.interval * self._steps + n
-                closed = torch.zeros_like(traffic.passed)
-                stages, lights = self._stages.step(number, stages, traffic, closed, lights)
-            shown = lights.light
-            if share is not None:
-                used, shown = self.gates.limit(used, shown.expand(len(used), -1), opens[n], share)
-            traffic = flows.step(traffic, released, shown, lights.yields, self._share)
-            spent = spent + dt * (traffic.inside.sum(1) + traffic.outside.sum(1))
+                shown = shown.expand(len(used), -1)
+                used, shown = self._gates.limit(used, shown, opens[n], share)
+            traffic = flows.step(traffic, released, shown, lights.yields, ways)
+            present = present + traffic.inside
+            outside = outside + traffic.due
             if commands.metering is not None:
-                spent = spent + dt * traffic.held.sum(1)
+                outside = outside + traffic.held
         realised = state.realised
         if commands.gates is not None:
             realised = self._realised(commands.gates, mean_share)
-        return LinkState(state.interval + 1, traffic, used, stages, spent, realised)
+        before = state.traffic
+        gone = traffic.left[-1] - before.left[-1] + traffic.completed - before.completed
+        return LinkState(
+            interval=state.interval + 1,
+            traffic=traffic,
+            used=used,
+            stages=stages,
+            spent=state.spent + dt * (present.sum(1) + outside.sum(1)),
+            present=dt * present,
+            gone=gone,
+            realised=realised,
+        )
+
+    def _ways(self, state: LinkState, commands: Commands) -> Tensor:
+        """Return the shares of the cells (-, (B, C)) of an interval."""
+        choices = self._choices
+        drivers = self._drivers
+        if commands.splits is not None and commands.prices is None:
+            return drivers.mixed(drivers.by_splits(commands.splits), choices.compliance)
+        compliance = choices.rerouting
+        if choices.guided or commands.prices is not None:
+            compliance = choices.compliance
+        if compliance == 0.0:
+            return drivers.static
+        guided = drivers.by_times(state.present, state.gone, commands.prices)
+        return drivers.mixed(guided, compliance)
 
     def _metered(
-        self, held: Tensor, due: Tensor, metering: PerRegion | None
-    ) -> tuple[Tensor, Tensor]:
-        """Return the trips that are held back, and those that may begin, by entry (veh, (B, E))."""
-        held = held + due
+        self, traffic: Traffic, due: Tensor, metering: PerRegion | None
+    ) -> tuple[Traffic, Tensor]:
+        """Return the state, and the trips that may begin, by entry (veh, (B, E))."""
+        held = traffic.held + due
         if metering is None:
-            return torch.zeros_like(held), held
+            return traffic._replace(held=torch.zeros_like(held)), held
         by_region = self.flows.sums(held, self._region_of_entry, self.network.regions)
         share = (metering * self.flows.dt / by_region.clamp(min=LEAST)).clamp(max=1.0)
         released = held * share.index_select(1, self._region_of_entry)
-        return held - released, released
+        return traffic._replace(held=held - released), released
 
     def _gate_shares(self, gates: PerPair, inside: Tensor) -> Tensor:
         """Return the share of green of each gate (-, (B, gates)).
 
         As in cosim.plant.room, a gate opens while its street fills: from half the limit on.
         """
-        share = gates.reshape(len(gates), -1).index_select(1, self._boundary_of_gate)
+        share = gates.flatten(1).index_select(1, self._boundary_of_gate)
         share = torch.where(share >= OPEN_SHARE, 1.0, share)
-        if self.choices.chain_limit:
+        limit = self._choices.chain_limit
+        if limit:
             full = (inside / self.flows.storage).index_select(1, self._link_of_gate)
-            floor = (2.0 * full / self.choices.chain_limit - 1.0).clamp(0.0, 1.0)
-            share = torch.maximum(share, floor)
+            share = torch.maximum(share, (2.0 * full / limit - 1.0).clamp(0.0, 1.0))
         return share
 
     def _realised(self, gates: PerPair, share: Tensor) -> PerPair:

@@ -2,11 +2,12 @@
 
 from dataclasses import dataclass, fields
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 
 from nmfd.errors import InputError
-from nmfd.runs.files import atomic, check_file
+from nmfd.runs.files import atomic
 
 FILE = "links.npz"  # in the folder of a scenario
 
@@ -16,9 +17,8 @@ class LinkNetwork:
     """A city of L links, sorted by length.
 
     A link is a group of lanes of one street that share movements. A movement leads from a link to
-    another street, a turn to a link of that street. An entry is a link with a
-    destination region, a cell is a turn with one: vehicles are counted by these. All numbers are
-    places in the other arrays.
+    another street, a turn to a link of that street. An entry is a link with a destination region, a
+    cell is a turn with one: vehicles are counted by these. All numbers are places in other arrays.
 
     regions: number of regions
     street: names of the links' streets (L,)
@@ -33,13 +33,13 @@ class LinkNetwork:
     entry_link, destination: of each entry (E,), sorted by free_time
     ending: share of the vehicles of each entry whose trip ends in the link (E,)
     origin: share of the trips from the link's region to the destination that begin here (E,)
-    cell_turn, cell_entry, cell_onward: turn of each cell, the entry it leaves, and that it enters (C,)
+    cell_turn, cell_entry, cell_onward: turn of each cell, entry it leaves, entry it enters (C,)
     cell_share: share of the vehicles of its entry, of those whose trip goes on (C,)
     yielding, foe: pairs of a movement that gives way and the one that it gives way to (F,)
     cycle: length of each movement's programme (s) (M,)
     begin: place of its first second in `light` and `yields` (M,)
-    light: capacity in each second of the programmes, as a share of the saturation flow (all seconds,)
-    yields: 1 if the movement must give way in that second, else 0 (all seconds,)
+    light: capacity in each second of the programmes, as a share of the saturation flow
+    yields: 1 if the movement must give way in that second, else 0
     gated: True for movements over boundaries whose green commands limit (M,)
 
     Of the S signals whose stages can be chosen, with at most n stages:
@@ -48,11 +48,11 @@ class LinkNetwork:
     stages: number of stages of each signal (S,)
     stage_light, stage_yields: of each movement in each stage of its signal (M, n)
     stage_loss: time between two stages (s, (S, n, n))
-    stage_least, stage_most: green of each stage under actuation (s, (S, n))
-    pressure_movement, pressure_link, pressure_weight: vehicles on the link press, times the weight,
-        for the movement (any number of them)
-    gain_stage, gain_movement, gain: share of this pressure that the stage, counted as place in (S, n),
-        serves (any number of them)
+    stage_least: least green of each stage (s, (S, n))
+    pressure_movement, pressure_link, pressure_weight: vehicles on the link press, times the
+        weight, for the movement (any number of them)
+    gain_stage, gain_movement, gain: share of this pressure that the stage serves, a place in
+        (S, n) (any number of them)
     """
 
     regions: int
@@ -89,7 +89,6 @@ class LinkNetwork:
     stage_yields: np.ndarray
     stage_loss: np.ndarray
     stage_least: np.ndarray
-    stage_most: np.ndarray
     pressure_movement: np.ndarray
     pressure_link: np.ndarray
     pressure_weight: np.ndarray
@@ -100,8 +99,8 @@ class LinkNetwork:
     def write(self, path: Path) -> None:
         """Write the arrays to the .npz file `path`, whole or not at all."""
         arrays = {field.name: getattr(self, field.name) for field in fields(self)}
-        with atomic(path) as temporary:
-            np.savez_compressed(temporary, **arrays)
+        with atomic(path) as temporary, temporary.open("wb") as file:
+            np.savez_compressed(file, **arrays)
 
 
 def read_links(path: Path) -> LinkNetwork:
@@ -109,14 +108,13 @@ def read_links(path: Path) -> LinkNetwork:
 
     Raises: InputError if the file is missing or no network of this version
     """
-    remedy = "write one with: cosim links"
-    check_file(path, remedy)
+    remedy = "write it with 'cosim links'"
     try:
         with np.load(path) as file:
             arrays = {field.name: file[field.name] for field in fields(LinkNetwork)}
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; {remedy}") from None
-    except (OSError, KeyError, ValueError) as error:
-        raise InputError(f"{path}: is not a network of links ({error}); {remedy}") from None
+    except (OSError, KeyError, ValueError, BadZipFile) as error:
+        raise InputError(f"{path}: is no network of links ({error}); {remedy}") from None
     arrays["regions"] = int(arrays["regions"])
     return LinkNetwork(**arrays)

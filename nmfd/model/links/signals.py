@@ -1,9 +1,8 @@
-"""Signals of the link model: fixed programmes, stages by actuation or max-pressure, and gates.
+"""Signals of the link model: fixed programmes, stages chosen by max-pressure, and gates.
 
-A stage is a green phase of a programme. Actuated signals show their stages in turn, each until its
-queues are empty, between a least and a largest green. Max-pressure (Varaiya, 2013) chooses the
-stage with the highest pressure, as cosim.plant.max_pressure does, with the model's own queues. The
-choice has no derivative; the flows have one while the choices stay.
+A stage is a green phase of a programme. Max-pressure (Varaiya, 2013) chooses the stage with the
+highest pressure, as cosim.plant.max_pressure does, with the model's own queues. The choice has no
+derivative; the flows have one while the choices stay.
 
 A gate leaves a movement, of each window of green with the capacity W (s), the share u:
 
@@ -16,15 +15,17 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from nmfd.model.links.flows import LEAST, Flows, Tensor, Traffic
+from nmfd.model.links.flows import LEAST, Flows
 
 LEAST_GREEN_S = 5.0  # of a gated movement in each window of green
 DECISION_PERIOD_S = 5.0
 LONGEST_GREEN_S = 50.0  # under max-pressure while others wait
 LONGEST_RED_S = 120.0  # then a stage with vehicles comes first
 CALLED_VEH = 0.2  # vehicles that call a stage
-FIXED, ACTUATED, MAX_PRESSURE = "fixed", "actuated", "max-pressure"
+FIXED = "fixed"
+MAX_PRESSURE = "max-pressure"
 
 
 class Lights(NamedTuple):
@@ -55,30 +56,37 @@ class Stages(NamedTuple):
 
 
 class Gates:
-    """Limits the green of gated movements; its state is the capacity used in the window (s)."""
+    """Limits the green of gated movements; its state is the capacity used in the window (s).
+
+    movements: gated ones; opens: True in seconds of the programmes with which a window begins
+    """
 
     def __init__(self, flows: Flows, *, by_cycle: bool):
         """by_cycle: the window is the cycle, not a time of green"""
         network = flows.network
-        self._flows = flows
+        self._dt = flows.dt
         self.movements = np.flatnonzero(network.gated)
-        self.opens = np.zeros(len(network.light))  # seconds of the programmes: a window begins
-        whole, taken = np.ones(len(self.movements)), np.ones(len(self.movements))
+        self.opens = np.zeros(len(network.light))
+        whole = np.ones(len(self.movements))
+        taken = np.ones(len(self.movements))
         for number, movement in enumerate(self.movements):
-            cycle, begin = network.cycle[movement], network.begin[movement]
+            begin = network.begin[movement]
+            cycle = network.cycle[movement]
             light = network.light[begin : begin + cycle]
             opens = (light > 0.0) & (np.roll(light, 1) == 0.0)
-            whole[number], green = light.sum(), (light == 1.0).sum()
+            capacity = light.sum()
+            green = (light == 1.0).sum()
             if by_cycle:
                 opens[:] = False
-                whole[number] = green = cycle
+                capacity = green = cycle
             if not opens.any():
                 opens[0] = True
             self.opens[begin : begin + cycle] = opens
-            whole[number] /= opens.sum()
+            whole[number] = capacity / opens.sum()
             taken[number] = max(green / opens.sum() - LEAST_GREEN_S, 0.0)
         self.places = flows.places(self.movements)
-        self._whole, self._taken = flows.values(whole), flows.values(taken)
+        self._whole = flows.values(whole)
+        self._taken = flows.values(taken)
 
     def start(self, batch: int) -> Tensor:
         """Return the state (B, gates) before the first step."""
@@ -92,7 +100,7 @@ class Gates:
         opens: 1 where a window begins with this step, else 0 (gates,)
         share: of the commands (-, (B, gates))
         """
-        seconds = light.index_select(1, self.places) * self._flows.dt
+        seconds = light.index_select(1, self.places) * self._dt
         used = used * (1.0 - opens)
         budget = self._whole - (1.0 - share) * self._taken
         left = ((budget - used) / seconds.clamp(min=LEAST)).clamp(0.0, 1.0)
@@ -104,12 +112,14 @@ class Programmes:
     """Fixed programmes, second by second."""
 
     def __init__(self, flows: Flows, opens: np.ndarray):
-        """opens: seconds of the programmes in which a gate's window begins (S,)"""
-        self._flows, self._opens = flows, opens
+        """opens: of the gates"""
+        self._flows = flows
+        self._opens = opens
 
     def read(self, begin: float, steps: int) -> tuple[Tensor, Tensor, Tensor]:
         """Return lights, duties to give way and openings (steps, M) from `begin` (s) on."""
-        network, seconds = self._flows.network, round(self._flows.dt)
+        network = self._flows.network
+        seconds = round(self._flows.dt)
         clock = round(begin) + np.arange(steps * seconds)[:, None]
         place = network.begin + clock % network.cycle
 
@@ -124,33 +134,27 @@ class Programmes:
         return values(light), values(yields), values(opens)
 
 
-class StageSignals:
-    """Signals that choose their stages, actuated or by max-pressure."""
+class MaxPressure:
+    """Signals that choose their stages."""
 
-    def __init__(self, flows: Flows, kind: str, lookahead: float, *, gateways_fixed: bool):
-        """lookahead: green after a change over which max-pressure compares (s)
-
-        gateways_fixed: signals with gates keep their programmes
-        """
+    def __init__(self, flows: Flows, lookahead: float):
+        """lookahead: green after a change over which stages are compared (s)"""
         network = flows.network
-        self._flows, self._kind, self._lookahead = flows, kind, lookahead
-        chosen = network.signal >= 0
-        if gateways_fixed:
-            chosen &= ~np.isin(network.signal, network.signal[network.gated])
-        self.chooses = torch.as_tensor(chosen, device=flows.device)
+        self._flows = flows
+        self._lookahead = lookahead
+        self._chooses = torch.as_tensor(network.signal >= 0, device=flows.device)
         self._signal = flows.places(np.maximum(network.signal, 0))
-        self._light, self._yields = (
-            flows.values(network.stage_light),
-            flows.values(network.stage_yields),
-        )
+        self._light = flows.values(network.stage_light)
+        self._yields = flows.values(network.stage_yields)
         self._loss = flows.values(network.stage_loss)
         self._least = flows.values(network.stage_least)
-        self._most = flows.values(network.stage_most)
         self._count = flows.places(network.stages)
         self._link = flows.places(network.movement_link)
-        self._weighs = flows.places(network.pressure_movement), flows.places(network.pressure_link)
+        self._pressed = flows.places(network.pressure_movement)
+        self._presses = flows.places(network.pressure_link)
         self._weight = flows.values(network.pressure_weight)
-        self._gains = flows.places(network.gain_stage), flows.places(network.gain_movement)
+        self._gain_stage = flows.places(network.gain_stage)
+        self._gain_movement = flows.places(network.gain_movement)
         self._gain = flows.values(network.gain)
         self._period = max(round(DECISION_PERIOD_S / flows.dt), 1)
 
@@ -162,28 +166,23 @@ class StageSignals:
         return Stages(stage, stage, zeros, zeros, self._least.new_zeros(batch, signals, most))
 
     def step(
-        self, number: int, stages: Stages, traffic: Traffic, closed: Tensor, programme: Lights
+        self, number: int, stages: Stages, inside: Tensor, programme: Lights
     ) -> tuple[Stages, Lights]:
         """Return the state and the lights of a step.
 
-        number: of the step; closed: 1 for movements without more green in this cycle (B, M)
+        number: of the step
+        inside: vehicles by link (veh, (B, L))
         programme: lights of the signals that keep their programmes
         """
         if number % self._period == 0:
             with torch.no_grad():
-                stages = self._decide(stages, traffic, closed)
-        flows, dt = self._flows, self._flows.dt
-        batch = len(stages.stage)
-
-        def shown(table: Tensor, stage: Tensor) -> Tensor:
-            place = stage.index_select(1, self._signal).unsqueeze(2)
-            return table.expand(batch, -1, -1).gather(2, place).squeeze(2)
-
-        after, before = shown(self._light, stages.stage), shown(self._light, stages.before)
-        kept = torch.minimum(after, before)
+                stages = self._decide(stages, inside)
+        dt = self._flows.dt
+        after = self._shown(self._light, stages.stage)
+        kept = torch.minimum(after, self._shown(self._light, stages.before))
         waits = (stages.clearing / dt).clamp(max=1.0).index_select(1, self._signal)
         light = waits * kept + (1.0 - waits) * after
-        yields = shown(self._yields, stages.stage)
+        yields = self._shown(self._yields, stages.stage)
         begun = (dt - stages.clearing).clamp(min=0.0)
         running = torch.nn.functional.one_hot(stages.stage, self._least.shape[1])
         stages = stages._replace(
@@ -191,55 +190,52 @@ class StageSignals:
             green=stages.green + begun,
             red=(stages.red + dt) * (1 - running),
         )
-        light = torch.where(self.chooses, light, programme.light)
-        return stages, Lights(light, torch.where(self.chooses, yields, programme.yields))
+        light = torch.where(self._chooses, light, programme.light)
+        return stages, Lights(light, torch.where(self._chooses, yields, programme.yields))
 
-    def _decide(self, stages: Stages, traffic: Traffic, closed: Tensor) -> Stages:
+    def _shown(self, table: Tensor, stage: Tensor) -> Tensor:
+        """Return the column of a table (M, n) that each signal's stage (B, S) shows (B, M)."""
+        place = stage.index_select(1, self._signal).unsqueeze(2)
+        return table.expand(len(stage), -1, -1).gather(2, place).squeeze(2)
+
+    def _decide(self, stages: Stages, inside: Tensor) -> Stages:
         """Return the state with the stages that each signal wants now."""
-        flows, own = self._flows, stages.stage.unsqueeze(2)
+        own = stages.stage.unsqueeze(2)
+        batch = len(own)
         signals, most = self._least.shape
-        present = traffic.inside.index_select(1, self._link) * (1.0 - closed)
-        waiting = torch.zeros(len(own), signals, most, dtype=flows.dtype, device=flows.device)
-        waiting = waiting.index_add(1, self._signal, self._light * present.unsqueeze(2))
-        number = torch.arange(most, device=flows.device)
+        present = inside.index_select(1, self._link).unsqueeze(2)
+        waiting = inside.new_zeros(batch, signals, most)
+        waiting = waiting.index_add(1, self._signal, self._light * present)
+        number = torch.arange(most, device=inside.device)
         exists = number < self._count.unsqueeze(1)
         called = (waiting >= CALLED_VEH) & exists & (number != own)
-        loss = self._loss.expand(len(own), -1, -1, -1)
-        loss = loss.gather(2, own.unsqueeze(3).expand(-1, -1, 1, most)).squeeze(2)
-        least = self._least.expand(len(own), -1, -1).gather(2, own).squeeze(2)
-        if self._kind == ACTUATED:
-            best = torch.where(called, (number - own - 1) % self._count.unsqueeze(1), most)
-            best = best.argmin(2)
-            longest = self._most.expand(len(own), -1, -1).gather(2, own).squeeze(2)
-            wants = (waiting.gather(2, own).squeeze(2) < CALLED_VEH) | (stages.green >= longest)
-        else:
-            pressure = self._pressure(traffic.inside, closed)
-            worth = pressure * self._lookahead / (self._lookahead + loss)
-            worth = torch.where(called, worth, -torch.inf)
-            overdue = torch.where(called & (stages.red >= LONGEST_RED_S), stages.red, 0.0)
-            late = overdue.amax(2) > 0.0
-            best = torch.where(late, overdue.argmax(2), worth.argmax(2))
-            ahead = worth.amax(2) > pressure.gather(2, own).squeeze(2)
-            too_long = stages.green + DECISION_PERIOD_S > LONGEST_GREEN_S
-            wants = ahead | too_long | late
+        rows = own.unsqueeze(3).expand(-1, -1, 1, most)
+        loss = self._loss.expand(batch, -1, -1, -1).gather(2, rows).squeeze(2)
+        least = self._least.expand(batch, -1, -1).gather(2, own).squeeze(2)
+
+        pressure = self._pressure(inside)
+        worth = pressure * self._lookahead / (self._lookahead + loss)
+        worth = torch.where(called, worth, -torch.inf)
+        overdue = torch.where(called & (stages.red >= LONGEST_RED_S), stages.red, 0.0)
+        late = overdue.amax(2) > 0.0
+        best = torch.where(late, overdue.argmax(2), worth.argmax(2))
+        ahead = worth.amax(2) > pressure.gather(2, own).squeeze(2)
+        too_long = stages.green + DECISION_PERIOD_S > LONGEST_GREEN_S
         may = (stages.clearing == 0.0) & (stages.green >= least) & called.any(2)
-        switch = may & wants
+        switch = may & (ahead | too_long | late)
+        lost = loss.gather(2, best.unsqueeze(2)).squeeze(2)
         return stages._replace(
             stage=torch.where(switch, best, stages.stage),
             before=torch.where(switch, stages.stage, stages.before),
-            clearing=torch.where(
-                switch, loss.gather(2, best.unsqueeze(2)).squeeze(2), stages.clearing
-            ),
+            clearing=torch.where(switch, lost, stages.clearing),
             green=torch.where(switch, 0.0, stages.green),
         )
 
-    def _pressure(self, inside: Tensor, closed: Tensor) -> Tensor:
+    def _pressure(self, inside: Tensor) -> Tensor:
         """Return the pressures of all stages (B, S, n)."""
-        movement, link = self._weighs
-        weighed = inside.index_select(1, link) * self._weight
-        weight = self._flows.sums(weighed, movement, self._flows.movements)
-        weight = weight.clamp(min=0.0) * (1.0 - closed)
-        stage, movement = self._gains
-        gained = weight.index_select(1, movement) * self._gain
+        flows = self._flows
+        weighed = inside.index_select(1, self._presses) * self._weight
+        weight = flows.sums(weighed, self._pressed, flows.movements).clamp(min=0.0)
+        gained = weight.index_select(1, self._gain_movement) * self._gain
         signals, most = self._least.shape
-        return self._flows.sums(gained, stage, signals * most).view(-1, signals, most)
+        return flows.sums(gained, self._gain_stage, signals * most).view(-1, signals, most)
