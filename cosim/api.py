@@ -26,6 +26,7 @@ from cosim.plant import strategy as strategies_of
 from cosim.plant.settings import Settings
 from cosim.plant.strategy import Strategy, parse
 from cosim.report import figures
+from cosim.sumo.trips import PLANNING_SEEDS
 from nmfd.api import (
     Controllers,
     ScenarioLike,
@@ -425,12 +426,21 @@ def get(name: str | None, out: Path | str | None = None) -> str:
     return cities.get(name, Path("cities", name) if out is None else Path(out))
 
 
-def links(scenario: ScenarioLike, out: Path | str | None = None) -> Path:
+def links(
+    scenario: ScenarioLike,
+    out: Path | str | None = None,
+    *,
+    seeds: int | Iterable[int] = len(PLANNING_SEEDS),
+) -> Path:
     """Write the streets of a city for nmfd.LinkPlant; return the file.
 
     out: file, SCENARIO/links.npz if None
+    seeds: how many draws of planned trips, or the seeds of the trips
     """
-    return write_links(loaded(scenario), None if out is None else Path(out))
+    chosen = seeds_of(seeds)
+    if isinstance(seeds, int):
+        chosen = list(PLANNING_SEEDS[:seeds])
+    return write_links(loaded(scenario), None if out is None else Path(out), chosen)
 
 
 def catalogue() -> dict[str, dict[str, str]]:

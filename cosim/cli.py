@@ -463,8 +463,9 @@ def identify(scenario: Path, **options: Any) -> None:
 
 @main.command()
 @SCENARIO
+@seeds_option(4, "Draws of trips, or the seeds of these; recorded trips are one draw.")
 @click.option("--out", type=FILE, metavar="FILE", help="File. [default: SCENARIO/links.npz]")
-def links(scenario: Path, settings: dict, out: Path | None) -> None:
+def links(scenario: Path, settings: dict, out: Path | None, seeds: int | tuple[int, ...]) -> None:
     """Write the streets of a SUMO city as a plant without SUMO.
 
     Reads the network, static routes and signal programmes. `nmfd benchmark SCENARIO --plant links`
@@ -474,4 +475,5 @@ def links(scenario: Path, settings: dict, out: Path | None) -> None:
     Example:
       cosim links grid7_peak --out links.npz
     """
-    click.echo(f"Written to {cosim.api.links(nmfd.load_scenario(scenario, settings), out)}")
+    loaded = nmfd.load_scenario(scenario, settings)
+    click.echo(f"Written to {cosim.api.links(loaded, out, seeds=seeds)}")

@@ -53,19 +53,19 @@ class Drivers:
         """nominal: split ratios without guidance (-, (R, R, R)); None: no splits are commanded"""
         network = flows.network
         self._flows = flows
-        link = network.entry_link
         region = network.region
         target = network.destination[network.cell_entry]
-        here = region[link[network.cell_entry]]
+        here = region[network.entry_link[network.cell_entry]]
         onward = region[network.turn_link[network.cell_turn]]
-        self.static = flows.values(network.cell_share).unsqueeze(0)
-        self._share = self.static.double()
+        self._draws = flows.values(network.cell_share).double()
         self._target = flows.places(target)
         self._link = flows.places(network.turn_link[network.cell_turn])
         self._region_of_link = flows.places(region)
         self._at_home = torch.as_tensor(here == target, device=flows.device)
         self._enters_home = torch.as_tensor(onward == target, device=flows.device)
         self._free = flows.values(flows.numbers.time_factor * network.free_time)
+        home = region[network.entry_link] == network.destination
+        self._home = torch.as_tensor(home, device=flows.device).unsqueeze(0)
         self._to_destination = self._ways(onward == target)
         self._to_next_region = self._ways(onward != here)
         regions = network.regions
@@ -75,9 +75,16 @@ class Drivers:
         if nominal is not None:
             self._nominal = flows.values(nominal).reshape(1, -1).clamp(min=LEAST_NOMINAL)
 
-    def by_times(self, present: Tensor, left: Tensor, prices: PerRegion | None) -> Tensor:
+    def static(self, draw: Tensor) -> Tensor:
+        """Return the shares without guidance; draw: that of each rollout (B,)."""
+        return self._draws.index_select(0, draw)
+
+    def by_times(
+        self, share: Tensor, present: Tensor, left: Tensor, prices: PerRegion | None
+    ) -> Tensor:
         """Return the shares of drivers who weigh travel times.
 
+        share: static ones (-, (B, C))
         present: vehicles on each link, summed over the last interval (veh s, (B, L))
         left: vehicles that left it then (veh, (B, L))
         """
@@ -87,56 +94,50 @@ class Drivers:
         if prices is not None:
             priced = time * prices.index_select(1, self._region_of_link)
             cost = cost + torch.where(self._enters_home, 0.0, priced.index_select(1, self._link))
-        return self._weighed(torch.exp(-cost.double() / SPREAD_S), self._to_destination)
+        weight = torch.exp(-cost.double() / SPREAD_S)
+        return self._weighed(share, weight, self._to_destination)
 
-    def by_splits(self, splits: Turns) -> Tensor:
-        """Return the shares of drivers who head for commanded next regions."""
+    def by_splits(self, share: Tensor, splits: Turns) -> Tensor:
+        """Return the shares of drivers who head for commanded next regions.
+
+        share: static ones (-, (B, C))
+        """
         if self._nominal is None:
-            return self.static
+            return share
         ratio = splits.flatten(1) / self._nominal
         weight = torch.where(self._crosses, ratio.index_select(1, self._turn), 1.0)
-        return self._weighed(weight.double(), self._to_next_region)
-
-    def mixed(self, guided: Tensor, compliance: float) -> Tensor:
-        """Return the shares if a share of the drivers complies."""
-        return self.static + compliance * (guided - self.static)
+        return self._weighed(share, weight.double(), self._to_next_region)
 
     def _ways(self, ends: np.ndarray) -> _Ways:
         """Return ways that end with some cells (C,)."""
         last = torch.as_tensor(ends, device=self._flows.device)
-        reached = self._begin()
+        reached = self._home.double().expand(len(self._draws), -1)
         steps = 0
-        weight = torch.ones_like(self._share)
-        ways = _Ways(last, 1)
         while steps < LONGEST_WAY and float(reached.min()) < ARRIVED:
-            reached = self._onward(reached, weight, ways)[1]
+            reached = self._onward(reached, self._draws, last)[1]
             steps += 1
-        return _Ways(last, steps)
+        return _Ways(last, max(steps, 1))
 
-    def _begin(self) -> Tensor:
-        """Return zeros by entry (1, E), ones in the region of destination."""
-        network = self._flows.network
-        home = network.region[network.entry_link] == network.destination
-        return torch.as_tensor(home, device=self._flows.device).double().unsqueeze(0)
+    def _onward(self, value: Tensor, weighed: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
+        """Return p_c w_c z(c) (B, C), and its sums z_e (B, E).
 
-    def _onward(self, value: Tensor, weight: Tensor, ways: _Ways) -> tuple[Tensor, Tensor]:
-        """Return p_c w_c z(c) (B, C), and its sums z_e (B, E), from values z (B, E)."""
+        value: z_e before (B, E)
+        weighed: p_c w_c (B, C)
+        ends: of the ways (C,)
+        """
         flows = self._flows
-        onward = torch.where(ways.ends, 1.0, value.index_select(1, flows.onward))
-        share = self._share * weight * onward
-        share = torch.where(self._at_home, self._share, share)
+        share = weighed * torch.where(ends, 1.0, value.index_select(1, flows.onward))
         zeros = share.new_zeros(len(share), flows.entries)
         total = zeros.index_add(1, flows.entry_of_cell, share)
-        # All trips of some entries at home end there.
-        return share, torch.maximum(total, self._begin())
+        return share, torch.where(self._home, 1.0, total)
 
-    def _weighed(self, weight: Tensor, ways: _Ways) -> Tensor:
-        value = torch.ones_like(self._begin())
-        share = self._share
-        for _ in range(max(ways.steps, 1)):
-            share, value = self._onward(value, weight, ways)
+    def _weighed(self, share: Tensor, weight: Tensor, ways: _Ways) -> Tensor:
+        """Return p'_c (-, (B, C)); where no way is left, the static shares."""
+        value = share.new_ones(len(share), self._flows.entries)
+        weighed = share * weight
+        onward = weighed
+        for _ in range(ways.steps):
+            onward, value = self._onward(value, weighed, ways.ends)
         total = value.index_select(1, self._flows.entry_of_cell)
-        possible = total > torch.finfo(torch.float64).tiny
-        shares = torch.where(possible, share / torch.where(possible, total, 1.0), self._share)
-        shares = torch.where(self._at_home, self._share, shares)
-        return shares.to(self._flows.dtype)
+        possible = (total > torch.finfo(torch.float64).tiny) & ~self._at_home
+        return torch.where(possible, onward / torch.where(possible, total, 1.0), share)

@@ -91,6 +91,19 @@ class Traffic(NamedTuple):
     left: tuple[Tensor, ...]
 
 
+class Ways(NamedTuple):
+    """Shares by which B rollouts divide vehicles (-).
+
+    cells: of each cell among those of its entry (B, C)
+    goes_on: of the vehicles that enter, those whose trip does not end there, by entry (B, E)
+    ends: one less that, for the entries at home, where trips end (B, H)
+    """
+
+    cells: Tensor
+    goes_on: Tensor
+    ends: Tensor
+
+
 class Delay:
     """Reads values of a history that are as many steps old as each column says."""
 
@@ -158,11 +171,10 @@ class Flows:
         self._lane_share = self.values(1.0 / lanes_of_turn[network.served])
         self._yielding = self.places(network.yielding)
         self._foe = self.places(network.foe)
-        self._goes_on = self.values(1.0 - network.ending)
-        at_home = np.flatnonzero(network.ending > 0.0)
+        at_home = np.flatnonzero(network.ending.max(axis=0) > 0.0)
         self._home = self.places(at_home)
         self._home_link = self.places(network.entry_link[at_home])
-        self._home_share = self.values(network.ending[at_home])
+        self._ending = self.values(network.ending)
 
     def _delay(self) -> None:
         """Set the times that vehicles and holes take, in steps."""
@@ -242,15 +254,23 @@ class Flows:
             left=tuple(empty(self.links) for _ in range(self._before.longest)),
         )
 
+    def ways(self, cells: Tensor, draw: Tensor) -> Ways:
+        """Return the ways with these cells (-, (B, C)).
+
+        draw: number of the draw of trips of each rollout (B,)
+        """
+        ending = self._ending.index_select(0, draw)
+        return Ways(cells, 1.0 - ending, ending.index_select(1, self._home))
+
     def step(
-        self, traffic: Traffic, begin: Tensor, light: Tensor, yields: Tensor, share: Tensor
+        self, traffic: Traffic, begin: Tensor, light: Tensor, yields: Tensor, ways: Ways
     ) -> Traffic:
         """Return the state a step later.
 
         begin: trips that may begin from now on, by entry (veh, (B, E))
         light: green of each movement in this step, with gates (-, (B, M))
         yields: share of this green in which it gives way (-, (B, M))
-        share: of the cells among those of their entry (-, (B, C))
+        ways: of the vehicles
         """
         # Vehicles arrive at the queue; trips end before it or in it.
         queue = traffic.queue + self._along.read(traffic.entered)
@@ -266,7 +286,7 @@ class Flows:
         moving_up = (room / self.by_link(queue).clamp(min=LEAST)).clamp(max=1.0)
         ahead = queue * moving_up.index_select(1, self.link_of_entry)
         stopped = stopping * (2.0 * moving_up).clamp(max=1.0)
-        first = traffic.first + ahead.index_select(1, self.entry_of_cell) * share
+        first = traffic.first + ahead.index_select(1, self.entry_of_cell) * ways.cells
         by_turn = self.sums(first, self._turn_of_cell, len(self._link_entered))
 
         # 2. Those that can go, and the trips that can begin.
@@ -290,7 +310,7 @@ class Flows:
         coming = self.sums(flow, self._link_entered, self.links) + waiting * put
         # Trips begin anywhere along the street: half of them here at its end.
         half = 0.5 * begun
-        ending = entered.index_select(1, self._home) * self._home_share
+        ending = entered.index_select(1, self._home) * ways.ends
         return Traffic(
             held=traffic.held,
             due=due - begun,
@@ -301,7 +321,7 @@ class Flows:
             inside=traffic.inside + coming - left - completed,
             passed=passed,
             completed=traffic.completed + completed,
-            entered=(*traffic.entered[1:], entered * self._goes_on + half),
+            entered=(*traffic.entered[1:], entered * ways.goes_on + half),
             ending=(*traffic.ending[1:], self.sums(ending, self._home_link, self.links)),
             left=(*traffic.left[1:], traffic.left[-1] + left),
         )

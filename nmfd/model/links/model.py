@@ -1,5 +1,6 @@
 """The link model of a city: B rollouts under commands by control interval, differentiable."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +11,7 @@ from torch.utils.checkpoint import checkpoint
 from nmfd.arrays import PerTurn
 from nmfd.model.links.choices import Choices
 from nmfd.model.links.drivers import Drivers
-from nmfd.model.links.flows import LEAST, Flows, Numbers, Traffic
+from nmfd.model.links.flows import LEAST, Flows, Numbers, Traffic, Ways
 from nmfd.model.links.network import LinkNetwork
 from nmfd.model.links.signals import (
     MAX_PRESSURE,
@@ -45,6 +46,7 @@ class LinkState(NamedTuple):
     """State of B rollouts at the beginning of a control interval.
 
     interval: its number
+    draw: number of the draw of trips of each rollout (B,)
     used: of the gates' windows; stages: of max-pressure
     spent: time spent so far (veh s, (B,))
     present: vehicles on each link, summed over the last interval (veh s, (B, L))
@@ -53,6 +55,7 @@ class LinkState(NamedTuple):
     """
 
     interval: int
+    draw: Tensor
     traffic: Traffic
     used: Tensor
     stages: Stages | None
@@ -117,12 +120,17 @@ class LinkModel:
         total = np.bincount(boundary, lanes, regions**2)[boundary]
         self._weight_of_gate = flows.values(lanes / total)
 
-    def start(self, batch: int) -> LinkState:
-        """Return the empty city at the beginning of interval 0."""
+    def start(self, batch: int, draws: Sequence[int] = (0,)) -> LinkState:
+        """Return the empty city at the beginning of interval 0.
+
+        draws: numbers of the draws of trips; the rollouts take them in turn
+        """
         regions = self.network.regions
+        draw = np.resize(np.array(draws) % len(self.network.origin), batch)
         traffic = self.flows.start(batch)
         return LinkState(
             interval=0,
+            draw=self.flows.places(draw),
             traffic=traffic,
             used=self._gates.start(batch),
             stages=None if self._pressure is None else self._pressure.start(batch),
@@ -147,7 +155,8 @@ class LinkModel:
         traffic = state.traffic
         used = state.used
         stages = state.stages
-        due = demand.flatten(1).index_select(1, self._pair_of_entry) * self._origin * dt
+        origin = self._origin.index_select(0, state.draw)
+        due = demand.flatten(1).index_select(1, self._pair_of_entry) * origin * dt
         light, yields, opens = self._programmes.read(state.interval * self.step, self._steps)
         opens = opens[:, self._gates.movements]
         ways = self._ways(state, commands)
@@ -179,6 +188,7 @@ class LinkModel:
         gone = traffic.left[-1] - before.left[-1] + traffic.completed - before.completed
         return LinkState(
             interval=state.interval + 1,
+            draw=state.draw,
             traffic=traffic,
             used=used,
             stages=stages,
@@ -188,19 +198,22 @@ class LinkModel:
             realised=realised,
         )
 
-    def _ways(self, state: LinkState, commands: Commands) -> Tensor:
-        """Return the shares of the cells (-, (B, C)) of an interval."""
+    def _ways(self, state: LinkState, commands: Commands) -> Ways:
+        """Return the ways of an interval."""
         choices = self._choices
         drivers = self._drivers
-        if commands.splits is not None and commands.prices is None:
-            return drivers.mixed(drivers.by_splits(commands.splits), choices.compliance)
+        static = drivers.static(state.draw)
         compliance = choices.rerouting
-        if choices.guided or commands.prices is not None:
+        by_splits = commands.splits is not None and commands.prices is None
+        if by_splits or choices.guided or commands.prices is not None:
             compliance = choices.compliance
-        if compliance == 0.0:
-            return drivers.static
-        guided = drivers.by_times(state.present, state.gone, commands.prices)
-        return drivers.mixed(guided, compliance)
+        cells = static
+        if by_splits:
+            cells = drivers.by_splits(static, commands.splits)
+        elif compliance > 0.0:
+            cells = drivers.by_times(static, state.present, state.gone, commands.prices)
+        cells = static + compliance * (cells - static)
+        return self.flows.ways(cells.to(self.flows.dtype), state.draw)
 
     def _metered(
         self, traffic: Traffic, due: Tensor, metering: PerRegion | None

@@ -19,6 +19,7 @@ class LinkNetwork:
     A link is a group of lanes of one street that share movements. A movement leads from a link to
     another street, a turn to a link of that street. An entry is a link with a destination region, a
     cell is a turn with one: vehicles are counted by these. All numbers are places in other arrays.
+    Shares are those of D draws of trips: each locks at another demand, and their mean later.
 
     regions: number of regions
     street: names of the links' streets (L,)
@@ -31,10 +32,10 @@ class LinkNetwork:
     turn_movement, turn_link: movement of each turn, and the link that it enters (T,)
     served, server: pairs of a turn and a lane that leads there (P,)
     entry_link, destination: of each entry (E,), sorted by free_time
-    ending: share of the vehicles of each entry whose trip ends in the link (E,)
-    origin: share of the trips from the link's region to the destination that begin here (E,)
+    ending: share of the vehicles of each entry whose trip ends in the link (D, E)
+    origin: share of the trips from the link's region to the destination that begin here (D, E)
     cell_turn, cell_entry, cell_onward: turn of each cell, entry it leaves, entry it enters (C,)
-    cell_share: share of the vehicles of its entry, of those whose trip goes on (C,)
+    cell_share: share of the vehicles of its entry, of those whose trip goes on (D, C)
     yielding, foe: pairs of a movement that gives way and the one that it gives way to (F,)
     cycle: length of each movement's programme (s) (M,)
     begin: place of its first second in `light` and `yields` (M,)

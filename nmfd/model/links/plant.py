@@ -20,7 +20,8 @@ DT_S = 3.0  # time step; a second if it does not divide the control interval
 class LinkPlant:
     """A city of streets without SUMO (nmfd.types.Plant); `cosim links` writes its file.
 
-    It is deterministic: seeds change nothing. It begins empty and without process noise.
+    A seed chooses a draw of trips of the file: their routes, not their departures. It begins empty
+    and has no process noise.
 
     >>> plant = nmfd.LinkPlant(nmfd.load_scenario("grid7_peak"))
     >>> plant.reset(0).time
@@ -62,7 +63,7 @@ class LinkPlant:
 
     def reset(self, seed: int) -> State:
         """Return the empty city."""
-        self.state = self.model.start(1)
+        self.state = self.model.start(1, [seed])
         self._entered = 0.0
         self._realised: np.ndarray | None = None
         return self._state()
@@ -131,7 +132,7 @@ def _check_demand(scenario: Scenario, network: LinkNetwork, where: Path) -> None
         problem = f"has {regions} regions, the scenario {scenario.network.regions}"
         raise InputError(f"{where}: {problem}; {remedy}")
     pair = network.region[network.entry_link] * regions + network.destination
-    begin = np.bincount(pair, network.origin, regions**2).reshape(regions, regions)
+    begin = np.bincount(pair, network.origin.min(axis=0), regions**2).reshape(regions, regions)
     missing = (scenario.demand.sum(axis=0) > 0.0) & (begin == 0.0)
     if missing.any():
         i, j = np.argwhere(missing)[0]
