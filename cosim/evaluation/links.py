@@ -199,7 +199,13 @@ def _shown(connection: Connection, programmes: Mapping[str, Programme], begin: f
     number = np.searchsorted(ends, clock, side="right")
     states = [phases[n].state[connection.place] for n in number]
     light = np.array([CAPACITY.get(state, 0.0) for state in states])
-    return Lights(light, np.array([float(state in GIVES_WAY) for state in states]))
+    yields = np.array([float(state in GIVES_WAY) for state in states])
+    for second in range(2 * cycle):  # twice: yellow may begin before the end of the cycle
+        before = states[(second - 1) % cycle]
+        if states[second % cycle] == "y" and before == "g":
+            states[second % cycle] = before
+            light[second % cycle] = 1.0  # those who wait on the junction go at last
+    return Lights(light, yields)
 
 
 def _stage_arrays(

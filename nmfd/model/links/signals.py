@@ -179,10 +179,13 @@ class MaxPressure:
                 stages = self._decide(stages, inside)
         dt = self._flows.dt
         after = self._shown(self._light, stages.stage)
-        kept = torch.minimum(after, self._shown(self._light, stages.before))
+        before = self._shown(self._light, stages.before)
+        # Those who gave way wait on the junction, and go while it clears.
+        last = before * self._shown(self._yields, stages.before)
+        kept = torch.maximum(torch.minimum(after, before), last)
         waits = (stages.clearing / dt).clamp(max=1.0).index_select(1, self._signal)
         light = waits * kept + (1.0 - waits) * after
-        yields = self._shown(self._yields, stages.stage)
+        yields = (1.0 - waits) * self._shown(self._yields, stages.stage)
         begun = (dt - stages.clearing).clamp(min=0.0)
         running = torch.nn.functional.one_hot(stages.stage, self._least.shape[1])
         stages = stages._replace(
