@@ -137,6 +137,7 @@ def key_of(
         "plant": plant,
     }
     if plant == LINKS:
+        LinkPlant(scenario)  # or its error before the first run
         shared["links_hash"] = file_hash(links_file(scenario))
     return lambda name: {**shared, "controller": own[name]}
 

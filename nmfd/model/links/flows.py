@@ -65,6 +65,7 @@ class Traffic(NamedTuple):
 
     held: trips that metering keeps outside, by entry (B, E)
     due: trips that wait outside until their link has room, by entry (B, E)
+    outside: the same by link (B, L)
     queue: vehicles at the end of the street, behind the first ones, by entry (B, E)
     first: first vehicles, by cell (B, C)
     standing: the same by turn (B, T)
@@ -79,6 +80,7 @@ class Traffic(NamedTuple):
 
     held: Tensor
     due: Tensor
+    outside: Tensor
     queue: Tensor
     first: Tensor
     standing: Tensor
@@ -167,8 +169,6 @@ class Flows:
         self._served = self.places(network.served)
         self._server = self.places(network.server)
         self._link_of_lane = self.places(network.lane_link)
-        lanes_of_turn = np.bincount(network.served)
-        self._lane_share = self.values(1.0 / lanes_of_turn[network.served])
         self._yielding = self.places(network.yielding)
         self._foe = self.places(network.foe)
         at_home = np.flatnonzero(network.ending.max(axis=0) > 0.0)
@@ -213,6 +213,9 @@ class Flows:
         self._first_of_lane = self.values(fastest)
         of_movement = np.zeros(self.movements)
         np.maximum.at(of_movement, movement, fastest[network.server])
+        lanes_of_turn = np.bincount(network.served)
+        self._lane_share = self.values(1.0 / lanes_of_turn[network.served])
+        self._most_of_turn = self.values(lanes_of_turn * of_movement[network.turn_movement])
         self._pace = self.values(saturation / of_movement)
         self._per_step = self.values(saturation)
 
@@ -242,6 +245,7 @@ class Flows:
         return Traffic(
             held=empty(self.entries),
             due=empty(self.entries),
+            outside=empty(self.links),
             queue=empty(self.entries),
             first=empty(len(self.onward)),
             standing=empty(len(self._link_entered)),
@@ -314,6 +318,7 @@ class Flows:
         return Traffic(
             held=traffic.held,
             due=due - begun,
+            outside=waiting - waiting * put,
             queue=queue - ahead + half,
             first=first - leaving,
             standing=by_turn - flow,
@@ -339,7 +344,9 @@ class Flows:
         leader = (self._per_step * open_share).clamp(max=1.0)
         leader = leader.index_select(1, self._movement_of_turn)
         stood = traffic.standing / by_turn.clamp(min=EPSILON)
-        return arriving + (leader - arriving) * stood
+        green = arriving + (leader - arriving) * stood
+        # A queue for few of the lanes is no faster than these.
+        return green * (self._most_of_turn / torch.maximum(by_turn, self._most_of_turn))
 
     def _room(self, traffic: Traffic) -> Tensor:
         """Return the vehicles R that each link can receive (veh, (B, L))."""

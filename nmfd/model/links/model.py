@@ -163,9 +163,12 @@ class LinkModel:
         share = None
         mean_share = torch.zeros_like(used)
         present = torch.zeros_like(traffic.inside)
-        outside = torch.zeros_like(traffic.due)
+        outside = torch.zeros_like(traffic.inside)
+        held = torch.zeros_like(traffic.held)
         for n in range(self._steps):
-            traffic, released = self._metered(traffic, due, commands.metering)
+            released = due
+            if commands.metering is not None or n == 0:
+                traffic, released = self._metered(traffic, due, commands.metering)
             lights = Lights(light[n : n + 1], yields[n : n + 1])
             if self._pressure is not None and stages is not None:
                 number = state.interval * self._steps + n
@@ -178,9 +181,9 @@ class LinkModel:
                 used, shown = self._gates.limit(used, shown, opens[n], share)
             traffic = flows.step(traffic, released, shown, lights.yields, ways)
             present = present + traffic.inside
-            outside = outside + traffic.due
+            outside = outside + traffic.outside
             if commands.metering is not None:
-                outside = outside + traffic.held
+                held = held + traffic.held
         realised = state.realised
         if commands.gates is not None:
             realised = self._realised(commands.gates, mean_share)
@@ -192,7 +195,7 @@ class LinkModel:
             traffic=traffic,
             used=used,
             stages=stages,
-            spent=state.spent + dt * (present.sum(1) + outside.sum(1)),
+            spent=state.spent + dt * (present.sum(1) + outside.sum(1) + held.sum(1)),
             present=dt * present,
             gone=gone,
             realised=realised,

@@ -82,7 +82,7 @@ class LinkPlant:
             *map(_batch, (gates, controls.metering, controls.splits, controls.prices))
         )
         demand = self._demand[self.state.interval]
-        with torch.no_grad():
+        with torch.inference_mode():
             self.state = self.model.advance(self.state, demand, commands)
         self._entered += float(demand.sum()) * self._scenario.step
         if gates is not None:
