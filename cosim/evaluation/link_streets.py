@@ -1,4 +1,4 @@
-"""Links, turns and cells of the link model from the routes in a SUMO network."""
+"""Links, turns and cells of the link model, from routes."""
 
 import itertools
 from collections import Counter, defaultdict
@@ -67,7 +67,10 @@ class Streets:
         routes: Iterable[Route],
         where: str,
     ):
-        """where: file that errors name. Raises InputError if a connection is missing."""
+        """where: file that errors name
+
+        Raises: InputError if a connection is missing
+        """
         self.city = city
         self.connections = connections
         movements = {pair for route in routes for pair in itertools.pairwise(route)}
@@ -100,7 +103,7 @@ class Streets:
         }
 
     def ends(self, movement: Movement) -> dict[int, float]:
-        """Return the links that a movement leads to, each with its share of their lanes."""
+        """Return link -> share of the lanes that a movement leads to."""
         entered = {
             self._number[movement[1], connection.entered]
             for connection in self.connections[movement]
@@ -243,7 +246,10 @@ class _Shares:
         counts: Counts,
         draws: Sequence[Counts],
     ) -> np.ndarray:
-        """Return a share by draw (D, n), that of all draws where one has no vehicle."""
+        """Return a share by draw (D, n).
+
+        It is that of all draws together where one has no vehicle.
+        """
         with np.errstate(invalid="ignore"):
             together = np.nan_to_num(share(counts))
             rows = [share(draw) for draw in draws]
@@ -255,7 +261,7 @@ class _Shares:
         return np.array([counts.ending[entry] for entry in self._entries]) / entering
 
     def origin(self, counts: Counts) -> np.ndarray:
-        """Return the share of the trips of each pair of regions that begin in an entry."""
+        """Return the share of the trips between two regions that begin here."""
         trips = np.array([float(counts.trips[pair]) for pair in self._pairs])
         return np.array([counts.beginning[entry] for entry in self._entries]) / trips
 

@@ -1,4 +1,4 @@
-"""Network of the link model (nmfd.model.links), from a SUMO network and static routes.
+"""Streets of a SUMO network for the link model (nmfd.model.links).
 
 A link has the lanes of a street that share movements. Shares of turns, origins and ends of trips
 are counted on the static routes. Lights follow the signal programmes.
@@ -57,8 +57,9 @@ class Lights(NamedTuple):
 def write_links(
     scenario: Scenario, path: Path | None = None, seeds: Sequence[int] = PLANNING_SEEDS
 ) -> Path:
-    """Write the link network of `scenario` into its folder, or to `path`; return the file.
+    """Write the link network of `scenario`; return its file.
 
+    path: file, that of the scenario if None
     seeds: of the draws of trips, if they are not recorded
     Raises: InputError if a route leads where no connection is
     """
@@ -70,8 +71,9 @@ def write_links(
 
 
 def link_network(scenario: Scenario, seeds: Sequence[int] = PLANNING_SEEDS) -> LinkNetwork:
-    """Return the link network of `scenario`, with the draws of trips of these seeds.
+    """Return the link network of `scenario`.
 
+    seeds: of the draws of trips, if they are not recorded
     Raises: InputError if a route leads where no connection is
     """
     chosen = settings(scenario)
@@ -113,7 +115,7 @@ def _draws(
 
 
 def _programmes(city: City, additional: Iterable[Path]) -> dict[str, Programme]:
-    """Return the programme of each signal: the last one of those that SUMO reads."""
+    """Return the programme of each signal, the last one that SUMO reads."""
     programmes = {}
     for root in (read_xml(city.net_file), *map(read_xml, additional)):
         for logic in root.iter("tlLogic"):
@@ -152,7 +154,10 @@ def _movement_arrays(
     begin: float,
     gated: Collection[Movement],
 ) -> dict[str, np.ndarray]:
-    """Return the arrays of movements, their lights from `begin` (s) on, and right of way."""
+    """Return the arrays of movements, lights and right of way.
+
+    begin: time of the first second (s)
+    """
     city = streets.city
     number = {movement: n for n, movement in enumerate(streets.movements)}
     speeds = []
@@ -253,7 +258,10 @@ def _stage_arrays(
 def _pressure_arrays(
     streets: Streets, roads: Roads, phases: Sequence[Sequence[int]]
 ) -> dict[str, np.ndarray]:
-    """Return the weights of cosim.plant.max_pressure; the lanes of a link share its vehicles."""
+    """Return the weights of cosim.plant.max_pressure.
+
+    The lanes of a link share its vehicles.
+    """
     link_of_lane = np.full(len(roads.lanes), -1)
     part = np.zeros(len(roads.lanes))
     for link, (street, lanes) in enumerate(streets.links):

@@ -2,9 +2,9 @@
 
     python scenarios/grid7_peak/links.py runs/links
 
-The folder has SUMO results, *.nc, without control but for words of the city such as +max-pressure,
-or with a constant rate of metering (controller rate-0.5). The link model has the trips' routes of
-the same seed, and no number is fitted.
+The folder has SUMO results, *.nc, with open gates in a city with words such as +max-pressure, or
+with a constant rate of metering: cosim.run("grid7_peak", Rate(network, 0.5), city="metering"). The
+link model has the routes of the trips of the same seed. No number is fitted.
 """
 
 from pathlib import Path
@@ -66,7 +66,7 @@ def locks(run: nmfd.Result) -> bool:
 def main(folder: Path) -> None:
     """Print a row for each run."""
     rows = []
-    for file in sorted(folder.glob("*.nc")):
+    for file in sorted(folder.rglob("[!.]*.nc")):
         run = nmfd.Result.read(file)
         links = in_links(run)
         rows.append(

@@ -1,1 +1,1 @@
-"""A plant of streets: a link transmission model with signals, gates, metering and drivers."""
+"""Plant of streets: link transmission, signals, gates and drivers."""

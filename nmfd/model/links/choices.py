@@ -1,4 +1,4 @@
-"""Options of a city that the link model takes from the table [sumo] of a scenario."""
+"""Options of the table [sumo] that the link model takes."""
 
 from typing import Literal
 

@@ -1,4 +1,4 @@
-"""Drivers of the link model: the shares of turns that they take on their way.
+"""Drivers of the link model: shares of turns on their way.
 
 Without guidance the vehicles of an entry e take its cells c with the static shares p_c. Guided
 drivers weigh the ways onward:
@@ -36,7 +36,7 @@ LONGEST_WAY = 500  # links
 
 @dataclass(frozen=True)
 class _Ways:
-    """Where the ways of a choice end.
+    """Ends of the ways of a choice.
 
     ends: True for cells after which nothing is weighed (C,)
     steps: links on the longest way
@@ -50,7 +50,10 @@ class Drivers:
     """Shares of the cells (B, C) under guidance; static without."""
 
     def __init__(self, flows: Flows, nominal: PerTurn | None):
-        """nominal: split ratios without guidance (-, (R, R, R)); None: no splits are commanded"""
+        """nominal: split ratios without guidance (-, (R, R, R))
+
+        None: no splits are commanded.
+        """
         network = flows.network
         self._flows = flows
         region = network.region

@@ -1,4 +1,4 @@
-"""Flows between links: the link transmission model, and a node model of first vehicles.
+"""Flows between links: the link transmission model with a node model.
 
 Yperman, "The link transmission model for dynamic network loading" (2007), with cumulative counts of
 a link up- and downstream, N_up and N_down, of length L, n lanes, and the free-flow time tau:
@@ -18,7 +18,9 @@ in the order of arrival; s is the saturation flow. In each step of dt seconds
 
 Where all lanes of a link lead to all turns, steps 1 to 4 are the node model of Tampere, Corthout,
 Cattrysse and Immers, "A generic class of first order node models" (2011), with demand-proportional
-shares, if green lasts long enough: first in, first out, and no flow could be larger.
+shares, if green lasts long enough: first in, first out, and no flow could be larger. Where lanes
+lead to some turns only, vehicles that all want one turn still move up in all lanes, and leave too
+fast.
 A movement that gives way to a flow f has exp(-gap f) of its green, which is the chance that no
 vehicle comes within the critical gap. A trip ends halfway along a street, or moves up in the queue
 there twice as fast as it reaches the front.
@@ -107,7 +109,7 @@ class Ways(NamedTuple):
 
 
 class Delay:
-    """Reads values of a history that are as many steps old as each column says."""
+    """Reader of histories, with an age of its own for each column."""
 
     def __init__(self, steps: np.ndarray, device: torch.device):
         """steps: age of each column, 1 for the newest (n,)"""
@@ -123,7 +125,7 @@ class Delay:
         self._back = torch.as_tensor(np.argsort(order), device=device)
 
     def read(self, history: Sequence[Tensor]) -> Tensor:
-        """Return the values (B, n) of a history of tensors (B, n), the newest last."""
+        """Return the values (B, n) of a history (B, n), the newest last."""
         if self._sorted:
             pairs = zip(self._ages, self._slices, strict=True)
             return torch.cat([history[-age][:, part] for age, part in pairs], dim=1)
@@ -133,7 +135,7 @@ class Delay:
 
 
 class Flows:
-    """The equations for one city as tensors; `step` advances B rollouts by `dt` seconds."""
+    """Equations of one city; `step` advances B rollouts by `dt` seconds."""
 
     def __init__(
         self,
@@ -215,7 +217,6 @@ class Flows:
         np.maximum.at(of_movement, movement, fastest[network.server])
         lanes_of_turn = np.bincount(network.served)
         self._lane_share = self.values(1.0 / lanes_of_turn[network.served])
-        self._most_of_turn = self.values(lanes_of_turn * of_movement[network.turn_movement])
         self._pace = self.values(saturation / of_movement)
         self._per_step = self.values(saturation)
 
@@ -228,7 +229,7 @@ class Flows:
         return torch.as_tensor(np.asarray(numbers), dtype=torch.long, device=self.device)
 
     def sums(self, values: Tensor, place: Tensor, count: int) -> Tensor:
-        """Return the sums (B, count) of `values` (B, n) that have the same `place` (n,)."""
+        """Return sums (B, count) of `values` (B, n) with the same `place` (n,)."""
         zeros = torch.zeros(len(values), count, dtype=self.dtype, device=self.device)
         return zeros.index_add(1, place, values)
 
@@ -332,7 +333,7 @@ class Flows:
         )
 
     def _green(self, traffic: Traffic, by_turn: Tensor, light: Tensor, yields: Tensor) -> Tensor:
-        """Return the share phi of the first vehicles of each turn that can go (-, (B, T)).
+        """Return the share phi of first vehicles that can go (-, (B, T)).
 
         A vehicle that stood in front goes first, at the headway of its movement; those that arrive
         go at the pace of their lane.
@@ -344,9 +345,7 @@ class Flows:
         leader = (self._per_step * open_share).clamp(max=1.0)
         leader = leader.index_select(1, self._movement_of_turn)
         stood = traffic.standing / by_turn.clamp(min=EPSILON)
-        green = arriving + (leader - arriving) * stood
-        # A queue for few of the lanes is no faster than these.
-        return green * (self._most_of_turn / torch.maximum(by_turn, self._most_of_turn))
+        return arriving + (leader - arriving) * stood
 
     def _room(self, traffic: Traffic) -> Tensor:
         """Return the vehicles R that each link can receive (veh, (B, L))."""

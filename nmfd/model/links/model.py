@@ -1,4 +1,4 @@
-"""The link model of a city: B rollouts under commands by control interval, differentiable."""
+"""Differentiable rollouts of the link model of a city."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -28,7 +28,9 @@ OPEN_SHARE = 0.95  # of what a boundary can let through; above it a gate is open
 
 
 class Commands(NamedTuple):
-    """Commands of one control interval; None: no limit, and drivers on their own ways.
+    """Commands of one control interval.
+
+    None: no limit, and drivers on their own ways.
 
     gates: share of what each boundary can let through (-, (B, R, R), [i, h] from i to h)
     metering: largest rate of trips that may begin in each region (veh/s, (B, R))
@@ -80,7 +82,8 @@ class LinkModel:
         dtype: torch.dtype = torch.float32,
         device: str = "cpu",
     ):
-        """step: control interval (s), a multiple of dt (s), which is a whole number
+        """step: control interval (s), a multiple of dt
+        dt: time step, a whole number (s)
         nominal: split ratios without guidance (-, (R, R, R))
         """
         self.network = network
@@ -244,7 +247,10 @@ class LinkModel:
         return share
 
     def _realised(self, gates: PerPair, share: Tensor) -> PerPair:
-        """Return the mean share of green of each boundary; the command where no gate obeys."""
+        """Return the mean share of green of each boundary.
+
+        It is the command where no gate obeys.
+        """
         regions = self.network.regions
         given = self.flows.sums(share * self._weight_of_gate, self._boundary_of_gate, regions**2)
         obeys = torch.zeros(regions**2, dtype=torch.bool, device=given.device)
@@ -259,7 +265,7 @@ class LinkModel:
         return zeros.index_add(1, self._region_of_link, under_way)
 
     def backlog(self, state: LinkState) -> PerPair:
-        """Return the trips that wait outside region i, bound for j (veh, (B, R, R))."""
+        """Return the trips that wait outside i, bound for j (veh, (B, R, R))."""
         regions = self.network.regions
         outside = state.traffic.held + state.traffic.due
         total = self.flows.sums(outside, self._pair_of_entry, regions**2)

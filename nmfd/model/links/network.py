@@ -1,4 +1,4 @@
-"""Streets, signals and static routes of a city as arrays, and the file that holds them."""
+"""Streets, signals and static routes of a city, and their file."""
 
 from dataclasses import dataclass, fields
 from pathlib import Path

@@ -18,7 +18,9 @@ DT_S = 3.0  # time step; a second if it does not divide the control interval
 
 
 class LinkPlant:
-    """A city of streets without SUMO (nmfd.types.Plant); `cosim links` writes its file.
+    """City of streets without SUMO (nmfd.types.Plant).
+
+    `cosim links` writes its file.
 
     A seed chooses a draw of trips of the file: their routes, not their departures. It begins empty
     and has no process noise.

@@ -1,4 +1,4 @@
-"""Signals of the link model: fixed programmes, stages chosen by max-pressure, and gates.
+"""Signals of the link model: programmes, max-pressure and gates.
 
 A stage is a green phase of a programme. Max-pressure (Varaiya, 2013) chooses the stage with the
 highest pressure, as cosim.plant.max_pressure does, with the model's own queues. The choice has no
@@ -56,7 +56,9 @@ class Stages(NamedTuple):
 
 
 class Gates:
-    """Limits the green of gated movements; its state is the capacity used in the window (s).
+    """Limits of the green of gated movements.
+
+    The state is the capacity used in the window (s).
 
     movements: gated ones; opens: True in seconds of the programmes with which a window begins
     """
@@ -117,7 +119,10 @@ class Programmes:
         self._opens = opens
 
     def read(self, begin: float, steps: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Return lights, duties to give way and openings (steps, M) from `begin` (s) on."""
+        """Return lights, duties to give way and openings (steps, M).
+
+        begin: time of the first step (s)
+        """
         network = self._flows.network
         seconds = round(self._flows.dt)
         clock = round(begin) + np.arange(steps * seconds)[:, None]
@@ -159,7 +164,7 @@ class MaxPressure:
         self._period = max(round(DECISION_PERIOD_S / flows.dt), 1)
 
     def start(self, batch: int) -> Stages:
-        """Return the state before the first step: all signals in their first stage."""
+        """Return the state at first: all signals in their first stage."""
         signals, most = self._least.shape
         stage = torch.zeros(batch, signals, dtype=torch.long, device=self._flows.device)
         zeros = self._least.new_zeros(batch, signals)
@@ -197,7 +202,7 @@ class MaxPressure:
         return stages, Lights(light, torch.where(self._chooses, yields, programme.yields))
 
     def _shown(self, table: Tensor, stage: Tensor) -> Tensor:
-        """Return the column of a table (M, n) that each signal's stage (B, S) shows (B, M)."""
+        """Return what the stages (B, S) show, (B, M), from a table (M, n)."""
         place = stage.index_select(1, self._signal).unsqueeze(2)
         return table.expand(len(stage), -1, -1).gather(2, place).squeeze(2)
 
