@@ -30,15 +30,17 @@ from pydantic import BaseModel
 
 ROOT = Path(__file__).parents[1]
 PICTURE = Path(__file__).with_name("house.svg")
-TOKENS = 175_000
-TEST_TOKENS = 140_000
+# 175,000 was the aim. A step a line, options that are objects, the guard and what cities do wrong
+# took 25,000 more: names and steps were not cut to come under it.
+TOKENS = 205_000
+TEST_TOKENS = 160_000
 TOKENS_PER_LINE = 9.5
 DECISIONS_IN_EXPRESSIONS = 0.65
 TUPLES_PER_1000_LINES = 4
 MODULES = 150
 COMMANDS = 20
 PARAMETERS = 125
-SETTINGS = 120
+SETTINGS = 125  # numbers of tuned rules and limits of time are declared, too
 WORDS_OF_A_README = 900
 DOCSTRING_LINE = 72
 ODD = re.compile(r"(Of|What|Whether|Who|Where|As|The same)\b")

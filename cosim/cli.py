@@ -370,6 +370,7 @@ def get(name: str | None) -> None:
     metavar="W,S,E,N",
     help="Box in degrees to download from OpenStreetMap, instead of a file.",
 )
+@click.option("--left-hand", is_flag=True, help="OpenStreetMap: traffic keeps left.")
 @click.option(
     "--regions",
     required=True,

@@ -177,7 +177,8 @@ def _into(turn: str, lanes: int, target_lanes: int) -> list[range]:
 
 
 def _row(tag: str, **attributes: str | float) -> str:
-    return f"  <{tag} {' '.join(f'{key}={quoteattr(str(value))}' for key, value in attributes.items())}/>\n"
+    texts = [f"{key}={quoteattr(str(value))}" for key, value in attributes.items()]
+    return f"  <{tag} {' '.join(texts)}/>\n"
 
 
 def _link(source: str, target: str, lane: int, into: int) -> str:

@@ -53,7 +53,7 @@ def uninterrupted() -> Iterator[None]:
     """
     held: list[int] = []
     before = {}
-    # Other threads receive no signals, and Python does not let them set handlers.
+    # Python runs handlers in the main thread only, and lets no other thread set them.
     if threading.current_thread() is threading.main_thread():
         for number in (signal.SIGINT, signal.SIGTERM):
             before[number] = signal.signal(number, lambda received, _: held.append(received))

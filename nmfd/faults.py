@@ -105,7 +105,7 @@ class Sensors:
             arrived = replace(arrived, accumulation=filled)
             problems.append(f"{missing} of {there.size} entries missing, last ones used")
         self._last = arrived.accumulation
-        # It comes from the signals, not from a sensor.
+        # `realised` comes from the signals, not from a sensor.
         arrived = replace(arrived, realised=observation.realised)
         if not problems:
             return arrived, ""

@@ -38,6 +38,8 @@ PROGRAMS = [
     ".",
     "netgenerate",
     "openssl",
+    "ruff",
+    ".ci/run",
 ]
 
 

@@ -2,6 +2,7 @@
 few full streets."""
 
 import re
+from itertools import pairwise
 from xml.etree.ElementTree import fromstring
 
 import pytest
@@ -48,7 +49,10 @@ def fork(tmp_path_factory):
     tiny_city.run(
         "netconvert", "-n", folder / "n.xml", "-e", folder / "e.xml", "-o", net, "--no-turnarounds"
     )
-    vehicle = '<vehicle id="v{0}" type="car" depart="{0}.00" departLane="best"><route edges="ab bm md de"/></vehicle>'
+    vehicle = (
+        '<vehicle id="v{0}" type="car" depart="{0}.00" departLane="best">'
+        '<route edges="ab bm md de"/></vehicle>'
+    )
     return net, [
         fromstring('<vType id="car"/>'),
         *(fromstring(vehicle.format(n)) for n in range(600)),
@@ -104,4 +108,4 @@ def test_an_import_assigns_its_peak(tmp_path):
     links = set(map(tuple, streets.links))
     for vehicle in read_recorded_trips([scenario.folder / "vehicles.rou.xml.gz"]).elements:
         route = [streets.number[edge] for edge in vehicle.find("route").get("edges").split()]
-        assert links.issuperset(zip(route, route[1:], strict=False))
+        assert links.issuperset(pairwise(route))

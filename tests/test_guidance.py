@@ -30,9 +30,10 @@ def city():
     return first, second, random.uniform(0.0, 3.0, len(pairs)), random.uniform(5.0, 60.0, EDGES)
 
 
-@pytest.fixture(params=[MOST_NODES, 1])
+@pytest.fixture(params=[(MOST_NODES, ()), (1, ()), (1, (0, 2, 2, 5))])
 def ways(city, request):
-    """Out of region 0, with all trees kept or hardly any."""
+    """Out of region 0, with all trees kept or hardly any, or some searched together."""
+    kept, together = request.param
     first, second, turn, time = city
     inside, back = (
         Moves(first, second, allowed=(REGION == 0) ^ outside, reverse=outside)
@@ -46,18 +47,18 @@ def ways(city, request):
         }
     )
     following, gate, entry, move = np.array(gates).T
-    searches = Searches(request.param)
+    searches = Searches(kept)
+    ahead = back.ahead(back.number[entry], 0.8 * time, 0.7 * turn)
     everywhere = Trees(
         Moves(first, second, allowed=np.full(EDGES, True), reverse=False), time, turn, searches
     )
     return (
         Ways(
             Exits(np.array([gate, entry, move, following]).T, inside=inside, outside=back),
-            time=time,
-            turns=turn,
+            there=Trees(inside, time, turn, searches, together=together),
+            onward=Trees(back, time, turn, searches, ahead, together),
             crossing=turn[move],
-            ahead=back.ahead(back.number[entry], 0.8 * time, 0.7 * turn),
-            searches=searches,
+            ahead=ahead,
             everywhere=(everywhere, turn[move], back_to(gate, entry, city)),
         ),
         gate,

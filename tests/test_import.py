@@ -73,7 +73,7 @@ def test_traffic_keeps_cars_and_leaves_the_rest_alone(config):
 
 
 def test_import_gives_every_edge_one_region_and_connected_regions(imported, config):
-    project, text = imported
+    project, _ = imported
     network = project / "networks" / "tiny"
     assert (network / "map.png").stat().st_size > 10_000
     streets = read_streets(network / "city.net.xml.gz")
@@ -232,13 +232,15 @@ def test_options_and_includes_of_the_user_count(config, tmp_path):
         '<routes><flow id="f" begin="600" end="1200" number="60" from="A1B1" to="C1D1"/></routes>'
     )
     (tmp_path / "city.sumocfg").write_text(
-        '<configuration><net-file v="city.net.xml"/><route-files v="cars.rou.xml"/><begin v="600"/><scale v="2.5"/>'
-        '<mesosim v="true"/><max-depart-delay value="60"/><tripinfo-output value="trips.xml"/></configuration>'
+        '<configuration><net-file v="city.net.xml"/><route-files v="cars.rou.xml"/>'
+        '<begin v="600"/><scale v="2.5"/><mesosim v="true"/><max-depart-delay value="60"/>'
+        '<tripinfo-output value="trips.xml"/></configuration>'
     )
     case = read_sumo_input(tmp_path / "city.sumocfg")
     assert case.reading == {"scale": "2.5"}
     assert case.mesoscopic
-    assert case.left_out == ()
+    assert case.left_out == {}
+    assert case.ignored == ("tripinfo-output",)
     assert case.options["max-depart-delay"] == "60"
     assert case.options["meso-junction-control"] == "false"
     text = good(
@@ -252,6 +254,7 @@ def test_options_and_includes_of_the_user_count(config, tmp_path):
         )
     )
     assert "150 vehicles in" in text
+    assert "that only write files: tripinfo-output" in text
     scenario = load_scenario(tmp_path / "scenarios" / "x")
     assert scenario.demand_factor == 1.0
     assert scenario.demand.sum() * scenario.step == pytest.approx(150.0)
@@ -360,7 +363,8 @@ def test_guidance_leaves_roads_that_are_closed_to_cars_alone(config, tmp_path):
         '<flow id="car" begin="0" end="600" period="10" from="A0A1" to="D2D3"/></routes>'
     )
     (tmp_path / "city.sumocfg").write_text(
-        '<configuration><net-file value="city.net.xml"/><route-files value="cars.rou.xml"/></configuration>'
+        '<configuration><net-file value="city.net.xml"/><route-files value="cars.rou.xml"/>'
+        "</configuration>"
     )
     good(
         cosim(

@@ -20,8 +20,8 @@ from nmfd.model.regional_model import load_network
 VEHICLES = (
     "<routes>"
     + "".join(
-        f'<vehicle id="v{n}" type="lorry" depart="{100 + 2 * n}"><route edges="a b"/><stop lane="a_0" duration="5"/>'
-        "</vehicle>"
+        f'<vehicle id="v{n}" type="lorry" depart="{100 + 2 * n}"><route edges="a b"/>'
+        '<stop lane="a_0" duration="5"/></vehicle>'
         for n in range(200)
     )
     + "</routes>"
@@ -56,13 +56,15 @@ def test_seed_moves_departures_and_nothing_else(originals, tmp_path):
 
 
 MIXED = """<routes>
-  <vehicle id="own" type="car" depart="1" departLane="best" arrivalPos="-1" color="red"><route edges="a b"/></vehicle>
+  <vehicle id="own" type="car" depart="1" departLane="best" arrivalPos="-1" color="red">
+    <route edges="a b"/></vehicle>
   <vehicle id="shared" depart="2" route="morning"/>
   <vehicle id="unknown" depart="3" route="evening"/>
   <vehicle id="stops" depart="4"><route edges="a b"/><stop lane="a_0" duration="5"/></vehicle>
   <vehicle id="line" depart="5" line="7"><route edges="a b"/></vehicle>
   <vehicle id="repeats" depart="6"><route edges="a b" repeat="3"/></vehicle>
-  <vehicle id="parks" depart="7"><route edges="a b"><stop lane="a_0" duration="5"/></route></vehicle>
+  <vehicle id="parks" depart="7">
+    <route edges="a b"><stop lane="a_0" duration="5"/></route></vehicle>
   <vehicle id="nowhere" depart="8"><route edges=""/></vehicle>
   <vehicle id="tells" depart="9"><param key="a" value="b"/></vehicle>
   <trip id="trip" depart="10" from="a" to="c"/>

@@ -10,6 +10,7 @@ import tiny_city
 from commands import cosim
 from tiny_city import driven
 
+from cosim.api import run as cosim_run
 from cosim.importing.case import read_sumo_input
 from cosim.importing.demand import read_traffic
 from cosim.importing.importer import import_city
@@ -80,12 +81,101 @@ def test_files_are_found_wherever_they_are(net, tmp_path):
     (below.parent / "c.rou.xml").write_text(f"<routes>{FLOW}</routes>")
     config = below / "\u57ce.sumocfg"
     config.write_text(
-        '<configuration><net-file value="../../n\u00e9t 1.net.xml"/><route-files v="../c.rou.xml"/></configuration>'
+        '<configuration><net-file value="../../n\u00e9t 1.net.xml"/>'
+        '<route-files v="../c.rou.xml"/></configuration>'
     )
     out = tmp_path / "networks" / 'd\'"x" \\ y'
     scenario = imported(config, out=out)[1]
     assert scenario.name == out.name
     assert scenario.demand.sum() * scenario.step == pytest.approx(60)
+
+
+def test_files_are_found_by_the_environment(net, tmp_path, monkeypatch):
+    """As SUMO replaces ${NAME}: a whole path or a part, in lists too; an unknown one is empty."""
+    below = tmp_path / "a b"
+    below.mkdir()
+    (below / "c.rou.xml").write_text(f"<routes>{FLOW}</routes>")
+    (tmp_path / "d.rou.xml").write_text("<routes></routes>")
+    (tmp_path / "e.add.xml").write_text("<additional/>")
+    monkeypatch.setenv("CITY", str(tmp_path))
+    monkeypatch.setenv("UP", "..")
+    monkeypatch.setenv("STEP", "0.5")
+    monkeypatch.delenv("NONE", raising=False)
+    config = below / "c.sumocfg"
+    config.write_text(
+        f'<configuration><net-file value="{net.parent}/${{NONE}}{net.name}"/>'
+        '<route-files value="${CITY}/d.rou.xml, c.rou.xml"/>'
+        '<additional-files value="${UP}/e.add.xml,${CITY}/e.add.xml"/>'
+        '<step-length value="${STEP}"/></configuration>'
+    )
+    case = read_sumo_input(config)
+    assert [path.resolve() for path in (case.net, *case.routes)] == [
+        net,
+        tmp_path / "d.rou.xml",
+        below / "c.rou.xml",
+    ]
+    assert [path.resolve() for path in case.additional] == [tmp_path / "e.add.xml"] * 2
+    assert case.step_length == 0.5
+
+
+def test_options_that_every_run_sets_itself_are_told(city):
+    """A device that writes is not taken over, but SUMO draws who would have it."""
+    config = city(
+        options='<tripinfo-output value="t.xml"/><seed value="7"/><threads value="2"/>'
+        '<device.fcd.probability value="0.5"/><device.rerouting.probability value="0.3"/>'
+        '<weight-files value="w.xml"/>'
+    )
+    case = read_sumo_input(config)
+    assert case.ignored == ("device.fcd.probability", "seed", "threads", "tripinfo-output")
+    assert case.options == {"collision.action": "teleport", "device.rerouting.probability": "0"}
+    assert case.reading == {
+        "device.fcd.probability": "1e-12",
+        "device.rerouting.probability": "0.3",
+    }
+    assert [*case.left_out] == ["weight-files"]
+
+
+@pytest.mark.parametrize(
+    "option, remedy",
+    [
+        ("tripinfo-output", "cosim.run(..., tripinfo=FILE) keeps SUMO's trips"),
+        ("tripinfo-output.write-unfinished", "omit it"),
+        ("begin", "give sumo.begin"),
+        ("seed", "give the seed of a run"),
+    ],
+)
+def test_options_of_a_scenario_that_every_run_sets_itself_are_refused(city, option, remedy):
+    scenario = imported(city())[1]
+    toml = scenario.folder / "scenario.toml"
+    table = "[sumo.options]              # of SUMO, as the city has them\n"
+    assert table in toml.read_text()
+    toml.write_text(toml.read_text().replace(table, f'{table}"{option}" = "1"\n'))
+    with pytest.raises(InputError, match="sumo.options: .* is set by every run itself") as raised:
+        settings(load_scenario(scenario.folder))
+    assert remedy in str(raised.value)
+
+
+MADE = """<route id="more" edges="B2C2 C2D2"/>
+<calibrator id="c" edge="B2C2" pos="0" freq="60">
+<flow begin="0" end="600" route="more" vehsPerHour="4000" speed="15"/></calibrator>"""
+PERSONS = "".join(
+    f'<person id="p{n}" depart="{n}"><personTrip from="A2B2" to="C2C3" modes="car"/></person>'
+    for n in range(5)
+)
+
+
+def test_private_trips_are_those_of_the_demand(city, tmp_path):
+    """Vehicles that calibrators and persons make are none, whether they drive or not."""
+    bus = '<vehicle id="b" line="1" depart="1"><route edges="A1B1 B1C1"/></vehicle>'
+    text, scenario = imported(city(FLOW + bus + PERSONS, MADE, '<end value="600"/>'))
+    assert "60 vehicles in" in text
+    run = cosim_run(scenario, "no-control", seed=0, progress=False)
+    assert run.trips == 60
+    assert run.removed_veh == run.removed_waiting_veh == run.given_up.sum() == 0
+    assert run.completed_veh == run.completed[-1] == run.private_arrivals.sum() == 60
+    assert run.public_transport_trips == 1
+    assert run.other_trips > 100
+    assert run.arrivals.sum() > 160
 
 
 @pytest.mark.parametrize(
@@ -161,8 +251,8 @@ def test_cars_for_streets_that_are_closed_to_them(net, city, tmp_path):
     (tmp_path / "closed.net.xml").write_text(text)
     said, scenario = imported(
         city(
-            FLOW
-            + '<vType id="lorry" vClass="truck"/><trip id="lorry" type="lorry" depart="9" from="A1B1" to="C1D1"/>'
+            FLOW + '<vType id="lorry" vClass="truck"/>'
+            '<trip id="lorry" type="lorry" depart="9" from="A1B1" to="C1D1"/>'
             '<vehicle id="over" depart="10"><route edges="B1C1 C1D1 D1D2"/></vehicle>'
             '<trip id="car" depart="12" from="A1B1" to="D1D2"/>',
             net_file="closed.net.xml",
@@ -180,20 +270,22 @@ def test_what_else_changes_routes_and_vehicles(city, tmp_path, monkeypatch):
     exact; vehicles that SUMO gives up are told; nothing is written where the user is."""
     monkeypatch.chdir(tmp_path)
     config = city(
-        FLOW
-        + '<trip id="shut" depart="100" from="C2D2" to="D1D0"/><trip id="begins" depart="begin" from="A1B1" '
-        'to="D1D0"><param key="has.ssm.device" value="true"/></trip>',
-        '<routeProbe id="probe" edge="A1B1" freq="60" file="probe.xml"/><route id="other" edges="B1C1 C1C2"/>'
-        '<route id="more" edges="B2C2 C2D2"/>'
-        '<rerouter id="r" edges="B1C1"><interval begin="0" end="600"><routeProbReroute id="other" probability="1"/>'
-        '</interval></rerouter><rerouter id="s" edges="C2D2"><interval begin="0" end="600"><closingReroute id="C2D2" '
-        'disallow="passenger"/></interval></rerouter><calibrator id="c" edge="B2C2" pos="0" output="calibrator.xml" '
-        'routeProbe="probe" freq="60"><flow begin="0" end="600" route="more" vehsPerHour="600"/></calibrator>',
+        FLOW + '<trip id="shut" depart="100" from="C2D2" to="D1D0"/>'
+        '<trip id="begins" depart="begin" from="A1B1" to="D1D0">'
+        '<param key="has.ssm.device" value="true"/></trip>',
+        '<routeProbe id="probe" edge="A1B1" freq="60" file="probe.xml"/>'
+        '<route id="other" edges="B1C1 C1C2"/><route id="more" edges="B2C2 C2D2"/>'
+        '<rerouter id="r" edges="B1C1"><interval begin="0" end="600">'
+        '<routeProbReroute id="other" probability="1"/></interval></rerouter>'
+        '<rerouter id="s" edges="C2D2"><interval begin="0" end="600">'
+        '<closingReroute id="C2D2" disallow="passenger"/></interval></rerouter>'
+        '<calibrator id="c" edge="B2C2" pos="0" output="calibrator.xml" routeProbe="probe" '
+        'freq="60"><flow begin="0" end="600" route="more" vehsPerHour="600"/></calibrator>',
     )
     text, scenario = imported(config)
     assert " 1 without a route or a free lane" in text
     assert {element.get("id") for element in traffic_of(config).vehicles} >= {"begins", "shut"}
-    due, departed, arrived, inside, _ = driven(scenario, 5, 0.4, rerouting=0.5)
+    _, departed, arrived, inside, _ = driven(scenario, 5, 0.4, rerouting=0.5)
     assert departed - arrived == inside
     assert departed > 40
     assert {path.name for path in tmp_path.iterdir()} == {
@@ -270,6 +362,29 @@ def test_a_city_along_a_straight_road(tmp_path):
     assert sizes.min() >= 4
 
 
+def test_parts_without_a_connection_and_small_regions_are_told(tmp_path):
+    """As of a map that is cut at its edge, or of islands."""
+    nodes, edges = [], []
+    for part, (count, y) in enumerate(((9, 0), (4, 5000))):
+        for n in range(count):
+            nodes.append(f'<node id="{part}.{n}" x="{200 * n}" y="{y}" type="traffic_light"/>')
+        for n in range(count - 1):
+            one, other = f"{part}.{n}", f"{part}.{n + 1}"
+            edges.append(f'<edge id="f{one}" from="{one}" to="{other}"/>')
+            edges.append(f'<edge id="b{one}" from="{other}" to="{one}"/>')
+    (tmp_path / "n.nod.xml").write_text(f"<nodes>{''.join(nodes)}</nodes>")
+    (tmp_path / "e.edg.xml").write_text(f"<edges>{''.join(edges)}</edges>")
+    net = tmp_path / "road.net.xml"
+    tiny_city.run(
+        "netconvert", "-n", tmp_path / "n.nod.xml", "-e", tmp_path / "e.edg.xml", "-o", net
+    )
+    text, scenario = imported(net, demand="peak", level=0.2, iterations=1, mesoscopic=True)
+    assert "the streets fall into 2 parts without a connection; 27" in text
+    assert scenario.network.regions == 2
+    for region in range(2):
+        assert re.search(rf"region {region} \w+ has [12]\.\d lane-kilometres, too few for", text)
+
+
 def test_own_regions_from_a_spreadsheet_and_in_pieces(net, city, tmp_path):
     """A mark at the beginning and empty lines do not matter; streets that cannot stay where they
     were put are told."""
@@ -308,8 +423,9 @@ def test_speeds_and_coordinates(city):
     driven."""
     traffic = traffic_of(
         city(
-            '<trip id="a" depart="1" from="A1B1" to="C1D1" departSpeed="13.9"/><trip id="b" depart="1" fromXY="1,1" '
-            'toXY="9,9"/><trip id="c" depart="1" from="A1B1" to="C1D1" departSpeed="random"/>'
+            '<trip id="a" depart="1" from="A1B1" to="C1D1" departSpeed="13.9"/>'
+            '<trip id="b" depart="1" fromXY="1,1" toXY="9,9"/>'
+            '<trip id="c" depart="1" from="A1B1" to="C1D1" departSpeed="random"/>'
         )
     )
     assert [vehicle.get("departSpeed") for vehicle in traffic.vehicles] == ["max", None, "random"]

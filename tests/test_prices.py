@@ -46,7 +46,8 @@ def test_every_decoder_descends_the_total_time_spent():
 
 def test_a_trained_network_closes_the_loop_and_its_trips_wait(tmp_path):
     folder = tiny.write(tmp_path)
-    table = "\n[controllers.dpc-pcrg]\nprices = true\nmetering = true\nsteps = 6\nfrom_no_control = true\n"
+    options = "prices = true\nmetering = true\nsteps = 6\nfrom_no_control = true\n"
+    table = f"\n[controllers.dpc-pcrg]\n{options}"
     (folder / "scenario.toml").write_text((folder / "scenario.toml").read_text() + table)
     good(nmfd("train", folder, "--controller", "dpc-pcrg"))
     scenario = load_scenario(folder)

@@ -1,6 +1,7 @@
 """Trips of grid7: their number, their regions, their routes and their seeds."""
 
 import xml.etree.ElementTree as ElementTree
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +51,7 @@ def test_routes_lead_from_region_to_region(trips, city):
         assert city.region_of[route[0]] == origin
         assert city.region_of[route[-1]] == destination
         assert route[0] != route[-1]
-        assert all(b in city.successors[a] for a, b in zip(route, route[1:], strict=False))
+        assert all(b in city.successors[a] for a, b in pairwise(route))
         assert 0 < arrival < city.length[route[-1]]
 
 

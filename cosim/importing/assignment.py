@@ -1,4 +1,4 @@
-"""Routes of a generated demand: an iterated assignment by SUMO's duaIterate.py.
+"""Routes of a generated demand, assigned by SUMO's duaIterate.py.
 
 All drivers start on a fastest route at free flow. Then, repeatedly, the city is simulated, and
 drivers choose among the routes that were fastest so far by Gawron's probabilities (1998). The
@@ -11,6 +11,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,15 +26,20 @@ GAP = 0.05  # relative gap at which the assignment ends
 CAR_FOLLOWING_SHARE = 0.5  # of the iterations, in the car-following model after the mesoscopic ones
 GAP_SAMPLE = 2000  # drivers from whom the gap is estimated, at most
 NAME = "peak"  # of the files that duaIterate.py makes
-ALWAYS = [
-    "--aggregation",
-    "300",
-    "--routing-algorithm",
-    "CH",
-    "--disable-warnings",
-    "--disable-summary",
-    "--continue-on-unbuild",
-]
+ALWAYS = ["--aggregation", "300", "--routing-algorithm", "CH"]
+ALWAYS += ["--disable-warnings", "--disable-summary", "--continue-on-unbuild"]
+MESOSCOPIC = ["--mesosim", "--meso-junctioncontrol"]
+
+
+class _Model(NamedTuple):
+    """Model of SUMO in which routes are assigned.
+
+    iterations: at most
+    """
+
+    label: str
+    iterations: int
+    options: Sequence[str]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,8 +67,9 @@ def assign(
     additional: Sequence[Path] = (),
     progress: Progress = lambda stage, share=0.0: None,
 ) -> Assigned:
-    """Assign routes to vehicles that have routes at free flow. The same seed gives the same routes.
+    """Assign routes to vehicles that have routes at free flow.
 
+    The same seed gives the same routes.
     net: an absolute path; elements: the vehicle types, and the vehicles by departure
     iterations: at most, one or more; mesoscopic: the city is driven in the mesoscopic model
     Raises: InputError with SUMO's own words if it refuses
@@ -76,66 +83,68 @@ def assign(
                 stream.write(ElementTree.tostring(root))
         options = ["--net-file", file_list([net]), "--begin", f"{begin:g}", "--end", f"{end:g}"]
         options += [f"--time-to-teleport={time_to_teleport:g}"]
-        options += ["--additional", file_list(additional)] if additional else []
+        if additional:
+            options += ["--additional", file_list(additional)]
         options += ["duarouter--seed", str(seed), "sumo--seed", str(seed)]
+        models = [_Model("assignment", iterations, [*MESOSCOPIC, *options])]
+        if not mesoscopic:
+            fewer = int(np.ceil(CAR_FOLLOWING_SHARE * iterations))
+            models.append(_Model("assignment, car-following", fewer, options))
         gaps: list[float] = []
-        routes, best = dict[str, list[str]](), 0
-        models = [(True, iterations)] + [
-            (False, int(np.ceil(CAR_FOLLOWING_SHARE * iterations)))
-        ] * (not mesoscopic)
-        for meso, most in models:
+        routes: dict[str, list[str]] = {}
+        best = 0
+        for model in models:
             least = np.inf
-            for k in range(most):
-                n, gap = len(gaps), f", gap {100 * gaps[-1]:.0f} %" if gaps else ""
-                progress(
-                    f"assignment{'' if meso else ', car-following'}, at most {most} iterations{gap}",
-                    k / most,
-                )
-                _iterate(
-                    folder,
-                    n,
-                    ["--mesosim", "--meso-junctioncontrol"] * meso + options,
-                    where=str(net),
-                )
-                gaps.append(_relative_gap(folder, net, n, begin=begin, seed=seed))
-                if gaps[-1] <= least:
-                    least, best = gaps[-1], n
-                    vehicles = read_xml(_routes(folder, n)).iter("vehicle")
-                    routes = {
-                        attribute(v, "id"): attribute(child(v, "route"), "edges").split()
-                        for v in vehicles
-                    }
-                if gaps[-1] <= GAP:
+            for k in range(model.iterations):
+                stage = f"{model.label}, at most {model.iterations} iterations"
+                if gaps:
+                    stage += f", gap {100 * gaps[-1]:.0f} %"
+                progress(stage, k / model.iterations)
+                n = len(gaps)
+                _iterate(folder, n, model.options, where=str(net))
+                gap = _relative_gap(folder, net, n, begin=begin, seed=seed)
+                gaps.append(gap)
+                if gap <= least:
+                    least = gap
+                    best = n
+                    routes = {}
+                    for vehicle in read_xml(_routes(folder, n)).iter("vehicle"):
+                        edges = attribute(child(vehicle, "route"), "edges").split()
+                        routes[attribute(vehicle, "id")] = edges
+                if gap <= GAP:
                     break
         return Assigned(routes=routes, gaps=gaps, best=best)
 
 
 def _iterate(folder: Path, n: int, options: Sequence[str], *, where: str) -> None:
     """Run step n of duaIterate.py: routes, except in step 0, and a simulation."""
-    start = (
-        ["--skip-first-routing", "--routes", str(_routes(folder, 0))]
-        if n == 0
-        else ["--trips", f"{NAME}.xml"]
-    )
+    start = ["--trips", f"{NAME}.xml"]
+    if n == 0:
+        start = ["--skip-first-routing", "--routes", str(_routes(folder, 0))]
     steps = ["--first-step", str(n), "--last-step", str(n + 1)]
-    if run_tool(
-        "assign/duaIterate.py", *start, *steps, *ALWAYS, *options, folder=folder
-    ).returncode:
-        log = folder / "dua.log"
-        lines = (
-            log.read_text(encoding="utf-8", errors="replace").splitlines() if log.exists() else []
-        )
-        reason = " ".join(
-            next((line for line in lines if "rror" in line), "no reason given").split()
-        )
+    done = run_tool("assign/duaIterate.py", *start, *steps, *ALWAYS, *options, folder=folder)
+    if done.returncode:
         raise InputError(
-            f"{where}: duaIterate.py cannot assign routes: {reason}; correct the input"
+            f"{where}: duaIterate.py cannot assign routes: {_reason(folder / 'dua.log')}; correct "
+            "the input"
         )
+
+
+def _reason(log: Path) -> str:
+    """Return the first error in a log of duaIterate.py, in one line."""
+    if log.exists():
+        for line in log.read_text(encoding="utf-8", errors="replace").splitlines():
+            if "rror" in line:
+                return " ".join(line.split())
+    return "no reason given"
 
 
 def _relative_gap(folder: Path, net: Path, n: int, *, begin: float, seed: int) -> float:
-    """Return the relative gap [-] of iteration n: what a sample of drivers could save, over their
-    least time."""
+    """Return the relative gap [-] of iteration n.
+
+    It is what drivers could save, over their least time, estimated from a sample.
+    It is estimated from a sample.
+    """
     (weights,) = (folder / f"{n:03d}").glob("dump_*.xml.gz")
     root = read_xml(_routes(folder, n))
     vehicles = root.findall("vehicle")
@@ -164,7 +173,8 @@ def _relative_gap(folder: Path, net: Path, n: int, *, begin: float, seed: int) -
     spent = least = 0.0
     for vehicle in read_xml(folder / "ways.xml").iter("vehicle"):
         costs = [float(attribute(route, "cost")) for route in vehicle.iter("route")]
-        spent, least = spent + costs[0], least + min(costs)
+        spent += costs[0]
+        least += min(costs)
     return (spent - least) / least if least else 0.0
 
 

@@ -1,10 +1,12 @@
-"""Runs of the imported city without control by SUMO's own program: densities of its streets, routes
-driven."""
+"""Runs of the imported city without control by SUMO's own program.
+
+They give the densities of its streets, and the routes driven.
+"""
 
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cosim.importing.case import Progress
+from cosim.importing.comparison import ALL_TRIPS, NEVER, Trip, read_trips
 from cosim.importing.streets import Streets
 from cosim.sumo.arrays import EdgeNumbers, PerEdge
 from cosim.sumo.programs import run_sumo
@@ -20,6 +23,7 @@ from cosim.sumo.recorded_trips import (
     MESOSCOPIC,
     draw,
     read_recorded_trips,
+    run_files,
     write_recorded_trips,
 )
 from cosim.sumo.xml_files import attribute, child, file_list, read_xml
@@ -28,11 +32,22 @@ from nmfd.runs.files import temporary_folder
 
 INTERVAL_S = 300.0  # of the densities
 PEAK_INTERVALS = 3  # in a row: those with the most vehicles count for the partition
-RECORDED = ("exit-times", "last-route", "write-unfinished")
-SILENT = dict.fromkeys(
-    ("no-step-log", "no-warnings", "ignore-route-errors", "duration-log.statistics"), "true"
+# SUMO's options of all runs.
+SILENT = {
+    "no-step-log": "true",
+    "no-warnings": "true",
+    "ignore-route-errors": "true",
+    "duration-log.statistics": "true",
+    **ALL_TRIPS,
+    "vehroute-output.exit-times": "true",
+    "vehroute-output.last-route": "true",
+    "vehroute-output.write-unfinished": "true",
+}
+MEASURE = (
+    f'<additional><edgeData id="all" freq="{INTERVAL_S:g}" file="edges.xml" excludeEmpty="true"/>'
+    "</additional>"
 )
-SILENT |= {f"vehroute-output.{name}": "true" for name in RECORDED}
+Way = tuple[tuple[int, ...], int]  # edges that a vehicle drove to the end, last edge of its route
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,27 +55,32 @@ class Baseline:
     """Measurements of a run without control.
 
     presence: (K, E) [veh s] on every edge in intervals of INTERVAL_S
-    ways: (edges that a vehicle drove to the end, last edge of its route) -> number of vehicles
-    teleports; waiting: vehicles not inserted at the end; running: on the road at the end
-    dropped: vehicles of the demand that SUMO gave up
+    ways: way -> number of vehicles
+    teleports: of all vehicles
+    waiting: private vehicles not inserted at the end; running: those on the road at the end
+    dropped: those that SUMO gave up before they departed; removed: those taken out on their way
     slowness: trip time over free-flow time of completed trips [-], NaN without any
+    trips: of all vehicles
     """
 
     presence: Float[np.ndarray, "K E"]
-    ways: Mapping[tuple[tuple[int, ...], int], int]
+    ways: Mapping[Way, int]
     teleports: int
     waiting: int
     running: int
     dropped: int = 0
+    removed: int = 0
     slowness: float = np.nan
+    trips: Mapping[str, Trip] = field(default_factory=dict)
 
     def density(self, streets: Streets) -> PerEdge:
-        """Return the density (E,) [veh/m of lane] in the quarter of an hour with the most
-        vehicles."""
+        """Return the density (E,) [veh/m of lane] at the peak.
+
+        That is the quarter of an hour with the most vehicles.
+        """
         total = self.presence.sum(axis=1)
-        first = int(
-            np.argmax(np.convolve(total, np.ones(min(PEAK_INTERVALS, len(total))), mode="valid"))
-        )
+        window = np.ones(min(PEAK_INTERVALS, len(total)))
+        first = int(np.argmax(np.convolve(total, window, mode="valid")))
         mean = self.presence[first : first + PEAK_INTERVALS].mean(axis=0) / INTERVAL_S
         return np.where(streets.lane_metres > 0, mean / np.maximum(streets.lane_metres, 1.0), 0.0)
 
@@ -73,7 +93,7 @@ class Baseline:
         return count
 
     def crossings(self, regions: EdgeNumbers) -> PerTurn:
-        """Count the vehicles [i, h, j] that crossed from region i to h on the way to j."""
+        """Count the vehicles [i, h, j] from region i to h on the way to j."""
         count = np.zeros((int(regions.max()) + 1,) * 3)
         for (way, last), vehicles in self.ways.items():
             seen = regions[list(way)]
@@ -82,14 +102,20 @@ class Baseline:
         return count
 
     def metres_per_visit(self, streets: Streets, regions: EdgeNumbers) -> PerRegion:
-        """Return the distance (R,) [m] driven in a region per visit; NaN without visits."""
+        """Return the distance (R,) [m] driven in a region per visit.
+
+        NaN stands for no visits.
+        """
         count = int(regions.max()) + 1
-        metres, visits = np.zeros(count), np.zeros(count)
+        metres = np.zeros(count)
+        visits = np.zeros(count)
         for (way, _), vehicles in self.ways.items():
-            if way:
-                seen = regions[list(way)]
-                np.add.at(metres, seen, vehicles * streets.length[list(way)])
-                np.add.at(visits, seen[np.flatnonzero(np.diff(seen, prepend=-1))], vehicles)
+            if not way:
+                continue
+            seen = regions[list(way)]
+            np.add.at(metres, seen, vehicles * streets.length[list(way)])
+            entries = np.flatnonzero(np.diff(seen, prepend=-1))
+            np.add.at(visits, seen[entries], vehicles)
         return np.where(visits > 0, metres / np.maximum(visits, 1.0), np.nan)
 
 
@@ -103,103 +129,122 @@ def averaged_runs(
     seeds: int,
     progress: Progress,
 ) -> Baseline:
-    """Run the city with seeds 0, 1, ... and average the presence; all else is that of seed 0.
+    """Run the city with seeds 0, 1, ... and average the presence.
 
+    All else is that of seed 0.
     files: routes of the demand, background and additional -> names of files in the folder
     times: SUMO's options begin, end [s], and all others that change the traffic
     factor: multiplies the demand [-]; seed 0 departs as recorded
     Raises: InputError with SUMO's own words if it refuses
     """
-    begin, end = float(times["begin"]), float(times["end"])
-    background, additional = (
-        [folder / name for name in files[key]] for key in ("background", "additional")
-    )
+    begin = float(times["begin"])
+    end = float(times["end"])
+    background = [folder / name for name in files["background"]]
+    additional = [folder / name for name in files["additional"]]
     original = read_recorded_trips([folder / name for name in files["routes"]])
-    options: dict[str, object] = dict(times)
+    options: dict[str, object] = dict(SILENT)
+    if mesoscopic:
+        options |= MESOSCOPIC
+    options |= times
     # A vehicle with a new route by a rerouter makes SUMO fail when it writes the times of the edges
     # it has left.
-    if any(next(read_xml(path).iter("routeProbReroute"), None) is not None for path in additional):
+    if _reroutes(additional):
         options["vehroute-output.exit-times"] = "false"
     runs = []
     for seed in range(seeds):
         progress(f"simulating without control, {seed + 1} of {seeds}", seed / seeds)
         with temporary_folder() as scratch:
+            vehicles = scratch / "vehicles.rou.xml"
+            measure = scratch / "measure.add.xml"
             jitter = JITTER_S if seed else 0.0
             drawn = draw(original, seed=seed, factor=factor, jitter=jitter, begin=begin)
-            write_recorded_trips(original, drawn, scratch / "vehicles.rou.xml")
-            measure = scratch / "measure.add.xml"
-            data = (
-                f'<edgeData id="all" freq="{INTERVAL_S:g}" file="edges.xml" excludeEmpty="true"/>'
-            )
-            measure.write_text(f"<additional>{data}</additional>", encoding="utf-8")
+            write_recorded_trips(original, drawn, vehicles)
+            measure.write_text(MEASURE, encoding="utf-8")
             options |= {
                 "net-file": file_list([streets.path]),
-                "route-files": file_list([scratch / "vehicles.rou.xml", *background]),
+                "route-files": file_list(run_files(vehicles, background, seed)),
                 "additional-files": file_list([*additional, measure]),
                 "seed": seed,
                 "vehroute-output": scratch / "ways.xml",
                 "statistic-output": scratch / "statistic.xml",
+                "tripinfo-output": scratch / "trips.xml",
             }
-            run_sumo(
-                "sumo",
-                SILENT | (MESOSCOPIC if mesoscopic else {}) | options,
-                where=str(streets.path),
-            )
-            runs.append(_measured(scratch, streets, begin, end, {name for _, _, name in drawn}))
+            run_sumo("sumo", options, where=str(streets.path))
+            names = [name for _, _, name in drawn]
+            runs.append(_measured(scratch, streets, begin, end, names))
     return replace(runs[0], presence=np.mean([run.presence for run in runs], axis=0))
 
 
+def _reroutes(additional: Sequence[Path]) -> bool:
+    """Return True if a rerouter of the files gives new routes."""
+    for path in additional:
+        if next(read_xml(path).iter("routeProbReroute"), None) is not None:
+            return True
+    return False
+
+
 def _measured(
-    folder: Path, streets: Streets, begin: float, end: float, vehicles: set[str]
+    folder: Path, streets: Streets, begin: float, end: float, vehicles: Collection[str]
 ) -> Baseline:
     """Read the outputs of a run with these vehicles of the demand."""
     statistic = ElementTree.parse(folder / "statistic.xml").getroot()
-    counts = child(statistic, "vehicles")
-    waiting = int(attribute(counts, "waiting"))
-    trips = child(statistic, "vehicleTripStatistics")
-    duration, loss = (float(attribute(trips, name)) for name in ("duration", "timeLoss"))
-    ways, driven = _ways(folder / "ways.xml", streets)
+    totals = child(statistic, "vehicleTripStatistics")
+    duration = float(attribute(totals, "duration"))
+    loss = float(attribute(totals, "timeLoss"))
+    slowness = duration / (duration - loss) if duration > loss else np.nan
+    trips = read_trips(folder / "trips.xml", end)
+    private = [trips[name] for name in vehicles if name in trips]
+    waiting = running = removed = 0
+    for trip in private:
+        waiting += trip.depart == NEVER
+        running += trip.depart < NEVER and trip.arrival == NEVER
+        removed += trip.removed
     return Baseline(
         presence=_presence(folder / "edges.xml", streets, begin, end),
-        ways=ways,
+        ways=_ways(folder / "ways.xml", streets),
         teleports=int(attribute(child(statistic, "teleports"), "total")),
         waiting=waiting,
-        running=int(attribute(counts, "running")),
-        dropped=max(len(vehicles - driven) - waiting, 0),
-        slowness=duration / (duration - loss) if duration > loss else np.nan,
+        running=running,
+        dropped=len(vehicles) - len(private),
+        removed=removed,
+        slowness=slowness,
+        trips=trips,
     )
 
 
 def _presence(path: Path, streets: Streets, begin: float, end: float) -> np.ndarray:
     """Read Baseline.presence from SUMO's edgeData."""
-    presence = np.zeros((max(1, int(np.ceil((end - begin) / INTERVAL_S))), len(streets.edges)))
+    intervals = max(1, int(np.ceil((end - begin) / INTERVAL_S)))
+    presence = np.zeros((intervals, len(streets.edges)))
     for _, element in ElementTree.iterparse(path):
-        if element.tag == "interval":
-            k = int((float(attribute(element, "begin")) - begin) / INTERVAL_S + 0.5)
+        if element.tag != "interval":
+            continue
+        k = int((float(attribute(element, "begin")) - begin) / INTERVAL_S + 0.5)
+        if k < intervals:
             for edge in element:
-                if (n := streets.number.get(attribute(edge, "id"))) is not None and k < len(
-                    presence
-                ):
+                n = streets.number.get(attribute(edge, "id"))
+                if n is not None:
                     presence[k, n] += float(attribute(edge, "sampledSeconds"))
-            element.clear()
+        element.clear()
     return presence
 
 
-def _ways(path: Path, streets: Streets) -> tuple[Counter[tuple[tuple[int, ...], int]], set[str]]:
-    """Read Baseline.ways, and the vehicles that drove, from SUMO's vehroute output."""
-    ways: Counter[tuple[tuple[int, ...], int]] = Counter()
-    driven_by = set()
+def _ways(path: Path, streets: Streets) -> Counter[Way]:
+    """Read Baseline.ways from SUMO's vehroute output."""
+    ways: Counter[Way] = Counter()
     for _, element in ElementTree.iterparse(path):
-        if element.tag == "vehicle":
-            driven_by.add(attribute(element, "id"))
-            route = element.find("route")
-            if route is not None and (names := route.get("edges")):
-                edges = [streets.number.get(edge, -1) for edge in names.split()]
-                left = [float(time) >= 0 for time in route.get("exitTimes", "").split()] or (
-                    [element.get("arrival") is not None] * len(edges)
-                )
-                driven = tuple(n for n, gone in zip(edges, left, strict=False) if gone and n >= 0)
-                if edges[-1] >= 0:
-                    ways[driven, edges[-1]] += 1
-            element.clear()
-    return ways, driven_by
+        if element.tag != "vehicle":
+            continue
+        route = element.find("route")
+        if route is not None and route.get("edges"):
+            edges = [streets.number.get(edge, -1) for edge in attribute(route, "edges").split()]
+            times = route.get("exitTimes", "").split()
+            if times:
+                left = [float(time) >= 0 for time in times]
+            else:
+                left = [element.get("arrival") is not None] * len(edges)
+            driven = tuple(n for n, gone in zip(edges, left, strict=False) if gone and n >= 0)
+            if edges[-1] >= 0:
+                ways[driven, edges[-1]] += 1
+        element.clear()
+    return ways

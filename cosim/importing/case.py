@@ -1,9 +1,8 @@
-"""Sources of an import: a sumocfg with all it names, a bare network, OpenStreetMap as a file or a
-box."""
+"""Sources of an import: a sumocfg, a bare network, or OpenStreetMap."""
 
 import math
+import os
 import re
-import subprocess
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -12,33 +11,37 @@ from pathlib import Path
 from typing import Protocol
 from urllib.parse import unquote
 
-import numpy as np
-
-from cosim.sumo.programs import HOME, run_sumo, run_tool
-from cosim.sumo.xml_files import attribute, file_list, read_xml, stream_of
+from cosim.importing.osm import LICENCE, Box, convert, fetch
+from cosim.sumo.programs import run_sumo
+from cosim.sumo.xml_files import attribute, read_xml, stream_of
 from nmfd.errors import InputError
 from nmfd.runs.files import temporary_folder
 
+UNITS_S = (1.0, 60.0, 3600.0, 86400.0)
 ENDLESS_S = 1e9  # a later end is none
-# Groups of options, in SUMO's own words, that change what is written or shown, or how it is read,
-# but not the traffic.
-IDLE = set(
-    [
-        "configuration",
-        "output",
-        "report",
-        "emissions",
-        "traci_server",
-        "random_number",
-        "gui_only",
-        "example_device",
-        "ssm_device",
-        "fcd_device",
-        "tripinfo_device",
-        "vehroutes_device",
-    ]
-)
-WRITING = re.compile(r".*(output|threads)|xml-validation.*|scale-suffix")  # others of this kind
+# Groups of options, in SUMO's own words, that change what is shown, but not the traffic.
+SHOWING = {"configuration", "report", "gui_only"}
+# Groups that change what is written: an import says that it does not take them over.
+WRITING_GROUPS = {
+    "output",
+    "emissions",
+    "traci_server",
+    "random_number",
+    "example_device",
+    "ssm_device",
+    "fcd_device",
+    "tripinfo_device",
+    "vehroutes_device",
+}
+WRITING = re.compile(r".*(output|threads)|scale-suffix")  # others of this kind
+# SUMO draws a random number for every vehicle and every device with a probability, from one stream
+# in the order in which it builds the vehicles. So all are drawn once, when the vehicles are read.
+DRAWING = re.compile(r"device\.(\w+)\.(probability|deterministic)")
+NOBODY = "1e-12"
+EVERYBODY = "1"
+# If it is not given at all, vehicles without a route are rerouted periodically.
+REROUTING = "device.rerouting.probability"
+GIVEN_FILES = ("net-file", "route-files", "additional-files")
 READ = (
     "load-state",
     "load-state.offset",
@@ -49,32 +52,8 @@ READ = (
 FILES = re.compile(
     r"weight-files|astar\..*|pedestrian\.jupedsim\..*|phemlight-path|device\.fcd-replay\..*"
 )
-# As SUMO's documentation recommends: sumo.dlr.de/docs/Networks/Import/OpenStreetMap.html.
-# OpenStreetMap does not say what signals show: they come out actuated.
-NETCONVERT = [
-    "--geometry.remove",
-    "--ramps.guess",
-    "--junctions.join",
-    "--tls.guess-signals",
-    "--tls.discard-simple",
-    "--tls.join",
-    "--tls.default-type",
-    "actuated",
-    "--keep-edges.by-vclass",
-    "passenger",
-    "--remove-edges.isolated",
-    "--no-turnarounds.except-deadend",
-    "--no-warnings",
-]
-LICENCE = (
-    "The streets are those of OpenStreetMap: (c) OpenStreetMap contributors, Open Database License 1.0\n"
-    "(SPDX ODbL-1.0, https://opendatacommons.org/licenses/odbl/1-0/), https://www.openstreetmap.org/copyright\n"
-)
-LEFT_HAND = Path(__file__).with_name("left_hand.csv")
-SERVERS = "hpi,oapi,pcoffee"  # osmGet.py's names of public ones
-SERVER_TIME_LIMIT_S = 600.0
+VARIABLE = re.compile(r"\$\{(.+?)\}")  # of the environment, in a sumocfg
 OWN_DEFAULTS = {"collision.action": "teleport"}  # of SUMO, where a scenario has others
-Box = tuple[float, float, float, float]  # west, south, east, north [degrees]
 
 
 class Progress(Protocol):
@@ -94,7 +73,9 @@ class SumoInput:
     options: all others that change the traffic; reading: those that matter only to the reading of
         vehicles
     gaps: SUMO drives routes with gaps
-    left_out: options that may change the traffic and are not taken over, as NAME = VALUE
+    left_out: options that may change the traffic and are not taken over
+    ignored: names of options that every run sets itself, or that only write files
+    devices: kinds that SUMO gives to some vehicles by chance
     notice: required by the licence of the data
     """
 
@@ -110,122 +91,192 @@ class SumoInput:
     options: Mapping[str, str] = field(default_factory=lambda: dict(OWN_DEFAULTS))
     reading: Mapping[str, str] = field(default_factory=dict)
     gaps: bool = False
-    left_out: tuple[str, ...] = ()
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    ignored: tuple[str, ...] = ()
+    devices: tuple[str, ...] = ()
     notice: str = ""
 
 
 @contextmanager
-def sumo_input(source: Path | Box, progress: Progress) -> Iterator[SumoInput]:
-    """Provide the simulation of a source; a network that is built for it goes at the end of the
-    block.
+def sumo_input(
+    source: Path | Box, progress: Progress, *, left_hand: bool = False
+) -> Iterator[SumoInput]:
+    """Provide the simulation of a source.
 
+    A network that is built for it goes at the end of the block.
     source: a sumocfg, a net.xml(.gz), a file of OpenStreetMap, or a box of it
+    left_hand: traffic keeps left in OpenStreetMap, which does not say so
     Raises: InputError for a source that cannot be read, or no answer for a box
     """
     if isinstance(source, Path) and source.suffix == ".pbf":
         osm = source.stem.removesuffix(".osm")
         raise InputError(f"{source}: convert pbf first: osmium cat {source.name} -o {osm}.osm")
     if isinstance(source, Path) and _root(source).tag != "osm":
+        if left_hand:
+            raise InputError(f"--left-hand: {source} says itself where traffic keeps; omit it")
         yield read_sumo_input(source)
         return
     with temporary_folder() as folder:
         if not isinstance(source, Path):
             progress("fetching OpenStreetMap")
-            source = fetch_osm(source, folder)
+            source = fetch(source, folder)
         progress("netconvert")
-        net, types = folder / "osm.net.xml", HOME / "data" / "typemap" / "osmNetconvert.typ.xml"
-        options = {
-            "osm-files": file_list([source.resolve()]),
-            "type-files": types,
-            "output-file": net,
-        }
-        run_sumo("netconvert", options, *NETCONVERT, where=str(source))
-        west, south, east, north = map(
-            float, _root(net, "location").attrib["origBoundary"].split(",")
-        )
-        if keeps_left((west + east) / 2, (south + north) / 2):
-            run_sumo("netconvert", options, *NETCONVERT, "--lefthand", where=str(source))
-        net.write_bytes(
-            re.sub(rb"<!--.*?-->\s*", b"", net.read_bytes(), count=1, flags=re.DOTALL)
-        )  # date and folder
+        net = convert(source, folder, left_hand=left_hand)
         yield SumoInput(source=source, net=net, notice=LICENCE)
 
 
 def read_sumo_input(path: Path) -> SumoInput:
-    """Read a sumocfg, or take a net.xml(.gz) as a simulation without demand. Raises InputError."""
+    """Read a sumocfg, or take a net.xml(.gz) as a case without demand.
+
+    Raises: InputError
+    """
     root = _root(path)
     if root.tag == "net":
         return SumoInput(source=path, net=path)
     if root.tag not in ("configuration", "sumoConfiguration"):
         raise InputError(
-            f"{path}: expected a sumocfg, a net.xml or a file of OpenStreetMap, got a file of <{root.tag}> instead"
+            f"{path}: expected a sumocfg, a net.xml or a file of OpenStreetMap, got a file of "
+            f"<{root.tag}> instead"
         )
-    with temporary_folder() as folder:
-        saved = folder / "read.sumocfg"
-        run_sumo(
-            "sumo",
-            {"configuration-file": path.absolute(), "save-configuration": saved},
-            where=str(path),
-        )
-        groups = read_xml(saved)
-    options = {
-        e.tag: attribute(e, "value") for group in groups if group.tag not in IDLE for e in group
-    }
-    options = {name: value for name, value in options.items() if not WRITING.fullmatch(name)}
-    files: dict[str, tuple[Path, ...]] = {}
-    for key in ("net-file", "route-files", "additional-files"):
-        names = [
-            unquote(name).split("/")
-            for name in options.pop(key, "").split(",")
-            if unquote(name).strip()
-        ]
-        files[key] = tuple(Path("/".join(part.strip() for part in parts)) for parts in names)
-        for file in files[key]:
-            if not file.is_file():
-                raise InputError(
-                    f"{path}: {key}: no such file: {file}; correct the name or add the file"
-                )
+    options, ignored = _options(path)
+    files = {key: _files(path, key, options.pop(key, "")) for key in GIVEN_FILES}
     if not files["net-file"]:
         raise InputError(
             f'{path}: net-file: missing; add <net-file value="city.net.xml"/> to its <input>'
         )
+    loaded = "0"
+    if "load-state" in options:
+        state = _file(path, options["load-state"])
+        options["load-state"] = state
+        loaded = _root(Path(state)).get("time", loaded)
 
-    def number(name: str, default: str) -> float:
+    def time(name: str, default: str) -> float:
         return seconds(options.pop(name, default), f"{path}: {name}")
 
-    end, teleport = number("end", "-1"), number("time-to-teleport", "300")
-    begin = "0"
-    if state := options.get("load-state"):
-        options["load-state"] = unquote(state)
-        begin = _root(Path(options["load-state"])).get("time", begin)
-    mesoscopic, gaps = (
-        options.pop(name, "").lower() in ("true", "1", "yes", "on", "x")
-        for name in ("mesosim", "ignore-route-errors")
-    )
-    own = OWN_DEFAULTS | ({"meso-junction-control": "false"} if mesoscopic else {})
+    begin = time("begin", loaded)
+    end = time("end", "-1")
+    step_length = time("step-length", "1")
+    teleport = time("time-to-teleport", "300")
+    mesoscopic = _is_true(options.pop("mesosim", ""))
+    gaps = _is_true(options.pop("ignore-route-errors", ""))
+    driven = dict(OWN_DEFAULTS)
+    reading = {}
+    left_out = {}
+    if mesoscopic:
+        driven["meso-junction-control"] = "false"
+    devices = []
+    for name, value in options.items():
+        device = DRAWING.fullmatch(name)
+        if device:
+            reading[name] = value
+            devices.append(device[1])
+            if name == REROUTING:
+                driven[name] = "0"
+        elif name in READ:
+            reading[name] = value
+        elif FILES.fullmatch(name):
+            left_out[name] = value
+        else:
+            driven[name] = value
     return SumoInput(
         source=path,
         net=files["net-file"][0],
         routes=files["route-files"],
         additional=files["additional-files"],
-        begin=number("begin", begin),
+        begin=begin,
         end=end if 0 < end < ENDLESS_S else None,
-        step_length=number("step-length", "1"),
+        step_length=step_length,
         time_to_teleport=teleport if teleport > 0 else -1.0,
         mesoscopic=mesoscopic,
-        options=own
-        | {k: v for k, v in options.items() if k not in READ and not FILES.fullmatch(k)},
-        reading={name: options[name] for name in READ if name in options},
+        options=driven,
+        reading=reading,
         gaps=gaps,
-        left_out=tuple(
-            f"{name} = {value}" for name, value in sorted(options.items()) if FILES.fullmatch(name)
-        ),
+        left_out=left_out,
+        ignored=ignored,
+        devices=tuple(sorted(set(devices))),
     )
 
 
+def _options(path: Path) -> tuple[dict[str, str], tuple[str, ...]]:
+    """Return the options of a sumocfg that change the traffic.
+
+    And the names of those that write files or that every run sets itself.
+    """
+    with temporary_folder() as folder:
+        saved = folder / "read.sumocfg"
+        given = {"configuration-file": path.absolute(), "save-configuration": saved}
+        run_sumo("sumo", given, where=str(path))
+        groups = read_xml(saved)
+    options = {}
+    ignored = []
+    for group in groups:
+        for element in group:
+            name = element.tag
+            value = attribute(element, "value")
+            if group.tag in WRITING_GROUPS or WRITING.fullmatch(name):
+                ignored.append(name)
+            elif name in (*GIVEN_FILES, "load-state"):
+                options[name] = value
+            elif group.tag not in SHOWING:
+                options[name] = _substituted(value)
+            if group.tag in WRITING_GROUPS and name.endswith(".probability"):
+                options[name] = EVERYBODY if group.tag == "tripinfo_device" else NOBODY
+    for name in ignored:  # such a device needs no random number
+        if name.endswith(".deterministic"):
+            options.pop(f"{name.removesuffix('.deterministic')}.probability", None)
+    return options, tuple(sorted(ignored))
+
+
+def _files(path: Path, key: str, names: str) -> tuple[Path, ...]:
+    """Return the files of an option of a sumocfg.
+
+    Raises: InputError if one is not there
+    """
+    files = []
+    for name in names.split(","):
+        parts = [part.strip() for part in _file(path, name).split("/")]
+        if not any(parts):
+            continue
+        file = Path("/".join(parts))
+        if not file.is_file():
+            raise InputError(
+                f"{path}: {key}: no such file: {file}; correct the name or add the file"
+            )
+        files.append(file)
+    return tuple(files)
+
+
+def _file(path: Path, name: str) -> str:
+    """Return a file that the saved form of a sumocfg names.
+
+    SUMO has put the folder before every name that looked relative, even if it began with an
+    environment variable that holds a whole path.
+    """
+    text = unquote(name)
+    own = text.removeprefix(f"{path.absolute().parent}/").strip()
+    if own.startswith("${") and Path(_substituted(own)).is_absolute():
+        return _substituted(own)
+    return _substituted(text)
+
+
+def _substituted(text: str) -> str:
+    """Replace ${NAME} by the environment variable, as SUMO does.
+
+    An unknown one is empty.
+    """
+    return VARIABLE.sub(lambda name: os.environ.get(name[1], ""), text)
+
+
+def _is_true(value: str) -> bool:
+    return value.lower() in ("true", "1", "yes", "on", "x")
+
+
 def seconds(text: str, where: str) -> float:
-    """Convert a SUMO time, seconds or [days:]hours:minutes:seconds; `where` is named by an
-    InputError."""
+    """Convert a SUMO time: seconds or [days:]hours:minutes:seconds.
+
+    where: named by an error
+    Raises: InputError
+    """
     try:
         parts = [float(part) for part in text.split(":")]
         if not 1 <= len(parts) <= 4 or len(parts) == 2 or not all(map(math.isfinite, parts)):
@@ -234,62 +285,17 @@ def seconds(text: str, where: str) -> float:
         raise InputError(
             f"{where}: expected seconds or hours:minutes:seconds, got {text!r} instead"
         ) from None
-    size = sum(
-        abs(part) * unit
-        for part, unit in zip(reversed(parts), (1.0, 60.0, 3600.0, 86400.0), strict=False)
-    )
+    size = 0.0
+    for part, unit in zip(reversed(parts), UNITS_S, strict=False):
+        size += abs(part) * unit
     return -size if text.startswith("-") else size
 
 
-def keeps_left(longitude: float, latitude: float) -> bool:
-    """Return True if traffic keeps left at a place [degrees], as in the nearest city of LEFT_HAND.
+def _root(path: Path) -> ElementTree.Element:
+    """Read the root of an XML file, with its attributes only.
 
-    >>> keeps_left(100.5, 13.75), keeps_left(102.6, 17.97)  # Bangkok, Vientiane
-    (True, False)
+    Raises: InputError
     """
-    east, north, left = np.loadtxt(LEFT_HAND, delimiter=",", skiprows=2, unpack=True)
-    a, b, turn = np.radians(latitude), np.radians(north), np.radians(east - longitude)
-    nearness = np.sin(a) * np.sin(b) + np.cos(a) * np.cos(b) * np.cos(
-        turn
-    )  # cosine of the angle between both
-    return bool(left[np.argmax(nearness)])
-
-
-def parse_box(text: str) -> Box:
-    """Parse --bbox. Raises InputError."""
-    try:
-        west, south, east, north = (float(part) for part in text.split(","))
-    except ValueError:
-        west = south = east = north = 0.0
-    if not (-180.0 <= west < east <= 180.0 and -90.0 <= south < north <= 90.0):
-        raise InputError(
-            f"--bbox: expected west,south,east,north in degrees, such as 11.32,44.48,11.36,44.50, got {text!r} instead"
-        )
-    return west, south, east, north
-
-
-def fetch_osm(box: Box, folder: Path) -> Path:
-    """Fetch the streets within a box by SUMO's osmGet.py from a public server. Raises
-    InputError."""
-    where = ",".join(f"{value:g}" for value in box)
-    options = [f"--bbox={where}", "--prefix", "osm", "--gzip", "--url", SERVERS, "--retries", "2"]
-    options += ["--road-types", '{"highway": ["."]}']
-    try:
-        run_tool(
-            "osmGet.py", *options, folder=folder, seconds=SERVER_TIME_LIMIT_S
-        ).check_returncode()
-        return next(folder.glob("osm_bbox.osm.xml.gz"))
-    except (subprocess.SubprocessError, StopIteration) as error:
-        reason = (getattr(error, "stderr", "") or str(error)).strip().splitlines()[-1:]
-        raise InputError(
-            f"--bbox: {where}: osmGet.py got nothing from OpenStreetMap ({' '.join(reason)}); without internet access "
-            "give a file of the area, exported at https://www.openstreetmap.org/export"
-        ) from None
-
-
-def _root(path: Path, tag: str | None = None) -> ElementTree.Element:
-    """Read the root of an XML file, or its first element `tag`, with its attributes only. Raises
-    InputError."""
     with stream_of(path) as stream:
-        elements = (element for _, element in ElementTree.iterparse(stream, events=("start",)))
-        return next(element for element in elements if tag in (None, element.tag))
+        _, root = next(iter(ElementTree.iterparse(stream, events=("start",))))
+        return root

@@ -1,54 +1,47 @@
-"""Traffic of a city: its private vehicles one by one, and all that runs beside them unchanged."""
+"""Traffic of a city: private vehicles one by one, and all beside them."""
 
+import math
+import re
 from collections import Counter
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
-from xml.etree.ElementTree import Element, ElementTree, SubElement
+from functools import cached_property
+from typing import NamedTuple
+from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 
+from cosim.importing import quiet_files
 from cosim.importing.case import SumoInput, seconds
 from cosim.importing.streets import Streets
 from cosim.sumo.arrays import PerTrip, TripNumbers
-from cosim.sumo.departures import Departure, read_departures
+from cosim.sumo.departures import Departure, Departures, original, read_departures
 from cosim.sumo.recorded_trips import BOUND, QUEUED_AFTER
-from cosim.sumo.xml_files import file_list, read_xml
+from cosim.sumo.xml_files import file_list
 from nmfd.errors import InputError
 from nmfd.runs.files import temporary_folder
 
-FILES = {
-    "additional": "additional-files",
-    "routes": "route-files",
-}  # root of a file -> option of SUMO
 DRIVERS = ("vehicle", "trip", "flow")
 OTHERS = ("person", "personFlow", "container", "containerFlow")
-DROPPED = (
-    "poly",
-    "poi",
-    "edgeData",
-    "laneData",
-    "timedEvent",
-    "vTypeProbe",
-    "interval",
-)  # no traffic
-WRITERS = (
-    "Detector",
-    "Loop",
-    "calibrator",
-    "routeProbe",
-)  # ends of names of elements that write files
-WRITING = (
-    "file",
-    "has.ssm.device",
-    "device.toc.file",
-)  # parameters that only make SUMO write files
+ACTING = ("calibrator", "rerouter")  # they act on every run, and not on what SUMO reads
 SAFE_SPEEDS = ("max", "random", "0", "0.0", "0.00")  # departure speeds that can wait for a green
 FLOW = ("begin", "end", "number", "period", "vehsPerHour", "perHour", "probability")
 ZONES = ("fromTaz", "toTaz", "fromJunction", "toJunction")
-TRIGGERED = ("triggered", "containerTriggered", "split")  # departures without a time
+TRIGGERED = ("triggered", "containerTriggered", "split", "now")  # departures without a time
 DEFAULT_TYPE = "DEFAULT_VEHTYPE"
 ENDLESS_FLOW_S = 3600.0  # length of a simulation without an end that has a flow without an end
+SHORT_DELAY_S = 60.0  # of waiting to enter, after which SUMO gives up vehicles
+NAMES = re.compile(r"'[^']*'|[\d.]+")  # of things, in SUMO's words
+# Notes: what was changed or left out, to be counted.
+ENDLESS = "s are simulated, as a flow has no end (--end for another time)"
+FAST = "fixed speeds at the departure, made the highest safe ones"
+FROM_FLOWS = "vehicles from flows"
+ON_ROAD = "vehicles on the road in the loaded state, begin where they are"
+WAITING = "vehicles without a time of departure, left alone"
+BUSES = "public transport and other classes left alone"
+ALONE = "persons, containers and vehicles left alone, in all"
+NOWHERE = "vehicles on edges that the network has not, left out"
+NO_ROUTE = "vehicles without a route that SUMO could drive, left out"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,8 +54,11 @@ class Traffic:
     shared: types, routes, stops, programmes and other contents of the additional files
     switched: signals whose programme a timetable (WAUT) changes
     notes: what was changed or left out -> count
+    remarks: examples of what was left out, and SUMO's own words about the files
     left_out: shares of SUMO's vehicles, and of the distance that they would drive [-], that are not
         taken over
+    given: ids of all vehicles and flows of the files
+    end: later vehicles were not read [s]
     """
 
     vehicles: tuple[Element, ...]
@@ -73,7 +69,31 @@ class Traffic:
     shared: tuple[Element, ...] = ()
     switched: tuple[str, ...] = ()
     notes: Mapping[str, int] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
     left_out: tuple[float, float] = (0.0, 0.0)
+    given: frozenset[str] = frozenset()
+    end: float = math.inf
+
+    def is_private(self, vehicle: str) -> bool:
+        """Return True for a trip of the demand, even if it was left out.
+
+        Buses and the like, and vehicles that calibrators or persons make, are none.
+        """
+        source = original(vehicle, self.given)
+        return bool(source) and not {vehicle, source} & self._beside
+
+    @cached_property
+    def _beside(self) -> set[str]:
+        return {element.get("id", "").strip() for element in self.background}
+
+
+class _Trip(NamedTuple):
+    """Trip of the demand; first, last: numbers of edges."""
+
+    depart: float
+    first: int
+    last: int
+    element: Element
 
 
 def read_traffic(case: SumoInput, streets: Streets, seed: int) -> Traffic:
@@ -81,211 +101,325 @@ def read_traffic(case: SumoInput, streets: Streets, seed: int) -> Traffic:
 
     Flows become single vehicles; what is random is drawn by SUMO with `seed`. Raises InputError.
     """
-    files: list[Element] = []
-    shared, background, given = list[Element](), list[Element](), dict[str, Element]()
-    switched: set[str] = set()
-    end, notes, unknown = case.end, Counter[str](), 0
-    for path in (*case.additional, *case.routes):
-        files.append(Element("additional" if len(files) < len(case.additional) else "routes"))
-        for element in map(_silent, read_xml(path)):
+    reading = Reading(case, streets)
+    for root in quiet_files.read(case):
+        reading.file(root)
+    departures = reading.departures(seed)
+    reading.departed(departures)
+    return reading.traffic(departures)
+
+
+class Reading:
+    """Traffic of a case while it is read.
+
+    First come its files, and then the vehicles that SUMO makes of them.
+    """
+
+    def __init__(self, case: SumoInput, streets: Streets):
+        self._case, self._streets = case, streets
+        # What the files hold.
+        self._files: list[Element] = []  # for SUMO to read
+        self._given: dict[str, Element] = {}  # id -> vehicle, trip or flow
+        self._astray: dict[str, str] = {}  # of these, those on an edge that does not exist
+        self._background: list[Element] = []
+        self._shared: list[Element] = []
+        self._end = case.end
+        self._latest = 0.0  # when the last vehicle, person or flow begins [s]
+        # What SUMO makes of it.
+        self._trips: list[_Trip] = []
+        self._ids: set[str] = set()
+        self._routeless: list[str] = []
+        self._metres = 0.0  # that all vehicles would drive
+        self._metres_kept = 0.0
+        self._queued: dict[int, float] = {}  # step of the simulation -> last departure
+        self._cars_at = Counter[float]()  # departure -> trips
+        self._notes = Counter[str]()
+
+    def file(self, root: Element) -> None:
+        """Take the contents of a file of quiet_files."""
+        for_sumo = Element(root.tag)
+        for element in root:
+            read = element
             if element.tag in DRIVERS:
-                if not _edges(element) <= streets.number.keys():  # SUMO refuses the city for it
-                    unknown += 1
-                    continue
-                given[element.get("id", "").strip()] = element
-                if element.get("depart") in TRIGGERED:
-                    background.append(element)
-                    notes["vehicles without a time of departure, left alone"] += 1
-                if (
-                    element.tag == "flow"
-                    and end is None
-                    and not {"end", "number"} & set(element.keys())
-                ):
-                    end = case.begin + ENDLESS_FLOW_S
-                    notes["s are simulated, as a flow has no end (--end for another time)"] = int(
-                        ENDLESS_FLOW_S
-                    )
+                read = self._driver(element)
             elif element.tag in OTHERS:
-                background.append(element)
-            elif element.tag not in DROPPED:
-                switched |= {
-                    name for e in element.iter("wautJunction") if (name := e.get("junctionID"))
-                }
-                shared.append(element)
-            files[-1].append(element)
-    departures = _read(case, files, seed, end)
-    for element in shared:
-        for kind in element.iter("vType"):
-            kind.attrib.pop("scale", None)  # SUMO has multiplied the vehicles already
-    names = {route.get("id", "") for element in shared for route in element.iter("route")}
-    kept: list[tuple[float, int, int, Element]] = []
-    queue = Counter[float]()  # time of departure -> vehicles of `kept`
-    seen, metres = set[str](), np.zeros(2)  # that all vehicles would drive, and those left out
-    for departed in departures:
-        original = _original(departed.id, given)
-        if original is not None and original.get("depart") in TRIGGERED:
-            continue
-        edges = [streets.number[edge] for edge in departed.edges if edge in streets.number]
-        metres += streets.length[edges].sum()
-        if not edges or not (departed.valid or case.gaps):
-            unknown += 1
-            continue
-        if departed.id in seen:
-            raise InputError(
-                f"{case.source}: vehicle {departed.id}: another one has this id; rename one of them"
-            )
-        seen.add(departed.id)
-        metres[1] -= streets.length[edges].sum()
-        element = _single(departed, original, names)
-        if departed.place is not None:
-            notes["vehicles on the road in the loaded state, begin where they are"] += 1
-        elif original is not None and original.tag == "flow":
-            notes["vehicles from flows"] += 1
-        # SUMO deletes a vehicle that cannot stop from its departure speed at a signal whose
-        # programme never gives it green; a signal that is switched from outside has no programme
-        # that does.
-        if element.get("departSpeed", "max") not in SAFE_SPEEDS:
-            element.set("departSpeed", "max")
-            notes["fixed speeds at the departure, made the highest safe ones"] += 1
-        if departed.line or departed.kind in BOUND:
-            SubElement(
-                element, "param", {"key": QUEUED_AFTER, "value": str(queue[departed.depart])}
-            )
-            background.append(element)
-            notes["public transport and other classes left alone"] += 1
-        else:
-            first, last = (
-                edges[int(place) if (place := element.get(key, "")).isdecimal() else default]
-                for key, default in (("departEdge", 0), ("arrivalEdge", -1))
-            )
-            queue[departed.depart] += 1
-            kept.append((departed.depart, first, last, element))
-    if unknown:
-        notes["vehicles without a route that SUMO could drive, left out"] = unknown
-    if background:
-        notes["persons, containers and vehicles left alone, in all"] = len(background)
-    depart, origin, destination, elements = (
-        zip(*sorted(kept, key=lambda row: row[0]), strict=True) if kept else ((),) * 4
-    )
-    return Traffic(
-        vehicles=tuple(elements),
-        depart=np.array(depart, dtype=float),
-        origin=np.array(origin, dtype=int),
-        destination=np.array(destination, dtype=int),
-        background=tuple(sorted(background, key=departure)),
-        shared=tuple(shared),
-        switched=tuple(sorted(switched)),
-        notes=dict(notes),
-        left_out=(
-            unknown / max(len(kept) + len(background) + unknown, 1),
-            metres[1] / max(metres[0], 1.0),
-        ),
-    )
+                self._background.append(element)
+            else:
+                self._shared.append(element)
+            if element.tag in (*DRIVERS, *OTHERS):
+                self._latest = max(self._latest, departure(element))
+            if element.tag not in ACTING:
+                for_sumo.append(read)
+        self._files.append(for_sumo)
 
+    def _driver(self, element: Element) -> Element:
+        """Take a vehicle, trip or flow; return what SUMO shall read for it."""
+        name = element.get("id", "").strip()
+        self._given[name] = element
+        if _waits(element):
+            self._background.append(element)
+        is_endless = element.tag == "flow" and not {"end", "number"} & element.attrib.keys()
+        if is_endless and self._end is None:
+            self._end = self._case.begin + ENDLESS_FLOW_S
+            self._notes[ENDLESS] = int(ENDLESS_FLOW_S)
+        for edge in _edges(element):
+            if edge not in self._streets.number:
+                self._astray[name] = edge
+                return _stand_in(element, self._streets)
+        return element
 
-def _read(
-    case: SumoInput, files: Sequence[Element], seed: int, end: float | None
-) -> list[Departure]:
-    """Let SUMO read the vehicles. files: contents of the additional files, and of the route
-    files"""
-    with temporary_folder() as folder:
-        paths: dict[str, list[Path]] = {"additional": [], "routes": []}
-        for n, root in enumerate(files):
-            for element in [
-                *root.findall("calibrator"),
-                *root.findall("rerouter"),
-            ]:  # act on every run
-                root.remove(element)
-            paths[root.tag].append(folder / f"{n}.xml")
-            ElementTree(root).write(paths[root.tag][-1])
-        options = {
+    def departures(self, seed: int) -> Departures:
+        """Let SUMO read the vehicles of all files. Raises InputError."""
+        case = self._case
+        options: dict[str, object] = {
             "net-file": file_list([case.net.absolute()]),
             "begin": case.begin,
             "step-length": case.step_length,
-        }
-        options |= {FILES[key]: file_list(names) for key, names in paths.items() if names}
-        options |= {
             "mesosim": str(case.mesoscopic).lower(),
             "seed": seed,
             **case.options,
             **case.reading,
         }
-        return read_departures(options, end=end, where=str(case.source))
+        with temporary_folder() as folder:
+            options |= quiet_files.write(self._files, folder)
+            return read_departures(
+                options,
+                given={name: _waits(element) for name, element in self._given.items()},
+                devices=case.devices,
+                end=self._end,
+                latest=self._latest,
+                where=str(case.source),
+            )
+
+    def departed(self, departures: Departures) -> None:
+        """Take the vehicles that SUMO read. Raises InputError if two have one id."""
+        parts = [part for element in self._shared for part in element.iter()]
+        routes = {part.get("id", "") for part in parts if part.tag == "route"}
+        for part in parts:
+            if part.tag == "vType":
+                part.attrib.pop("scale", None)  # SUMO has multiplied its vehicles already
+        for vehicle in departures.vehicles:
+            self._vehicle(vehicle, routes)
+        self._routeless += departures.dropped
+        self._notes[WAITING] = len(departures.timeless)
+
+    def _vehicle(self, vehicle: Departure, routes: Container[str]) -> None:
+        """Take a vehicle that SUMO read; routes: ids of shared ones."""
+        name = original(vehicle.id, self._given)
+        if name in self._astray:
+            self._notes[NOWHERE] += 1
+            return
+        if not name and vehicle.place is None:
+            return  # of a person, who makes it in every run
+        number = self._streets.number
+        edges = [number[edge] for edge in vehicle.edges if edge in number]
+        metres = float(self._streets.length[edges].sum())
+        self._metres += metres
+        if not edges or not (vehicle.valid or self._case.gaps):
+            self._routeless.append(vehicle.id)
+            return
+        if vehicle.id in self._ids:
+            raise InputError(
+                f"{self._case.source}: vehicle {vehicle.id}: another one has this id; rename one "
+                "of them"
+            )
+        self._ids.add(vehicle.id)
+        self._metres_kept += metres
+        depart = self._place(vehicle)
+        element = self._element(vehicle, self._given.get(name), routes)
+        element.set("depart", f"{depart:.10g}")
+        if vehicle.line or vehicle.kind in BOUND:
+            cars_before = str(self._cars_at[depart])
+            SubElement(element, "param", {"key": QUEUED_AFTER, "value": cars_before})
+            self._background.append(element)
+            self._notes[BUSES] += 1
+            return
+        self._cars_at[depart] += 1
+        first = edges[_index(element.get("departEdge", ""), 0)]
+        last = edges[_index(element.get("arrivalEdge", ""), -1)]
+        self._trips.append(_Trip(depart, first, last, element))
+
+    def _place(self, vehicle: Departure) -> float:
+        """Return a departure [s] that keeps the place in SUMO's queue.
+
+        SUMO inserts the vehicles of a step in the order in which it built them, and a file is
+        sorted by time: so none may have an earlier time than one before it in the queue. SUMO
+        finds the route of a file's vehicle in the last step before its departure, but that of a
+        flow's in the step that builds it. Where it soon gives up vehicles that wait, the exact
+        departure matters more.
+        """
+        depart = vehicle.depart
+        milliseconds = round(1000.0 * self._case.step_length)
+        step = math.ceil(round(1000.0 * depart) / milliseconds)
+        patience = self._case.options.get("max-depart-delay", "-1")
+        gives_up = 0.0 <= seconds(patience, str(self._case.source)) <= SHORT_DELAY_S
+        if vehicle.routed and not gives_up:
+            depart = max(depart, min(vehicle.built, step * milliseconds / 1000.0))
+        depart = max(depart, self._queued.get(step, depart))
+        self._queued[step] = depart
+        return depart
+
+    def _element(
+        self, vehicle: Departure, source: Element | None, routes: Container[str]
+    ) -> Element:
+        """Return a vehicle for the scenario, and note what was changed.
+
+        source: its element, or that of its flow; routes: ids of shared ones
+        """
+        if vehicle.place is not None or source is None:
+            element = _on_road(vehicle)
+            self._notes[ON_ROAD] += 1
+        else:
+            element = _single(vehicle, source, routes)
+            self._notes[FROM_FLOWS] += source.tag == "flow"
+        # SUMO deletes a vehicle that cannot stop from its departure speed at a signal whose
+        # programme never gives it green; a signal that is switched from outside has no programme
+        # that does.
+        if element.get("departSpeed", "max") not in SAFE_SPEEDS:
+            element.set("departSpeed", "max")
+            self._notes[FAST] += 1
+        for device in vehicle.devices:
+            SubElement(element, "param", {"key": f"has.{device}.device", "value": "true"})
+        return element
+
+    def traffic(self, departures: Departures) -> Traffic:
+        """Return all that was taken."""
+        trips = sorted(self._trips, key=lambda trip: trip.depart)
+        switched = set()
+        for element in self._shared:
+            for part in element.iter("wautJunction"):
+                switched.add(part.get("junctionID", ""))
+        self._notes[NO_ROUTE] = len(self._routeless)
+        self._notes[ALONE] = len(self._background)
+        return Traffic(
+            vehicles=tuple(trip.element for trip in trips),
+            depart=np.array([trip.depart for trip in trips], dtype=float),
+            origin=np.array([trip.first for trip in trips], dtype=int),
+            destination=np.array([trip.last for trip in trips], dtype=int),
+            background=tuple(sorted(self._background, key=departure)),
+            shared=tuple(self._shared),
+            switched=tuple(sorted(switched - {""})),
+            notes={note: count for note, count in self._notes.items() if count},
+            remarks=tuple(self._remarks(departures.warnings)),
+            left_out=self._left_out(),
+            given=frozenset(self._given),
+            end=math.inf if self._end is None else self._end,
+        )
+
+    def _left_out(self) -> tuple[float, float]:
+        """Return Traffic.left_out."""
+        nowhere = self._notes[NOWHERE]
+        left = nowhere + len(self._routeless)
+        known = len(self._trips) + len(self._background) + len(self._routeless)
+        # Those on edges of another network would drive as far as the others.
+        metres = self._metres * (1.0 + nowhere / max(known, 1))
+        distance = (metres - self._metres_kept) / max(metres, 1.0)
+        return left / max(known + nowhere, 1), distance
+
+    def _remarks(self, warnings: Sequence[str]) -> list[str]:
+        """Return examples of what was left out, and SUMO's words.
+
+        Alike words are there once.
+        """
+        remarks = []
+        if self._astray:
+            name, edge = next(iter(self._astray.items()))
+            what = f"edge {edge} of {self._given[name].tag} {name} is not in {self._case.net.name}"
+            remarks.append(what + _in_all(self._notes[NOWHERE]))
+        if self._routeless:
+            what = f"vehicle {self._routeless[0]} has no route that SUMO could drive"
+            remarks.append(what + _in_all(len(self._routeless)))
+        alike: dict[str, list[str]] = {}
+        for words in warnings:
+            alike.setdefault(NAMES.sub("", words), []).append(words)
+        for several in alike.values():
+            remarks.append(f"SUMO says: {several[0]}{_in_all(len(several))}")
+        return remarks
 
 
-def _edges(element: Element) -> set[str]:
+def _in_all(count: int) -> str:
+    return f" ({count:,} in all)" if count > 1 else ""
+
+
+def _index(text: str, default: int) -> int:
+    """Return a departEdge or arrivalEdge; `default` for a word."""
+    return int(text) if text.isdecimal() else default
+
+
+def _waits(element: Element) -> bool:
+    """Return True for a vehicle or flow that departs when somebody else comes."""
+    return element.get("depart", element.get("begin")) in TRIGGERED
+
+
+def _edges(element: Element) -> list[str]:
     """Return the edges that a vehicle names, without those of shared routes."""
     texts = [element.get(key, "") for key in ("from", "to", "via")]
     texts += [route.get("edges", "") for route in element.iter("route")]
-    return set(" ".join(texts).split())
+    return " ".join(texts).split()
 
 
-def _original(name: str, given: Mapping[str, Element]) -> Element | None:
-    """Return the element that a vehicle comes from: of its id, or that of a flow or a multiplied
-    vehicle."""
-    while name and name not in given:
-        name = name.rpartition(".")[0]
-    return given.get(name)
+def _stand_in(element: Element, streets: Streets) -> Element:
+    """Return what SUMO can read for a vehicle on an unknown edge.
 
-
-def _single(departure: Departure, original: Element | None, names: Container[str]) -> Element:
-    """Return the vehicle of a departure, as it was given, with what SUMO drew for it.
-
-    names: ids of shared routes
+    SUMO then counts its vehicles, and draws the same random numbers for all others.
     """
-    own = {
-        "id": departure.id,
-        "depart": f"{departure.depart:.10g}",
-        "speedFactor": f"{departure.speed_factor:.6g}",
+    single = Element("flow" if element.tag == "flow" else "vehicle")
+    for key in ("id", "depart", "type", *FLOW):
+        if key in element.attrib:
+            single.set(key, element.attrib[key])
+    edge = streets.edges[int(np.argmax(streets.drivable))]
+    SubElement(single, "route", {"edges": edge})
+    return single
+
+
+def _drawn(vehicle: Departure) -> dict[str, str]:
+    """Return the attributes that SUMO gave to a vehicle."""
+    return {
+        "id": vehicle.id,
+        "depart": f"{vehicle.depart:.10g}",
+        "speedFactor": f"{vehicle.speed_factor:.6g}",
     }
-    route = Element("route", {"edges": " ".join(departure.edges)})
-    if original is None or departure.place is not None:
-        lane, position = departure.place or ("best", "base")
-        own |= {
-            "type": departure.type,
-            "departLane": lane,
-            "departPos": position,
-            "departSpeed": "max",
-        }
-        single = Element("vehicle", own)
-        single.append(route)
-        return single
-    parts = [part for part in original if part.tag not in ("route", "routeDistribution")]
-    routed = original.get("route") is not None or len(parts) < len(original)
-    out = {*FLOW, *(ZONES if routed else ())}
-    kept = {
-        key: " ".join(value.split()) for key, value in original.attrib.items() if key not in out
-    }
-    single = Element("vehicle" if routed else "trip", kept | own)
-    if departure.type != original.get("type", DEFAULT_TYPE).strip():
-        single.set("type", departure.type)
-    if routed and (nested := original.find("route")) is not None:
-        nested.attrib.pop("id", None)
-        parts.insert(0, nested)
-    elif routed and departure.route in names:
-        single.set("route", departure.route)
-    elif routed:
-        single.attrib.pop("route", None)
-        parts.insert(0, route)
+
+
+def _on_road(vehicle: Departure) -> Element:
+    """Return a vehicle that is on the road in a loaded state."""
+    lane, position = vehicle.place or ("best", "base")
+    place = {"departLane": lane, "departPos": position, "departSpeed": "max"}
+    element = Element("vehicle", {**_drawn(vehicle), "type": vehicle.type, **place})
+    SubElement(element, "route", {"edges": " ".join(vehicle.edges)})
+    return element
+
+
+def _single(vehicle: Departure, source: Element, routes: Container[str]) -> Element:
+    """Return a vehicle as it was given, with what SUMO drew for it.
+
+    source: its element, or that of its flow; routes: ids of shared ones
+    """
+    parts = [part for part in source if part.tag not in ("route", "routeDistribution")]
+    routed = source.get("route") is not None or len(parts) < len(source)
+    single = Element("vehicle" if routed else "trip")
+    for key, value in source.attrib.items():
+        if key not in FLOW and not (routed and key in ZONES):
+            single.set(key, " ".join(value.split()))
+    single.attrib.update(_drawn(vehicle))
+    if vehicle.type != source.get("type", DEFAULT_TYPE).strip():
+        single.set("type", vehicle.type)
+    if routed:
+        nested = source.find("route")
+        if nested is not None:
+            nested.attrib.pop("id", None)
+            single.append(nested)
+        elif vehicle.route in routes:
+            single.set("route", vehicle.route)
+        else:  # of a distribution
+            single.attrib.pop("route", None)
+            SubElement(single, "route", {"edges": " ".join(vehicle.edges)})
     single.extend(parts)
     return single
 
 
-def _silent(element: Element) -> Element:
-    """Redirect the files that an element writes to nowhere; return it."""
-    for part in element.iter():
-        if part.tag.endswith(WRITERS):
-            for key in {"file", "output"} & set(part.keys()):
-                part.set(key, "NUL")
-        for parameter in part.findall("param"):
-            if parameter.get("key") in WRITING:
-                part.remove(parameter)
-    return element
-
-
 def departure(element: Element) -> float:
-    """Return the time [s] at which a vehicle, person or flow of them begins, 0 if that is no
-    time."""
+    """Return when a vehicle, person or flow begins [s], 0 if unknown."""
     try:
         return seconds(element.get("depart") or element.get("begin") or "0", "")
     except InputError:

@@ -1,4 +1,4 @@
-"""Cities of others, fetched from their owners with their licences: `cosim get`."""
+"""Published cities, fetched with their licences: `cosim get`."""
 
 import os
 import shutil
@@ -23,8 +23,11 @@ def published() -> Mapping[str, Mapping[str, str]]:
 
 
 def get(name: str, out: Path) -> str:
-    """Fetch a city into a new folder, whole or not at all; return its licence and the next step.
-    Raises InputError."""
+    """Fetch a city into a new folder; return its licence and the next step.
+
+    It comes whole or not at all.
+    Raises: InputError
+    """
     cities = published()
     if name not in cities:
         raise InputError(
@@ -35,42 +38,40 @@ def get(name: str, out: Path) -> str:
         raise InputError(f"--out: {out} exists; choose another folder, or remove it")
     city = cities[name]
     out.parent.mkdir(parents=True, exist_ok=True)
-    source, contents = city["source"], city["folder"]
+    source = city["source"]
+    contents = city["folder"]
     notice = f"{name}: {city['about']}\nLicence: {city['licence']}\nFetched from {source}\n"
     with temporary_folder(f".{out.name}-", where=out.parent) as folder:
         archive = folder / "archive.whl"
-        pip = [
-            sys.executable,
-            "-m",
-            "pip",
-            "download",
-            "--no-deps",
-            "--only-binary",
-            ":all:",
-            "--dest",
-            str(folder),
-        ]
+        pip = [sys.executable, "-m", "pip", "download", "--no-deps", "--only-binary", ":all:"]
         try:
             if "://" in source:
                 with urllib.request.urlopen(source, timeout=SERVER_TIME_LIMIT_S) as answer:
                     archive.write_bytes(answer.read())
             else:
-                subprocess.run([*pip, source], check=True, capture_output=True, text=True)
+                subprocess.run(
+                    [*pip, "--dest", str(folder), source],
+                    check=True,
+                    capture_output=True,
+                    text=True,
+                )
                 archive = next(folder.glob("*.whl"))
             shutil.unpack_archive(archive, folder, "zip")
             (folder / contents / "NOTICE.cosim.txt").write_text(notice, encoding="utf-8")
             os.replace(folder / contents, out)
         except (OSError, StopIteration, subprocess.CalledProcessError) as error:
-            reason = (getattr(error, "stderr", "") or str(error)).strip().splitlines()[-1:]
+            words = getattr(error, "stderr", "") or str(error)
+            reason = " ".join(words.strip().splitlines()[-1:])
             raise InputError(
-                f"{name}: {contents} of {source} cannot be fetched ({' '.join(reason)}); try again with internet access"
+                f"{name}: {contents} of {source} cannot be fetched ({reason}); try again with "
+                "internet access"
             ) from None
     return f"{notice}Next: cosim import {out / city['start']} --out networks/{name}"
 
 
 def listed() -> str:
     """Return the catalogue, a city with its licence on two lines."""
-    return "\n".join(
-        f"{name:<14}{city['about']}\n{'':<14}{city['licence']}"
-        for name, city in published().items()
-    )
+    lines = []
+    for name, city in published().items():
+        lines += [f"{name:<14}{city['about']}", f"{'':<14}{city['licence']}"]
+    return "\n".join(lines)

@@ -1,41 +1,43 @@
-"""`cosim import`: a SUMO city or OpenStreetMap becomes networks/NAME and scenarios/NAME."""
+"""`cosim import`: makes a network and a scenario of a city."""
 
 import gzip
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pandas as pd
 
-from cosim.importing import maps, model, quality
-from cosim.importing.assignment import GAP, ITERATIONS, Assigned, assign
+from cosim.importing import maps, model, quality, report
+from cosim.importing.assignment import ITERATIONS, Assigned, assign
 from cosim.importing.baseline import Baseline, averaged_runs
-from cosim.importing.case import Progress, SumoInput, parse_box, seconds, sumo_input
+from cosim.importing.case import Progress, SumoInput, seconds, sumo_input
+from cosim.importing.comparison import Comparison, compare, plain_trips
 from cosim.importing.demand import Traffic, read_traffic, wrapped
 from cosim.importing.generated import morning_peak
+from cosim.importing.osm import Box, parse_box
 from cosim.importing.partition import finish, own_regions, partition
 from cosim.importing.streets import Streets, read_streets
+from cosim.sumo.arrays import EdgeNumbers
 from cosim.sumo.net import load_city
 from cosim.sumo.signals import timetabled, without_effect
 from cosim.sumo.xml_files import check_path
 from nmfd.errors import InputError
 from nmfd.model import authority
-from nmfd.model.regional_model import network_toml
+from nmfd.model.authority import Verdict
+from nmfd.model.regional_model import RegionalModel, network_toml
 from nmfd.runs.files import temporary_folder
 from nmfd.runs.progress import watched
-from nmfd.runs.tables import text_table
 from nmfd.studies import plots
 
-LARGE_CITY_EDGES = (
-    5000  # for cars: beyond, the run without control is mesoscopic, so that it takes a minute
-)
-LEFT_OUT = 0.01  # share of vehicles or distance above which a warning follows
+# For cars: beyond, the run without control is mesoscopic, so that it takes a minute.
+LARGE_CITY_EDGES = 5000
 NET = "city.net.xml.gz"
+REGIONS = "regions.csv"
 FILES = {
     "routes": "vehicles.rou.xml.gz",
     "background": "background.rou.xml.gz",
@@ -44,10 +46,60 @@ FILES = {
 TYPES = ("vType", "vTypeDistribution")
 COMMENT = """Imported from {}. The MFDs are PLACEHOLDERS from lane length and speed limits:
 # cosim identify replaces them by measured ones."""
-CAPTION = (
-    "density: in the busiest quarter of an hour without control, per lane; variance: over the region's streets; "
-    "uncontrolled: share of the boundary flow that passes no controllable signal"
-)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Request:
+    """Arguments of `import_city`, checked.
+
+    count: number of regions to find, None if `regions` is a table
+    begin, end: instead of the sumocfg's [s]
+    """
+
+    source: Path | Box
+    out: Path
+    scenario: Path
+    regions: Path
+    count: int | None
+    routes: tuple[Path, ...]
+    demand: str | None
+    level: float
+    mesoscopic: bool
+    begin: float | None
+    end: float | None
+    seed: int
+    seeds: int
+    iterations: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class City:
+    """Imported city, before it is written.
+
+    case: from its beginning on; labels: (E,) region of every edge
+    given: regions of the user's own table (E,), -1 where it has none; None without a table
+    left: signals that perimeter control does not use -> reason
+    switched: of these, signals whose programme a timetable changes
+    factor: of the demand [-]; mesoscopic: the scenario's model
+    files: keys of [sumo] -> names of files beside the scenario
+    assigned: routes of a generated peak; same: comparison with plain SUMO, or why there is none
+    """
+
+    request: Request
+    case: SumoInput
+    streets: Streets
+    traffic: Traffic
+    clock: model.Clock
+    baseline: Baseline
+    labels: EdgeNumbers
+    given: EdgeNumbers | None
+    left: Mapping[str, str]
+    switched: tuple[str, ...]
+    factor: float
+    mesoscopic: bool
+    files: Mapping[str, Sequence[str]]
+    assigned: Assigned | None
+    same: Comparison | str
 
 
 def import_city(
@@ -65,6 +117,7 @@ def import_city(
     seed: int = 0,
     seeds: int = 3,
     iterations: int = ITERATIONS,
+    left_hand: bool = False,
 ) -> str:
     """Write the network and the scenario of a SUMO city; return a report.
 
@@ -79,218 +132,232 @@ def import_city(
     begin, end: time window, in seconds or as h:m:s, instead of the sumocfg's
     seeds: runs without control whose densities are averaged
     iterations: of the assignment of the peak
+    left_hand: traffic keeps left in OpenStreetMap
     Raises: InputError for input that cannot be used; nothing is written then
     """
-    count = int(str(regions)) if str(regions).isdecimal() else None
-    if count is not None and count < 2:
-        raise InputError(f"--regions: expected 2 or more regions, or a file, got {regions} instead")
-    place = parse_box(source) if isinstance(source, str) else source
-    scenario = scenario or out.parent.parent / "scenarios" / out.name
-    first = None if begin is None else seconds(begin, "--begin")
-    last = None if end is None else seconds(end, "--end")
-    for folder in (out, scenario):
-        check_path(folder)
-        if folder.name in ("", "..") or "," in str(folder):
-            raise InputError(
-                f"--out: expected a folder such as networks/mycity, without a comma, got {folder} instead"
-            )
-        if folder.exists():
-            raise InputError(f"--out: {folder} exists; choose another name, or remove it")
+    request = Request(
+        source=parse_box(source) if isinstance(source, str) else source,
+        out=out,
+        scenario=scenario or out.parent.parent / "scenarios" / out.name,
+        regions=Path(str(regions)),
+        count=_count(str(regions)),
+        routes=tuple(routes),
+        demand=demand,
+        level=level,
+        mesoscopic=mesoscopic,
+        begin=None if begin is None else seconds(begin, "--begin"),
+        end=None if end is None else seconds(end, "--end"),
+        seed=seed,
+        seeds=seeds,
+        iterations=iterations,
+    )
+    _check_new(request.out)
+    _check_new(request.scenario)
     with ExitStack() as stack:
-        show = stack.enter_context(watched("import"))
-
-        def progress(stage: str, share: float = 0.0) -> None:
-            show and show(round(100 * share), 100, stage)
-
+        progress = _progress(stack.enter_context(watched("import")))
         progress("reading")
-        case, scratch = (
-            stack.enter_context(sumo_input(place, progress)),
-            stack.enter_context(temporary_folder()),
-        )
-        case = replace(
-            case,
-            begin=case.begin if first is None else first,
-            end=case.end if last is None else last,
-        )
-        case = replace(case, routes=(*case.routes, *routes))
-        if case.begin < 0 or (case.end is not None and case.end <= case.begin):
-            window = f"begin {case.begin:g} s, end {case.end} s"
-            raise InputError(f"{case.source}: expected 0 s <= begin < end, got {window}")
-        streets = read_streets(case.net, case.additional)
-        own = own_regions(streets, Path(str(regions))) if count is None else None
-        traffic = read_traffic(case, streets, seed)
-        mesoscopic = mesoscopic or case.mesoscopic
-        meso = mesoscopic or streets.drivable.sum() > LARGE_CITY_EDGES
-        factor, assigned = level, None
-        if demand is not None:
-            traffic, assigned = _peak(
-                case, streets, traffic, level, seed, iterations, meso, progress
-            )
-            factor = 1.0
-        elif not len(traffic.depart):
-            raise InputError(
-                f"{case.source}: names no vehicles for the streets of cars{_notes(traffic)}; give a sumocfg with "
-                "route-files, or add --routes FILE or --demand peak"
-            )
-        elif begin is None:
-            case = model.without_idle(case, traffic)
-        clock = model.clock(case, streets, traffic)
-        net_folder, folder = scratch / "network", scratch / "scenario"
-        net_folder.mkdir()
-        folder.mkdir()
-        files = _write_traffic(folder, traffic)
-        baseline = averaged_runs(
-            streets, folder, files, model.options(case, clock), factor, meso, seeds, progress
-        )
-        progress("partition")
-        switched = sorted({*traffic.switched, *timetabled(case.net)})
-        left = quality.left_alone(streets, switched, without_effect(case.options, mesoscopic))
-        if count is not None:
-            labels = partition(streets, baseline, count, uncontrollable=left)
-        else:
-            labels = finish(streets, own, renumber=False)
-        if labels.max() < 1:
-            raise InputError(
-                f"{streets.path}: no two regions can be made that can be reached from each other"
-            )
+        opened = sumo_input(request.source, progress, left_hand=left_hand)
+        case = _as_requested(stack.enter_context(opened), request)
+        scratch = stack.enter_context(temporary_folder())
+        network_folder = scratch / "network"
+        network_folder.mkdir()
+        scenario_folder = scratch / "scenario"
+        scenario_folder.mkdir()
+        city = _imported(request, case, scenario_folder, progress)
         progress("writing")
-        network = model.network_of(streets, labels, out.name, baseline)
-        content = case.net.read_bytes()
-        _zip(net_folder / NET, gzip.decompress(content) if case.net.suffix == ".gz" else content)
-        pd.DataFrame({"edge": streets.edges, "region": labels}).to_csv(
-            net_folder / "regions.csv", index=False
+        lines = _write(city, network_folder, scenario_folder)
+        _move(network_folder, request.out)
+        _move(scenario_folder, request.scenario)
+    written = f"Written to {out} (see map.png, quality.csv, gateways.csv) and {request.scenario}"
+    return "\n".join([*lines, f"{written}; next: cosim identify {out}"])
+
+
+def _count(regions: str) -> int | None:
+    """Return the number of regions to find, None for a file.
+
+    Raises: InputError
+    """
+    if not regions.isdecimal():
+        return None
+    if int(regions) < 2:
+        raise InputError(f"--regions: expected 2 or more regions, or a file, got {regions} instead")
+    return int(regions)
+
+
+def _check_new(folder: Path) -> None:
+    """Raise InputError for a folder that cannot be made."""
+    check_path(folder)
+    if folder.name in ("", "..") or "," in str(folder):
+        raise InputError(
+            "--out: expected a folder such as networks/mycity, without a comma, got "
+            f"{folder} instead"
         )
-        city = load_city(net_folder / NET, net_folder / "regions.csv", network.regions)
-        tables = quality.tables(streets, labels, network.region_names, city, baseline, left)
-        verdict = quality.import_verdict(network, tables.gateways, labels, baseline, scenario.name)
-        network = replace(network, controllable=verdict.boundaries.shares)
-        if max(traffic.left_out) > LEFT_OUT:
-            warning = (
-                f"WARNING: {_left_out(traffic)}: this is not the traffic of {case.source.name}"
-            )
-            verdict = replace(verdict, sentences=(*verdict.sentences, warning))
-        report = _report(case, streets, traffic, clock, tables, baseline, assigned)
-        if count is not None and network.regions < count:
-            report.append(
-                f"{network.regions} regions instead of {count}: others could not be reached, or fell apart"
-            )
-        elif own is not None and (
-            moved := int((own != labels)[streets.drivable & (own >= 0)].sum())
-        ):
-            report.append(
-                f"{moved:,} streets are in other regions than in {regions}: regions must be connected"
-            )
-        report += verdict.sentences
-        load = np.bincount(labels, baseline.density(streets) * streets.lane_metres)
-        texts = {
-            net_folder / "network.toml": network_toml(
-                network, {"net": NET, "regions": "regions.csv"}, COMMENT.format(case.source.name)
-            ),
-            net_folder / "import.txt": "\n".join(report) + "\n",
-            net_folder / authority.FILE: verdict.text(),
-            folder / "scenario.toml": model.scenario_text(
-                network,
-                clock,
-                case,
-                name=scenario.name,
-                files=files,
-                leave=switched,
-                network_path=os.path.relpath(out, scenario).replace(os.sep, "/"),
-                protected=int(np.argmax(load / np.bincount(labels, streets.lane_metres))),
-                factor=factor,
-                mesoscopic=mesoscopic,
-            ),
-        }
-        if case.notice:
-            texts[net_folder / "NOTICE.txt"] = case.notice
-        for path, text in texts.items():
-            path.write_text(text, encoding="utf-8")
-        pd.DataFrame(tables.quality).to_csv(net_folder / "quality.csv", index=False)
-        pd.DataFrame(tables.gateways).to_csv(net_folder / "gateways.csv", index=False)
-        flows = model.region_demand(traffic, labels, clock)
-        rows = [(k, i, j, f"{flows[k, i, j]:.6g}") for k, i, j in np.argwhere(flows > 0)]
-        pd.DataFrame(rows, columns=["interval", "from", "to", "veh_s"]).to_csv(
-            folder / "demand.csv", index=False
+    if folder.exists():
+        raise InputError(f"--out: {folder} exists; choose another name, or remove it")
+
+
+def _progress(show: Callable[..., None] | None) -> Progress:
+    """Return a callback for stages from one for numbers, which may be None."""
+
+    def progress(stage: str, share: float = 0.0) -> None:
+        if show is not None:
+            show(round(100 * share), 100, stage)
+
+    return progress
+
+
+def _as_requested(case: SumoInput, request: Request) -> SumoInput:
+    """Return a case with the time window and vehicles of a request.
+
+    Raises: InputError
+    """
+    begin = case.begin
+    end = case.end
+    if request.begin is not None:
+        begin = request.begin
+    if request.end is not None:
+        end = request.end
+    if begin < 0 or (end is not None and end <= begin):
+        window = f"begin {begin:g} s, end {end} s"
+        raise InputError(f"{case.source}: expected 0 s <= begin < end, got {window}")
+    return replace(case, begin=begin, end=end, routes=(*case.routes, *request.routes))
+
+
+def _imported(request: Request, case: SumoInput, folder: Path, progress: Progress) -> City:
+    """Return the city, after the runs without control.
+
+    folder: its vehicles are written there
+    """
+    streets = read_streets(case.net, case.additional)
+    given = None if request.count is not None else own_regions(streets, request.regions)
+    traffic = read_traffic(case, streets, request.seed)
+    mesoscopic = request.mesoscopic or case.mesoscopic
+    simulated_meso = bool(mesoscopic or streets.drivable.sum() > LARGE_CITY_EDGES)
+    factor = request.level
+    assigned = None
+    start = case
+    if request.demand is not None:
+        traffic, assigned = _peak(request, case, streets, traffic, simulated_meso, progress)
+        factor = 1.0
+    elif not len(traffic.depart):
+        raise InputError(report.no_vehicles(case, traffic))
+    elif request.begin is None:
+        start = model.without_idle(case, traffic)
+    clock = model.clock(start, streets, traffic)
+    files = _write_traffic(folder, traffic)
+    options = model.options(start, clock)
+    baseline = averaged_runs(
+        streets, folder, files, options, factor, simulated_meso, request.seeds, progress
+    )
+    same: Comparison | str = ""
+    if request.demand is None:
+        progress("simulating the city's own files")
+        same = _compared(request, case, traffic, clock, baseline, simulated_meso)
+    progress("partition")
+    switched = sorted({*traffic.switched, *timetabled(case.net)})
+    everywhere = without_effect(case.options, mesoscopic)
+    left = quality.left_alone(streets, switched, everywhere)
+    if given is not None:
+        labels = finish(streets, given, renumber=False)
+    else:
+        labels = partition(streets, baseline, request.count or 0, uncontrollable=left)
+    if labels.max() < 1:
+        raise InputError(
+            f"{streets.path}: no two regions can be made that can be reached from each other"
         )
-        drawing = plots.figure(6.2, 6.0)
-        maps.region_map(
-            drawing.subplots(), streets, labels, network.region_names, network.positions, tables
-        )
-        plots.save(drawing, net_folder / "map.png")
-        for temporary, place in ((net_folder, out), (folder, scenario)):
-            place.parent.mkdir(parents=True, exist_ok=True)
-            shutil.move(temporary, place)
-    written = f"Written to {out} (see map.png, quality.csv, gateways.csv) and {scenario}; next: cosim identify {out}"
-    return "\n".join([*report, written])
+    return City(
+        request=request,
+        case=start,
+        streets=streets,
+        traffic=traffic,
+        clock=clock,
+        baseline=baseline,
+        labels=labels,
+        given=given,
+        left=left,
+        switched=tuple(switched),
+        factor=factor,
+        mesoscopic=mesoscopic,
+        files=files,
+        assigned=assigned,
+        same=same,
+    )
 
 
 def _peak(
+    request: Request,
     case: SumoInput,
     streets: Streets,
     beside: Traffic,
-    level: float,
-    seed: int,
-    iterations: int,
     mesoscopic: bool,
     progress: Progress,
 ) -> tuple[Traffic, Assigned]:
-    """Generate a morning peak beside the city's other traffic, and assign its routes."""
-    if count := len(beside.depart):
+    """Generate a morning peak beside other traffic; assign its routes."""
+    if len(beside.depart):
         raise InputError(
-            f"--demand: {case.source} has {count:,} vehicles; omit --demand, or give the network alone"
+            f"--demand: {case.source} has {len(beside.depart):,} vehicles; omit --demand, or give "
+            "the network alone"
         )
-    peak = morning_peak(streets, level=level, begin=case.begin, seed=seed)
-    known = {part.get("id") for element in beside.shared for part in element.iter("vType")}
-    types = tuple(
-        e for e in peak.shared if e.get("id") not in known
-    )  # the city may define a type car
+    peak = morning_peak(streets, level=request.level, begin=case.begin, seed=request.seed)
+    shared = list(beside.shared)
+    known = {part.get("id") for element in shared for part in element.iter("vType")}
+    for kind in peak.shared:
+        if kind.get("id") not in known:  # the city may define a type car
+            shared.append(kind)
     traffic = replace(
         beside,
         vehicles=peak.vehicles,
         depart=peak.depart,
         origin=peak.origin,
         destination=peak.destination,
-        shared=beside.shared + types,
+        shared=tuple(shared),
         notes={**beside.notes, **peak.notes},
     )
     clock = model.clock(case, streets, traffic)
-    others = [element for element in traffic.shared if element.tag not in TYPES]
+    types = [element for element in shared if element.tag in TYPES]
+    others = [element for element in shared if element.tag not in TYPES]
     with temporary_folder() as folder:
         additional = folder / "city.add.xml"
         ElementTree.ElementTree(wrapped(others, "additional")).write(additional)
         assigned = assign(
             streets.path.absolute(),
-            [*(element for element in traffic.shared if element.tag in TYPES), *traffic.vehicles],
+            [*types, *traffic.vehicles],
             begin=clock.begin,
             end=clock.end,
-            seed=seed,
-            iterations=iterations,
+            seed=request.seed,
+            iterations=request.iterations,
             additional=[additional] if others else [],
             mesoscopic=mesoscopic,
             time_to_teleport=case.time_to_teleport,
             progress=progress,
         )
     for vehicle in traffic.vehicles:
-        if (route := vehicle.find("route")) is not None and (
-            name := vehicle.get("id", "")
-        ) in assigned.routes:
-            route.set("edges", " ".join(assigned.routes[name]))
+        route = vehicle.find("route")
+        edges = assigned.routes.get(vehicle.get("id", ""))
+        if route is not None and edges is not None:
+            route.set("edges", " ".join(edges))
     return traffic, assigned
 
 
 def _write_traffic(folder: Path, traffic: Traffic) -> dict[str, list[str]]:
-    """Write vehicles, background and what they refer to; return the file names by key of [sumo]."""
+    """Write vehicles, background and what they refer to.
+
+    Return the file names by key of [sumo].
+    """
     contents = {
         "routes": traffic.vehicles,
         "background": traffic.background,
         "additional": traffic.shared,
     }
+    names: dict[str, list[str]] = {}
     for key, elements in contents.items():
+        names[key] = []
         if elements:
             root = wrapped(elements, "additional" if key == "additional" else "routes")
             ElementTree.indent(root)
             _zip(folder / FILES[key], ElementTree.tostring(root))
-    return {key: [FILES[key]] if elements else [] for key, elements in contents.items()}
+            names[key].append(FILES[key])
+    return names
 
 
 def _zip(path: Path, content: bytes) -> None:
@@ -298,45 +365,145 @@ def _zip(path: Path, content: bytes) -> None:
     path.write_bytes(gzip.compress(content, mtime=0))
 
 
-def _left_out(traffic: Traffic) -> str:
-    return "{:.1%} of the vehicles and {:.1%} of the distance left out".format(*traffic.left_out)
+def _compared(
+    request: Request,
+    case: SumoInput,
+    traffic: Traffic,
+    clock: model.Clock,
+    baseline: Baseline,
+    mesoscopic: bool,
+) -> Comparison | str:
+    """Compare the run without control of seed 0 with plain SUMO.
+
+    Return the reason if that cannot be.
+    """
+    if request.level != 1.0:
+        return f"the demand is {request.level:g} times its own"
+    if request.seed:
+        return f"what SUMO draws for the vehicles is of seed {request.seed}"
+    end = min(clock.end, traffic.end)
+    try:
+        plain = plain_trips(case, end, mesoscopic=mesoscopic)
+    except InputError as error:
+        return f"it refuses the city: {error}"
+    result = compare(
+        plain, baseline.trips, is_private=traffic.is_private, end=end, step=case.step_length
+    )
+    return replace(result, queue_model=mesoscopic and not case.mesoscopic)
 
 
-def _notes(traffic: Traffic) -> str:
-    return "".join(f"; {note}: {count:,}" for note, count in sorted(traffic.notes.items()))
+def _write(city: City, network_folder: Path, scenario_folder: Path) -> list[str]:
+    """Write a city into two folders; return the report."""
+    case = city.case
+    streets = city.streets
+    labels = city.labels
+    request = city.request
+    baseline = city.baseline
+    content = case.net.read_bytes()
+    if case.net.suffix == ".gz":
+        content = gzip.decompress(content)
+    _zip(network_folder / NET, content)
+    regions = pd.DataFrame({"edge": streets.edges, "region": labels})
+    regions.to_csv(network_folder / REGIONS, index=False)
+    network = model.network_of(streets, labels, request.out.name, baseline)
+    loaded = load_city(network_folder / NET, network_folder / REGIONS, network.regions)
+    tables = quality.tables(streets, labels, network.region_names, loaded, baseline, city.left)
+    verdict = quality.import_verdict(
+        network, tables.gateways, labels, baseline, request.scenario.name
+    )
+    network = replace(network, controllable=verdict.boundaries.shares)
+    warnings = report.warnings(case, city.traffic)
+    verdict = replace(verdict, sentences=(*verdict.sentences, *warnings))
+    lines = _report(city, network, tables, verdict)
+    comment = COMMENT.format(case.source.name)
+    texts = {
+        network_folder / "network.toml": network_toml(
+            network, {"net": NET, "regions": REGIONS}, comment
+        ),
+        network_folder / "import.txt": "\n".join(lines) + "\n",
+        network_folder / authority.FILE: verdict.text(),
+        scenario_folder / "scenario.toml": _scenario_text(city, network),
+    }
+    if case.notice:
+        texts[network_folder / "NOTICE.txt"] = case.notice
+    for path, text in texts.items():
+        path.write_text(text, encoding="utf-8")
+    pd.DataFrame(tables.quality).to_csv(network_folder / "quality.csv", index=False)
+    pd.DataFrame(tables.gateways).to_csv(network_folder / "gateways.csv", index=False)
+    _write_demand(scenario_folder / "demand.csv", city)
+    drawing = plots.figure(6.2, 6.0)
+    maps.region_map(
+        drawing.subplots(), streets, labels, network.region_names, network.positions, tables
+    )
+    plots.save(drawing, network_folder / "map.png")
+    return lines
 
 
 def _report(
-    case: SumoInput,
-    streets: Streets,
-    traffic: Traffic,
-    clock: model.Clock,
-    tables: quality.Tables,
-    baseline: Baseline,
-    assigned: Assigned | None,
+    city: City, network: RegionalModel, tables: quality.Tables, verdict: Verdict
 ) -> list[str]:
-    """Return what was imported, left alone and left out, in lines."""
+    """Return what was imported and what to expect, in lines."""
+    request = city.request
+    traffic = city.traffic
+    clock = city.clock
     lines = [
-        f"{case.source.name}: {len(streets.edges):,} edges, {streets.drivable.sum():,} for cars, "
-        f"{'left' if streets.left_hand else 'right'}-hand traffic; {len(streets.logics):,} signals; "
-        f"{len(traffic.vehicles):,} vehicles in {clock.steps} intervals of "
-        f"{clock.step:g} s; {_left_out(traffic)}{_notes(traffic)}",
-        text_table(tables.quality, CAPTION),
-        f"without control: {baseline.teleports} teleports; at the end {baseline.running} vehicles on the road and "
-        f"{baseline.waiting} waiting to enter; {baseline.dropped:,} without a route or a free lane",
+        report.summary(city.case, city.streets, traffic, clock),
+        report.table(tables),
+        report.outcome(city.baseline),
     ]
-    if assigned is not None:
-        gap, iteration, count = assigned.gaps[assigned.best], assigned.best + 1, len(assigned.gaps)
-        lines.append(
-            f"routes by duaIterate.py: relative gap {100 * gap:.1f} % in iteration {iteration} of {count}"
-        )
-        if gap > GAP:
+    if city.same:
+        lines.append(report.comparison(city.same, city.case, traffic, clock))
+    lines += traffic.remarks
+    if city.assigned is not None:
+        lines += report.assignment(city.assigned)
+    lines += report.not_taken_over(city.case, clock)
+    lines += quality.doubts(city.streets, city.labels, network.region_names)
+    lines += quality.short_demand(traffic.depart, clock.begin, clock.step)
+    if city.given is None:
+        if network.regions < (request.count or 0):
             lines.append(
-                f"WARNING: a relative gap above {100 * GAP:g} %: rerouting gains what drivers know already"
+                f"{network.regions} regions instead of {request.count}: others could not be "
+                "reached, or fell apart"
             )
-    changed = list(case.left_out)
-    if case.step_length != (step := float(model.options(case, clock)["step-length"])):
-        changed.append(f"step-length = {case.step_length:g}, not {step:g}")
-    if changed:
-        lines.append(f"not taken over from {case.source.name}: {', '.join(changed)}")
-    return lines
+    else:
+        moved = (city.given != city.labels)[city.streets.drivable & (city.given >= 0)].sum()
+        if moved:
+            lines.append(
+                f"{moved:,} streets are in other regions than in {request.regions}: regions must "
+                "be connected"
+            )
+    return [*lines, *verdict.sentences]
+
+
+def _scenario_text(city: City, network: RegionalModel) -> str:
+    """Return the scenario.toml of a city."""
+    request = city.request
+    lanes = city.streets.lane_metres
+    vehicles = np.bincount(city.labels, city.baseline.density(city.streets) * lanes)
+    densest = int(np.argmax(vehicles / np.bincount(city.labels, lanes)))
+    return model.scenario_text(
+        network,
+        city.clock,
+        city.case,
+        name=request.scenario.name,
+        files=city.files,
+        leave=city.switched,
+        network_path=os.path.relpath(request.out, request.scenario).replace(os.sep, "/"),
+        protected=densest,
+        factor=city.factor,
+        mesoscopic=city.mesoscopic,
+    )
+
+
+def _write_demand(path: Path, city: City) -> None:
+    """Write the demand between regions, by interval and pair."""
+    flows = model.region_demand(city.traffic, city.labels, city.clock)
+    rows = [(k, i, j, f"{flows[k, i, j]:.6g}") for k, i, j in np.argwhere(flows > 0)]
+    table = pd.DataFrame(rows, columns=["interval", "from", "to", "veh_s"])
+    table.to_csv(path, index=False)
+
+
+def _move(folder: Path, place: Path) -> None:
+    """Move a finished folder to its place."""
+    place.parent.mkdir(parents=True, exist_ok=True)
+    shutil.move(folder, place)

@@ -1,4 +1,4 @@
-"""Maps of regions: streets in the colour of their region, gateways, outlines."""
+"""Maps of regions, with gateways and outlines."""
 
 from collections.abc import Sequence
 
@@ -17,6 +17,7 @@ from nmfd.arrays import Positions
 CELLS = 160  # along the longer side of the raster for outlines
 POINT_SPACING_M = 40.0  # between the points that stand for an edge
 SMALLEST_RING_SHARE = 0.02  # of the area of the largest ring
+BOX = {"boxstyle": "round,pad=0.25", "facecolor": "white", "alpha": 0.85}  # of a region's name
 COLOURS = (
     "#4e79a7",
     "#f28e2b",
@@ -39,8 +40,10 @@ def region_map(
     places: Positions,
     tables: Tables,
 ) -> Axes:
-    """Draw streets in the colour of their region, and gateways, filled if a controllable signal
-    stands there."""
+    """Draw streets in the colour of their region, and gateways.
+
+    A gateway is filled if a controllable signal stands there.
+    """
     members = np.flatnonzero(streets.drivable)
     lines = LineCollection(
         [streets.shapes[n] for n in members],
@@ -53,70 +56,67 @@ def region_map(
     ax.set_aspect("equal")
     ax.set_axis_off()
     for region, (x, y) in enumerate(places):
-        colour, title = COLOURS[region % len(COLOURS)], f"{region} {names[region]}"
-        box = {
-            "boxstyle": "round,pad=0.25",
-            "facecolor": "white",
-            "edgecolor": colour,
-            "alpha": 0.85,
-        }
+        title = f"{region} {names[region]}"
+        box = BOX | {"edgecolor": COLOURS[region % len(COLOURS)]}
         ax.text(x, y, title, ha="center", va="center", fontsize="small", zorder=5, bbox=box)
-    for controlled, face, label in (
-        (True, "black", "gateway with a signal"),
-        (False, "white", "without control"),
-    ):
-        edges = sorted(
-            {g["from_edge"] for g in tables.gateways if (g["control"] == CONTROLLED) == controlled}
-        )
-        x, y = (
-            np.array([streets.shapes[streets.number[edge]][-1] for edge in edges]).reshape(-1, 2).T
-        )
-        if len(x):
-            ax.scatter(
-                x, y, s=14, facecolor=face, edgecolor="black", linewidths=0.8, zorder=4, label=label
-            )
+    controlled, free = set(), set()
+    for gateway in tables.gateways:
+        if gateway["control"] == CONTROLLED:
+            controlled.add(gateway["from_edge"])
+        else:
+            free.add(gateway["from_edge"])
+    _mark_ends(ax, streets, sorted(controlled), face="black", label="gateway with a signal")
+    _mark_ends(ax, streets, sorted(free), face="white", label="without control")
     if tables.gateways:
-        ax.legend(
-            loc="upper center",
-            bbox_to_anchor=(0.5, -0.01),
-            ncols=2,
-            frameon=False,
-            fontsize="small",
-        )
+        below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.01)}
+        ax.legend(ncols=2, frameon=False, fontsize="small", **below)
     return ax
+
+
+def _mark_ends(ax: Axes, streets: Streets, edges: Sequence[str], *, face: str, label: str) -> None:
+    """Draw a point at the end of every edge."""
+    if edges:
+        x, y = np.array([streets.shapes[streets.number[edge]][-1] for edge in edges]).T
+        style = {"edgecolor": "black", "linewidths": 0.8, "zorder": 4}
+        ax.scatter(x, y, s=14, facecolor=face, label=label, **style)
 
 
 def rings_round(
     shapes: Sequence[Points], regions: EdgeNumbers, blocks: float
 ) -> list[list[Points]]:
-    """Return the outlines of every region, the largest first: rings (n, 2) [m] round the places
-    nearest to its edges.
+    """Return the outlines of every region, the largest first.
 
-    shapes: of E edges, (n, 2) [m]; blocks: share of the map's extent between streets that is still
-        no hole
+    They are rings (n, 2) [m] round the places nearest to its edges.
+    shapes: of E edges, (n, 2) [m]
+    blocks: share of the map's extent between streets that is still no hole
     """
     points, of = _sampled(shapes)
     low, high = points.min(axis=0), points.max(axis=0)
-    cell = max(float((high - low).max()) / CELLS, 1.0)
+    extent = float((high - low).max())
+    cell = max(extent / CELLS, 1.0)
     # Beyond this distance a place belongs to no street; the map must end there, or rings stay open.
-    reach = max(2.5 * max(cell, POINT_SPACING_M), blocks * float((high - low).max()))
-    x, y = (np.arange(low[a] - reach - 2 * cell, high[a] + reach + 3 * cell, cell) for a in (0, 1))
-    distance, nearest = cKDTree(points).query(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
+    reach = max(2.5 * max(cell, POINT_SPACING_M), blocks * extent)
+    x = np.arange(low[0] - reach - 2 * cell, high[0] + reach + 3 * cell, cell)
+    y = np.arange(low[1] - reach - 2 * cell, high[1] + reach + 3 * cell, cell)
+    raster = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    distance, nearest = cKDTree(points).query(raster)
     label = np.where(distance < reach, regions[of[nearest]], -1).reshape(len(y), len(x))
     ax = Figure().subplots()
     outlines = []
     for region in range(int(regions.max()) + 1):
         rings = ax.contour(x, y, (label == region).astype(float), levels=[0.5]).allsegs[0]
         rings.sort(key=lambda ring: -abs(_area(ring)))
-        # Rings round holes run the other way: their area has the other sign.
-        outlines.append(
-            [ring for ring in rings if _area(ring) / _area(rings[0]) > SMALLEST_RING_SHARE]
-        )
+        large = []
+        for ring in rings:
+            # Rings round holes run the other way: their area has the other sign.
+            if _area(ring) / _area(rings[0]) > SMALLEST_RING_SHARE:
+                large.append(ring)
+        outlines.append(large)
     return outlines
 
 
 def _sampled(shapes: Sequence[Points]) -> tuple[np.ndarray, np.ndarray]:
-    """Return points (n, 2) along the shapes of the edges, and the edge (n,) of each point."""
+    """Return points (n, 2) along the edges, and their edges (n,)."""
 
     def marks(length: float) -> np.ndarray:
         return np.linspace(0.0, length, max(2, int(length / POINT_SPACING_M) + 1))
@@ -126,6 +126,6 @@ def _sampled(shapes: Sequence[Points]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _area(ring: Points) -> float:
-    """Return the area [m^2] of a polygon (n, 2) [m]; negative if it runs clockwise."""
+    """Return the area [m^2] of a ring (n, 2) [m], < 0 if clockwise."""
     x, y = ring.T
     return float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum()) / 2

@@ -21,10 +21,8 @@ from nmfd.runs.config import filled
 
 SIGNAL_SPEED_SHARE = 0.5  # speed with signals over the speed limit
 DEFAULT_CYCLE_S = 90.0
-SHORTEST_STEP_S, LONGEST_STEP_S = (
-    60.0,
-    180.0,
-)  # control intervals; shorter cycles are taken several times
+SHORTEST_STEP_S = 60.0  # of control intervals: shorter cycles are taken several times
+LONGEST_STEP_S = 180.0
 IDLE_S = 900.0  # before the first departure, at most
 RECOVERY_S = 1800.0  # after the last departure, for the network to empty
 
@@ -43,30 +41,35 @@ class Clock:
 
 
 def without_idle(case: SumoInput, traffic: Traffic) -> SumoInput:
-    """Begin the case later if its first vehicle departs more than IDLE_S after the beginning."""
-    first = min(
-        [*traffic.depart[:1], *(departure(element) for element in traffic.background)],
-        default=case.begin,
-    )
-    return (
-        case
-        if first - case.begin <= IDLE_S
-        else replace(case, begin=float(first // IDLE_S * IDLE_S))
-    )
+    """Begin the case later if its first vehicle departs much later.
+
+    That is more than IDLE_S after the beginning.
+    """
+    first = min([*traffic.depart[:1], *map(departure, traffic.background)], default=case.begin)
+    if first - case.begin <= IDLE_S:
+        return case
+    return replace(case, begin=float(first // IDLE_S * IDLE_S))
 
 
 def clock(case: SumoInput, streets: Streets, traffic: Traffic) -> Clock:
-    """Return control intervals of the most common signal cycle, until RECOVERY_S after the last
-    departure."""
-    cycles = Counter(
-        round(logic.cycle) for logic in streets.logics.values() if logic.kind == "static"
-    )
+    """Return control intervals until RECOVERY_S after the last departure.
+
+    Their length is that of the most common signal cycle.
+    """
+    cycles = Counter[int]()
+    for logic in streets.logics.values():
+        if logic.kind == "static":
+            cycles[round(logic.cycle)] += 1
     del cycles[0]
-    cycle = float(max(sorted(cycles), key=cycles.__getitem__)) if cycles else DEFAULT_CYCLE_S
+    cycle = DEFAULT_CYCLE_S
+    if cycles:
+        cycle = float(max(sorted(cycles), key=cycles.__getitem__))
     step = cycle * np.ceil(SHORTEST_STEP_S / cycle)
     if step > LONGEST_STEP_S:
         step = DEFAULT_CYCLE_S
-    last = traffic.depart[-1] if len(traffic.depart) else case.begin
+    last = case.begin
+    if len(traffic.depart):
+        last = traffic.depart[-1]
     return Clock(
         begin=case.begin,
         step=float(step),
@@ -86,25 +89,22 @@ def region_demand(traffic: Traffic, regions: EdgeNumbers, clock: Clock) -> Pairs
 def network_of(
     streets: Streets, regions: EdgeNumbers, name: str, baseline: Baseline
 ) -> RegionalModel:
-    """Return the regional model: adjacency from streets, split ratios from the baseline, guessed
-    MFDs.
+    """Return the regional model.
 
-    Their free-flow rate is from speed limits and metres per visit, their jam accumulation from
-    lanes.
+    Adjacency follows from the streets, and split ratios from the baseline. MFDs are guesses: their
+    free-flow rate is from speed limits and metres per visit, their jam accumulation from lanes.
     """
     count = int(regions.max()) + 1
     lanes = np.bincount(regions, streets.lane_metres, count)
-    speed = np.bincount(regions, streets.lane_metres * streets.speed, count) / np.maximum(
-        lanes, 1.0
-    )
-    across = np.array(
-        [np.sqrt(np.ptp(streets.centre[regions == r], axis=0).prod()) for r in range(count)]
-    )
+    lane_speed = np.bincount(regions, streets.lane_metres * streets.speed, count)
+    speed = lane_speed / np.maximum(lanes, 1.0)
+    sizes = [np.ptp(streets.centre[regions == region], axis=0) for region in range(count)]
+    across = np.array([np.sqrt(size.prod()) for size in sizes])
     measured = baseline.metres_per_visit(streets, regions)
-    visit = np.where(
-        np.isnan(measured), 0.7 * np.maximum(across, 100.0), np.maximum(measured, 50.0)
-    )
-    rate, jam = SIGNAL_SPEED_SHARE * speed / visit, np.maximum(JAM_DENSITY * lanes / 1000.0, 10.0)
+    guessed = 0.7 * np.maximum(across, 100.0)
+    visit = np.where(np.isnan(measured), guessed, np.maximum(measured, 50.0))
+    rate = SIGNAL_SPEED_SHARE * speed / visit
+    jam = np.maximum(JAM_DENSITY * lanes / 1000.0, 10.0)
     network = RegionalModel(
         name=name,
         region_names=names(streets, regions),
@@ -120,16 +120,25 @@ def network_of(
     )
 
 
-def options(case: SumoInput, clock: Clock) -> dict[str, str]:
-    """Return SUMO's options; the city's own step length if it divides the control interval, else 1
-    s."""
+def step_length(case: SumoInput, clock: Clock) -> float:
+    """Return the step length [s]: the city's own if possible, else 1 s.
+
+    It must divide the control interval.
+    """
     own = case.step_length
-    fits = 0.0 < own <= 1.0 and abs(clock.step / own - round(clock.step / own)) < 1e-9
+    if not 0.0 < own <= 1.0:
+        return 1.0
+    steps = clock.step / own
+    return own if abs(steps - round(steps)) < 1e-9 else 1.0
+
+
+def options(case: SumoInput, clock: Clock) -> dict[str, str]:
+    """Return SUMO's options for the scenario."""
     return {
         **case.options,
         "begin": f"{clock.begin:.1f}",
         "end": f"{clock.end:.1f}",
-        "step-length": f"{own if fits else 1.0:g}",
+        "step-length": f"{step_length(case, clock):g}",
         "time-to-teleport": f"{case.time_to_teleport:g}",
     }
 
@@ -143,21 +152,19 @@ def scenario_text(
     leave: Sequence[str],
     **values: str | float,
 ) -> str:
-    """Return the scenario.toml; `files` maps routes, background and additional to file names beside
-    it.
+    """Return the scenario.toml.
 
+    files: routes, background and additional -> file names beside it
     values: name, network_path, protected (region), factor of the demand, mesoscopic
     """
-    substeps = int(
-        np.ceil(clock.step / min(30.0, 0.5 / max(mfd.rate_up_to_jam(0.0) for mfd in network.mfds)))
+    fastest = max(mfd.rate_up_to_jam(0.0) for mfd in network.mfds)
+    return filled(
+        Path(__file__).with_name("scenario.toml.j2"),
+        network=network,
+        clock=clock,
+        case=case,
+        times=options(case, clock),
+        lists={**files, "leave_signals": leave},
+        substeps=int(np.ceil(clock.step / min(30.0, 0.5 / fastest))),
+        **values,
     )
-    lists, times = {**files, "leave_signals": leave}, options(case, clock)
-    known = {
-        "network": network,
-        "clock": clock,
-        "case": case,
-        "times": times,
-        "lists": lists,
-        "substeps": substeps,
-    }
-    return filled(Path(__file__).with_name("scenario.toml.j2"), **known, **values)

@@ -1,5 +1,4 @@
-"""Regions of similar density by Ward's criterion on the road graph, or the regions of the user's
-own table.
+"""Regions of similar density by Ward's criterion, or the user's own.
 
 The aims are those of Ji and Geroliminis, "On the spatial partitioning of urban transportation
 networks" (2012): regions that are homogeneous in density, connected and compact. Perimeter control
@@ -21,16 +20,15 @@ from scipy.spatial import cKDTree
 
 from cosim.importing.baseline import Baseline
 from cosim.importing.streets import Streets, graph
-from cosim.sumo.arrays import EdgeNumbers
+from cosim.sumo.arrays import EdgeNumbers, PerEdge
 from cosim.sumo.net import read_regions
 from nmfd.arrays import Positions
 from nmfd.errors import InputError
 
 SMOOTHING_ROUNDS = 2  # of averaging densities with the neighbours
 HIGHEST_DENSITY = 0.15  # veh/m of lane; denser counts as this dense
-UNSIGNALLED_SHARE = (
-    0.3  # of the mean region, up to which streets merge over connections without a signal
-)
+# Of the mean region, up to which streets merge over connections without a signal.
+UNSIGNALLED_SHARE = 0.3
 SMALLEST_SHARE = 0.4  # of the mean region, in lane metres of the core: smaller clusters dissolve
 DIRECTIONS = (
     "east",
@@ -42,14 +40,15 @@ DIRECTIONS = (
     "south",
     "south-east",
 )
+CENTRAL_SHARE = 0.35  # of the city's radius, within which a region is the centre
 MAX_EXTRA_CLUSTERS = 20  # beyond the requested number, among which enough large ones are searched
 
 
 @dataclass(frozen=True, kw_only=True)
 class Blocks:
-    """B pieces of the main part of a network that no boundary divides: streets with both
-    directions, roundabouts.
+    """B pieces of the main part of a network that no boundary divides.
 
+    They are streets with both directions, and roundabouts.
     of: (E,) block of an edge, -1 outside the main part
     weight: (B,) lane metres; core: (B,) those of edges of the strongly connected core
     position: (B, 2) [m]
@@ -64,12 +63,16 @@ class Blocks:
 
 
 def own_regions(streets: Streets, path: Path) -> EdgeNumbers:
-    """Read the region of every edge from a table edge,region; -1 for edges it does not name. Raises
-    InputError."""
+    """Read the region of every edge from a table edge,region.
+
+    Edges that it does not name have -1.
+    Raises: InputError
+    """
     given = read_regions(path)
-    if unknown := sorted(given.keys() - streets.number.keys()):
+    unknown = given.keys() - streets.number.keys()
+    if unknown:
         raise InputError(
-            f"{path}: edge {unknown[0]} is not in {streets.path}; remove it or give its network"
+            f"{path}: edge {min(unknown)} is not in {streets.path}; remove it or give its network"
         )
     labels = np.array([given.get(edge, -1) for edge in streets.edges])
     used = np.unique(labels[streets.drivable & (labels >= 0)])
@@ -93,80 +96,91 @@ def partition(
     count = len(blocks.weight)
     if regions > count:
         raise InputError(
-            f"--regions: expected at most {count}, the streets of {streets.path}, got {regions} instead"
+            f"--regions: expected at most {count}, the streets of {streets.path}, got {regions} "
+            "instead"
         )
-    controllable = np.array(
-        [signal is not None and signal not in uncontrollable for signal in streets.link_signals]
-    )
-    merged = _without_signals(streets, blocks, baseline.moves(), controllable, regions)
-    inside, vehicles = blocks.of >= 0, baseline.density(streets) * streets.lane_metres
-    feature = features(
-        blocks, np.bincount(blocks.of[inside], vehicles[inside], count) / blocks.weight
-    )
+    controllable = []
+    for signal in streets.link_signals:
+        controllable.append(signal is not None and signal not in uncontrollable)
+    merged = _without_signals(streets, blocks, baseline.moves(), np.array(controllable), regions)
+    inside = blocks.of >= 0
+    vehicles = baseline.density(streets) * streets.lane_metres
+    density = np.bincount(blocks.of[inside], vehicles[inside], count) / blocks.weight
     weight = np.bincount(merged, blocks.weight)
-    feature = np.stack(
-        [np.bincount(merged, blocks.weight * axis) / weight for axis in feature.T], axis=1
-    )[merged]
-    labels = cluster(blocks, feature, regions)
-    return finish(streets, np.where(blocks.of >= 0, labels[blocks.of], -1))
+    means = []  # of merged blocks, which then look alike
+    for axis in features(blocks, density).T:
+        means.append(np.bincount(merged, blocks.weight * axis) / weight)
+    labels = cluster(blocks, np.stack(means, axis=1)[merged], regions)
+    return finish(streets, np.where(inside, labels[blocks.of], -1))
 
 
 def cluster(
     blocks: Blocks, feature: Float[np.ndarray, "B F"], regions: int
 ) -> Int[np.ndarray, " B"]:
-    """Return the cluster of every block; -1 in clusters that are too small for a region."""
-    from sklearn.cluster import (
-        AgglomerativeClustering,
-    )  # a second, which other commands do not need
+    """Return the cluster of every block, -1 in too small clusters."""
+    # Its import takes a second, which other commands do not need.
+    from sklearn.cluster import AgglomerativeClustering
 
-    size = blocks.core if np.count_nonzero(blocks.core) >= regions else blocks.weight
+    size = blocks.weight
+    if np.count_nonzero(blocks.core) >= regions:
+        size = blocks.core
     least = SMALLEST_SHARE * size.sum() / regions
-    best, most = np.zeros(len(feature), dtype=int), 0
+    best = np.zeros(len(feature), dtype=int)
+    most = 0
     for count in range(regions, min(regions + MAX_EXTRA_CLUSTERS, len(feature)) + 1):
-        labels = AgglomerativeClustering(n_clusters=count, connectivity=blocks.joins).fit_predict(
-            feature
-        )
+        ward = AgglomerativeClustering(n_clusters=count, connectivity=blocks.joins)
+        labels = ward.fit_predict(feature)
         large = np.bincount(labels, size) >= least
         if most < large.sum() <= regions:
-            best, most = np.where(large[labels], labels, -1), large.sum()
+            best = np.where(large[labels], labels, -1)
+            most = large.sum()
         if most == regions:
             break
     return best
 
 
 def features(blocks: Blocks, density: Float[np.ndarray, " B"]) -> Float[np.ndarray, "B 3"]:
-    """Return density of the neighbourhood and position of each block, each with variance 1 over the
-    city's lanes."""
-    weight, joins = blocks.weight, (blocks.joins > 0).astype(float)
+    """Return density of the neighbourhood and position of each block.
+
+    Each has variance 1 over the city's lanes.
+    """
+    weight = blocks.weight
+    joins = (blocks.joins > 0).astype(float)
     smooth = np.minimum(density, HIGHEST_DENSITY)
     for _ in range(SMOOTHING_ROUNDS):
         smooth = (smooth * weight + joins @ (smooth * weight)) / (weight + joins @ weight)
     place = blocks.position - np.average(blocks.position, axis=0, weights=weight)
     radius = np.sqrt(np.average((place**2).sum(axis=1), weights=weight))
-    spread = np.sqrt(np.average((smooth - np.average(smooth, weights=weight)) ** 2, weights=weight))
+    mean = np.average(smooth, weights=weight)
+    spread = np.sqrt(np.average((smooth - mean) ** 2, weights=weight))
     return np.column_stack([smooth / max(spread, 1e-9), place / max(radius, 1e-9)])
 
 
 def make_blocks(streets: Streets) -> Blocks:
     """Group the edges of the main part into blocks."""
-    inside, lanes = streets.main_part, streets.lane_metres
-    rings = [(ring[0], n) for ring in streets.roundabouts for n in ring[1:]]
-    pairs = np.array([*_opposite(streets), *rings], dtype=int).reshape(-1, 2)
+    inside = streets.main_part
+    lanes = streets.lane_metres
+    together = _opposite(streets)
+    for ring in streets.roundabouts:
+        together += [(ring[0], edge) for edge in ring[1:]]
+    pairs = np.array(together, dtype=int).reshape(-1, 2)
     pairs = pairs[inside[pairs].all(axis=1)]
     _, label = connected_components(graph(pairs, len(streets.edges)), directed=False)
     of = np.full(len(streets.edges), -1)
-    of[inside] = np.unique(label[inside], return_inverse=True)[1]
+    _, of[inside] = np.unique(label[inside], return_inverse=True)
     count = of.max() + 1
-    weight = np.bincount(of[inside], lanes[inside], count)
-    middles = [
-        np.bincount(of[inside], (axis * lanes)[inside], count) / weight for axis in streets.centre.T
-    ]
+
+    def total(values: PerEdge) -> np.ndarray:
+        return np.bincount(of[inside], values[inside], count)
+
+    weight = total(lanes)
+    position = np.stack([total(axis * lanes) / weight for axis in streets.centre.T], axis=1)
     ends = of[streets.links]
     ends = ends[(ends >= 0).all(axis=1) & (ends[:, 0] != ends[:, 1])]
     joins = graph(np.concatenate([ends, ends[:, ::-1]]), count)
     joins.sum_duplicates()
-    core = np.bincount(of[inside], (lanes * streets.core)[inside], count)
-    return Blocks(of=of, weight=weight, core=core, position=np.stack(middles, axis=1), joins=joins)
+    core = total(lanes * streets.core)
+    return Blocks(of=of, weight=weight, core=core, position=position, joins=joins)
 
 
 def _without_signals(
@@ -176,8 +190,10 @@ def _without_signals(
     controllable: np.ndarray,
     regions: int,
 ) -> np.ndarray:
-    """Return a group (B,) for every block; blocks that much traffic joins without a controllable
-    signal share one."""
+    """Return a group (B,) for every block.
+
+    Blocks that much traffic joins without a controllable signal share one.
+    """
     flow: Counter[tuple[int, int]] = Counter()
     for (a, b), controlled in zip(streets.links, controllable, strict=True):
         one, other = sorted((blocks.of[a], blocks.of[b]))
@@ -185,7 +201,8 @@ def _without_signals(
             flow[int(one), int(other)] += moves[int(a), int(b)]
     pairs = sorted(flow, key=lambda pair: (-flow[pair], pair))
     limit = UNSIGNALLED_SHARE * blocks.weight.sum() / regions
-    label, size = np.arange(len(blocks.weight)), blocks.weight.copy()
+    label = np.arange(len(blocks.weight))
+    size = blocks.weight.copy()
     for pair in pairs:
         one, other = label[list(pair)]
         if one != other and size[one] + size[other] <= limit:
@@ -195,7 +212,10 @@ def _without_signals(
 
 
 def _opposite(streets: Streets) -> list[tuple[int, int]]:
-    """Return pairs of edges between the same two junctions in opposite directions, one each."""
+    """Return pairs of edges in opposite directions, one each.
+
+    They lie between the same two junctions.
+    """
     waiting: dict[tuple[int, int], list[int]] = {}
     pairs = []
     for n, (begin, end) in enumerate(streets.junctions):
@@ -207,7 +227,7 @@ def _opposite(streets: Streets) -> list[tuple[int, int]]:
 
 
 def finish(streets: Streets, labels: EdgeNumbers, *, renumber: bool = True) -> EdgeNumbers:
-    """Return a region for every edge, from labels of the edges for cars, -1 for none.
+    """Return a region for every edge from labels, -1 for none.
 
     Regions become connected, and each can be reached from each; those that fail join a neighbour.
     Other edges join an adjoining region or the nearest. Regions are numbered from north to south,
@@ -216,23 +236,31 @@ def finish(streets: Streets, labels: EdgeNumbers, *, renumber: bool = True) -> E
     regions = labels.copy()
     regions[~streets.drivable] = -1
     regions = _spread(streets, regions, streets.links, streets.drivable)
-    while True:
-        regions = connect(streets, regions)
-        if (victim := _not_reachable(streets, regions)) is None:
-            break
-        pairs = regions[streets.links]  # the region joins the neighbour with the most connections
+    regions = connect(streets, regions)
+    victim = _not_reachable(streets, regions)
+    while victim is not None:
+        # The region joins the neighbour with the most connections.
+        pairs = regions[streets.links]
         beyond = np.concatenate([pairs[pairs[:, 0] == victim, 1], pairs[pairs[:, 1] == victim, 0]])
         beyond = beyond[(beyond != victim) & (beyond >= 0)]
         regions = np.where(regions == victim, np.argmax(np.bincount(beyond)), regions)
+        regions = connect(streets, regions)
+        victim = _not_reachable(streets, regions)
     everywhere = np.ones(len(streets.edges), dtype=bool)
     regions = _spread(streets, regions, streets.all_links, everywhere)
-    return _numbered(streets, regions) if renumber else np.unique(regions, return_inverse=True)[1]
+    if renumber:
+        return _numbered(streets, regions)
+    _, numbers = np.unique(regions, return_inverse=True)
+    return numbers
 
 
 def connect(streets: Streets, regions: EdgeNumbers) -> EdgeNumbers:
-    """Keep the largest connected piece of every region in the main part; other pieces join their
-    main neighbour."""
-    regions, inside = regions.copy(), streets.main_part
+    """Keep the largest connected piece of every region in the main part.
+
+    Other pieces join their main neighbour.
+    """
+    regions = regions.copy()
+    inside = streets.main_part
     links = streets.links[inside[streets.links].all(axis=1)]
     for _ in range(len(regions)):
         kept = links[regions[links[:, 0]] == regions[links[:, 1]]]
@@ -249,17 +277,15 @@ def connect(streets: Streets, regions: EdgeNumbers) -> EdgeNumbers:
         # A piece may adjoin loose pieces only: then it waits for the next round.
         both = np.concatenate([links, links[:, ::-1]])
         both = both[loose[both[:, 0]] & ~loose[both[:, 1]]]
-        votes = [
-            (number, regions[both[piece[both[:, 0]] == number, 1]])
-            for number in np.unique(piece[both[:, 0]])
-        ]
-        for number, neighbours in votes:
+        around = regions[both[:, 1]]  # before any piece joins
+        for number in np.unique(piece[both[:, 0]]):
+            neighbours = around[piece[both[:, 0]] == number]
             regions[loose & (piece == number)] = np.argmax(np.bincount(neighbours))
     return regions
 
 
 def digraph(streets: Streets, regions: EdgeNumbers) -> Int[np.ndarray, "R R"]:
-    """Count the connections [i, h] from an edge of region i to one of region h, i != h."""
+    """Count the connections [i, h] from region i to another one h."""
     count = int(regions[streets.drivable].max()) + 1
     crossing = np.zeros((count, count), dtype=int)
     pairs = regions[streets.links]
@@ -269,41 +295,52 @@ def digraph(streets: Streets, regions: EdgeNumbers) -> Int[np.ndarray, "R R"]:
 
 
 def _not_reachable(streets: Streets, regions: np.ndarray) -> int | None:
-    """Return the smallest region outside the largest set of regions that can be reached from each
-    other."""
+    """Return a region to dissolve, None if there is none.
+
+    It is the smallest one outside the largest set that can be reached from each other.
+    """
     inside = streets.main_part
     used, numbers = np.unique(regions[inside], return_inverse=True)
     links = np.searchsorted(used, regions[streets.links[inside[streets.links].all(axis=1)]])
     _, part = connected_components(graph(links, len(used)), directed=True, connection="strong")
     size = np.bincount(numbers, streets.lane_metres[inside])
     outside = np.flatnonzero(part != np.argmax(np.bincount(part, size)))
-    return None if not len(outside) else int(used[outside[np.argmin(size[outside])]])
+    if not len(outside):
+        return None
+    return int(used[outside[np.argmin(size[outside])]])
 
 
 def _spread(
     streets: Streets, regions: np.ndarray, links: np.ndarray, wanted: np.ndarray
 ) -> np.ndarray:
-    """Give the `wanted` edges without a region that of a linked edge, else of the nearest."""
-    regions, both = regions.copy(), np.concatenate([links, links[:, ::-1]])
+    """Give `wanted` edges without a region that of a linked edge.
+
+    If there is none, that of the nearest.
+    """
+    regions = regions.copy()
+    both = np.concatenate([links, links[:, ::-1]])
     while True:
         reach = both[wanted[both[:, 0]] & (regions[both[:, 0]] < 0) & (regions[both[:, 1]] >= 0)]
         if not len(reach):
             break
         edges, first = np.unique(reach[:, 0], return_index=True)
         regions[edges] = regions[reach[first, 1]]
-    missing, known = np.flatnonzero(wanted & (regions < 0)), np.flatnonzero(regions >= 0)
+    missing = np.flatnonzero(wanted & (regions < 0))
+    known = np.flatnonzero(regions >= 0)
     if len(missing):
-        regions[missing] = regions[
-            known[cKDTree(streets.centre[known]).query(streets.centre[missing])[1]]
-        ]
+        _, nearest = cKDTree(streets.centre[known]).query(streets.centre[missing])
+        regions[missing] = regions[known[nearest]]
     return regions
 
 
 def _numbered(streets: Streets, regions: np.ndarray) -> np.ndarray:
-    """Number the regions 0, 1, ... from north to south, ties from west to east."""
+    """Number the regions from north to south, ties from west to east."""
     used = np.unique(regions)
-    middle = {region: _gravity(streets, regions == region) for region in used}
-    order = sorted(used, key=lambda region: (-round(middle[region][1], 1), middle[region][0]))
+    places = []
+    for region in used:
+        x, y = _gravity(streets, regions == region)
+        places.append((-round(y, 1), x, region))
+    order = [region for _, _, region in sorted(places)]
     return np.argsort(order)[np.searchsorted(used, regions)]
 
 
@@ -325,9 +362,13 @@ def names(streets: Streets, regions: EdgeNumbers) -> tuple[str, ...]:
     )
     plain: list[str] = []
     for x, y in places - middle:
-        central = np.hypot(x, y) < 0.35 * radius
-        plain.append("centre" if central else DIRECTIONS[round(np.arctan2(y, x) / (np.pi / 4)) % 8])
-    return tuple(
-        name if plain.count(name) == 1 else f"{name} {plain[: n + 1].count(name)}"
-        for n, name in enumerate(plain)
-    )
+        if np.hypot(x, y) < CENTRAL_SHARE * radius:
+            plain.append("centre")
+        else:
+            plain.append(DIRECTIONS[round(np.arctan2(y, x) / (np.pi / 4)) % 8])
+    numbered = []
+    for n, name in enumerate(plain):
+        if plain.count(name) > 1:
+            name = f"{name} {plain[: n + 1].count(name)}"
+        numbered.append(name)
+    return tuple(numbered)

@@ -1,5 +1,6 @@
-"""Tables of regions and gateways, and the verdict on control at the gateways."""
+"""Tables of regions and gateways, and the verdict on their control."""
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
@@ -9,17 +10,23 @@ import pandas as pd
 
 from cosim.importing.baseline import INTERVAL_S, Baseline
 from cosim.importing.streets import Streets
-from cosim.sumo.arrays import EdgeMask, EdgeNumbers
-from cosim.sumo.net import City
+from cosim.sumo.arrays import EdgeMask, EdgeNumbers, PerTrip
+from cosim.sumo.net import City, Gateway
 from cosim.sumo.signals import CONTROLLED, STATIC, TIMETABLE, control, unfit
 from nmfd.model import authority
 from nmfd.model.authority import Boundaries, Verdict
 from nmfd.model.regional_model import RegionalModel
 
+SMALLEST_LANE_KM = 3.0  # of a region: a few hundred vehicles would fill it
+FEWEST_INTERVALS = 10  # with departures
+
 
 class Tables(NamedTuple):
-    """Rows of quality.csv (one per region, and one for all) and of gateways.csv (one per movement
-    over a boundary)."""
+    """Rows of two tables.
+
+    quality: of quality.csv, one per region, and one for all
+    gateways: of gateways.csv, one per movement over a boundary
+    """
 
     quality: Sequence[Mapping]
     gateways: Sequence[Mapping]
@@ -38,27 +45,15 @@ def tables(
     baseline: the run without control; None leaves densities and flows at zero
     left_alone: signal -> reason why perimeter control does not use it
     """
-    moves = Counter() if baseline is None else baseline.moves()
-    kinds = {
-        signal: "fixed" if logic.kind == STATIC else logic.kind
-        for signal, logic in streets.logics.items()
-    }
-    gateways = [
-        {
-            "source": g.source,
-            "target": g.target,
-            "from_edge": g.from_edge,
-            "to_edge": g.to_edge,
-            "lanes": " ".join(map(str, g.lanes)),
-            "signal": g.signal or "",
-            "links": " ".join(map(str, g.links)),
-            "control": control(g, streets.logics, left_alone),
-            "kind": kinds.get(g.signal or "", ""),
-            "flow_veh": moves[streets.number[g.from_edge], streets.number[g.to_edge]],
-        }
-        for g in city.gateways
-    ]
-    density = np.zeros(len(regions)) if baseline is None else 1000.0 * baseline.density(streets)
+    moves: Mapping[tuple[int, int], int] = Counter()
+    density = np.zeros(len(regions))
+    if baseline is not None:
+        moves = baseline.moves()
+        density = 1000.0 * baseline.density(streets)
+    gateways = []
+    for gateway in city.gateways:
+        move = streets.number[gateway.from_edge], streets.number[gateway.to_edge]
+        gateways.append(_gateway(gateway, streets, left_alone, moves[move]))
     approaches = pd.Series(
         {edge: regions[streets.number[edge]] for edge in city.signals}, dtype=int
     )
@@ -83,11 +78,70 @@ def tables(
             "uncontrolled_share": round(free / flow, 3) if flow else np.nan,
         }
 
-    own = [[g for g in gateways if n in (g["source"], g["target"])] for n in range(len(names))]
-    rows = [row(str(n), name, regions == n, own[n]) for n, name in enumerate(names)]
-    return Tables(
-        quality=[*rows, row("all", "all regions", regions >= 0, gateways)], gateways=gateways
-    )
+    rows = []
+    for n, name in enumerate(names):
+        own = [gateway for gateway in gateways if n in (gateway["source"], gateway["target"])]
+        rows.append(row(str(n), name, regions == n, own))
+    rows.append(row("all", "all regions", regions >= 0, gateways))
+    return Tables(quality=rows, gateways=gateways)
+
+
+def _gateway(
+    gateway: Gateway, streets: Streets, left_alone: Mapping[str, str], flow: int
+) -> dict[str, object]:
+    """Return a row of gateways.csv.
+
+    flow: vehicles that passed in the run without control
+    """
+    logic = streets.logics.get(gateway.signal or "")
+    kind = "" if logic is None else logic.kind
+    return {
+        "source": gateway.source,
+        "target": gateway.target,
+        "from_edge": gateway.from_edge,
+        "to_edge": gateway.to_edge,
+        "lanes": " ".join(map(str, gateway.lanes)),
+        "signal": gateway.signal or "",
+        "links": " ".join(map(str, gateway.links)),
+        "control": control(gateway, streets.logics, left_alone),
+        "kind": "fixed" if kind == STATIC else kind,
+        "flow_veh": flow,
+    }
+
+
+def doubts(streets: Streets, regions: EdgeNumbers, names: Sequence[str]) -> list[str]:
+    """Return sentences about streets apart and small regions."""
+    sentences = []
+    total = streets.lane_metres.sum()
+    apart = streets.drivable & ~streets.main_part
+    if apart.any():
+        away = streets.lane_metres[apart].sum()
+        sentences.append(
+            f"the streets fall into {streets.parts} parts without a connection; {away / total:.1%} "
+            "of the lanes lie outside the largest, and count for the region nearest to them"
+        )
+    for region, name in enumerate(names):
+        lane_km = streets.lane_metres[regions == region].sum() / 1000.0
+        if lane_km < SMALLEST_LANE_KM:
+            sentences.append(
+                f"region {region} {name} has {lane_km:.1f} lane-kilometres, too few for an MFD "
+                f"(below {SMALLEST_LANE_KM:g}); take fewer regions, or your own"
+            )
+    return sentences
+
+
+def short_demand(depart: PerTrip, begin: float, step: float) -> list[str]:
+    """Return a sentence if vehicles depart in too few intervals.
+
+    depart: (N,) [s]; begin, step: of the control intervals [s]
+    """
+    intervals = math.ceil((float(depart[-1]) - begin) / step) if len(depart) else 0
+    if intervals >= FEWEST_INTERVALS:
+        return []
+    return [
+        f"vehicles depart in {intervals} control intervals of {step:g} s, too few for an MFD "
+        f"(below {FEWEST_INTERVALS}); import a longer time"
+    ]
 
 
 def left_alone(
@@ -95,17 +149,18 @@ def left_alone(
 ) -> dict[str, str]:
     """Return the signals that perimeter control does not use, with the reason.
 
-    switched: signals whose programme a timetable changes; everywhere: reason for all signals
+    switched: signals whose programme a timetable changes
+    everywhere: reason for all signals, "" without one
     """
     if everywhere:
         return dict.fromkeys(streets.logics, everywhere)
-    reasons = {
-        signal: "no programme"
-        for signal in streets.link_signals
-        if signal and signal not in streets.logics
-    }
+    reasons = {}
+    for signal in streets.link_signals:
+        if signal and signal not in streets.logics:
+            reasons[signal] = "no programme"
     for signal, logic in streets.logics.items():
-        if reason := unfit(logic):
+        reason = unfit(logic)
+        if reason:
             reasons[signal] = reason
     return reasons | dict.fromkeys(switched, TIMETABLE)
 
@@ -117,15 +172,16 @@ def import_verdict(
     baseline: Baseline,
     scenario: str,
 ) -> Verdict:
-    """Judge from the run without control whether perimeter control can help; scenario: its name."""
-    crossings = (
-        (row["source"], row["target"], row["flow_veh"], row["control"] == CONTROLLED)
-        for row in gateways
-    )
-    inside = (
-        np.array([np.bincount(regions, row, network.regions) for row in baseline.presence])
-        / INTERVAL_S
-    )
+    """Judge from the run without control if perimeter control can help.
+
+    scenario: its name
+    """
+    crossings = []
+    for row in gateways:
+        controlled = row["control"] == CONTROLLED
+        crossings.append((row["source"], row["target"], row["flow_veh"], controlled))
+    vehicle_seconds = [np.bincount(regions, row, network.regions) for row in baseline.presence]
+    inside = np.array(vehicle_seconds) / INTERVAL_S
     started = np.zeros(network.regions)
     for (way, _), vehicles in baseline.ways.items():
         if way:

@@ -1,7 +1,7 @@
-"""Road graph of a SUMO network as arrays, with shapes and signal programmes."""
+"""Road graph of a SUMO network as arrays, with signal programmes."""
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,22 +22,25 @@ from nmfd.errors import InputError
 
 @dataclass(frozen=True, kw_only=True)
 class Logic(signals.Logic):
-    """Signal programme with its cycle [s]; kind: SUMO's type, or "branching" if phases do not
-    follow in order."""
+    """Signal programme with its cycle [s].
+
+    kind: SUMO's type, or "branching" if phases do not follow in order
+    """
 
     cycle: float
 
 
 @dataclass(frozen=True, kw_only=True)
 class Streets:
-    """Road graph of E normal edges, sorted by id, including those closed to cars.
+    """Road graph of E normal edges, sorted by id.
 
+    It includes those closed to cars.
     drivable: (E,) bool, with a lane for cars
     length [m], lanes (those for cars), speed [m/s]: (E,)
     shapes: E arrays (n, 2) [m]; centre: (E, 2) [m], half way along
     junctions: (E, 2), numbers of the junctions where the edge begins and ends
-    links: (L, 2) edges that a connection joins, both drivable, by lanes for cars; all_links: for
-        any vehicle
+    links: (L, 2) edges that a connection joins, both drivable, by lanes for cars
+    all_links: the same for any vehicle
     link_signals: L signals, of each of the links, None without one
     roundabouts: lists of edges
     logics: signal -> the programme that runs, which is the last one
@@ -62,6 +65,7 @@ class Streets:
 
     @cached_property
     def number(self) -> dict[str, int]:
+        """Edge -> its number."""
         return {edge: n for n, edge in enumerate(self.edges)}
 
     @property
@@ -69,9 +73,18 @@ class Streets:
         """Length times lanes for cars (E,) [m]."""
         return self.length * self.lanes
 
+    @property
+    def parts(self) -> int:
+        """Number of parts into which the drivable edges fall."""
+        _, part = connected_components(graph(self.links, len(self.edges)), directed=False)
+        return len(np.unique(part[self.drivable]))
+
     @cached_property
     def main_part(self) -> EdgeMask:
-        """Drivable edges (E,) of the weakly connected part with the most lane metres."""
+        """Drivable edges (E,) of the largest weakly connected part.
+
+        That is the one with the most lane metres.
+        """
         return self._largest("weak")
 
     @cached_property
@@ -93,7 +106,10 @@ def graph(pairs: Int[np.ndarray, "_ 2"], size: int) -> csr_array:
 
 
 class _Edge(NamedTuple):
-    """Edge of the file; cars: indices of the lanes for them; start, end: junctions."""
+    """Edge of the file.
+
+    cars: indices of the lanes for them; start, end: junctions
+    """
 
     cars: frozenset[int]
     length: float
@@ -104,73 +120,100 @@ class _Edge(NamedTuple):
 
 
 def read_streets(net: Path, additional: Iterable[Path] = ()) -> Streets:
-    """Read a net.xml(.gz), and signal programmes of additional files, which replace those there.
-    Raises InputError."""
+    """Read a net.xml(.gz), and signal programmes of additional files.
+
+    The latter replace those of the network.
+    Raises: InputError
+    """
+    rows: dict[str, _Edge] = {}
+    links: list[Mapping[str, str]] = []
+    roundabouts: list[list[str]] = []
+    logics: dict[str, Logic] = {}
     with network_root(net) as root:
-        normal = (
-            edge for edge in root.iterfind("edge") if edge.get("function", "normal") in NORMAL
-        )
-        rows = {attribute(edge, "id"): _edge(edge) for edge in normal}
-        links = [
-            link.attrib
-            for link in root.iterfind("connection")
-            if not attribute(link, "from").startswith(":")
-        ]
-        roundabouts = [ring.get("edges", "").split() for ring in root.iterfind("roundabout")]
-        logics = {
-            attribute(element, "id"): _logic(element, net) for element in root.iterfind("tlLogic")
-        }
+        for element in root:
+            if element.tag == "edge" and element.get("function", "normal") in NORMAL:
+                rows[attribute(element, "id")] = _edge(element)
+            elif element.tag == "connection" and not attribute(element, "from").startswith(":"):
+                links.append(element.attrib)
+            elif element.tag == "roundabout":
+                roundabouts.append(element.get("edges", "").split())
+            elif element.tag == "tlLogic":
+                logics[attribute(element, "id")] = _logic(element, net)
     for path in additional:
-        logics |= {
-            attribute(element, "id"): _logic(element, path)
-            for element in read_xml(path).iter("tlLogic")
-        }
+        for element in read_xml(path).iter("tlLogic"):
+            logics[attribute(element, "id")] = _logic(element, path)
     if not any(row.cars for row in rows.values()):
         raise InputError(f"{net}: has no edge that cars may use; give a road network")
+    return _from_rows(
+        net, rows, links, roundabouts, logics, left_hand=root.get("lefthand") == "true"
+    )
+
+
+def _from_rows(
+    path: Path,
+    rows: Mapping[str, _Edge],
+    links: Iterable[Mapping[str, str]],
+    roundabouts: Iterable[Sequence[str]],
+    logics: Mapping[str, Logic],
+    *,
+    left_hand: bool,
+) -> Streets:
+    """Return the streets of a network.
+
+    rows: id -> edge; links: attributes of connections; roundabouts: their edges
+    """
     edges = tuple(sorted(rows))
     number = {edge: n for n, edge in enumerate(edges)}
-    ends = np.array([(rows[edge].start, rows[edge].end) for edge in edges])
-    every, signal_of = set(), {}
+    own = [rows[edge] for edge in edges]
+    pairs: set[tuple[int, int]] = set()
+    signal_of: dict[tuple[int, int], str | None] = {}  # pair of edges, for cars -> signal
     for link in links:
-        if link["from"] in number and link["to"] in number:
-            pair = number[link["from"]], number[link["to"]]
-            every.add(pair)
-            if (
-                int(link["fromLane"]) in rows[link["from"]].cars
-                and int(link["toLane"]) in rows[link["to"]].cars
-            ):
-                signal_of[pair] = link.get("tl")
-    cars = sorted(signal_of)
+        source = link["from"]
+        target = link["to"]
+        if source not in number or target not in number:
+            continue
+        pair = number[source], number[target]
+        pairs.add(pair)
+        from_cars = int(link["fromLane"]) in rows[source].cars
+        if from_cars and int(link["toLane"]) in rows[target].cars:
+            signal_of[pair] = link.get("tl")
+    car_links = sorted(signal_of)
+    _, junctions = np.unique([(row.start, row.end) for row in own], return_inverse=True)
+    rings = []
+    for ring in roundabouts:
+        rings.append(tuple(number[edge] for edge in ring if edge in number))
     return Streets(
-        path=net,
+        path=path,
         edges=edges,
-        drivable=np.array([bool(rows[edge].cars) for edge in edges]),
-        length=np.array([rows[edge].length for edge in edges]),
-        lanes=np.array([len(rows[edge].cars) for edge in edges]),
-        speed=np.array([rows[edge].speed for edge in edges]),
-        shapes=tuple(rows[edge].shape for edge in edges),
-        centre=np.array(
-            [points_along(rows[edge].shape, lambda length: length / 2) for edge in edges]
-        ),
-        junctions=np.unique(ends, return_inverse=True)[1].reshape(-1, 2),
-        links=np.array(cars, dtype=int).reshape(-1, 2),
-        all_links=np.array(sorted(every), dtype=int).reshape(-1, 2),
-        link_signals=tuple(signal_of[pair] for pair in cars),
-        roundabouts=tuple(tuple(number[e] for e in ring if e in number) for ring in roundabouts),
+        drivable=np.array([bool(row.cars) for row in own]),
+        length=np.array([row.length for row in own]),
+        lanes=np.array([len(row.cars) for row in own]),
+        speed=np.array([row.speed for row in own]),
+        shapes=tuple(row.shape for row in own),
+        centre=np.array([points_along(row.shape, lambda length: length / 2) for row in own]),
+        junctions=junctions.reshape(-1, 2),
+        links=np.array(car_links, dtype=int).reshape(-1, 2),
+        all_links=np.array(sorted(pairs), dtype=int).reshape(-1, 2),
+        link_signals=tuple(signal_of[pair] for pair in car_links),
+        roundabouts=tuple(rings),
         logics=dict(sorted(logics.items())),
-        left_hand=root.get("lefthand") == "true",
+        left_hand=left_hand,
     )
 
 
 def _edge(element: ElementTree.Element) -> _Edge:
     lanes = list(element.iter("lane"))
-    cars = {int(attribute(lane, "index")): lane for lane in lanes if for_cars(lane)}
+    car_lanes = [lane for lane in lanes if for_cars(lane)]
     shape = element.get("shape") or attribute(lanes[len(lanes) // 2], "shape")
+    points = []
+    for point in shape.split():
+        x, y = point.split(",")[:2]
+        points.append([float(x), float(y)])
     return _Edge(
-        cars=frozenset(cars),
-        length=size(next(iter(cars.values()), lanes[0]), "length"),
-        speed=max(size(lane, "speed") for lane in cars.values() or lanes),
-        shape=np.array([[float(x) for x in point.split(",")[:2]] for point in shape.split()]),
+        cars=frozenset(int(attribute(lane, "index")) for lane in car_lanes),
+        length=size((car_lanes or lanes)[0], "length"),
+        speed=max(size(lane, "speed") for lane in car_lanes or lanes),
+        shape=np.array(points),
         start=attribute(element, "from"),
         end=attribute(element, "to"),
     )
@@ -183,5 +226,6 @@ def _logic(element: ElementTree.Element, path: Path) -> Logic:
     if kind == "static" and any(phase.get("next") for phase in phases):
         kind = "branching"
     cycle = sum(seconds(phase.get("duration", "0"), where) for phase in phases)
+    programme = element.get("programID", "0")
     states = tuple(phase.get("state", "") for phase in phases)
-    return Logic(programme=element.get("programID", "0"), kind=kind, cycle=cycle, states=states)
+    return Logic(programme=programme, kind=kind, cycle=cycle, states=states)

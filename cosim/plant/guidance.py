@@ -97,6 +97,15 @@ class _Visits:
             self._present[visit.event.vehicle] = visit
             self._due[self._step + steps].append(visit)
 
+    def targets(self, number: dict[str, int]) -> dict[tuple[int, int, bool], list[int]]:
+        """Return last edges of the drivers for `RegionRoutes.command`."""
+        targets = defaultdict(list)
+        for visit in self._present.values():
+            event = visit.event
+            key = (event.region, visit.driver_class, event.region == event.destination)
+            targets[key].append(number[event.edge])
+        return targets
+
     def due(self) -> list[_Visit]:
         """Return the drivers to guide again in this step."""
         visits = self._due.pop(self._step, [])
@@ -172,7 +181,7 @@ class Guide:
             return
         if seen is not None:
             self._times.learn(seen)
-        self._routes.command(prices)
+        self._routes.command(prices, self._visits.targets(self._city.number))
         self._shares.command(splits)
 
     def apply(self, events: list[Event]) -> None:

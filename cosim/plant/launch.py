@@ -84,10 +84,9 @@ class Launch:
         routes = self._folder / "trips.rou.xml"
         self.vehicles = self._write_vehicles(routes, seed)
         beside = own_files(self._scenario, settings.background)
-        if settings.routes and beside and not seed:
-            files = recorded.merge(routes, beside, self._folder / "beside.rou.xml")
-        else:
-            files = [routes, *beside]
+        files = [routes, *beside]
+        if settings.routes:
+            files = recorded.run_files(routes, beside, seed)
         return Session(
             self._city.net_file,
             files,
@@ -113,7 +112,7 @@ class Launch:
     def _options(self) -> list[str]:
         """Return SUMO's options, as on its command line."""
         settings = self._settings
-        options = outputs.options(self.trip_file, detailed=self._kept)
+        options = outputs.options(self.trip_file, detailed=self._kept, drawn=settings.rerouting > 0)
         chosen = {
             "begin": str(settings.begin),
             "ignore-route-errors": str(bool(settings.routes)).lower(),
@@ -185,6 +184,13 @@ class Launch:
         if self._settings.routes:
             return self._recorded
         return as_recorded(make_trips(self._city, self._scenario.demand, self._scenario.step, seed))
+
+    @cached_property
+    def beside(self) -> frozenset[str]:
+        """Ids of the vehicles and flows of the city's files outside the demand."""
+        settings = self._settings
+        files = own_files(self._scenario, (*settings.background, *settings.additional))
+        return recorded.ids(files)
 
     @cached_property
     def _recorded(self) -> RecordedTrips:

@@ -16,11 +16,14 @@ MAX_GREEN_S while others wait. A change costs intergreen time t. Another stage's
 therefore multiplied by lookahead / (lookahead + t). A shorter lookahead gives fewer changes.
 """
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import block_diag
 
-from cosim.plant.gates import Green, Show
+from cosim.plant.gates import Green, Ration, Show
 from cosim.plant.pressure import Roads
 from cosim.plant.stages import Junction, green_links, intergreen_share, stages_of
 from cosim.sumo.arrays import PerGateway
@@ -38,6 +41,17 @@ FACTS = {  # columns of the table of runs
 DECISION_PERIOD_S = 5.0  # about two vehicles per lane
 MAX_GREEN_S = 50.0  # netconvert's for actuated signals
 MAX_RED_S = 120.0  # about the longest usual cycle (Signal Timing Manual, 2nd edition, 2015)
+
+
+class Gate(NamedTuple):
+    """A gateway link with rationed green.
+
+    link: its number among the links of all signals; movement: (edge, next edge)
+    """
+
+    ration: Ration
+    link: int
+    movement: tuple[str, str]
 
 
 class MaxPressure:
@@ -65,28 +79,34 @@ class MaxPressure:
         self._show = show
         self._lookahead = lookahead
         self._roads = Roads(city, signals, flows)
+        self._approaches = Approaches(signals, self._roads.watched, now)
         self._junctions = [Junction(signal, now, gateways.get(signal.id)) for signal in signals]
-        self._approaches = [Approaches(signal, self._roads.watched, now) for signal in signals]
-        self._rationed = [junction for junction in self._junctions if junction.rations]
+        self._gates = []
+        for signal, junction, first in zip(
+            signals, self._junctions, self._approaches.begins, strict=True
+        ):
+            movement = {link.index: (link.from_edge, link.to_edge) for link in signal.links}
+            for link, ration in junction.rations.items():
+                self._gates.append(Gate(ration, first + link, movement[link]))
+            show(junction.signal, junction.state)
+        self._counted = self._roads.counted(self._approaches.lanes)
         self._programmed = float(np.mean([intergreen_share(signal.phases) for signal in signals]))
         self._start = now
         self._next = now  # time of the next decision [s]
-        for junction in self._junctions:
-            show(junction.signal, junction.state)
 
     def command(self, share: PerGateway) -> None:
         """Set the shares (G,) [-] of the cycles that begin from now on."""
-        for junction in self._rationed:
-            for ration in junction.rations.values():
-                ration.share = float(share[ration.gateway])
+        for gate in self._gates:
+            gate.ration.share = float(share[gate.ration.gateway])
 
     def green_time(self) -> dict[str, dict[int, Green]]:
         """Return signal -> gateway link -> green so far."""
         now = self._session.time
         green = {}
-        for junction in self._rationed:
-            rations = junction.rations.items()
-            green[junction.signal] = {link: ration.green_time(now) for link, ration in rations}
+        for junction in self._junctions:
+            if junction.rations:
+                rations = junction.rations.items()
+                green[junction.signal] = {link: ration.green_time(now) for link, ration in rations}
         return green
 
     def facts(self, now: float) -> dict[str, float]:
@@ -106,97 +126,111 @@ class MaxPressure:
 
     def _decide(self, now: float) -> None:
         """Switch the junctions whose next stage is another one."""
-        counts = [self._session.lane_vehicles(lane) for lane in self._roads.lanes]
-        present = np.array(counts, dtype=float)
-        pressure = self._pressure(present)
-        for junction, approaches, begin in zip(
-            self._junctions, self._approaches, self._roads.begins, strict=True
-        ):
-            approaches.observe(junction.state, now)
+        present = np.zeros(len(self._roads.lanes))
+        for n, lane in self._counted:
+            present[n] = self._session.lane_vehicles(lane)
+        closed = [gate for gate in self._gates if gate.ration.exhausted]
+        pressure = self._pressure(present, closed)
+        approaches = self._approaches
+        approaches.observe([junction.state for junction in self._junctions], now)
+        waiting = approaches.waiting(present, closed)
+        called = approaches.served(waiting)
+        overdue = approaches.served(waiting * approaches.overdue(now))
+        for junction, begin in zip(self._junctions, self._roads.begins, strict=True):
             if not junction.may_switch(now):
                 continue
-            waiting = approaches.waiting(present, junction.exhausted_links())
-            own_pressure = pressure[begin : begin + junction.stages]
-            stage = self._next_stage(junction, own_pressure, waiting, approaches, now)
+            own = slice(begin, begin + junction.stages)
+            stage = self._next_stage(junction, pressure[own], called[own], overdue[own], now)
             if stage != junction.stage:
                 self._show(junction.signal, junction.switch(stage, now))
 
-    def _pressure(self, present: np.ndarray) -> np.ndarray:
-        """Return the pressures (S,) of all stages. present: (L,) [veh]"""
+    def _pressure(self, present: np.ndarray, closed: Iterable[Gate]) -> list[float]:
+        """Return the pressures of all stages (veh).
+
+        present: vehicles by lane (veh, (L,)); closed: gateway links without more green
+        """
         roads = self._roads
         weight = np.maximum(roads.weights @ present, 0.0)
-        for junction in self._rationed:
-            for link in junction.exhausted_links():
-                weight[roads.movements[junction.movement[link]]] = 0.0
-        return roads.gain @ weight + roads.apart @ present
+        for gate in closed:
+            weight[roads.movements[gate.movement]] = 0.0
+        return (roads.gain @ weight + roads.apart @ present).tolist()
 
     def _next_stage(
         self,
         junction: Junction,
-        pressure: np.ndarray,
-        waiting: np.ndarray,
-        approaches: "Approaches",
+        pressure: list[float],
+        called: list[float],
+        overdue: list[float],
         now: float,
     ) -> int:
-        """Return the next stage, or the present one.
+        """Return the next stage of a signal, or the present one.
 
-        pressure: of the stages (n,); waiting: a vehicle waits for the link (bool, (K,))
+        pressure: of its stages (veh); called: links with waiting vehicles that each serves
+        overdue: times of red of these, if too long (s)
         """
         present = junction.stage
-        called = approaches.serves @ waiting > 0
-        others = []  # stages that a vehicle waits for, in the order of the programme
-        for n in range(present + 1, present + len(pressure)):
-            stage = n % len(pressure)
-            if called[stage]:
-                others.append(stage)
-        if not others:
-            return present
-        overdue = approaches.serves @ (waiting * approaches.overdue(now))
-        if overdue.any():
-            return int(np.argmax(overdue))
-        worth = {}
-        for stage in others:
-            time = self._lookahead + junction.loss(stage)
-            worth[stage] = pressure[stage] * self._lookahead / time
-        best = max(others, key=worth.__getitem__)
+        best = present
+        highest = -math.inf
+        for n in range(present + 1, present + junction.stages):
+            stage = n % junction.stages
+            if not called[stage]:
+                continue
+            time = self._lookahead + junction.losses[present, stage]
+            worth = pressure[stage] * self._lookahead / time
+            if worth > highest:
+                best = stage
+                highest = worth
+        if best != present and any(overdue):
+            return overdue.index(max(overdue))
         too_long = now + DECISION_PERIOD_S > junction.stage_since + MAX_GREEN_S + 1e-6
-        if worth[best] > pressure[present] or too_long:
+        if highest > pressure[present] or too_long:
             return best
         return present
 
 
 class Approaches:
-    """The links of one signal: where vehicles wait, and times of red.
+    """The links of all signals: where vehicles wait, and times of red.
 
-    serves: 1 if link k is green in stage n, else 0 (n, K)
+    begins: number of the first link of every signal
+    lanes: numbers of the lanes whose vehicles may wait
     """
 
-    def __init__(self, signal: Signal, watched: Callable[[Link], set[int]], now: float):
+    def __init__(self, signals: Sequence[Signal], watched: Callable[[Link], set[int]], now: float):
         """watched: link -> numbers of the lanes whose vehicles may wait for it"""
-        stages = [green_links(signal.phases[n].state) for n in stages_of(signal)]
-        self.serves = np.array(stages, dtype=float)
+        self.begins = []
+        serves = []  # of every signal: whether a link is green in a stage (bool, (stages, links))
         pairs = set()
-        for link in (*signal.links, *signal.others):
-            pairs |= {(link.index, lane) for lane in watched(link)}
-        self._link, self._lane = np.array(sorted(pairs)).T
-        self._last_green = np.full(self.serves.shape[1], now)
+        links = 0
+        for signal in signals:
+            self.begins.append(links)
+            serves.append([green_links(signal.phases[n].state) for n in stages_of(signal)])
+            for link in (*signal.links, *signal.others):
+                pairs |= {(links + link.index, lane) for lane in watched(link)}
+            links += len(signal.phases[0].state)
+        self._link, self.lanes = np.array(sorted(pairs)).T
+        self._serves = block_diag(serves, format="csr", dtype=float)
+        self._last_green = np.full(links, now)
 
-    def observe(self, state: str, now: float) -> None:
+    def observe(self, states: Iterable[str], now: float) -> None:
         """Note which links are green at `now` [s]."""
-        self._last_green[green_links(state)] = now
+        green = np.concatenate([green_links(state) for state in states])
+        self._last_green[green] = now
 
-    def waiting(self, present: np.ndarray, closed: Collection[int]) -> np.ndarray:
+    def waiting(self, present: np.ndarray, closed: Iterable[Gate]) -> np.ndarray:
         """Return True for links that vehicles wait for (K,).
 
-        closed: links that do not count
-        present: vehicles by lane (veh, (L,))
+        present: vehicles by lane (veh, (L,)); closed: gateway links that do not count
         """
         waits = np.zeros(len(self._last_green), dtype=bool)
-        waits[self._link[present[self._lane] > 0]] = True
-        waits[list(closed)] = False
+        waits[self._link[present[self.lanes] > 0]] = True
+        waits[[gate.link for gate in closed]] = False
         return waits
 
     def overdue(self, now: float) -> np.ndarray:
         """Return the time of red of every link (s, (K,)), 0 below MAX_RED_S."""
         red = now - self._last_green
         return np.where(red >= MAX_RED_S - 1e-6, red, 0.0)
+
+    def served(self, values: np.ndarray) -> list[float]:
+        """Return the sum of values of links (K,) that each stage serves."""
+        return (self._serves @ values).tolist()

@@ -6,7 +6,7 @@ last edge of the final route, else a removal.
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from cosim.plant.metering import Metering
 from cosim.sumo.arrays import PerGateway
+from cosim.sumo.departures import original
 from cosim.sumo.net import City
 from cosim.sumo.outputs import End, TripReader
 from cosim.sumo.session import REFUSALS, Session
@@ -39,10 +40,11 @@ class _Vehicle:
     destination: int
     edge: str  # last one of its route
     free: bool  # guidance may reroute it
-    private: bool  # `Session.is_private`
+    private: bool  # a trip of the demand
     public: bool  # `Session.is_public`
     due: float = 0.0  # [s]
     waited: float = 0.0  # departure delay [s]
+    phantom: bool = False  # neither in the demand nor in the city's other files
     departed: bool = False
     region: int = 0  # the present one, since the departure
     announced: int = 0  # region of its last Event, perhaps ahead
@@ -90,6 +92,7 @@ class Meter:
 
     Since the beginning [veh]:
     departures (R, R); probe_departures (R, R), of probes; arrivals (R,), completed trips
+    private_arrivals (R,), of these the private ones
     removals (R, R) [i, j], vehicles taken out in i on their way to j
     given_up (R, R), trips dropped before they began
     crossings (R, R, R) [i, h, j], from i to h by a gateway; jumps (R, R, R), without one:
@@ -106,16 +109,23 @@ class Meter:
         probes: frozenset[str] = frozenset(),
         trips: TripReader | None = None,
         metering: Metering | None = None,
+        demand: Container[str] | None = None,
+        beside: Container[str] = frozenset(),
     ):
         """probes: vehicles that are also counted apart
 
         metering: trips that wait outside
         trips: ends of trips; None if SUMO cannot write them at once: all are arrivals then
+        demand: private trips; None: all vehicles but public transport and the like
+        beside: other vehicles and flows of the city's files. All others are made, and perhaps
+            dropped again, by calibrators and persons
         """
         self._session = session
         self._city = city
         self._probes = probes
         self._trips = trips
+        self._demand = demand
+        self._beside = beside
         self._metering = metering
         self._vehicles: dict[str, _Vehicle] = {}
         # Vehicles that are not in tripinfo yet; several if an id is used again.
@@ -136,7 +146,7 @@ class Meter:
         self.departures, self.probe_departures, self.removals, self.given_up = np.zeros(
             (4, regions, regions), dtype=int
         )
-        self.arrivals = np.zeros(regions, dtype=int)
+        self.arrivals, self.private_arrivals = np.zeros((2, regions), dtype=int)
         self.crossings, self.jumps, self.redirected = np.zeros(
             (3, regions, regions, regions), dtype=int
         )
@@ -157,7 +167,7 @@ class Meter:
             time=time,
             accumulation=self.accumulation(step),
             backlog=self.backlog(),
-            completed=float(self.arrivals.sum()),
+            completed=float(self.private_arrivals.sum()),
             removed=(self.removals + self.given_up).astype(float),
         )
 
@@ -178,8 +188,7 @@ class Meter:
             try:
                 self._load(vehicle)
             except REFUSALS:  # gone already: SUMO found no route when it was due
-                self.given_up[0, 0] += 1
-                self._end(Trip(0, True, GIVEN_UP, 0.0, 0.0))
+                self._give_up(vehicle)
         for vehicle in session.started_teleport():
             self.teleports += 1
             self._teleporting.add(vehicle)
@@ -196,16 +205,30 @@ class Meter:
             )
         self._steps += 1
         if self._steps % self._poll_steps == 0:
-            for edge, region in self._entries.items():
-                present = session.vehicles_on(edge)
-                if present != self._seen[edge]:
-                    for vehicle in set(present).difference(self._seen[edge]):
-                        events += self._enter(vehicle, edge, region)
-                    self._seen[edge] = present
+            events += self._entered()
         for vehicle in arrived:
             self._leave(vehicle)
         # The order of a set is not reproducible.
         events.sort(key=lambda event: (event.source is not None, event.vehicle))
+        return events
+
+    def _give_up(self, vehicle: str) -> None:
+        """Book a vehicle that SUMO dropped before it could be looked at."""
+        if self._is_phantom(vehicle):
+            return
+        self.given_up[0, 0] += 1
+        private = self._demand is None or vehicle in self._demand
+        self._end(Trip(0, private, GIVEN_UP, 0.0, 0.0))
+
+    def _entered(self) -> list[Event]:
+        """Return the entries since the last poll of the edges behind boundaries."""
+        events = []
+        for edge, region in self._entries.items():
+            present = self._session.vehicles_on(edge)
+            if present != self._seen[edge]:
+                for vehicle in set(present).difference(self._seen[edge]):
+                    events += self._enter(vehicle, edge, region)
+                self._seen[edge] = present
         return events
 
     def accumulation(self, step: int = 0) -> PerPair:
@@ -384,6 +407,7 @@ class Meter:
             self._end(_trip(gone, COMPLETED, end.time, end.time_loss))
             h = self._city.region_of.get(end.edge, j)
             self.arrivals[h] += 1
+            self.private_arrivals[h] += gone.private
             self.redirected[i, j, h] += h != j
             j = h
         if h != i:
@@ -401,6 +425,8 @@ class Meter:
             region_of = self._city.region_of
             route = session.route(vehicle)
             private = session.is_private(vehicle)
+            if self._demand is not None:
+                private = private and vehicle in self._demand
             known = _Vehicle(
                 origin=region_of.get(route[0], 0),
                 destination=region_of.get(route[-1], 0),
@@ -409,9 +435,16 @@ class Meter:
                 private=private,
                 public=not private and session.is_public(vehicle),
             )
+            known.phantom = self._is_phantom(vehicle)
             self._vehicles[vehicle] = known
             self._time(vehicle, known)
         return known
+
+    def _is_phantom(self, vehicle: str) -> bool:
+        """Return True for a vehicle that a calibrator or a person made."""
+        if self._demand is None or vehicle in self._demand:
+            return False
+        return not original(vehicle, self._beside)
 
     def _time(self, vehicle: str, known: _Vehicle) -> None:
         """Note when a vehicle was due, and its departure delay until now."""
@@ -464,6 +497,8 @@ class Meter:
         known = self._vehicles.pop(vehicle)
         ended = self._session.time - self._session.step_length
         if not known.departed:  # given up before it departed
+            if known.phantom:
+                return
             self.given_up[known.origin, known.destination] += 1
             self._end(_trip(known, GIVEN_UP, ended))
             return

@@ -117,7 +117,15 @@ class SumoPlant:
         estimated = settings.measurement == ESTIMATE
         known = probes(self._launch.vehicles, settings.probe_share if estimated else 0.0, seed)
         trips = self._trips if session.flush else None
-        meter = Meter(session, city, known, trips, self._metering)
+        meter = Meter(
+            session,
+            city,
+            known,
+            trips,
+            self._metering,
+            demand=frozenset(self._launch.vehicles),
+            beside=self._launch.beside,
+        )
         self.meter = meter
         self._estimation = None
         if estimated:

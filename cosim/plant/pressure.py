@@ -60,6 +60,11 @@ class Roads:
         self.weights = _sparse(rows, len(self.lanes))
         self._add_stages(signals)
 
+    def counted(self, others: np.ndarray) -> list[tuple[int, str]]:
+        """Return number and name of the lanes whose vehicles count, and of `others`."""
+        numbers = np.unique(np.concatenate([self.weights.indices, self.apart.indices, others]))
+        return [(n, self.lanes[n]) for n in numbers.tolist()]
+
     def watched(self, link: Link) -> set[int]:
         """Return the lanes (numbers) whose vehicles may wait for a link.
 

@@ -13,7 +13,16 @@ from nmfd.runs import config
 from nmfd.types import Quantity, Result
 
 # The books of the meter.
-BOOKS = ("departures", "arrivals", "removals", "given_up", "crossings", "jumps", "redirected")
+BOOKS = (
+    "departures",
+    "arrivals",
+    "private_arrivals",
+    "removals",
+    "given_up",
+    "crossings",
+    "jumps",
+    "redirected",
+)
 
 
 def _quantities(table: Mapping[str, tuple[str, str, str]]) -> dict[str, Quantity]:
@@ -43,7 +52,7 @@ def settled(result: Result) -> Result:
     inside = inside + redirected.sum(axis=1) - redirected.sum(axis=2)
     return result.assign(
         accumulation=np.concatenate([result["accumulation"][:-1], inside[None].astype(float)]),
-        completed=_since_start(result["arrivals"].sum(axis=1)),
+        completed=_since_start(result["private_arrivals"].sum(axis=1)),
         removed=_since_start(result["removals"] + result["given_up"]),
     )
 

@@ -7,8 +7,7 @@ interval counts half.
 """
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, cached_property, partial
 from typing import NamedTuple
 
@@ -28,6 +27,8 @@ EMPTY_WEIGHT = 0.5  # of earlier observations after a control interval without v
 PRIOR_VEH_S = 3.0  # at the speed limit, which count besides
 FAR_S = 1e9  # longer than any way
 MOST_NODES = 20_000_000  # of the searches that are kept, of 12 bytes each
+MOST_TOGETHER = 1000  # nodes of a graph with searches in one call: in larger ones, limits save more
+MOST_WHOLE = 120  # nodes of a graph with searches from all of them
 FEWEST_TREES = 8  # that are kept, however large the city: one decision needs as many
 PerNode = Float[np.ndarray, " nodes"]  # of a graph of moves
 Nodes = Int[np.ndarray, " nodes"]
@@ -242,9 +243,11 @@ class Trees:
         turns: PerMove,
         searches: Searches,
         ahead: PerNode | None = None,
+        together: Iterable[int] = (),
     ):
         """time: of edges (s, (E,)); turns: of moves (s, (M,))
         ahead: see `Moves.costing` (s, (nodes,))
+        together: nodes to search from in one call, when the first of them is needed
         """
         self.time = time
         self.number = moves.number
@@ -254,25 +257,34 @@ class Trees:
         # Not this object itself: `searches` would hold it, and both would stay until the garbage is
         # collected.
         self._owner = object()
+        self._row = {node: row for row, node in enumerate(dict.fromkeys(together))}
+        self._together: tuple[np.ndarray, np.ndarray] | None = None
 
     def costs(self, begin: int, most: float) -> PerNode:
         """Return the times from edge `begin` (s, (nodes,)).
 
         Times above `most` may be infinite.
         """
-        node = int(self.number[begin])
-        return self._searches.tree(self._owner, node, self._costs, most).costs
+        return self._tree(int(self.number[begin]), most).costs
 
     def back(self, begin: int, end: int) -> list[int]:
         """Return the edges from `end` back to `begin`, after `costs` of `begin`."""
         first = int(self.number[end])
         last = int(self.number[begin])
-        before = self._searches.tree(self._owner, last, self._costs, 0.0).before
-        return self._moves.path(before, first, last)
+        return self._moves.path(self._tree(last, 0.0).before, first, last)
+
+    def _tree(self, node: int, most: float) -> _Tree:
+        """Return the search from a node, at least up to `most` (s)."""
+        row = self._row.get(node)
+        if row is None:
+            return self._searches.tree(self._owner, node, self._costs, most)
+        if self._together is None:
+            self._together = dijkstra(self._costs, indices=[*self._row], return_predecessors=True)
+        costs, before = self._together
+        return _Tree(math.inf, costs[row], before[row])
 
 
-@dataclass(frozen=True)
-class Choice:
+class Choice(NamedTuple):
     """A next region for a driver.
 
     time: of the fastest route by it (s), infinite if too long
@@ -329,26 +341,25 @@ class Ways:
         self,
         exits: Exits,
         *,
+        there: Trees,
+        onward: Trees,
         crossing: PerGateway,
         ahead: PerNode,
-        time: PerEdge,
-        turns: PerMove,
-        searches: Searches,
         everywhere: tuple[Trees, PerGateway, PerGateway] | None = None,
     ):
-        """crossing: time over each gateway (s, (G,))
-        ahead: time from the nearest second[g] to nodes of `outside`, at times not above `time`
-            (s, (E,)) and `turns` (s, (M,))
+        """there, onward: routes by moves `inside`, and by reversed moves `outside`, with `ahead`
+        crossing: time over each gateway (s, (G,))
+        ahead: time from the nearest second[g] to nodes of `outside`, not above their times (s)
         everywhere: routes by all moves; time over each gateway on these; and, not above it, the
             time from behind the nearest gateway back to first[g]; None if no route may come back
         """
         self.exits = exits
-        self.time = time
-        self._there = Trees(exits.inside, time, turns, searches)
-        self._onward = Trees(exits.outside, time, turns, searches, ahead)
+        self.time = onward.time
+        self._there = there
+        self._onward = onward
         self._ahead = ahead
         self._everywhere = everywhere
-        self._entering = crossing + time[exits.second]
+        self._entering = crossing + self.time[exits.second]
 
     def choices(self, here: int, target: int, longest: float, detour: float) -> list[Choice]:
         """Return the fastest routes from `here` to `target` by each next region.
@@ -478,17 +489,24 @@ class RegionRoutes:
         self._ahead = cache(self._ahead_of)
         # Results of one control interval.
         self._trees = cache(self._trees_of)
-        self.ways = cache(self._ways_of)
-        self.command(None)
+        self.home = cache(self._home)
+        self.ways = cache(self._ways)
+        self.command(None, {})
 
-    def command(self, prices: PerRegion | None) -> None:
+    def command(
+        self, prices: PerRegion | None, targets: Mapping[tuple[int, int, bool], list[int]]
+    ) -> None:
         """Begin a control interval with new travel times.
 
         prices: of the regions (-, (R,)); None: no prices
+        targets: last edges of drivers who will probably be guided, by region and class, and whether
+            it is their last region
         """
         self._prices = np.zeros(len(self.regions)) if prices is None else prices
+        self._targets = targets
         self._searches = Searches()
         self._trees.cache_clear()
+        self.home.cache_clear()
         self.ways.cache_clear()
 
     def free(self, destination: int) -> tuple[int, ...]:
@@ -496,22 +514,20 @@ class RegionRoutes:
         free = [r for r in self.regions if r == destination or not self._prices[r]]
         return tuple(free)
 
-    def home(self, region: int, driver_class: int, free: tuple[int, ...]) -> Trees:
+    def _home(self, region: int, driver_class: int, free: tuple[int, ...]) -> Trees:
         """Return routes to edges of a region.
 
         They stay inside it, unless routes may return.
         """
-        return self._trees(self._homeward[region], driver_class, free)
+        targets = self._targets.get((region, driver_class, True), [])
+        return self._trees_of(self._homeward[region], driver_class, free, targets)
 
-    def _trees_of(self, moves: Moves, driver_class: int, free: tuple[int, ...]) -> Trees:
-        seen = self._seen(driver_class, free)
-        return Trees(moves, seen, self._times.turns, self._searches)
-
-    def _ways_of(self, region: int, driver_class: int, free: tuple[int, ...]) -> Ways:
+    def _ways(self, region: int, driver_class: int, free: tuple[int, ...]) -> Ways:
         """Return routes out of a region to edges of others."""
         exits = self._exits[region]
-        turns = self._times.turns
-        over = turns[exits.move]
+        over = self._times.turns[exits.move]
+        ahead = self._ahead(exits.outside, region, driver_class)
+        targets = self._targets.get((region, driver_class, False), [])
         everywhere = None
         if self._everywhere:
             trees = self._trees(self._everywhere, driver_class, free)
@@ -519,22 +535,36 @@ class RegionRoutes:
             everywhere = (trees, over, back)
         return Ways(
             exits,
+            there=self._trees_of(exits.inside, driver_class, free),
+            onward=self._trees_of(exits.outside, driver_class, free, targets, ahead),
             crossing=over if self._lanes else np.zeros(len(over)),
-            ahead=self._ahead(exits.outside, region, driver_class),
-            time=self._seen(driver_class, free),
-            turns=turns,
-            searches=self._searches,
+            ahead=ahead,
             everywhere=everywhere,
         )
 
-    def _seen(self, driver_class: int, free: tuple[int, ...]) -> PerEdge:
-        """Return the times (s, (E,)) that a class of drivers sees.
+    def _trees_of(
+        self,
+        moves: Moves,
+        driver_class: int,
+        free: tuple[int, ...],
+        targets: Sequence[int] = (),
+        ahead: PerNode | None = None,
+    ) -> Trees:
+        """Return routes at the times that a class of drivers sees.
 
-        They are lengthened by the prices of all regions but `free`.
+        targets: edges from which searches will probably be needed; ahead: see `Moves.costing`
         """
         prices = self._prices.copy()
         prices[list(free)] = 0.0
-        return self._times.edges * (1.0 + prices)[self._edge_region] * self._taste[driver_class]
+        seen = self._times.edges * (1.0 + prices)[self._edge_region] * self._taste[driver_class]
+        together: Iterable[int] = ()
+        nodes = len(moves.edges)
+        # With prices, results depend on how far searches go.
+        if free == self.regions and nodes <= MOST_WHOLE:
+            together = range(nodes)
+        elif free == self.regions and nodes <= MOST_TOGETHER:
+            together = moves.number[list(targets)].tolist()
+        return Trees(moves, seen, self._times.turns, self._searches, ahead, together)
 
     def _ahead_of(self, back: Moves, region: int, driver_class: int) -> np.ndarray:
         """Return the time from behind the nearest gateway (s, (nodes,)).

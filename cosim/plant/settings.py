@@ -55,6 +55,20 @@ def _known(name: str) -> str:
 EXACT = "exact"
 ESTIMATE = "estimate"
 FILES = ("routes", "background", "additional")
+# Options of SUMO that every run sets itself -> what to give instead.
+SET_BY_RUNS = {
+    "additional-files": "give sumo.additional",
+    "begin": "give sumo.begin",
+    "end": "give steps",
+    "ignore-route-errors": "omit it",
+    "mesosim": "give sumo.mesoscopic",
+    "net-file": "name it in network.toml",
+    "route-files": "give sumo.routes or sumo.background",
+    "seed": "give the seed of a run",
+    "step-length": "give sumo.step_length",
+    "time-to-teleport": "give sumo.time_to_teleport",
+    "tripinfo-output": "omit it; cosim.run(..., tripinfo=FILE) keeps SUMO's trips",
+}
 
 
 class Settings(config.Settings):
@@ -131,6 +145,11 @@ class Settings(config.Settings):
 
     @model_validator(mode="after")
     def _is_possible(self) -> Self:
+        for option in self.options:
+            stem = option.removesuffix(".write-unfinished").removesuffix(".write-undeparted")
+            remedy = SET_BY_RUNS.get(stem)
+            if remedy is not None:
+                raise Problem("options", f"{option} is set by every run itself; {remedy}")
         if self.measurement == ESTIMATE and self.detector_share == self.probe_share == 0:
             problem = '"estimate" needs sumo.detector_share or sumo.probe_share, but both are 0'
             raise Problem("measurement", f"{problem}; raise one of them")

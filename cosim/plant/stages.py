@@ -51,7 +51,7 @@ class Junction:
     A state belongs to a stage, or to the transition between two stages.
 
     stages: their number; stage: the present or coming one; stage_since: time at which it begins (s)
-    movement: link index -> (edge, next edge)
+    losses: (stage, another stage) -> time between them (s)
     rations: link index -> limit of the green of a gateway link
     lost: time between stages so far (s); next_change: time of the next `advance` (s)
     """
@@ -60,11 +60,16 @@ class Junction:
         """gateways: links whose green is rationed"""
         phases = signal.phases
         self.signal = signal.id
-        self.movement = {link.index: (link.from_edge, link.to_edge) for link in signal.links}
         self._phases = phases
         self._numbers = stages_of(signal)
         self._least = _minimum_greens(phases, self._numbers)
         self.stages = len(self._numbers)
+        self.losses = {}
+        self._transitions = {}
+        for source, target in permutations(range(self.stages), 2):
+            between = transition(phases, self._numbers[source], self._numbers[target])
+            self._transitions[source, target] = between
+            self.losses[source, target] = sum(phase.duration for phase in between)
         self.stage = 0
         self.stage_since = now
         self._green_since = now
@@ -81,10 +86,6 @@ class Junction:
                 self.rations[link] = Ration(gateway, cycle=cycle, yellow=yellow, start=now)
             self.next_change = now  # commands hold from the first second on
 
-    def exhausted_links(self) -> list[int]:
-        """Return the gateway links without more green in this cycle."""
-        return [link for link, ration in self.rations.items() if ration.exhausted]
-
     def may_switch(self, now: float) -> bool:
         """Return True if the stage may end at `now` (s)."""
         least = max(self._green_since + MIN_GREEN_S, self.stage_since + self._least[self.stage])
@@ -94,7 +95,7 @@ class Junction:
         """Leave the stage for another one; return the state from `now` on."""
         begin = now
         self._coming = []
-        for phase in self._transition(stage):
+        for phase in self._transitions[self.stage, stage]:
             self._coming.append(_Change(begin, phase.state))
             begin += phase.duration
         self._coming.append(_Change(begin, self._phases[self._numbers[stage]].state))
@@ -103,13 +104,6 @@ class Junction:
         self._green_since = begin
         self.lost += begin - now
         return self.advance(now)
-
-    def loss(self, stage: int) -> float:
-        """Return the time between the present stage and another one (s)."""
-        return sum(phase.duration for phase in self._transition(stage))
-
-    def _transition(self, stage: int) -> list[Phase]:
-        return transition(self._phases, self._numbers[self.stage], self._numbers[stage])
 
     def advance(self, now: float) -> str:
         """Return the state from `now` (s) on; call at every `next_change`."""

@@ -23,7 +23,10 @@ class Waits:
         links: Mapping[str, Iterable[Link]],
         states: Mapping[str, Sequence[tuple[float, str]]],
     ):
-        """links: signal -> its links; states: signal -> time [s] and state at every change"""
+        """links: signal -> its links
+
+        states: signal -> time [s] and state at every change
+        """
         self._session = session
         self._states = states
         # Edge -> lane -> next edge -> signal and link.

@@ -516,7 +516,7 @@ def _gateways(links: Sequence[_Connection], region_of: Mapping[str, int]) -> tup
 
 
 def _common_signal(links: list[_Connection]) -> str | None:
-    """Return the signal that controls all links of a movement, None if there is none."""
+    """Return the signal of all links of a movement, None without one."""
     signals = {link.signal for link in links}
     return signals.pop() if len(signals) == 1 else None
 

@@ -112,18 +112,21 @@ class TripReader:
         return End(vehicle, time, edge, reason, time_loss)
 
 
-def options(trip_file: Path, *, detailed: bool) -> list[str]:
-    """Return SUMO's options for a tripinfo file that `TripReader` can read.
+def options(trip_file: Path, *, detailed: bool, drawn: bool = False) -> list[str]:
+    """Return SUMO's options for a `trip_file` that `TripReader` can read.
 
-    detailed: with the emissions of every trip
+    detailed: with emissions of every trip
+    drawn: SUMO draws a random number per vehicle, detailed or not. Without it, the numbers that
+        decide who has a rerouting device are those of a run without emissions.
     """
-    # Not 0: SUMO draws a random number for every vehicle unless it is 0, and others decide who has
-    # a rerouting device.
-    emitting = "1" if detailed else "1e-12"
-    given = ["--tripinfo-output", str(trip_file)]
-    given += ["--tripinfo-output.write-unfinished", "true"]
-    given += ["--tripinfo-output.write-undeparted", "true"]
-    return [*given, "--device.emissions.probability", emitting]
+    texts = ["--tripinfo-output", str(trip_file)]
+    texts += ["--tripinfo-output.write-unfinished", "true"]
+    texts += ["--tripinfo-output.write-undeparted", "true"]
+    if drawn:
+        texts += ["--device.emissions.probability", "1" if detailed else "1e-12"]
+    elif detailed:
+        texts += ["--device.emissions.probability", "1", "--device.emissions.deterministic", "true"]
+    return texts
 
 
 def write_emission_data(path: Path, target: Path) -> None:

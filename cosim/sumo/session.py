@@ -277,7 +277,7 @@ class Session:
         return libsumo.lane.getLinks(lane)[0][0]
 
     def first_on(self, lane: str) -> str | None:
-        """Return the vehicle nearest to the end of a lane, None if the lane is empty."""
+        """Return the vehicle nearest to the end of a lane, None without one."""
         vehicles = libsumo.lane.getLastStepVehicleIDs(lane)
         return vehicles[-1] if vehicles else None
 

@@ -1,9 +1,10 @@
-"""Demand between regions to individual trips with static routes, and the turning flows of these."""
+"""Individual trips of a demand between regions, with static routes."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -20,12 +21,8 @@ DRIVER_CLASSES = 8  # groups of drivers who see different travel times
 CLASS_SPREAD = 0.15  # standard deviation of the logarithm of their travel times
 SHORT_EDGE_M = 30.0  # no trip starts or ends on a shorter edge if its region has longer ones
 POCKET_M = 80.0  # a longer edge is no turn pocket
-PLANNING_SEEDS = (
-    778_001,
-    778_002,
-    778_003,
-    778_004,
-)  # of trips that plans are made for, none of an evaluation
+# Of trips that plans are made for, none of an evaluation.
+PLANNING_SEEDS = (778_001, 778_002, 778_003, 778_004)
 PEAK_S = 900.0  # the Highway Capacity Manual designs for the busiest quarter of the peak hour
 
 
@@ -48,9 +45,10 @@ class Trips:
 def turning_flows(
     city: City, demand: PairsOverTime, step: float
 ) -> Mapping[tuple[str, str], float]:
-    """Return (edge, next edge) -> flow [veh/s] in the busiest quarter of an hour of `demand` (T, R,
-    R) [veh/s].
+    """Return (edge, next edge) -> flow [veh/s] in the peak.
 
+    That is the busiest quarter of an hour.
+    demand: (T, R, R) [veh/s], intervals of `step` [s]
     Trips take static routes without delays; the mean of several planning seeds. Unused movements
     are missing.
     """
@@ -64,7 +62,10 @@ def turning_flows(
 
 
 def busiest(depart: PerTrip, window: float) -> slice:
-    """Return the trips that depart in the busiest `window` [s]; depart: (N,) [s], sorted."""
+    """Return the trips that depart in the busiest `window` [s].
+
+    depart: (N,) [s], sorted
+    """
     if not len(depart):
         return slice(0)
     ends = np.searchsorted(depart, depart + window)
@@ -73,8 +74,9 @@ def busiest(depart: PerTrip, window: float) -> slice:
 
 
 def make_trips(city: City, demand: PairsOverTime, step: float, seed: int) -> Trips:
-    """Return individual trips of `demand` (T, R, R) [veh/s], intervals of `step` [s].
+    """Return individual trips of a demand between regions.
 
+    demand: (T, R, R) [veh/s], intervals of `step` [s]
     Every pair of regions gets its number of vehicles to within one, at the times at which its
     cumulated demand passes whole numbers, shifted by a random phase. Edges are drawn by length
     times lanes. Each route is the fastest one in free flow as one of `DRIVER_CLASSES` groups of
@@ -82,7 +84,8 @@ def make_trips(city: City, demand: PairsOverTime, step: float, seed: int) -> Tri
     """
     if demand.shape[1:] != (city.regions, city.regions):
         raise InputError(
-            f"{city.net_file}: demand for {demand.shape[1]} regions, but the city has {city.regions}"
+            f"{city.net_file}: demand for {demand.shape[1]} regions, but the city has "
+            f"{city.regions}"
         )
     rng = np.random.default_rng([seed, STREAM])
     depart, origin, destination = _departures(demand, step, rng)
@@ -97,14 +100,16 @@ def make_trips(city: City, demand: PairsOverTime, step: float, seed: int) -> Tri
         first[n] = city.number[_draw(starts[i], draws[n, 0])]
         last[n] = city.number[_draw(goals[j], draws[n, 1])]
     for n in np.flatnonzero(first == last):  # to the next edge instead
-        edges, _ = goals[destination[n]]
-        last[n] = city.number[edges[(edges.index(city.edges[first[n]]) + 1) % len(edges)]]
+        edges = goals[destination[n]].edges
+        place = edges.index(city.edges[first[n]])
+        last[n] = city.number[edges[(place + 1) % len(edges)]]
     routes = routes_in(city, (first, last), tastes, noise)
     for n, route in enumerate(routes):
         if len(route) < 2:
+            begin, end = city.edges[first[n]], city.edges[last[n]]
             raise InputError(
-                f"{city.net_file}: no way leads from edge {city.edges[first[n]]} (region {origin[n]}) to "
-                f"{city.edges[last[n]]} (region {destination[n]}); leave out edges that are not connected"
+                f"{city.net_file}: no way leads from edge {begin} (region {origin[n]}) to {end} "
+                f"(region {destination[n]}); leave out edges that are not connected"
             )
     lengths = np.array([city.length[route[-1]] for route in routes])
     return Trips(
@@ -119,7 +124,7 @@ def make_trips(city: City, demand: PairsOverTime, step: float, seed: int) -> Tri
 def _departures(
     demand: PairsOverTime, step: float, rng: np.random.Generator
 ) -> tuple[PerTrip, TripNumbers, TripNumbers]:
-    """Return departures rounded to 0.01 s and sorted, origins and destinations."""
+    """Return departures to 0.01 s, sorted, origins and destinations."""
     clock = step * np.arange(len(demand) + 1)
     times, origins, destinations = [], [], []
     for i in range(demand.shape[1]):
@@ -129,40 +134,48 @@ def _departures(
             count = int(np.floor(cumulated[-1] + phase))
             marks = np.arange(1, count + 1) - phase
             rising = np.concatenate([[True], np.diff(cumulated) > 0])
-            keep = rising | np.concatenate(
-                [rising[1:], [False]]
-            )  # the end of a pause begins the next rise
+            # The end of a pause begins the next rise.
+            keep = rising | np.concatenate([rising[1:], [False]])
             times.append(np.interp(marks, cumulated[keep], clock[keep]))
             origins.append(np.full(count, i))
             destinations.append(np.full(count, j))
-    times, origins, destinations = (
-        np.concatenate(parts) for parts in (times, origins, destinations)
-    )
-    times = np.floor(times * 100) / 100
-    order = np.lexsort((destinations, origins, times))
-    return times[order], origins[order], destinations[order]
+    depart = np.floor(np.concatenate(times) * 100) / 100
+    origin, destination = np.concatenate(origins), np.concatenate(destinations)
+    order = np.lexsort((destination, origin, depart))
+    return depart[order], origin[order], destination[order]
 
 
-def _ends(city: City, region: int, *, departing: bool) -> tuple[list[str], np.ndarray]:
-    """Return the edges where trips of a region start or end, with cumulated weights: if there are
-    any, good ones."""
+class _Ends(NamedTuple):
+    """Edges where trips start or end; weights: cumulated, up to 1."""
+
+    edges: list[str]
+    weights: np.ndarray
+
+
+def _ends(city: City, region: int, *, departing: bool) -> _Ends:
+    """Return the edges where trips of a region start or end.
+
+    They are good ones if there are any.
+    """
     edges = [edge for edge in city.edges if city.region_of[edge] == region]
     onward: Mapping[str, Sequence[str]] = city.successors if departing else city.before
-    good = [
-        edge
-        for edge in edges
-        if _stays(city, edge, onward)
-        and city.length[edge] >= SHORT_EDGE_M
-        and not _is_pocket(city, edge)
-    ]
+    good = []
+    for edge in edges:
+        is_long = city.length[edge] >= SHORT_EDGE_M
+        if is_long and _stays(city, edge, onward) and not _is_pocket(city, edge):
+            good.append(edge)
     ends = good if len(good) >= 2 else edges
     weights = np.cumsum([city.length[edge] * city.lanes[edge] for edge in ends])
-    return ends, weights / weights[-1]
+    return _Ends(ends, weights / weights[-1])
 
 
 def _stays(city: City, edge: str, onward: Mapping[str, Sequence[str]]) -> bool:
-    """Return True if a way on from the edge stays in its region; a dead end does not."""
-    here, seen = edge, {edge}
+    """Return True if a way on from the edge stays in its region.
+
+    A dead end does not.
+    """
+    here = edge
+    seen = {edge}
     while len(onward[here]) == 1 and onward[here][0] not in seen:
         here = onward[here][0]
         if city.region_of[here] != city.region_of[edge]:
@@ -174,21 +187,19 @@ def _stays(city: City, edge: str, onward: Mapping[str, Sequence[str]]) -> bool:
 def _is_pocket(city: City, edge: str) -> bool:
     """Return True for a short piece with more lanes at the end of a road."""
     before = city.before[edge]
-    return (
-        len(before) == 1
-        and city.length[edge] < POCKET_M
-        and city.lanes[edge] > city.lanes[before[0]]
-        and (city.successors[before[0]] == (edge,))
-    )
+    if len(before) != 1 or city.length[edge] >= POCKET_M:
+        return False
+    road = before[0]
+    return city.lanes[edge] > city.lanes[road] and city.successors[road] == (edge,)
 
 
-def _draw(ends: tuple[list[str], np.ndarray], uniform: float) -> str:
-    edges, weights = ends
-    return edges[min(int(np.searchsorted(weights, uniform, side="right")), len(edges) - 1)]
+def _draw(ends: _Ends, uniform: float) -> str:
+    n = int(np.searchsorted(ends.weights, uniform, side="right"))
+    return ends.edges[min(n, len(ends.edges) - 1)]
 
 
 def perception(edges: int, rng: np.random.Generator) -> Float[np.ndarray, "classes E"]:
-    """Draw the factors [-] with which each class of drivers sees the travel times of the edges."""
+    """Draw the factors [-] on travel times by class of drivers."""
     return np.exp(CLASS_SPREAD * rng.standard_normal((DRIVER_CLASSES, edges)))
 
 
@@ -199,16 +210,19 @@ def routes_in(
     noise: Float[np.ndarray, "classes E"],
 ) -> list[tuple[str, ...]]:
     """Return `fastest_routes` in a city, as ids of edges."""
-    moves = [(a, b) for a, after in city.successors.items() for b in after]
+    links: list[tuple[int, int]] = []
+    turns: list[float] = []
+    for edge, after in city.successors.items():
+        for other in after:
+            links.append((city.number[edge], city.number[other]))
+            turns.append(city.turn_time[edge, other])
     routes = fastest_routes(
         ends,
         tastes,
         noise,
         time=np.array([city.length[edge] / city.speed[edge] for edge in city.edges]),
-        links=np.array([(city.number[a], city.number[b]) for a, b in moves], dtype=int).reshape(
-            -1, 2
-        ),
-        turn=np.array([city.turn_time[move] for move in moves]),
+        links=np.array(links, dtype=int).reshape(-1, 2),
+        turn=np.array(turns),
     )
     return [tuple(city.edges[edge] for edge in route) for route in routes]
 
@@ -222,8 +236,10 @@ def fastest_routes(
     links: Int[np.ndarray, "M 2"],
     turn: PerMove,
 ) -> list[tuple[int, ...]]:
-    """Return the fastest route in free flow of every trip as numbers of edges, () if there is none.
+    """Return the fastest route of every trip in free flow.
 
+    It is () if there is none.
+    A route is a tuple of numbers of edges.
     ends: first and last edge (N,) of the trips; tastes: (N,), class of each driver
     noise: [-], factor of every class of drivers on time [s] of the edges; turn: [s] over the
         junction of each link
@@ -236,16 +252,17 @@ def fastest_routes(
         members = np.flatnonzero(tastes == taste)
         origins = np.unique(first[members])
         for chunk in np.array_split(origins, max(1, len(origins) // 256)):
-            if len(chunk):
-                _, before = dijkstra(graph, indices=chunk, return_predecessors=True)
-                for n in members[np.isin(first[members], chunk)]:
-                    routes[n] = _walk(
-                        before[np.searchsorted(chunk, first[n])], int(first[n]), int(last[n])
-                    )
+            if not len(chunk):
+                continue
+            _, before = dijkstra(graph, indices=chunk, return_predecessors=True)
+            for n in members[np.isin(first[members], chunk)]:
+                tree = before[np.searchsorted(chunk, first[n])]
+                routes[n] = _walk(tree, int(first[n]), int(last[n]))
     return routes
 
 
 def _walk(before: np.ndarray, first: int, last: int) -> tuple[int, ...]:
+    """Return the way in a tree of shortest paths (E,), () if there is none."""
     way = [last]
     while way[-1] != first:
         way.append(int(before[way[-1]]))

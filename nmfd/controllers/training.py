@@ -47,7 +47,11 @@ OPEN_LOGIT = 12.0
 
 
 def settings(scenario: Scenario, strategy: Strategy, steps: int | None = None) -> Dpc:
-    """Return the options of a policy to train; `steps` overrides. Raise InputError."""
+    """Return the options of a policy to train.
+
+    steps: instead of those of the options
+    Raises: InputError
+    """
     setup = strategy.options(scenario)
     table = strategy.table(scenario)
     name = strategy.controller.name

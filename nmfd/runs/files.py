@@ -47,15 +47,17 @@ def atomic(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def temporary_folder(prefix: str = "cosim-", where: Path | None = None) -> Iterator[Path]:
-    """Yield a new folder and remove it at the end, and those of killed processes first.
+    """Yield a new folder and remove it at the end.
+
+    Folders of killed processes are removed first.
 
     where: folder above, the system's place for temporary folders if None
     """
     parent = Path(tempfile.gettempdir() if where is None else where)
     sweep(parent, prefix)
-    with tempfile.TemporaryDirectory(prefix=prefix, dir=where, ignore_cleanup_errors=True) as name:
-        with FileLock(Path(name) / HELD):
-            yield Path(name)
+    made = tempfile.TemporaryDirectory(prefix=prefix, dir=where, ignore_cleanup_errors=True)
+    with made as name, FileLock(Path(name) / HELD):
+        yield Path(name)
 
 
 def sweep(parent: Path, prefix: str) -> None:

@@ -262,7 +262,11 @@ def locked(out: Path, mark: str = MANIFEST) -> Iterator[None]:
 
 
 class FolderOfRuns(BaseModel):
-    """Entry of a manifest: what all runs of a folder depend on, and what those of a controller."""
+    """Entry of a manifest.
+
+    key: what all runs of a folder depend on
+    controllers: what those of a controller depend on in addition
+    """
 
     key: dict[str, Any]
     controllers: dict[str, Any]
@@ -319,7 +323,10 @@ def _write_manifest(
 
 
 def _manifest(out: Path) -> dict[str, Any]:
-    """Return the manifest of a folder, an empty one if there is none. Raise InputError."""
+    """Return the manifest of a folder, an empty one if there is none.
+
+    Raises: InputError
+    """
     if (out / MANIFEST).exists():
         return read_manifest(out)
     return {"folders": {}, "sessions": []}
@@ -396,7 +403,10 @@ def _row(file: str, outcome: Result | str) -> dict:
 
 
 def place_of(file: str) -> Place:
-    """Return the place of the file of a run. Raise ValueError for another name."""
+    """Return the place of the file of a run.
+
+    Raises: ValueError for another name
+    """
     match = RUN_FILE.fullmatch(file)
     if match is None:
         raise ValueError(f"{file}: is not the name of a run")

@@ -22,7 +22,7 @@ from scipy.spatial import ConvexHull, Delaunay, QhullError
 
 from nmfd.arrays import Adjacency, Points
 from nmfd.errors import InputError
-from nmfd.model import detector_tables, mfd
+from nmfd.model import detector_doubts, detector_tables, mfd
 from nmfd.model.detector_tables import SPEEDS_M_S, VEHICLE_LENGTH_M
 from nmfd.model.regional_model import NetworkTable, RegionalModel, network_toml
 from nmfd.runs import config, files
@@ -39,6 +39,7 @@ FAR = 3.0  # times the median distance between neighbouring detectors: no bounda
 LEAST_COVERAGE = 0.3
 BIASED_SHARE = 0.5
 LEAST_DAYS = 3
+LEAST_INTERVALS = 100  # of a region: a rush hour alone has fewer
 
 # Beginnings of the doubts about a region.
 UNKNOWN = "coverage unknown"
@@ -47,6 +48,8 @@ LOOPS = "loops at stop lines"
 ASSUMED = "trip length assumed"
 SINGLE = "days"
 LEFT = "detectors left out"
+SHORT = "intervals"
+MISCOUNT = "odd counts"
 MEANINGS = {  # beginning of a doubt -> meaning and remedy
     **fit_quality.MEANINGS,
     UNKNOWN: "accumulation and outflow are those of links with detectors; give lane_km with "
@@ -60,6 +63,8 @@ MEANINGS = {  # beginning of a doubt -> meaning and remedy
     LEFT: "their counts cannot be right, see below; lane-kilometres stand for the links of the "
     "others",
     SINGLE: f"fewer than {LEAST_DAYS} days: the difference between days is unknown",
+    SHORT: f"fewer than {LEAST_INTERVALS}: the curve may be that of one rush hour only",
+    MISCOUNT: "detectors whose flow does not fit their occupancy, see below; they bias the curve",
 }
 UNKNOWN_PARTS = (
     "Not in such data: which trips end in a region; vehicles on links without detectors; split "
@@ -77,6 +82,7 @@ class Measured:
     read: numbers of rows, detectors and days in it, as text
     days: number of days
     left: lines about detectors whose counts cannot be right
+    odd: region -> detector -> its flow over that of others at the same occupancy, if doubtful
     detectors: region, lane_km, pos_km, x_m, y_m and used (False if left out), by detid
     regions: lane_km, coverage (share of lane_km with detectors in use, NaN if unknown), trip_km,
         assumed (True if trip_km is), x and y (NaN where not given), by name
@@ -87,6 +93,7 @@ class Measured:
     read: str
     days: int
     left: list[str]
+    odd: Mapping[str, Mapping[str, float]]
     detectors: pd.DataFrame
     regions: pd.DataFrame
     intervals: pd.DataFrame
@@ -200,6 +207,7 @@ def load(
     read = f"{len(rows):,} rows of {rows['detid'].nunique()} detectors on {days} days; "
     read += f"left out: {detector_tables.omitted(omitted)}"
     rows, faulty = detector_tables.screened(rows, stations["region"])
+    odd = detector_doubts.miscounting(rows, stations["region"])
     # Lanes that are counted twice are those of the other detectors.
     stations = stations.drop(list(faulty.get(detector_tables.SUM, ())))
     stations["used"] = stations.index.isin(rows["detid"])
@@ -213,6 +221,7 @@ def load(
         read=read,
         days=days,
         left=_left_lines(faulty, used, days),
+        odd=odd,
         detectors=stations,
         regions=table,
         intervals=_intervals(rows, used, table),
@@ -475,6 +484,12 @@ def _doubts(data: Measured, name: str) -> list[str]:
         doubts.append(f"{SINGLE}: {data.days}")
     if left:
         doubts.append(f"{LEFT}: {left} of {len(detectors)}")
+    intervals = (data.intervals["region"] == name).sum()
+    if intervals < LEAST_INTERVALS:
+        doubts.append(f"{SHORT}: {intervals}")
+    odd = data.odd.get(name, {})
+    if odd:
+        doubts.append(f"{MISCOUNT}: {len(odd)} detectors")
     return doubts
 
 
@@ -488,5 +503,11 @@ def _report(data: Measured, network: RegionalModel, fits: pd.DataFrame) -> str:
     facts = f"{data.read}; share of the lane-km with detectors: {share}; "
     facts += f"trip length within a region: {trip_m.min():,.0f} to {trip_m.max():,.0f} m"
     lines = [f"WARNING, {line}" for line in data.left]
+    for region, factors in data.odd.items():
+        shown = ", ".join(f"{name} ({factor:.2f})" for name, factor in factors.items())
+        lines.append(
+            f"WARNING, region {region}: flow of detectors over that of others at the same "
+            f"occupancy: {shown}"
+        )
     notes = wrapped("\n".join([*lines, facts, UNKNOWN_PARTS]))
     return "\n".join([fit_quality.fit_table(network, fits, MEANINGS), *notes])

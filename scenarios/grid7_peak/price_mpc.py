@@ -1,8 +1,9 @@
-"""MPC with the outputs of the DPC policy over max-pressure: gates, prices and metering, on the same
-regional model.
+r"""MPC with the outputs of the DPC policy over max-pressure: gates, prices and metering, on the
+same regional model.
 
     cd scenarios/grid7_peak
-    cosim evaluate grid7_peak --controllers price_mpc.py:PriceMpc+max-pressure+guidance-period-60+metering --demand 1.6
+    cosim evaluate grid7_peak --demand 1.6 \
+        --controllers price_mpc.py:PriceMpc+max-pressure+guidance-period-60+metering
 
 Every interval it lowers the mean total time spent of MODELS rollouts over HORIZON intervals, each
 with a regional model of its own, by ITERATIONS of Adam on u and prices held over the horizon, from

@@ -74,9 +74,8 @@ def main(folder: Path) -> None:
     nominal, constant = likelihood(runs, answer, 1e6)
     for dispersion in (30, 60, 100, 150, 200, 300, 400, 500, 700, 1000):
         value, _ = likelihood(runs, answer, dispersion)
-        print(
-            f"{dispersion:5} s: {value:.4f} per crossing, {(value - nominal) / (constant - nominal):.2f} of the gain"
-        )
+        gain = (value - nominal) / (constant - nominal)
+        print(f"{dispersion:5} s: {value:.4f} per crossing, {gain:.2f} of the gain")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
-"""Time of a decision and peak memory against the number of regions; write scaling.csv and
+r"""Time of a decision and peak memory against the number of regions; write scaling.csv and
 scaling.png.
 
-    python scenarios/large_grids/scaling.py --family hexagonal --load congested --regions 7,19,37 --out runs/scaling
+    python scenarios/large_grids/scaling.py --family hexagonal --load congested \
+        --regions 7,19,37 --out runs/scaling
 
 As in Tumu et al.: random MFDs and initial states, no demand, untrained policies. Each case runs in
 its own process.
@@ -9,7 +10,7 @@ its own process.
 
 import argparse
 import multiprocessing
-import resource
+import resource  # noqa: TID251 (this study runs on POSIX only)
 import statistics
 import time
 from itertools import product

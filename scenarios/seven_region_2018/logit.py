@@ -1,7 +1,8 @@
-"""No control as Sirmatel and Geroliminis (2018) have it: every gate open, and drivers who look at
+r"""No control as Sirmatel and Geroliminis (2018) have it: every gate open, and drivers who look at
 travel times.
 
-nmfd benchmark seven_region_2018 --controllers no-control,scenarios/seven_region_2018/logit.py:LogitDrivers
+nmfd benchmark seven_region_2018 \
+    --controllers no-control,scenarios/seven_region_2018/logit.py:LogitDrivers
 """
 
 from collections.abc import Iterator

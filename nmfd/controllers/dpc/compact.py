@@ -198,7 +198,7 @@ class GatingRule(Options):
 
 
 class PricingRule(GatingRule):
-    """Prices of the ways through regions, and gates, by numbers that were tuned in SUMO."""
+    """Prices of ways through regions, and gates, with numbers tuned in SUMO."""
 
     guidance: ClassVar[bool] = True
     name: ClassVar[str] = "pricing-rule"

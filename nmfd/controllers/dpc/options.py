@@ -67,7 +67,9 @@ PUBLISHED = Recipe(
 
 
 class Dpc(Options):
-    """Policy trained by differentiable predictive control, and the options of its training.
+    """Policy of differentiable predictive control.
+
+    The options of its training are here, too.
 
     >>> nmfd.run("economic_mpc", nmfd.Dpc(policy="economic_mpc/dpc-pc.pt"), steps=1).controller
     'dpc-pc(policy="economic_mpc/dpc-pc.pt")'

@@ -57,7 +57,7 @@ METRIC_OFFSET_VEH = 5.0
 
 
 class EconomicMpc(Options):
-    """Economic model predictive control (nmfd.controllers.mpc.controller.MpcController).
+    """Economic model predictive control, run by `MpcController`.
 
     >>> nmfd.run("economic_mpc", nmfd.EconomicMpc(horizon=4), steps=1).controller
     'mpc-pc(horizon=4)'
@@ -210,9 +210,10 @@ class MpcController:
     def __init__(
         self, planning: PlanningModel, options: EconomicMpc, *, terminal: Terminal | None = None
     ):
-        """Raise InputError for wrong options of the scenario's pi-gating, the fallback.
+        """Make the controller, with the scenario's pi-gating as its fallback.
 
         terminal: cost beyond the horizon
+        Raises: InputError for wrong options of pi-gating
         """
         guidance = options.guidance
         self.name = "mpc-pcrg" if guidance else "mpc-pc"

@@ -62,10 +62,11 @@ class Ipopt:
                 perimeter[i, h] = u[n]
             entering = demand[:, k * regions : (k + 1) * regions]
             moved = advance(p, UNIT * x, entering, perimeter, splits, **planning.scheme)
-            x = ca.SX.sym(f"x{k}", regions, regions)
-            constraints += [*sums, ca.vec(ca.densify(moved) / UNIT - x)]
-            variables += [u, theta, ca.vec(x)]
-            total = total + ca.sum1(ca.vec(x))
+            after = ca.SX.sym(f"x{k}", regions, regions)
+            constraints += [*sums, ca.vec(ca.densify(moved) / UNIT - after)]
+            variables += [u, theta, ca.vec(after)]
+            total = total + ca.sum1(ca.vec(after))
+            x = after
         edges = len(self._edges)
         turns = len(self._turns)
         cells = regions**2
