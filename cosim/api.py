@@ -430,17 +430,14 @@ def links(
     scenario: ScenarioLike,
     out: Path | str | None = None,
     *,
-    seeds: int | Iterable[int] = len(PLANNING_SEEDS),
+    seeds: Sequence[int] = PLANNING_SEEDS,
 ) -> Path:
     """Write the streets of a city for nmfd.LinkPlant; return the file.
 
     out: file, SCENARIO/links.npz if None
-    seeds: how many draws of planned trips, or the seeds of the trips
+    seeds: of the draws of trips, if these are not recorded
     """
-    chosen = seeds_of(seeds)
-    if isinstance(seeds, int):
-        chosen = list(PLANNING_SEEDS[:seeds])
-    return write_links(loaded(scenario), None if out is None else Path(out), chosen)
+    return write_links(loaded(scenario), None if out is None else Path(out), seeds)
 
 
 def catalogue() -> dict[str, dict[str, str]]:

@@ -71,8 +71,7 @@ def span(text: str) -> tuple[float, float]:
     cls=Commands,
     context_settings={"show_default": True},
     sections={
-        "First steps": ("demo", "run", "watch"),
-        "Studies": ("evaluate", "compare", "report", "tune"),
+        "Runs": ("demo", "run", "watch", "evaluate", "compare", "report", "tune"),
         "A city of your own": ("get", "import", "identify", "links"),
     },
     elsewhere={"list": "nmfd show"} | {name: f"nmfd {name}" for name in nmfd.cli.main.commands},
@@ -464,9 +463,8 @@ def identify(scenario: Path, **options: Any) -> None:
 
 @main.command()
 @SCENARIO
-@seeds_option(4, "Draws of trips, or the seeds of these; recorded trips are one draw.")
 @click.option("--out", type=FILE, metavar="FILE", help="File. [default: SCENARIO/links.npz]")
-def links(scenario: Path, settings: dict, out: Path | None, seeds: int | tuple[int, ...]) -> None:
+def links(scenario: Path, settings: dict, out: Path | None) -> None:
     """Write the streets of a SUMO city as a plant without SUMO.
 
     Reads the network, static routes and signal programmes. `nmfd benchmark SCENARIO --plant links`
@@ -477,4 +475,4 @@ def links(scenario: Path, settings: dict, out: Path | None, seeds: int | tuple[i
       cosim links grid7_peak --out links.npz
     """
     loaded = nmfd.load_scenario(scenario, settings)
-    click.echo(f"Written to {cosim.api.links(loaded, out, seeds=seeds)}")
+    click.echo(f"Written to {cosim.api.links(loaded, out)}")

@@ -36,9 +36,9 @@ if TYPE_CHECKING:
     from nmfd.controllers.rules import Greedy, NoControl, PiGating, Probing, RouteGuidance
     from nmfd.errors import InputError
     from nmfd.metrics import summary, total_time_spent
+    from nmfd.model.links.plant import LinkPlant
     from nmfd.model.mfd import Cubic, Mfd, PiecewiseLinear, trapezoid
     from nmfd.model.planning import PlanningModel
-    from nmfd.model.links.plant import LinkPlant
     from nmfd.model.plant import AcyclicPlant, NmfdPlant
     from nmfd.model.regional_model import RegionalModel, load_network
     from nmfd.model.scenario import Scenario

@@ -11,9 +11,8 @@ from commands import nmfd as nmfd_command
 from cosim.evaluation.links import link_network, write_links
 from nmfd import api
 from nmfd.errors import InputError
-from nmfd.model.links.choices import Choices
 from nmfd.model.links.flows import REACTION_S, VEHICLE_M
-from nmfd.model.links.model import Commands, LinkModel
+from nmfd.model.links.model import Choices, Commands, LinkModel
 from nmfd.model.links.network import LinkNetwork, read_links
 from nmfd.model.links.plant import LinkPlant
 

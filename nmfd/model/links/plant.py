@@ -7,9 +7,8 @@ import torch
 
 from nmfd import ledger
 from nmfd.errors import InputError
-from nmfd.model.links.choices import choices_of
 from nmfd.model.links.flows import Numbers
-from nmfd.model.links.model import OPEN_SHARE, Commands, LinkModel
+from nmfd.model.links.model import OPEN_SHARE, Commands, LinkModel, choices_of
 from nmfd.model.links.network import FILE, LinkNetwork, read_links
 from nmfd.model.scenario import Scenario
 from nmfd.types import Controls, Observation, State
