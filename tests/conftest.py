@@ -88,6 +88,15 @@ def _fail_if_skipped(
             report.outcome, report.longrepr = "failed", f"--no-skips: {reason}"
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _preloaded():
+    """The first run of a process decides what the server of processes imports for all later runs:
+    here those in SUMO too, each of which would import them again."""
+    from nmfd.runs import pool  # not before annotations are checked
+
+    pool.PRELOADED += ("nmfd.closed_loop", "cosim.evaluation.simulate")
+
+
 @pytest.fixture
 def folder(tmp_path):
     """The folder of the tiny scenario; some modules have another `scenario` of their own."""

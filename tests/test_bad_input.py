@@ -308,7 +308,13 @@ IN_WRONG_FOLDERS = [
 @pytest.mark.skipif(sys.platform == "darwin", reason="file names are UTF-8")
 @pytest.mark.parametrize(
     "command, name, expected",
-    [(command, NOT_UTF_8, "the name is not UTF-8") for command in IN_ODD_FOLDERS + IN_WRONG_FOLDERS]
+    [
+        pytest.param(
+            *(command, NOT_UTF_8, "the name is not UTF-8"),
+            marks=pytest.mark.slow if command.startswith("watch") else (),
+        )
+        for command in IN_ODD_FOLDERS + IN_WRONG_FOLDERS
+    ]
     + [(command, REPLACED, "SUMO puts variables") for command in IN_ODD_FOLDERS],
 )
 def test_folders_that_sumo_cannot_open(city, tmp_path, command, name, expected):

@@ -54,7 +54,7 @@ def check(folder: Path, name: str, intervals: int) -> None:
     [
         ("cross", None),
         pytest.param("grid6", None, marks=pytest.mark.slow),
-        ("corridor", None),
+        pytest.param("corridor", None, marks=pytest.mark.slow),
         ("DRT", "names no vehicles for the streets of cars"),
         ("ramp", "no two regions can be made"),
         ("rail", "has no edge that cars may use"),

@@ -22,7 +22,7 @@ from nmfd.model.planning import planning_model
 from nmfd.types import Controls
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
-INTERVALS = 3
+INTERVALS = 2
 
 
 @pytest.fixture(scope="module")

@@ -64,17 +64,17 @@ def test_trips_that_never_began_count_with_what_they_have_waited():
 
 @pytest.fixture(scope="module")
 def run():
-    """Three intervals in the middle of the peak, second by second: plant, record, vehicles on the
+    """Two intervals in the middle of the peak, second by second: plant, record, vehicles on the
     road, facts."""
     loaded = load_scenario(SCENARIO)
-    scenario = replace(loaded, steps=3, demand=2.0 * loaded.demand[20:23])
+    scenario = replace(loaded, steps=2, demand=2.0 * loaded.demand[20:22])
     plant = SumoPlant(scenario)
     try:
         plant.reset(1)
         running, step, session = [], plant.session.step, plant.session
         session.step = lambda: (step(), running.append(len(session.running())))
         network = scenario.network
-        for _ in range(3):
+        for _ in range(2):
             plant.step(
                 Controls(perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=None)
             )
@@ -95,7 +95,7 @@ def test_time_on_the_road_is_that_of_the_vehicles_seen_second_by_second(run):
     assert sum(lost) < sum(running)
 
 
-@pytest.mark.parametrize("steps", [3, 10])
+@pytest.mark.parametrize("steps", [3, pytest.param(10, marks=pytest.mark.slow)])
 def test_measures_of_a_city_are_those_of_tripinfo(tmp_path, steps):
     """Cars and buses that cannot all enter, in a run that ends before their trips."""
     config, info = tiny_city.city(tmp_path), tmp_path / "trips.xml"
@@ -212,6 +212,6 @@ def test_full_edges_before_gateways(run):
     plant, record, _, _ = run
     city, room = plant.city, plant.city.room
     for share, expected in ((0.0, 0.0), (0.7, 0.0), (0.9, 1.0)):
-        full = vars(record) | {"edge_vehicles": np.tile(share * room, (3, 1))}
+        full = vars(record) | {"edge_vehicles": np.tile(share * room, (2, 1))}
         row = simulate.queue_facts(full, city)
         assert row["gateway_full_share"] == expected

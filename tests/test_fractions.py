@@ -29,7 +29,7 @@ def fractional(beyond):
     return contents
 
 
-@pytest.fixture(scope="module", params=DURATIONS)
+@pytest.fixture(scope="module", params=["mixed", pytest.param("halves", marks=pytest.mark.slow)])
 def town(request, tmp_path_factory):
     """A city with fixed-time gateway signals, beside actuated signals elsewhere."""
     others = ("--tls.set", ",".join((*SIGNALS, "A1", "D2")), "--tls.default-type", "actuated")

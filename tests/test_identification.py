@@ -65,7 +65,7 @@ def test_the_true_model_predicts_without_error(scenario, runs):
 def test_the_fit_predicts_a_run_that_it_has_not_seen(scenario, runs):
     line = (Cubic(a=0.0, b=-2e-7, c=0.004, jam=9000.0),) * 7
     start = replace(scenario.network, exit_rates=None, capacity=None, storage=None, mfds=line)
-    fitted = identification.fit(start, runs[:3], step=30.0, iterations=250)
+    fitted = identification.fit(start, runs[:3], step=30.0, iterations=120)
     assert all(mfd.problem() is None for mfd in fitted.mfds)
     assert error(fitted, runs[3:], 10) < 0.35 * error(start, runs[3:], 10)
     first, again, other = (

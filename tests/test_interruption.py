@@ -13,7 +13,9 @@ import tiny
 import torch
 from commands import error_line, good, nmfd, runs, same
 
+from nmfd import api
 from nmfd.controllers import training
+from nmfd.runs.run_many import run_many
 
 
 def stopped(program, *arguments, out, by, after="[!.]*.nc", wait=0.0):
@@ -37,7 +39,13 @@ def stopped(program, *arguments, out, by, after="[!.]*.nc", wait=0.0):
 
 
 @pytest.mark.parametrize(
-    "after, wait", [("*", 0.15), ("*", 1.0), (".lock", 0.0), ("manifest.json", 0.3)]
+    "after, wait",
+    [
+        ("*", 0.15),
+        pytest.param("*", 1.0, marks=pytest.mark.slow),
+        pytest.param(".lock", 0.0, marks=pytest.mark.slow),
+        ("manifest.json", 0.3),
+    ],
 )
 def test_ctrl_c_at_any_moment_is_one_line(tmp_path, after, wait):
     command = (
@@ -90,7 +98,7 @@ def test_runs_are_kept_without_standard_streams(tmp_path, streams):
         pytest.param(signal.SIGKILL, -9, id="kill -9", marks=pytest.mark.slow),
     ],
 )
-def test_a_stopped_benchmark_continues(tmp_path, by, status):
+def test_a_stopped_benchmark_continues(tmp_path, monkeypatch, by, status):
     scenario = tiny.write(tmp_path)
     command = (
         "benchmark",
@@ -109,6 +117,7 @@ def test_a_stopped_benchmark_continues(tmp_path, by, status):
         assert said.splitlines()[-1].startswith("nmfd: interrupted: finished runs are in"), said
     first = runs(tmp_path / "out")
     assert 0 < len(first) < 20
+    monkeypatch.setattr(api, "run_many", lambda *a, **o: run_many(*a, **{**o, "workers": 0}))
     good(nmfd(*command, "--out", tmp_path / "out"))
     good(nmfd(*command, "--out", tmp_path / "whole"))
     whole = runs(tmp_path / "whole")

@@ -2,6 +2,7 @@
 commanded."""
 
 import re
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -40,6 +41,9 @@ def everywhere(light):
     return lambda net: "".join(
         programme(net, signal, lambda state: light * len(state)) for signal in SIGNALS
     )
+
+
+blinking, switched_off = everywhere("o"), everywhere("O")
 
 
 def arrows(net):
@@ -113,6 +117,17 @@ def imported(folder, contents=nothing, network=plain, options="", signals=USUAL)
     return folder / "scenarios" / "x"
 
 
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """`imported` in a folder of its own, once for all tests that ask for the same."""
+
+    @cache
+    def make(*given, **options):
+        return imported(tmp_path_factory.mktemp("city"), *given, **options)
+
+    return make
+
+
 def edges_of(net):
     return [edge.get("id") for edge in read_xml(net).iter("edge") if edge.get("function") is None]
 
@@ -139,8 +154,8 @@ def told(folder):
 CASES = {
     "all alike": (nothing, plain, "", {"controlled"}),
     "turn on red": (arrows, plain, "", {"turn on red"}),
-    "blinking": (everywhere("o"), plain, "", {"blinking"}),
-    "switched off": (everywhere("O"), plain, "", {"switched off"}),
+    "blinking": (blinking, plain, "", {"blinking"}),
+    "switched off": (switched_off, plain, "", {"switched off"}),
     "off programme": (off, plain, "", {"switched off"}),
     "off option": (nothing, plain, '<tls.all-off value="true"/>', {"switched off"}),
     "timetable": (timetable, plain, "", {"programme follows a timetable"}),
@@ -155,11 +170,17 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_one_word_for_every_gateway(tmp_path, case):
+LIKE_OTHERS = ("blinking", "switched off", "off option")  # "off programme" is one of their kind
+
+
+@pytest.mark.parametrize(
+    "case",
+    [pytest.param(case, marks=pytest.mark.slow) if case in LIKE_OTHERS else case for case in CASES],
+)
+def test_one_word_for_every_gateway(made, case):
     """Table, verdict, map and run agree on which gateways a command can hold."""
     contents, network, options, expected = CASES[case]
-    seen = told(imported(tmp_path, contents, network, options))
+    seen = told(made(contents, network, options))
     at_signals = seen.table["control"] != "no signal"
     assert set(seen.table["control"][at_signals]) == expected
     assert (seen.loaded == seen.controlled).all()
@@ -171,9 +192,9 @@ def test_one_word_for_every_gateway(tmp_path, case):
     assert (seen.share > 0.5) == (case not in ("all alike", "last programme"))
 
 
-def test_turns_on_red_leak_and_the_other_gates_hold(tmp_path):
+def test_turns_on_red_leak_and_the_other_gates_hold(made):
     """SUMO's own signals with turns on red: right turns pass closed gates, all others are held."""
-    folder = imported(tmp_path, signals=ARROWS)
+    folder = made(signals=ARROWS)
     seen = told(folder)
     kinds = set(seen.table["control"])
     assert kinds == {"controlled", "turn on red"}
@@ -183,10 +204,13 @@ def test_turns_on_red_leak_and_the_other_gates_hold(tmp_path):
     assert seen.flow[seen.controlled].sum() < 0.5 * free[seen.controlled].sum()
 
 
-@pytest.mark.parametrize("contents", [arrows, off, timetable, everywhere("o")])
-def test_a_whole_run(tmp_path, contents):
+@pytest.mark.parametrize(
+    "contents",
+    [arrows, timetable, *(pytest.param(one, marks=pytest.mark.slow) for one in (off, blinking))],
+)
+def test_a_whole_run(made, tmp_path, contents):
     """Without words about broken rules; a timetable may cut the green of a programme short."""
-    scenario, out = imported(tmp_path, contents), tmp_path / "out"
+    scenario, out = made(contents, plain, ""), tmp_path / "out"
     text = run_controllers(scenario, ["no-control"], steps=3, out=out)
     assert "break their rules" not in text
     row = pd.read_csv(out / "runs.csv").iloc[0]
@@ -194,8 +218,8 @@ def test_a_whole_run(tmp_path, contents):
     assert row.leaking_share > 0.5
 
 
-def test_max_pressure_runs_signals_with_turns_on_red(tmp_path):
-    scenario = load_scenario(imported(tmp_path, signals=ARROWS))
+def test_max_pressure_runs_signals_with_turns_on_red(made):
+    scenario = load_scenario(made(signals=ARROWS))
     with tiny_city.played(scenario, 2, OPEN, signals="max-pressure") as (plant, _, record):
         assert len(plant.steered) == 12  # without those at the corners
         assert record.gateway_flow.sum() > 0.0
@@ -204,15 +228,15 @@ def test_max_pressure_runs_signals_with_turns_on_red(tmp_path):
 @pytest.mark.parametrize(
     "contents, reason",
     [
-        (everywhere("o"), "(blinking: 4)"),
+        pytest.param(blinking, "(blinking: 4)", marks=pytest.mark.slow),
         (off, "(switched off: 4)"),
         (one_phase, "(fewer than two green phases: 4)"),
         (red_and_yellow, "(light u: 4)"),
     ],
 )
-def test_max_pressure_says_why_it_cannot_run(tmp_path, contents, reason):
+def test_max_pressure_says_why_it_cannot_run(made, tmp_path, contents, reason):
     done = cosim(
-        *("run", imported(tmp_path, contents), "--controller", "max-pressure", "--steps", 1),
+        *("run", made(contents, plain, ""), "--controller", "max-pressure", "--steps", 1),
         *("--out", tmp_path / "out"),
     )
     assert done.exit_code != 0

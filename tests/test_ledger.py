@@ -95,7 +95,7 @@ def test_controls_that_move_more_than_there_is_stop_the_run(scenario, make):
             plant.step(opened(scenario, u=20.0))
 
 
-@pytest.mark.parametrize("plant", ["nmfd", "acyclic"])
+@pytest.mark.parametrize("plant", ["nmfd", pytest.param("acyclic", marks=pytest.mark.slow)])
 def test_the_command_says_it_in_one_line_and_keeps_what_was_finished(tmp_path, monkeypatch, plant):
     scenario, out = tiny.write(tmp_path), tmp_path / "out"
     command = [

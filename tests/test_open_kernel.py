@@ -119,7 +119,9 @@ def days(generator, batch):
     return 5.0 * torch.rand(batch, 4, 4, generator=generator), torch.where(back, there.mT, there)
 
 
-@pytest.mark.parametrize("controller", ["pi-gating", "mpc-pc", "mpc-pcrg"])
+@pytest.mark.parametrize(
+    "controller", ["pi-gating", "mpc-pc", pytest.param("mpc-pcrg", marks=pytest.mark.slow)]
+)
 def test_a_network_and_mfd_serve_plants_rules_and_mpc(controller):
     for plant in ("nmfd", "acyclic", TripBased(ring())):
         result = nmfd.run(ring(), controller, plant=plant, progress=False)
@@ -139,7 +141,7 @@ def test_a_policy_cost_constraint_and_days():
         policy = Linear(scenario.network)
         before = nmfd.run(scenario, nmfd.ModuleController(policy, scenario), progress=False)
         own = {"cost": burnt, "sample": days, "constraints": [(crowded, weight)]}
-        trained = nmfd.train(scenario, policy=policy, **own, steps=40, progress=False)
+        trained = nmfd.train(scenario, policy=policy, **own, steps=25, progress=False)
         after = nmfd.run(scenario, nmfd.ModuleController(trained, scenario), progress=False)
         most[weight] = after["accumulation"][:, 1].sum(-1).max()
         assert trained is policy

@@ -46,6 +46,14 @@ def city(net, tmp_path):
     return write
 
 
+@pytest.fixture(scope="module")
+def project(tmp_path_factory):
+    """The folder of an imported city."""
+    folder = tmp_path_factory.mktemp("project")
+    tiny_city.imported(folder)
+    return folder
+
+
 def traffic_of(config):
     case = read_sumo_input(config)
     return read_traffic(case, read_streets(case.net, case.additional), seed=0)
@@ -144,14 +152,17 @@ def test_options_that_every_run_sets_itself_are_told(city):
         ("seed", "give the seed of a run"),
     ],
 )
-def test_options_of_a_scenario_that_every_run_sets_itself_are_refused(city, option, remedy):
-    scenario = imported(city())[1]
-    toml = scenario.folder / "scenario.toml"
+def test_options_of_a_scenario_that_every_run_sets_itself_are_refused(project, option, remedy):
+    toml = project / "scenarios" / "tiny" / "scenario.toml"
+    text = toml.read_text()
     table = "[sumo.options]              # of SUMO, as the city has them\n"
-    assert table in toml.read_text()
-    toml.write_text(toml.read_text().replace(table, f'{table}"{option}" = "1"\n'))
-    with pytest.raises(InputError, match="sumo.options: .* is set by every run itself") as raised:
-        settings(load_scenario(scenario.folder))
+    assert table in text
+    toml.write_text(text.replace(table, f'{table}"{option}" = "1"\n'))
+    try:
+        with pytest.raises(InputError, match="options: .* is set by every run itself") as raised:
+            settings(load_scenario(toml.parent))
+    finally:
+        toml.write_text(text)
     assert remedy in str(raised.value)
 
 

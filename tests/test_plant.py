@@ -64,7 +64,7 @@ def test_open_gateways_leave_sumo_alone(scenario, plant_of):
             step(),
             states.append([session.signal_state(s) for s in session.signals()]),
         )
-        final = [plant.step(open_gateways) for _ in range(3)][-1]
+        final = [plant.step(open_gateways) for _ in range(2)][-1]
         shown.append((states, final.accumulation.tolist()))
     assert shown[0] == shown[1]
 
@@ -134,7 +134,7 @@ def test_the_samples_are_those_of_every_edge(scenario, plant_of):
 
 def test_teleporting_vehicles_stay_in_the_ledger(scenario, plant_of):
     plant = plant_of(time_to_teleport=20.0)
-    measurements, record = drive(plant, scenario, seed=2)
+    measurements, record = drive(plant, with_demand(scenario, steps=3), seed=2)
     assert record.teleports.sum() > 0
     inside = record.departures.sum() - record.arrivals.sum()
     assert measurements[-1].accumulation.sum() == inside
@@ -168,7 +168,7 @@ def sent_round(scenario, plant):
 
 def test_guided_vehicles_are_asked_again(scenario, plant_of):
     """The ledger is checked at every step; who was told something else counts for the last only."""
-    plant, scenario = plant_of(), with_demand(scenario, steps=2)
+    plant, scenario = plant_of(), with_demand(scenario, steps=1)
     _, once = drive(plant, scenario, guidance=True)
     plant.close()
     asked = plant_of(guidance_period=5.0)

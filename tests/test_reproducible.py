@@ -11,6 +11,8 @@ import tiny
 import tiny_city
 from commands import cosim, good, nmfd, runs, same
 
+from nmfd import api
+
 ROOT = Path(__file__).parents[1]
 
 
@@ -33,9 +35,12 @@ def test_benchmarks(tmp_path):
         "mpc-pcrg,probing-pcrg",
         "--plant",
         "acyclic",
+        "--set",
+        "steps=8",
         "--out",
     )
-    good(nmfd(*command, tmp_path / "a"))
+    controllers = ["mpc-pcrg", "probing-pcrg"]
+    api.benchmark(scenario, controllers, steps=8, plant="acyclic", out=tmp_path / "a", workers=0)
     elsewhere("nmfd", *command, tmp_path / "b")
     assert same(runs(tmp_path / "a"), runs(tmp_path / "b"))
     assert len(runs(tmp_path / "a")) == 2

@@ -51,7 +51,9 @@ def imported(folder, name, *options, signals):
     return folder / "scenarios" / name
 
 
-@pytest.fixture(scope="module", params=("actuated", "delay_based"))
+@pytest.fixture(
+    scope="module", params=("actuated", pytest.param("delay_based", marks=pytest.mark.slow))
+)
 def town(request, tmp_path_factory):
     """The kind of all signals, and the scenario."""
     return request.param, imported(

@@ -6,10 +6,10 @@ import sys
 import warnings
 from pathlib import Path
 
-import copies
 import numpy as np
 import pytest
 import tiny
+import tiny_city
 
 from cosim import SumoPlant
 from nmfd import api
@@ -36,8 +36,8 @@ def hexagon():
 
 
 @pytest.fixture(scope="module")
-def peak(tmp_path_factory):
-    return copies.peak(tmp_path_factory.mktemp("city"))
+def city(tmp_path_factory):
+    return tiny_city.imported(tmp_path_factory.mktemp("city"))
 
 
 def gymnasium_check(env):
@@ -67,8 +67,8 @@ def test_gymnasium_and_pettingzoo_accept_the_regional_plants(scenario, hexagon, 
     pettingzoo_check(rl.RegionsEnv(hexagon, guidance=guidance, cooperative=False), 10)
 
 
-def test_gymnasium_and_pettingzoo_accept_sumo(peak):
-    short = with_demand(load_scenario(peak), steps=2)
+def test_gymnasium_and_pettingzoo_accept_sumo(city):
+    short = with_demand(load_scenario(city), steps=2)
     gymnasium_check(rl.RegionalEnv(short, SumoPlant(short), guidance=True))
     pettingzoo_check(rl.RegionsEnv(short, SumoPlant(short)), 3)
 
@@ -86,7 +86,13 @@ def test_importing_nmfd_changes_nothing_outside():
     assert (done.returncode, done.stderr) == (0, "")
 
 
-@pytest.mark.parametrize("before", ["", "import nmfd; ", "import nmfd.rl; "])
+@pytest.mark.parametrize(
+    "before",
+    [
+        "",
+        *(pytest.param(f"import {name}; ", marks=pytest.mark.slow) for name in ("nmfd", "nmfd.rl")),
+    ],
+)
 def test_gymnasium_finds_an_environment_by_its_module(before):
     code = f"{before}import gymnasium; gymnasium.make('nmfd.rl:nmfd/Hexagon7-v0').reset(seed=1)"
     done = subprocess.run(

@@ -80,15 +80,15 @@ def test_demand_and_steps_are_arguments(scenario):
 
 def test_a_city_is_its_settings(tmp_path):
     city = cosim.Settings(signals="max-pressure", guided=True)
-    run = cosim.run("demo", nmfd.PiGating(), city=city, seed=1, steps=4)
+    run = cosim.run("demo", nmfd.PiGating(), city=city, seed=1, steps=2)
     assert run.controller == "pi-gating+guided+max-pressure"
-    named = cosim.run("demo", "pi-gating()+guided+max-pressure", seed=1, steps=4)
+    named = cosim.run("demo", "pi-gating()+guided+max-pressure", seed=1, steps=2)
     np.testing.assert_array_equal(named["accumulation"], run["accumulation"])
 
 
 def test_an_evaluation_is_a_table_and_its_runs_are_found(tmp_path):
     controllers = ["no-control", "pi-gating+max-pressure", nmfd.PiGating(kp=0.4)]
-    table = cosim.evaluate("demo", controllers, seeds=2, steps=2, out=tmp_path / "ev")
+    table = cosim.evaluate("demo", controllers, seeds=2, steps=1, out=tmp_path / "ev")
     assert isinstance(table, pd.DataFrame)
     assert len(table) == 6
     seed = table["seed"].iloc[0]

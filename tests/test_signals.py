@@ -28,7 +28,7 @@ SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
 def scenario():
     """The beginning of the peak, where the demand already flows."""
     loaded = load_scenario(SCENARIO)
-    return replace(loaded, steps=4, demand=loaded.demand[14:18])
+    return replace(loaded, steps=3, demand=loaded.demand[14:17])
 
 
 @pytest.fixture(scope="module")
@@ -38,14 +38,14 @@ def city(scenario):
 
 @pytest.fixture(scope="module")
 def driven(scenario):
-    """The first four intervals at u with these overrides, for all tests that ask for the same:
+    """The first three intervals at u with these overrides, for all tests that ask for the same:
     `drive`, and leaks."""
 
     @cache
     def run(u, **overrides):
         plant = SumoPlant(scenario, settings=Settings(**overrides))
         try:
-            return *drive(plant, scenario, 4, u=u), plant.actuation.leaks()
+            return *drive(plant, scenario, 3, u=u), plant.actuation.leaks()
         finally:
             plant.close()
 
@@ -172,7 +172,7 @@ def test_webster_in_sumo(scenario, plant_of):
     for logic in ElementTree.parse(offsets).getroot():  # a later offset is a later beginning
         programme = plans[logic.get("id")]
         assert programme.position == pytest.approx(-float(logic.get("offset")) % programme.cycle)
-    shown, _, _ = drive(plant, scenario, 2)
+    shown, _, _ = drive(plant, scenario, 1)
     assert len({p.cycle for p in plans.values()}) == 1
     assert len({p.position for p in plans.values()}) > 5
     for name, states in shown.items():

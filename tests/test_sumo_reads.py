@@ -182,7 +182,17 @@ def imported(config, **options) -> str:
     return import_city(config, *folders, regions=2, seeds=1, **options)
 
 
-@pytest.mark.parametrize("options", ["", *OPTIONS.values()], ids=["plain", *OPTIONS])
+def one_of(names, slow):
+    """Names of OPTIONS, some of them for `pytest -m slow`."""
+    return [
+        pytest.param(OPTIONS[name], id=name, marks=pytest.mark.slow if name in slow else ())
+        for name in names
+    ]
+
+
+@pytest.mark.parametrize(
+    "options", [pytest.param("", id="plain"), *one_of(OPTIONS, ("text", "lateral"))]
+)
 def test_an_import_reads_what_sumo_reads(tmp_path, options):
     """The same vehicles from edge to edge, with the same departures; none is left out."""
     config = city(tmp_path, FORMS, options, ADDITIONAL + CALIBRATOR)
@@ -208,12 +218,14 @@ SURE = [name for name in FORMS if name not in OF_CHANCE]
 
 
 @pytest.mark.parametrize(
-    "forms, options",
-    [(["line", "until_then"], ""), (SURE, "")] + [(SURE, OPTIONS[name]) for name in DRIVEN],
+    "options", [pytest.param("", id="plain"), *one_of(DRIVEN, ("lateral", "equipped"))]
 )
-def test_seed_0_without_control_is_plain_sumo(tmp_path, forms, options):
-    """Buses wait in one queue with cars."""
-    drive_and_compare(city(tmp_path, forms, options), ended=26)
+def test_seed_0_without_control_is_plain_sumo(tmp_path, options):
+    drive_and_compare(city(tmp_path, SURE, options), ended=26)
+
+
+def test_buses_wait_in_one_queue_with_cars(tmp_path):
+    drive_and_compare(city(tmp_path, ["line", "until_then"]), ended=26)
 
 
 def test_buses_keep_their_place_among_cars_that_depart_with_them(tmp_path):
@@ -243,7 +255,11 @@ DEVICES = """<device.rerouting.probability v="0.5"/><device.rerouting.period v="
         (SECONDS + TRIPS, '<step-length v="0.5"/>'),
         (HOURLY, ""),
         (HOURLY + TRIPS, DEVICES),
-        (TRIPS, '<device.rerouting.probability v="0.5"/><device.emissions.probability v="1"/>'),
+        pytest.param(
+            TRIPS,
+            '<device.rerouting.probability v="0.5"/><device.emissions.probability v="1"/>',
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=["on-the-second", "half-steps", "hourly", "devices", "two-devices"],
 )
@@ -326,7 +342,10 @@ MINUTES = '<flow id="f" begin="0" end="600" period="60" from="A1B1" to="C1D1"/>'
     "waits",
     [
         '<vehicle id="w" depart="triggered" route="r"/>' + RIDE.format("w"),
-        '<vehicle id="w" depart="containerTriggered" route="r"/>' + LOAD.format("w"),
+        pytest.param(
+            '<vehicle id="w" depart="containerTriggered" route="r"/>' + LOAD.format("w"),
+            marks=pytest.mark.slow,
+        ),
         '<flow id="w" begin="triggered" number="3" route="r"/>' + RIDE.format("w.0"),
         '<trip id="w" depart="triggered" from="A1B1" to="C1D1"/><trip id="w.x" depart="0" '
         'from="A1B1" to="C1D1"/>',

@@ -5,7 +5,9 @@ import gzip
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 
 import numpy as np
@@ -67,7 +69,12 @@ def run(program: str, *arguments) -> None:
 def network(folder: Path, *options: str, name: str = "city.net.xml") -> Path:
     """A grid of 4 x 4 junctions A0 to D3, 200 m apart, with signals at all inner ones unless told
     otherwise."""
-    options = options or ("--tls.set", "B1,B2,C1,C2,B3,C0")
+    (folder / name).write_bytes(_grid(options or ("--tls.set", "B1,B2,C1,C2,B3,C0")))
+    return folder / name
+
+
+@cache
+def _grid(options: tuple[str, ...]) -> bytes:
     grid = [
         "--grid",
         "--grid.number",
@@ -81,8 +88,10 @@ def network(folder: Path, *options: str, name: str = "city.net.xml") -> Path:
         "--seed",
         "1",
     ]
-    run("netgenerate", *grid, "--output-file", folder / name, *options)
-    return folder / name
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "city.net.xml"
+        run("netgenerate", *grid, "--output-file", file, *options)
+        return file.read_bytes()
 
 
 def pieces(streets: Streets, members: np.ndarray) -> int:

@@ -61,7 +61,10 @@ class Roads:
         self._add_stages(signals)
 
     def counted(self, others: np.ndarray) -> list[tuple[int, str]]:
-        """Return number and name of the lanes whose vehicles count, and of `others`."""
+        """Return number and name of the lanes whose vehicles count.
+
+        others: numbers of further lanes
+        """
         numbers = np.unique(np.concatenate([self.weights.indices, self.apart.indices, others]))
         return [(n, self.lanes[n]) for n in numbers.tolist()]
 

@@ -347,7 +347,9 @@ class Ways:
         ahead: PerNode,
         everywhere: tuple[Trees, PerGateway, PerGateway] | None = None,
     ):
-        """there, onward: routes by moves `inside`, and by reversed moves `outside`, with `ahead`
+        """there: routes by moves `inside`
+
+        onward: routes by reversed moves `outside`, with `ahead`
         crossing: time over each gateway (s, (G,))
         ahead: time from the nearest second[g] to nodes of `outside`, not above their times (s)
         everywhere: routes by all moves; time over each gateway on these; and, not above it, the

@@ -16,7 +16,7 @@ import cloudpickle
 import numpy as np
 
 from nmfd.errors import InputError
-from nmfd.model.commands import admissible
+from nmfd.model.commands import rounded
 from nmfd.model.planning import PlanningModel
 from nmfd.runs.files import check_name, file_hash
 from nmfd.types import Controller, Controls, Observation
@@ -88,18 +88,20 @@ class OwnController:
         self.name = name
         self._controller = _located(name, "__init__", load(name), planning)
         self.deadline = getattr(self._controller, "deadline", None)
+        self._network = planning.network
         regions = planning.network.regions
         empty = np.zeros((regions, regions))
         first = Observation(step=0, time=0.0, accumulation=empty, backlog=empty.copy())
         self.reset()
-        admissible(self.act(first), planning.network, f"{name}: act: interval 0")
+        self.act(first)
         self.reset()
 
     def reset(self, seed: int = 0) -> None:
         _located(self.name, "reset", lambda: self._controller.reset(seed))
 
     def act(self, observation: Observation) -> Controls:
-        return _located(self.name, "act", lambda: self._controller.act(observation))
+        command = _located(self.name, "act", lambda: self._controller.act(observation))
+        return rounded(command, self._network, f"{self.name}: act: interval {observation.step}")
 
 
 def _path(name: str) -> Path:

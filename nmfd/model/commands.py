@@ -9,7 +9,7 @@ from nmfd.errors import InputError
 from nmfd.model.regional_model import RegionalModel
 from nmfd.types import Controls
 
-TOLERANCE = 1e-5  # of bounds: rounding errors of float32
+TOLERANCE = 1e-6  # of bounds: rounding errors of float32, which are left as they are
 SUM_TOLERANCE = 1e-3  # of the sums of splits
 ROUNDING = 1e-12  # of sums in float64, which are left as they are
 LARGEST_PRICE = 100.0  # -
@@ -17,7 +17,9 @@ LARGEST_RATE_VEH_S = 1e6  # of metering: as good as no limit
 
 
 def admissible(controls: object, network: RegionalModel, where: str) -> Controls:
-    """Return a copy of `controls` as float64, without rounding errors.
+    """Return a copy of `controls` as float64, with splits that sum to 1.
+
+    Bounds may be missed by rounding errors.
 
     controls: command of a controller, not yet checked
     where: begins the error, such as "pi-gating: interval 3"
@@ -38,6 +40,22 @@ def admissible(controls: object, network: RegionalModel, where: str) -> Controls
         prices=_up_to(controls.prices, LARGEST_PRICE, network, f"{where}: prices"),
         metering=_up_to(controls.metering, LARGEST_RATE_VEH_S, network, f"{where}: metering"),
     )
+
+
+def rounded(controls: object, network: RegionalModel, where: str) -> Controls:
+    """Return `admissible` controls without rounding errors.
+
+    Those of a user's own file may come from float32.
+    """
+    command = admissible(controls, network, where)
+    within_bounds = np.clip(command.perimeter, network.u_min, network.u_max)
+    perimeter = np.where(network.adjacency, within_bounds, 0.0)
+    splits = command.splits
+    if splits is not None:
+        splits = np.clip(splits, 0.0, network.split_mask)
+        sums = splits.sum(axis=1)
+        splits = splits / np.where(sums > 0.0, sums, 1.0)[:, None, :]
+    return replace(command, perimeter=perimeter, splits=splits)
 
 
 def _splits(splits: ArrayLike | None, network: RegionalModel, where: str) -> np.ndarray | None:
@@ -62,11 +80,11 @@ def _up_to(
     if values is None:
         return None
     zeros = np.zeros(network.regions)
-    return within(values, zeros, zeros + most, where)
+    return np.clip(within(values, zeros, zeros + most, where), 0.0, most)
 
 
 def within(values: ArrayLike, low: np.ndarray, high: np.ndarray, where: str) -> np.ndarray:
-    """Return `values` as an array clipped to `low` and `high`.
+    """Return `values` as an array, which lies between `low` and `high`.
 
     Raises: InputError if the shape is another, or if bounds are missed by more than rounding errors
     """
@@ -82,4 +100,4 @@ def within(values: ArrayLike, low: np.ndarray, high: np.ndarray, where: str) -> 
         entry = tuple(np.argwhere(~inside)[0].tolist())
         allowed = f"{low[entry]:g} to {high[entry]:g}" if finite[entry] else "a finite number"
         raise InputError(f"{where}{list(entry)}: expected {allowed}, got {array[entry]:g} instead")
-    return np.clip(array, low, high)
+    return array

@@ -153,8 +153,9 @@ def _start(job: Job, limit: float | None, folder: str) -> Future:
             module = getattr(job, "func", job).__module__
             here.set_forkserver_preload([__name__, *PRELOADED, module])
             _start_server()
-        begin = concurrent.process(work, name=NAME, timeout=limit, mp_context=here)
-        return begin(cloudpickle.dumps(job), folder, dict(os.environ))
+        # Only as a decorator, and by this name, does pebble take the context.
+        decorated = concurrent.process(name=NAME, timeout=limit, context=here)
+        return decorated(work)(cloudpickle.dumps(job), folder, dict(os.environ))
 
 
 def _start_server() -> None:
