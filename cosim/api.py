@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from cosim.evaluation import evaluate as evaluation
 from cosim.evaluation import model_validation, results
 from cosim.evaluation.identify import identify as identify
+from cosim.evaluation.links import write_links
 from cosim.evaluation.runs import runs_of
 from cosim.evaluation.signal_proof import sheets
 from cosim.evaluation.simulate import Simulation, simulate
@@ -25,6 +26,7 @@ from cosim.plant import strategy as strategies_of
 from cosim.plant.settings import Settings
 from cosim.plant.strategy import Strategy, parse
 from cosim.reporting import figures
+from cosim.sumo.trips import PLANNING_SEEDS
 from nmfd.api import (
     Controllers,
     ScenarioLike,
@@ -424,6 +426,20 @@ def get(name: str | None, out: Path | str | None = None) -> str:
     if name is None:
         return cities.listed()
     return cities.get(name, Path("cities", name) if out is None else Path(out))
+
+
+def links(
+    scenario: ScenarioLike,
+    out: Path | str | None = None,
+    *,
+    seeds: Sequence[int] = PLANNING_SEEDS,
+) -> Path:
+    """Write the streets of a city for nmfd.LinkPlant; return the file.
+
+    out: file, SCENARIO/links.npz if None
+    seeds: of the draws of trips, if these are not recorded
+    """
+    return write_links(loaded(scenario), None if out is None else Path(out), seeds)
 
 
 def catalogue() -> dict[str, dict[str, str]]:

@@ -71,9 +71,8 @@ def span(text: str) -> tuple[float, float]:
     cls=Commands,
     context_settings={"show_default": True},
     sections={
-        "First steps": ("demo", "run", "watch"),
-        "Studies": ("evaluate", "compare", "report", "tune"),
-        "A city of your own": ("get", "import", "identify"),
+        "Runs": ("demo", "run", "watch", "evaluate", "compare", "report", "tune"),
+        "A city of your own": ("get", "import", "identify", "links"),
     },
     elsewhere={"list": "nmfd show"} | {name: f"nmfd {name}" for name in nmfd.cli.main.commands},
 )
@@ -460,3 +459,20 @@ def identify(scenario: Path, **options: Any) -> None:
       cosim identify grid7_peak --with guided+max-pressure --network networks/grid7_max_pressure
     """
     click.echo(cosim.api.identify(scenario, **options))
+
+
+@main.command()
+@SCENARIO
+@click.option("--out", type=FILE, metavar="FILE", help="File. [default: SCENARIO/links.npz]")
+def links(scenario: Path, settings: dict, out: Path | None) -> None:
+    """Write the streets of a SUMO city as a plant without SUMO.
+
+    Reads the network, static routes and signal programmes. `nmfd benchmark SCENARIO --plant links`
+    then simulates queues on every street in seconds.
+
+    \b
+    Example:
+      cosim links grid7_peak --out links.npz
+    """
+    loaded = nmfd.load_scenario(scenario, settings)
+    click.echo(f"Written to {cosim.api.links(loaded, out)}")

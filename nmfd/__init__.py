@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from nmfd.controllers.rules import Greedy, NoControl, PiGating, Probing, RouteGuidance
     from nmfd.errors import InputError
     from nmfd.metrics import summary, total_time_spent
+    from nmfd.model.links.plant import LinkPlant
     from nmfd.model.mfd import Cubic, Mfd, PiecewiseLinear, trapezoid
     from nmfd.model.planning import PlanningModel
     from nmfd.model.plant import AcyclicPlant, NmfdPlant
@@ -66,6 +67,7 @@ _MODULES = {
     "controllers.rules": ("Greedy", "NoControl", "PiGating", "Probing", "RouteGuidance"),
     "errors": ("InputError",),
     "metrics": ("summary", "total_time_spent"),
+    "model.links.plant": ("LinkPlant",),
     "model.mfd": ("Cubic", "Mfd", "PiecewiseLinear", "trapezoid"),
     "model.planning": ("PlanningModel",),
     "model.plant": ("AcyclicPlant", "NmfdPlant"),

@@ -179,7 +179,8 @@ def run(
     seed: seed of the measurement noise
     demand: factor of the scenario's demand
     steps: control intervals; the scenario's if None
-    plant: "nmfd", "acyclic", or an object with `reset`, `step` and `observe` as in nmfd.Plant
+    plant: "nmfd", "acyclic", "links", or an object with `reset`, `step` and `observe` as in
+        nmfd.Plant
     policy: as in `nmfd.controller`
     progress: None for a bar on a terminal or in a notebook, False for none, or a function of the
         steps done and all steps
@@ -228,7 +229,7 @@ def benchmark(
     seeds: how many, from 0, or which
     demand: factor or factors of the scenario's demand
     steps: control intervals; the scenario's if None
-    plant: "nmfd" or "acyclic"
+    plant: "nmfd", "acyclic" or "links"
     policies: controller -> file, if not SCENARIO/NAME.pt
     out: run folder, runs/SCENARIO-TIME if None; finished runs in it are kept
     workers: runs at a time

@@ -352,7 +352,7 @@ def show(scenario: Path | None, settings: dict, out: Path | None) -> None:
 @DEMAND
 @STEPS
 @click.option(
-    "--plant", type=click.Choice(["nmfd", "acyclic"]), default="nmfd", help="Plant model."
+    "--plant", type=click.Choice(["nmfd", "acyclic", "links"]), default="nmfd", help="Plant model."
 )
 @POLICIES
 @RUNNING

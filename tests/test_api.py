@@ -99,7 +99,11 @@ def test_a_controller_and_a_plant_as_objects(tmp_path):
     "arguments, options, expected",
     [
         (("nobody",), {}, "controller 'nobody' is unknown"),
-        (("pi-gating",), {"plant": "sumo"}, "plant 'sumo' is unknown; choose from nmfd, acyclic"),
+        (
+            ("pi-gating",),
+            {"plant": "sumo"},
+            "plant 'sumo' is unknown; choose from nmfd, acyclic, links",
+        ),
         (("pi-gating",), {"plant": HALF}, "plant: Acting has no step"),
         (("pi-gating",), {"steps": 0}, "steps: expected 1 or more"),
         ((HALF,), {"policy": "x.pt"}, "x.pt: controller half reads no policy"),

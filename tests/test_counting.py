@@ -167,6 +167,7 @@ def test_a_counted_model_comes_back_from_its_file(truth, runs, tmp_path):
         load_network(tmp_path)
 
 
+@pytest.mark.slow
 def test_mpc_solves_its_plans_on_a_counted_model(truth, runs):
     """Kinks are rounded: at sharp ones the solver of MPC stops."""
     scenario = load_scenario(ROOT / "scenarios" / "economic_mpc")

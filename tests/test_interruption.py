@@ -93,11 +93,12 @@ def test_runs_are_kept_without_standard_streams(tmp_path, streams):
 @pytest.mark.parametrize(
     "by, status",
     [
-        pytest.param(signal.SIGINT, 130, id="Ctrl-C"),
-        pytest.param(signal.SIGTERM, 130, id="SIGTERM", marks=pytest.mark.slow),
-        pytest.param(signal.SIGKILL, -9, id="kill -9", marks=pytest.mark.slow),
+        pytest.param(signal.SIGINT, 130, id="Ctrl-C"),  # by default: test_cli.py
+        pytest.param(signal.SIGTERM, 130, id="SIGTERM"),
+        pytest.param(signal.SIGKILL, -9, id="kill -9"),
     ],
 )
+@pytest.mark.slow
 def test_a_stopped_benchmark_continues(tmp_path, monkeypatch, by, status):
     scenario = tiny.write(tmp_path)
     command = (

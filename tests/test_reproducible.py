@@ -26,6 +26,7 @@ def elsewhere(program, *arguments):
     )
 
 
+@pytest.mark.slow
 def test_benchmarks(tmp_path):
     scenario = tiny.write(tmp_path)
     command = (

@@ -21,9 +21,10 @@ from nmfd.controllers import open_loop
 from nmfd.controllers.strategy import Strategy
 from nmfd.errors import InputError
 from nmfd.metrics import COUNTED, decision_ms, percent_change, summary
+from nmfd.model.links.plant import LinkPlant, links_file
 from nmfd.model.plant import AcyclicPlant, NmfdPlant
 from nmfd.model.scenario import Scenario, perturbed
-from nmfd.runs.files import run_name
+from nmfd.runs.files import file_hash, run_name
 from nmfd.runs.tables import text_columns, text_table
 from nmfd.studies import plots
 from nmfd.types import Plant, Result
@@ -33,7 +34,12 @@ if TYPE_CHECKING:
 
     from nmfd.runs.frame import Table
 
-PLANTS: dict[str, Callable[[Scenario], Plant]] = {"nmfd": NmfdPlant, "acyclic": AcyclicPlant}
+LINKS = "links"
+PLANTS: dict[str, Callable[[Scenario], Plant]] = {
+    "nmfd": NmfdPlant,
+    "acyclic": AcyclicPlant,
+    LINKS: LinkPlant,
+}
 REFERENCE = "no-control"
 CAPTION = (
     "TTS: total time spent, mean over seeds ± 95 % interval; change: of TTS against {against}; "
@@ -130,6 +136,9 @@ def key_of(
         "network_hash": scenario.network.hash,
         "plant": plant,
     }
+    if plant == LINKS:
+        LinkPlant(scenario)  # or its error before the first run
+        shared["links_hash"] = file_hash(links_file(scenario))
     return lambda name: {**shared, "controller": own[name]}
 
 
@@ -139,7 +148,7 @@ def lower_bound(scenario: Scenario, strategy: Strategy, plant: str) -> float:
     It is for the controls of `strategy`. Controllers of the user's own may meter, and plants of the
     user's own are other models.
     """
-    if strategy.own or plant not in PLANTS:
+    if strategy.own or plant == LINKS or plant not in PLANTS:
         return math.nan
     if getattr(strategy.options(scenario), "metering", False):
         return math.nan

@@ -39,6 +39,7 @@ OTHER_COLOURS = (
 PLANT_LABELS = {
     "nmfd": "regional model",
     "acyclic": "acyclic model",
+    "links": "link model",
     "sumo": "SUMO",
     "estimate": "estimate",
 }

@@ -17,6 +17,9 @@ from nmfd.api import load_scenario
 from nmfd.closed_loop import run
 from nmfd.controllers.dpc.policy_file import load_policy
 from nmfd.controllers.mpc.ipopt import Ipopt
+from nmfd.model.links.model import Commands, LinkModel
+from nmfd.model.links.network import read_links
+from nmfd.model.links.plant import links_file
 from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
 from nmfd.model.scenario import Scenario, with_demand
@@ -162,3 +165,19 @@ class TestMpc:
                 controller.act(measured)
 
         benchmark(decide)
+
+
+@pytest.mark.benchmark(group="Streets, rollouts of grid7 over 64 control intervals")
+@pytest.mark.parametrize("batch", [1, 10])
+def test_rollouts_of_streets(benchmark, batch):
+    grid = api.load_scenario("grid7_peak")
+    model = LinkModel(read_links(links_file(grid)), grid.step)
+    demand = torch.as_tensor(grid.demand, dtype=torch.float32)
+
+    def rollout():
+        state = model.start(batch, range(4))
+        with torch.inference_mode():
+            for k in range(grid.steps):
+                state = model.advance(state, demand[k].expand(batch, 7, 7), Commands())
+
+    benchmark.pedantic(rollout, rounds=3)

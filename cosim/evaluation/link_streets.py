@@ -1,0 +1,272 @@
+"""Links, turns and cells of the link model, from routes."""
+
+import itertools
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+
+from cosim.sumo.net import City
+from cosim.sumo.xml_files import attribute, network_root
+from nmfd.errors import InputError
+
+Route: TypeAlias = tuple[str, ...]
+Movement: TypeAlias = tuple[str, str]  # street, next street
+Turn: TypeAlias = tuple[Movement, int]  # and the link entered
+Lanes: TypeAlias = frozenset[int]
+
+
+class Connection(NamedTuple):
+    """A lane of a movement, and the lane that it leads to.
+
+    signal: None without one
+    place: in the signal's state
+    """
+
+    lane: int
+    entered: int
+    signal: str | None
+    place: int
+    state: str
+
+
+def read_connections(city: City) -> dict[Movement, list[Connection]]:
+    """Return the connections of each movement between lanes that cars may use."""
+    cars = {lane for lanes in city.lane_ids.values() for lane in lanes}
+    connections = defaultdict[Movement, list[Connection]](list)
+    with network_root(city.net_file) as root:
+        for element in root.iterfind("connection"):
+            source, target = attribute(element, "from"), attribute(element, "to")
+            lane, entered = attribute(element, "fromLane"), attribute(element, "toLane")
+            if f"{source}_{lane}" in cars and f"{target}_{entered}" in cars:
+                connection = Connection(
+                    lane=int(lane),
+                    entered=int(entered),
+                    signal=element.get("tl"),
+                    place=int(element.get("linkIndex", "-1")),
+                    state=element.get("state", "M"),
+                )
+                connections[source, target].append(connection)
+    return dict(connections)
+
+
+class Streets:
+    """Links of the streets on some routes.
+
+    movements: sorted
+    connections: of each
+    links: street and lanes of each, shortest first
+    link_of: movement -> its link
+    """
+
+    def __init__(
+        self,
+        city: City,
+        connections: Mapping[Movement, Sequence[Connection]],
+        routes: Iterable[Route],
+        where: str,
+    ):
+        """where: file that errors name
+
+        Raises: InputError if a connection is missing
+        """
+        self.city = city
+        self.connections = connections
+        movements = {pair for route in routes for pair in itertools.pairwise(route)}
+        for movement in sorted(movements.difference(connections)):
+            problem = "no connection leads from {} to {}".format(*movement)
+            raise InputError(f"{where}: sumo.routes: {problem}; give routes of this network")
+        self.movements = sorted(movements)
+        groups: dict[str, list[Lanes]] = {}
+        for street in sorted({street for route in routes for street in route}):
+            groups[street] = [frozenset({lane}) for lane in _lanes(city, street)]
+        for street, onward in self.movements:
+            lanes = {connection.lane for connection in connections[street, onward]}
+            joined = frozenset[int]()
+            apart = []
+            for group in groups[street]:
+                if group & lanes:
+                    joined |= group
+                else:
+                    apart.append(group)
+            groups[street] = [*apart, joined]
+        links = [(street, group) for street, some in groups.items() for group in some]
+        self.links = sorted(links, key=lambda link: (city.length[link[0]], link[0], min(link[1])))
+        self._number = {}
+        for number, (street, group) in enumerate(self.links):
+            for lane in group:
+                self._number[street, lane] = number
+        self.link_of = {
+            (street, onward): self._number[street, connections[street, onward][0].lane]
+            for street, onward in self.movements
+        }
+
+    def ends(self, movement: Movement) -> dict[int, float]:
+        """Return link -> share of the lanes that a movement leads to."""
+        entered = {
+            self._number[movement[1], connection.entered]
+            for connection in self.connections[movement]
+        }
+        total = sum(len(self.links[link][1]) for link in entered)
+        return {link: len(self.links[link][1]) / total for link in sorted(entered)}
+
+    def lanes(self, turn: Turn) -> list[int]:
+        """Return the lanes of a movement that lead to a link.
+
+        They are all its lanes if none leads there: vehicles change lanes behind the junction.
+        """
+        movement, link = turn
+        connections = self.connections[movement]
+        lanes = {one.lane for one in connections if one.entered in self.links[link][1]}
+        return sorted(lanes or {one.lane for one in connections})
+
+
+def _lanes(city: City, street: str) -> list[int]:
+    return [int(name.rpartition("_")[2]) for name in city.lane_ids[street]]
+
+
+class Counts:
+    """Vehicles on the routes.
+
+    cells: by (turn, destination)
+    flows: by movement
+    entering, ending: by (link, destination), those that do not begin there, and that end there
+    beginning: by (link, destination), trips that begin there
+    trips: by (region, destination)
+    """
+
+    def __init__(self, streets: Streets, routes: Iterable[Route]):
+        self.cells = defaultdict[tuple[Turn, int], float](float)
+        self.flows = Counter[Movement]()
+        self.entering = defaultdict[tuple[int, int], float](float)
+        self.ending = defaultdict[tuple[int, int], float](float)
+        self.beginning = Counter[tuple[int, int]]()
+        self.trips = Counter[tuple[int, int]]()
+        region_of = streets.city.region_of
+        for route in routes:
+            destination = region_of[route[-1]]
+            movements = list(itertools.pairwise(route))
+            links = [streets.link_of[movement] for movement in movements]
+            self.flows.update(movements)
+            self.trips[region_of[route[0]], destination] += 1
+            self.beginning[links[0], destination] += 1
+            for movement, link in zip(movements, links[1:], strict=False):
+                self.cells[(movement, link), destination] += 1
+                self.entering[link, destination] += 1
+            for link, share in streets.ends(movements[-1]).items():
+                self.cells[(movements[-1], link), destination] += share
+                self.entering[link, destination] += share
+                self.ending[link, destination] += share
+
+
+def link_arrays(streets: Streets) -> dict[str, np.ndarray]:
+    """Return the arrays of links and lanes."""
+    city = streets.city
+    names = [street for street, _ in streets.links]
+    behind = defaultdict[int, list[tuple[float, float]]](list)  # time and length over the junction
+    for movement, link in streets.link_of.items():
+        length = sum(city.inside.get(edge, 0.0) for edge in city.over.get(movement, ()))
+        behind[link].append((city.turn_time[movement], length))
+    over = np.array([np.mean(behind.get(link, [(0.0, 0.0)]), axis=0) for link in range(len(names))])
+    length = np.array([city.length[street] for street in names])
+    return {
+        "street": np.array(names),
+        "length": length,
+        "behind": over[:, 1],
+        "free_time": length / [city.speed[street] for street in names] + over[:, 0],
+        "region": np.array([city.region_of[street] for street in names]),
+        "lane_link": np.repeat(np.arange(len(names)), [len(lanes) for _, lanes in streets.links]),
+    }
+
+
+def vehicle_arrays(
+    streets: Streets, counts: Counts, draws: Sequence[Counts]
+) -> dict[str, np.ndarray]:
+    """Return the arrays of turns, entries and cells.
+
+    counts: of all draws of trips together
+    """
+    free_time = link_arrays(streets)["free_time"]
+    number_of = {movement: number for number, movement in enumerate(streets.movements)}
+    lane_number: dict[tuple[str, int], int] = {}
+    for street, lanes in streets.links:
+        for lane in sorted(lanes):
+            lane_number[street, lane] = len(lane_number)
+    turns = sorted({turn for turn, _ in counts.cells})
+    turn_number = {turn: number for number, turn in enumerate(turns)}
+    serving = []
+    for number, turn in enumerate(turns):
+        street, _ = turn[0]
+        serving += [(number, lane_number[street, lane]) for lane in streets.lanes(turn)]
+    served, server = np.array(serving).T
+    entries = sorted(
+        {*counts.entering, *counts.beginning}, key=lambda entry: (free_time[entry[0]], entry)
+    )
+    entry_number = {entry: number for number, entry in enumerate(entries)}
+    cells = sorted(counts.cells)
+    source = [entry_number[streets.link_of[turn[0]], destination] for turn, destination in cells]
+    where = [streets.city.region_of[streets.links[link][0]] for link, _ in entries]
+    shares = _Shares(entries, cells, np.array(source), where)
+    return {
+        "turn_movement": np.array([number_of[movement] for movement, _ in turns]),
+        "turn_link": np.array([link for _, link in turns]),
+        "served": served,
+        "server": server,
+        "entry_link": np.array([link for link, _ in entries]),
+        "destination": np.array([destination for _, destination in entries]),
+        "ending": shares.of(shares.ending, counts, draws),
+        "origin": shares.of(shares.origin, counts, draws),
+        "cell_turn": np.array([turn_number[turn] for turn, _ in cells]),
+        "cell_entry": np.array(source),
+        "cell_onward": np.array([entry_number[turn[1], j] for turn, j in cells]),
+        "cell_share": shares.of(shares.onward, counts, draws),
+    }
+
+
+class _Shares:
+    """Shares of entries and cells; NaN where a draw has no vehicle."""
+
+    def __init__(
+        self,
+        entries: Sequence[tuple[int, int]],
+        cells: Sequence[tuple[Turn, int]],
+        source: np.ndarray,
+        region: Sequence[int],
+    ):
+        """source: entry of each cell (C,); region: of each entry"""
+        self._entries = entries
+        self._cells = cells
+        self._source = source
+        self._pairs = [(i, j) for i, (_, j) in zip(region, entries, strict=True)]
+
+    def of(
+        self,
+        share: Callable[[Counts], np.ndarray],
+        counts: Counts,
+        draws: Sequence[Counts],
+    ) -> np.ndarray:
+        """Return a share by draw (D, n).
+
+        It is that of all draws together where one has no vehicle.
+        """
+        with np.errstate(invalid="ignore"):
+            together = np.nan_to_num(share(counts))
+            rows = [share(draw) for draw in draws]
+        return np.where(np.isnan(rows), together, rows)
+
+    def ending(self, counts: Counts) -> np.ndarray:
+        """Return the share of the vehicles of each entry whose trip ends there."""
+        entering = np.array([counts.entering[entry] for entry in self._entries])
+        return np.array([counts.ending[entry] for entry in self._entries]) / entering
+
+    def origin(self, counts: Counts) -> np.ndarray:
+        """Return the share of the trips between two regions that begin here."""
+        trips = np.array([float(counts.trips[pair]) for pair in self._pairs])
+        return np.array([counts.beginning[entry] for entry in self._entries]) / trips
+
+    def onward(self, counts: Counts) -> np.ndarray:
+        """Return the share of each cell of the vehicles that leave its entry."""
+        vehicles = np.array([counts.cells[cell] for cell in self._cells])
+        leaving = np.bincount(self._source, vehicles, len(self._entries))
+        return vehicles / leaving[self._source]

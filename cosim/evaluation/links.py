@@ -1,0 +1,292 @@
+"""Streets of a SUMO network for the link model (nmfd.model.links).
+
+A link has the lanes of a street that share movements. Shares of turns, origins and ends of trips
+are counted on the static routes. Lights follow the signal programmes.
+"""
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from cosim.evaluation.link_streets import (
+    Connection,
+    Counts,
+    Movement,
+    Route,
+    Streets,
+    link_arrays,
+    read_connections,
+    vehicle_arrays,
+)
+from cosim.plant.gates import MIN_GREEN_S, least_times
+from cosim.plant.pressure import Roads
+from cosim.plant.settings import Settings, own_files, settings
+from cosim.plant.stages import stages_of, transition
+from cosim.sumo import recorded_trips as recorded
+from cosim.sumo.net import City, city_of
+from cosim.sumo.session import Phase
+from cosim.sumo.signals import HELD, Signal, phases_of, read_signals
+from cosim.sumo.trips import PLANNING_SEEDS, make_trips
+from cosim.sumo.xml_files import attribute, network_root, read_xml
+from nmfd.model.links.network import FILE, LinkNetwork
+from nmfd.model.scenario import Scenario
+from nmfd.runs import shipped
+
+# Light -> share of the saturation flow.
+CAPACITY = {"G": 1.0, "g": 1.0, "o": 1.0, "O": 1.0, "s": 0.5}
+GIVES_WAY = frozenset("gso")  # lights
+MINOR = frozenset("m=so")  # states of connections without a signal that must give way
+
+
+class Programme(NamedTuple):
+    """Phases of a signal; offset: of its cycle (s)."""
+
+    offset: float
+    phases: Sequence[Phase]
+
+
+class Lights(NamedTuple):
+    """Capacity (-) and duty to give way (0 or 1) in every second of a cycle."""
+
+    light: np.ndarray
+    yields: np.ndarray
+
+
+def write_links(
+    scenario: Scenario, path: Path | None = None, seeds: Sequence[int] = PLANNING_SEEDS
+) -> Path:
+    """Write the link network of `scenario`; return its file.
+
+    path: file, that of the scenario if None
+    seeds: of the draws of trips, if they are not recorded
+    Raises: InputError if a route leads where no connection is
+    """
+    if path is None:
+        folder = scenario.folder or Path()
+        path = shipped.beside(folder, FILE, "--out FILE", scenario=True)
+    link_network(scenario, seeds).write(path)
+    return path
+
+
+def link_network(scenario: Scenario, seeds: Sequence[int] = PLANNING_SEEDS) -> LinkNetwork:
+    """Return the link network of `scenario`.
+
+    seeds: of the draws of trips, if they are not recorded
+    Raises: InputError if a route leads where no connection is
+    """
+    chosen = settings(scenario)
+    city = city_of(scenario.network)
+    draws = _draws(scenario, chosen, city, seeds)
+    together = [route for routes in draws for route in routes]
+    streets = Streets(city, read_connections(city), together, scenario.where)
+    counts = Counts(streets, together)
+    files = own_files(scenario, chosen.additional)
+    steered, _ = read_signals(city, files, HELD)
+    obeying = {signal.id for signal in steered}.difference(chosen.leave_signals)
+    gated = set()
+    for gateway in city.gateways:
+        if gateway.signal in obeying:
+            gated.add((gateway.from_edge, gateway.to_edge))
+    return LinkNetwork(
+        regions=city.regions,
+        **link_arrays(streets),
+        **_movement_arrays(streets, _programmes(city, files), chosen.begin, gated),
+        **vehicle_arrays(streets, counts, [Counts(streets, routes) for routes in draws]),
+        **_stage_arrays(streets, counts, steered),
+    )
+
+
+def _draws(
+    scenario: Scenario, chosen: Settings, city: City, seeds: Sequence[int]
+) -> list[list[Route]]:
+    """Return the routes of each draw; one draw of recorded trips."""
+    if not chosen.routes:
+        made = [make_trips(city, scenario.demand, scenario.step, seed) for seed in seeds]
+        return [[route for route in trips.routes if len(route) > 1] for trips in made]
+    shared = recorded.read_routes(own_files(scenario, chosen.additional))
+    routes = []
+    for element in recorded.read_recorded_trips(own_files(scenario, chosen.routes)).elements:
+        edges, driven = recorded.edges_of(element, shared)
+        if driven and len(edges) > 1 and city.number.keys() >= set(edges):
+            routes.append(tuple(edges))
+    return [routes]
+
+
+def _programmes(city: City, additional: Iterable[Path]) -> dict[str, Programme]:
+    """Return the programme of each signal, the last one that SUMO reads."""
+    programmes = {}
+    for root in (read_xml(city.net_file), *map(read_xml, additional)):
+        for logic in root.iter("tlLogic"):
+            offset = float(logic.get("offset", 0.0))
+            programmes[attribute(logic, "id")] = Programme(offset, phases_of(logic))
+    return programmes
+
+
+def _foes(city: City) -> set[tuple[Movement, Movement]]:
+    """Return pairs of movements of which the first gives way to the second."""
+    movement_over = {}
+    for movement, way in city.over.items():
+        for edge in way:
+            movement_over[edge] = movement
+    pairs = set()
+    with network_root(city.net_file) as root:
+        for junction in root.iterfind("junction"):
+            inner = [lane.rpartition("_")[0] for lane in (junction.get("intLanes") or "").split()]
+            movements = [movement_over.get(edge) for edge in inner]
+            for request in junction.iterfind("request"):
+                own = None
+                number = int(attribute(request, "index"))
+                if number < len(movements):
+                    own = movements[number]
+                # The last bit is that of the first movement.
+                bits = reversed(attribute(request, "response"))
+                for other, bit in zip(movements, bits, strict=False):
+                    if bit == "1" and own and other and other != own:
+                        pairs.add((own, other))
+    return pairs
+
+
+def _movement_arrays(
+    streets: Streets,
+    programmes: Mapping[str, Programme],
+    begin: float,
+    gated: Collection[Movement],
+) -> dict[str, np.ndarray]:
+    """Return the arrays of movements, lights and right of way.
+
+    begin: time of the first second (s)
+    """
+    city = streets.city
+    number = {movement: n for n, movement in enumerate(streets.movements)}
+    speeds = []
+    lights = []
+    for movement in streets.movements:
+        first = next(iter(city.over.get(movement, ())), "")
+        speed = city.speed[movement[0]]
+        if city.inside.get(first) and city.turn_time[movement]:
+            speed = min(speed, city.inside[first] / city.turn_time[movement])
+        speeds.append(speed)
+        shown = [_shown(one, programmes, begin) for one in streets.connections[movement]]
+        cycle = max(len(one.light) for one in shown)
+        light = np.mean([np.resize(one.light, cycle) for one in shown], axis=0)
+        yields = np.mean([np.resize(one.yields, cycle) for one in shown], axis=0)
+        lights.append(Lights(light, yields))
+    pairs = []
+    for movement, foe in sorted(_foes(city)):
+        if movement in number and foe in number:
+            pairs.append((number[movement], number[foe]))
+    cycles = [len(one.light) for one in lights]
+    yielding, foe_of = np.array(pairs, dtype=int).reshape(-1, 2).T
+    return {
+        "movement_link": np.array([streets.link_of[movement] for movement in streets.movements]),
+        "speed": np.array(speeds),
+        "yielding": yielding,
+        "foe": foe_of,
+        "cycle": np.array(cycles),
+        "begin": np.concatenate([[0], np.cumsum(cycles)[:-1]]),
+        "light": np.concatenate([one.light for one in lights]),
+        "yields": np.concatenate([one.yields for one in lights]),
+        "gated": np.array([movement in gated for movement in streets.movements]),
+    }
+
+
+def _shown(connection: Connection, programmes: Mapping[str, Programme], begin: float) -> Lights:
+    """Return the lights of a connection; one second if it has no signal."""
+    programme = programmes.get(connection.signal or "")
+    if programme is None:
+        return Lights(np.ones(1), np.array([float(connection.state in MINOR)]))
+    offset, phases = programme
+    ends = np.cumsum([phase.duration for phase in phases])
+    cycle = max(round(ends[-1]), 1)
+    clock = (begin - offset + np.arange(cycle) + 0.5) % ends[-1]
+    number = np.searchsorted(ends, clock, side="right")
+    states = [phases[n].state[connection.place] for n in number]
+    light = np.array([CAPACITY.get(state, 0.0) for state in states])
+    yields = np.array([float(state in GIVES_WAY) for state in states])
+    for second in range(2 * cycle):  # twice: yellow may begin before the end of the cycle
+        before = states[(second - 1) % cycle]
+        if states[second % cycle] == "y" and before == "g":
+            states[second % cycle] = before
+            light[second % cycle] = 1.0  # those who wait on the junction go at last
+    return Lights(light, yields)
+
+
+def _stage_arrays(
+    streets: Streets, counts: Counts, signals: Sequence[Signal]
+) -> dict[str, np.ndarray]:
+    """Return the arrays of the signals that can choose their stages."""
+    number_of = {signal.id: number for number, signal in enumerate(signals)}
+    phases = [stages_of(signal) for signal in signals]
+    count = len(signals)
+    most = max(map(len, phases), default=1)
+    own = np.full(len(streets.movements), -1)
+    light = np.zeros((len(streets.movements), most))
+    yields = np.zeros_like(light)
+    for row, movement in enumerate(streets.movements):
+        here = streets.connections[movement]
+        number = number_of.get(here[0].signal or "", -1)
+        if number < 0:
+            continue
+        own[row] = number
+        for stage, phase in enumerate(phases[number]):
+            states = [signals[number].phases[phase].state[one.place] for one in here]
+            light[row, stage] = np.mean([CAPACITY.get(state, 0.0) for state in states])
+            yields[row, stage] = np.mean([state in GIVES_WAY for state in states])
+    loss = np.zeros((count, most, most))
+    low = np.full((count, most), MIN_GREEN_S)
+    for row, (signal, numbers) in enumerate(zip(signals, phases, strict=True)):
+        least = least_times(signal.phases)
+        for stage, phase in enumerate(numbers):
+            low[row, stage] = max(least[phase], MIN_GREEN_S)
+            for other, coming in enumerate(numbers):
+                if other != stage:
+                    between = transition(signal.phases, phase, coming)
+                    loss[row, stage, other] = sum(part.duration for part in between)
+    return {
+        "signal": own,
+        "stages": np.array([len(numbers) for numbers in phases], dtype=int),
+        "stage_light": light,
+        "stage_yields": yields,
+        "stage_loss": loss,
+        "stage_least": low,
+        **_pressure_arrays(streets, Roads(streets.city, signals, counts.flows), phases),
+    }
+
+
+def _pressure_arrays(
+    streets: Streets, roads: Roads, phases: Sequence[Sequence[int]]
+) -> dict[str, np.ndarray]:
+    """Return the weights of cosim.plant.max_pressure.
+
+    The lanes of a link share its vehicles.
+    """
+    link_of_lane = np.full(len(roads.lanes), -1)
+    part = np.zeros(len(roads.lanes))
+    for link, (street, lanes) in enumerate(streets.links):
+        for lane in lanes:
+            number = roads.lane_number[f"{street}_{lane}"]
+            link_of_lane[number] = link
+            part[number] = 1.0 / len(lanes)
+    row_of = np.full(len(roads.movements), -1)
+    for row, movement in enumerate(streets.movements):
+        if movement in roads.movements:
+            row_of[roads.movements[movement]] = row
+    most = max(map(len, phases), default=1)
+    place: list[int] = []
+    for number, some in enumerate(phases):
+        first = number * most
+        place += range(first, first + len(some))
+    weights = roads.weights.tocoo()
+    gain = roads.gain.tocoo()
+    weighed = (row_of[weights.row] >= 0) & (link_of_lane[weights.col] >= 0)
+    gained = row_of[gain.col] >= 0
+    return {
+        "pressure_movement": row_of[weights.row[weighed]],
+        "pressure_link": link_of_lane[weights.col[weighed]],
+        "pressure_weight": weights.data[weighed] * part[weights.col[weighed]],
+        "gain_stage": np.array(place, dtype=int)[gain.row[gained]],
+        "gain_movement": row_of[gain.col[gained]],
+        "gain": gain.data[gained],
+    }

@@ -1,0 +1,1 @@
+"""Plant of streets: link transmission, signals, gates and drivers."""

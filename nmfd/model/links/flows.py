@@ -1,0 +1,373 @@
+"""Flows between links: the link transmission model with a node model.
+
+Yperman, "The link transmission model for dynamic network loading" (2007), with cumulative counts of
+a link up- and downstream, N_up and N_down, of length L, n lanes, and the free-flow time tau:
+
+    S(t) = N_up(t - tau) - N_down(t)                         vehicles that can leave (sending)
+    R(t) = N_down(t - L / w) + n L / spacing - N_up(t)       vehicles that can enter (receiving)
+
+Backward waves have the speed w. Vehicles are counted by link and destination region (entries). The
+first vehicles of a link, s dt in each lane, are counted by turn and destination (cells): y_c, first
+in the order of arrival; s is the saturation flow. In each step of dt seconds
+
+    1. the room in the lanes for first vehicles is filled in the order of arrival, by the shares of
+       the cells: a vehicle that cannot go on stays in front, and holds up those behind it;
+    2. of the first vehicles of turn t, phi_t can go: its light, less where it gives way;
+    3. they share the room of the next link in proportion: rho_h = min(1, R_h / sum_t phi_t y_t);
+    4. phi_t rho_h y_c leave the cell.
+
+Where all lanes of a link lead to all turns, steps 1 to 4 are the node model of Tampere, Corthout,
+Cattrysse and Immers, "A generic class of first order node models" (2011), with demand-proportional
+shares, if green lasts long enough: first in, first out, and no flow could be larger. Where lanes
+lead to some turns only, vehicles that all want one turn still move up in all lanes, and leave too
+fast.
+A movement that gives way to a flow f has exp(-gap f) of its green, which is the chance that no
+vehicle comes within the critical gap. A trip ends halfway along a street, or moves up in the queue
+there twice as fast as it reaches the front.
+
+Every vehicle that leaves one count enters another one: mass and its derivative are conserved.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nmfd.model.links.network import LinkNetwork
+
+EPSILON = 1e-3  # veh
+LEAST = 0.1  # veh: smaller counts do not divide a room, which bounds the gradient
+INFLOW = 0.6  # veh/s in each lane, the most that can enter a link
+REACTION_S = 0.9  # headway of SUMO's cars in a queue: REACTION_S + VEHICLE_M / v
+VEHICLE_M = 12.3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Numbers:
+    """Calibration of the model to a city; the defaults are not fitted.
+
+    time_factor: of the free-flow times (-)
+    spacing: length of lane that a standing vehicle takes (m)
+    saturation: flow of a lane at green, as a share of 1 / (0.9 s + 12.3 m / v) with the speed v on
+        the junction (-)
+    gap: critical gap of vehicles that give way (s)
+    """
+
+    time_factor: float = 1.0
+    spacing: float = 7.5
+    saturation: float = 1.0
+    gap: float = 4.7
+
+
+class Traffic(NamedTuple):
+    """State of B rollouts between two steps (veh).
+
+    held: trips that metering keeps outside, by entry (B, E)
+    due: trips that wait outside until their link has room, by entry (B, E)
+    outside: the same by link (B, L)
+    queue: vehicles at the end of the street, behind the first ones, by entry (B, E)
+    first: first vehicles, by cell (B, C)
+    standing: the same by turn (B, T)
+    stopping: vehicles in the queue whose trip ends in the link (B, L)
+    inside: all vehicles, by link (B, L)
+    passed: vehicles that made each movement in the last step (B, M)
+    completed: completed trips, by link (B, L)
+    entered: vehicles that entered in each of the last steps, the newest last, by entry (B, E)
+    ending: those that entered to end their trip there, by link (B, L)
+    left: vehicles that had left each link before each of the last steps, the newest last (B, L)
+    """
+
+    held: Tensor
+    due: Tensor
+    outside: Tensor
+    queue: Tensor
+    first: Tensor
+    standing: Tensor
+    stopping: Tensor
+    inside: Tensor
+    passed: Tensor
+    completed: Tensor
+    entered: tuple[Tensor, ...]
+    ending: tuple[Tensor, ...]
+    left: tuple[Tensor, ...]
+
+
+class Ways(NamedTuple):
+    """Shares by which B rollouts divide vehicles (-).
+
+    cells: of each cell among those of its entry (B, C)
+    goes_on: of the vehicles that enter, those whose trip does not end there, by entry (B, E)
+    ends: one less that, for the entries at home, where trips end (B, H)
+    """
+
+    cells: Tensor
+    goes_on: Tensor
+    ends: Tensor
+
+
+class Delay:
+    """Reader of histories, with an age of its own for each column."""
+
+    def __init__(self, steps: np.ndarray, device: torch.device):
+        """steps: age of each column, 1 for the newest (n,)"""
+        self.steps = steps
+        self.longest = int(steps.max(initial=1))
+        order = np.argsort(steps, kind="stable")
+        ages, begins = np.unique(steps[order], return_index=True)
+        ends = [*begins[1:], len(steps)]
+        self._ages = ages.tolist()
+        self._slices = [slice(*ends) for ends in zip(begins.tolist(), ends, strict=True)]
+        self._columns = [torch.as_tensor(order[part], device=device) for part in self._slices]
+        self._sorted = bool((np.diff(steps) >= 0).all())
+        self._back = torch.as_tensor(np.argsort(order), device=device)
+
+    def read(self, history: Sequence[Tensor]) -> Tensor:
+        """Return the values (B, n) of a history (B, n), the newest last."""
+        if self._sorted:
+            pairs = zip(self._ages, self._slices, strict=True)
+            return torch.cat([history[-age][:, part] for age, part in pairs], dim=1)
+        columns = zip(self._ages, self._columns, strict=True)
+        parts = [history[-age].index_select(1, some) for age, some in columns]
+        return torch.cat(parts, dim=1).index_select(1, self._back)
+
+
+class Flows:
+    """Equations of one city; `step` advances B rollouts by `dt` seconds."""
+
+    def __init__(
+        self,
+        network: LinkNetwork,
+        numbers: Numbers,
+        *,
+        dt: float,
+        dtype: torch.dtype = torch.float32,
+        device: str = "cpu",
+    ):
+        self.network = network
+        self.numbers = numbers
+        self.dt = dt
+        self.dtype = dtype
+        self.device = torch.device(device)
+        self.links = len(network.length)
+        self.movements = len(network.cycle)
+        self.entries = len(network.entry_link)
+        self._number()
+        self._delay()
+        self._limit()
+
+    def _number(self) -> None:
+        """Set which count belongs to which other one."""
+        network = self.network
+        self.link_of_entry = self.places(network.entry_link)
+        self.entry_of_cell = self.places(network.cell_entry)
+        self.onward = self.places(network.cell_onward)
+        self._turn_of_cell = self.places(network.cell_turn)
+        self._movement_of_turn = self.places(network.turn_movement)
+        self._link_entered = self.places(network.turn_link)
+        self._link_left = self.places(network.movement_link)
+        self._served = self.places(network.served)
+        self._server = self.places(network.server)
+        self._link_of_lane = self.places(network.lane_link)
+        self._yielding = self.places(network.yielding)
+        self._foe = self.places(network.foe)
+        at_home = np.flatnonzero(network.ending.max(axis=0) > 0.0)
+        self._home = self.places(at_home)
+        self._home_link = self.places(network.entry_link[at_home])
+        self._ending = self.values(network.ending)
+
+    def _delay(self) -> None:
+        """Set the times that vehicles and holes take, in steps."""
+        network = self.network
+        numbers = self.numbers
+        free_steps = numbers.time_factor * network.free_time / self.dt
+        along = np.maximum(np.round(free_steps), 1).astype(int)
+        halfway = np.maximum(np.round(free_steps / 2), 1).astype(int)
+        speed = (network.length + network.behind) / network.free_time
+        flow = numbers.saturation / (REACTION_S + VEHICLE_M / speed)
+        wave = flow / (1.0 / numbers.spacing - flow / speed)
+        # The newest count is that of now. Between two steps counts change evenly.
+        wave_steps = network.length / wave / self.dt + 1.0
+        backwards = np.floor(wave_steps).astype(int)
+        self._earlier = self.values(wave_steps - backwards)
+        self._along = Delay(along[network.entry_link], self.device)
+        self._halfway = Delay(halfway, self.device)
+        self._backwards = Delay(backwards, self.device)
+        self._before = Delay(backwards + 1, self.device)
+
+    def _limit(self) -> None:
+        """Set the storage of links, and the most vehicles that move in a step."""
+        network = self.network
+        numbers = self.numbers
+        lanes = np.bincount(network.lane_link, minlength=self.links)
+        most_in = INFLOW * self.dt * lanes
+        # A shorter link would hold up the flow that its lanes can take within a step.
+        storage = np.maximum(lanes * network.length / numbers.spacing, 2.0 * most_in)
+        self.storage = self.values(storage)
+        self._most_in = self.values(most_in)
+        saturation = numbers.saturation * self.dt / (REACTION_S + VEHICLE_M / network.speed)
+        movement = network.turn_movement[network.served]
+        fastest = np.zeros(len(network.lane_link))
+        np.maximum.at(fastest, network.server, saturation[movement])
+        fastest[fastest == 0.0] = saturation.max()  # lanes on which trips end
+        self._first_of_lane = self.values(fastest)
+        of_movement = np.zeros(self.movements)
+        np.maximum.at(of_movement, movement, fastest[network.server])
+        lanes_of_turn = np.bincount(network.served)
+        self._lane_share = self.values(1.0 / lanes_of_turn[network.served])
+        self._pace = self.values(saturation / of_movement)
+        self._per_step = self.values(saturation)
+
+    def values(self, numbers: np.ndarray) -> Tensor:
+        """Return an array of numbers as a tensor of this model."""
+        return torch.as_tensor(np.asarray(numbers), dtype=self.dtype, device=self.device)
+
+    def places(self, numbers: np.ndarray) -> Tensor:
+        """Return an array of places as a tensor of this model."""
+        return torch.as_tensor(np.asarray(numbers), dtype=torch.long, device=self.device)
+
+    def sums(self, values: Tensor, place: Tensor, count: int) -> Tensor:
+        """Return sums (B, count) of `values` (B, n) with the same `place` (n,)."""
+        zeros = torch.zeros(len(values), count, dtype=self.dtype, device=self.device)
+        return zeros.index_add(1, place, values)
+
+    def by_link(self, entries: Tensor) -> Tensor:
+        """Return the sums (B, L) of counts by entry (B, E)."""
+        return self.sums(entries, self.link_of_entry, self.links)
+
+    def start(self, batch: int) -> Traffic:
+        """Return the empty city."""
+
+        def empty(count: int) -> Tensor:
+            return torch.zeros(batch, count, dtype=self.dtype, device=self.device)
+
+        return Traffic(
+            held=empty(self.entries),
+            due=empty(self.entries),
+            outside=empty(self.links),
+            queue=empty(self.entries),
+            first=empty(len(self.onward)),
+            standing=empty(len(self._link_entered)),
+            stopping=empty(self.links),
+            inside=empty(self.links),
+            passed=empty(self.movements),
+            completed=empty(self.links),
+            entered=tuple(empty(self.entries) for _ in range(self._along.longest)),
+            ending=tuple(empty(self.links) for _ in range(self._halfway.longest)),
+            left=tuple(empty(self.links) for _ in range(self._before.longest)),
+        )
+
+    def ways(self, cells: Tensor, draw: Tensor) -> Ways:
+        """Return the ways with these cells (-, (B, C)).
+
+        draw: number of the draw of trips of each rollout (B,)
+        """
+        ending = self._ending.index_select(0, draw)
+        return Ways(cells, 1.0 - ending, ending.index_select(1, self._home))
+
+    def step(
+        self, traffic: Traffic, begin: Tensor, light: Tensor, yields: Tensor, ways: Ways
+    ) -> Traffic:
+        """Return the state a step later.
+
+        begin: trips that may begin from now on, by entry (veh, (B, E))
+        light: green of each movement in this step, with gates (-, (B, M))
+        yields: share of this green in which it gives way (-, (B, M))
+        ways: of the vehicles
+        """
+        # Vehicles arrive at the queue; trips end before it or in it.
+        queue = traffic.queue + self._along.read(traffic.entered)
+        ends = self._halfway.read(traffic.ending)
+        in_queue = ends * (traffic.inside / self.storage).clamp(max=1.0)
+        stopping = traffic.stopping + in_queue
+
+        # 1. The first vehicles.
+        in_lane = traffic.standing.index_select(1, self._served) * self._lane_share
+        in_lane = self.sums(in_lane, self._server, len(self._link_of_lane))
+        room = self._first_of_lane * (1.0 - in_lane).clamp(min=0.0)
+        room = self.sums(room, self._link_of_lane, self.links)
+        moving_up = (room / self.by_link(queue).clamp(min=LEAST)).clamp(max=1.0)
+        ahead = queue * moving_up.index_select(1, self.link_of_entry)
+        stopped = stopping * (2.0 * moving_up).clamp(max=1.0)
+        first = traffic.first + ahead.index_select(1, self.entry_of_cell) * ways.cells
+        by_turn = self.sums(first, self._turn_of_cell, len(self._link_entered))
+
+        # 2. Those that can go, and the trips that can begin.
+        green = self._green(traffic, by_turn, light, yields)
+        due = traffic.due + begin
+        waiting = self.by_link(due)
+        put = (self._most_in / waiting.clamp(min=LEAST)).clamp(max=1.0)
+        wanted = self.sums(by_turn * green, self._link_entered, self.links) + waiting * put
+
+        # 3. and 4. Room on the next link, and flows.
+        rho = (self._room(traffic) / wanted.clamp(min=LEAST)).clamp(max=1.0)
+        going = green * rho.index_select(1, self._link_entered)
+        leaving = first * going.index_select(1, self._turn_of_cell)
+        flow = by_turn * going
+        entered = self.sums(leaving, self.onward, self.entries)
+        passed = self.sums(flow, self._movement_of_turn, self.movements)
+        left = self.sums(passed, self._link_left, self.links)
+        put = put * rho
+        begun = due * put.index_select(1, self.link_of_entry)
+        completed = ends - in_queue + stopped
+        coming = self.sums(flow, self._link_entered, self.links) + waiting * put
+        # Trips begin anywhere along the street: half of them here at its end.
+        half = 0.5 * begun
+        ending = entered.index_select(1, self._home) * ways.ends
+        return Traffic(
+            held=traffic.held,
+            due=due - begun,
+            outside=waiting - waiting * put,
+            queue=queue - ahead + half,
+            first=first - leaving,
+            standing=by_turn - flow,
+            stopping=stopping - stopped,
+            inside=traffic.inside + coming - left - completed,
+            passed=passed,
+            completed=traffic.completed + completed,
+            entered=(*traffic.entered[1:], entered * ways.goes_on + half),
+            ending=(*traffic.ending[1:], self.sums(ending, self._home_link, self.links)),
+            left=(*traffic.left[1:], traffic.left[-1] + left),
+        )
+
+    def _green(self, traffic: Traffic, by_turn: Tensor, light: Tensor, yields: Tensor) -> Tensor:
+        """Return the share phi of first vehicles that can go (-, (B, T)).
+
+        A vehicle that stood in front goes first, at the headway of its movement; those that arrive
+        go at the pace of their lane.
+        """
+        foes = traffic.passed.index_select(1, self._foe) / self.dt
+        gap = torch.exp(-self.numbers.gap * self.sums(foes, self._yielding, self.movements))
+        open_share = light * (1.0 - yields * (1.0 - gap))
+        arriving = (self._pace * open_share).index_select(1, self._movement_of_turn)
+        leader = (self._per_step * open_share).clamp(max=1.0)
+        leader = leader.index_select(1, self._movement_of_turn)
+        stood = traffic.standing / by_turn.clamp(min=EPSILON)
+        return arriving + (leader - arriving) * stood
+
+    def _room(self, traffic: Traffic) -> Tensor:
+        """Return the vehicles R that each link can receive (veh, (B, L))."""
+        later = self._backwards.read(traffic.left)
+        before = self._before.read(traffic.left)
+        reached = later + self._earlier * (before - later)
+        free = self.storage - traffic.inside - (traffic.left[-1] - reached)
+        return free.clamp(min=0.0).minimum(self._most_in)
+
+    def under_way(self, traffic: Traffic) -> Tensor:
+        """Return all vehicles by link and destination (veh, (B, L, R))."""
+        regions = self.network.regions
+
+        def driving(history: tuple[Tensor, ...], steps: np.ndarray) -> Tensor:
+            age = torch.arange(len(history), 0, -1, device=self.device)[:, None, None]
+            behind = age <= self.places(steps)
+            return (torch.stack(history) * behind).sum(0)
+
+        first = self.sums(traffic.first, self.entry_of_cell, self.entries)
+        entries = traffic.queue + first + driving(traffic.entered, self._along.steps)
+        place = self.network.entry_link * regions + self.network.destination
+        total = self.sums(entries, self.places(place), self.links * regions)
+        ends = traffic.stopping + driving(traffic.ending, self._halfway.steps)
+        place = np.arange(self.links) * regions + self.network.region
+        return total.index_add(1, self.places(place), ends).view(-1, self.links, regions)

@@ -1,0 +1,298 @@
+"""Differentiable rollouts of the link model of a city."""
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from nmfd.arrays import PerTurn
+from nmfd.model.links.drivers import Drivers
+from nmfd.model.links.flows import LEAST, Flows, Numbers, Traffic, Ways
+from nmfd.model.links.network import LinkNetwork
+from nmfd.model.links.signals import (
+    MAX_PRESSURE,
+    Gates,
+    Lights,
+    MaxPressure,
+    Programmes,
+    Stages,
+)
+from nmfd.model.scenario import Scenario
+from nmfd.runs import config
+from nmfd.runs.config import Share, setting
+from nmfd.tensors import PerPair, PerRegion
+from nmfd.tensors import PerTurn as Turns
+
+OPEN_SHARE = 0.95  # of what a boundary can let through; above it a gate is open
+
+
+class Choices(config.Settings):
+    """Signals and drivers of the city; other values are not in the link model."""
+
+    signals: Literal["fixed", "max-pressure"] = setting("control of the signals", "fixed")
+    lookahead: float = setting("as of max-pressure in a city", 1.0, unit="s", gt=0.0)
+    chain_limit: Share = setting(
+        "share of a link's room beyond which no gate holds vehicles there; 0: no limit", 0.6
+    )
+    guided: bool = setting("drivers are guided by travel times without a command", False)
+    compliance: Share = setting("share of the drivers who follow the guidance", 1.0)
+    rerouting: Share = setting("share of the drivers who weigh travel times by themselves", 0.0)
+    metering: float = setting("metering without a command; 0: never", 0.0, ge=0.0, le=0.0)
+    measurement: Literal["exact"] = setting("what controllers see", "exact")
+
+
+def choices_of(scenario: Scenario) -> Choices:
+    """Return the choices of the table [sumo].
+
+    Raises: InputError for a value that the link model has not
+    """
+    own = {name: value for name, value in scenario.sumo.items() if name in Choices.model_fields}
+    return config.checked(Choices, own, scenario.where, "sumo.")
+
+
+class Commands(NamedTuple):
+    """Commands of one control interval.
+
+    None: no limit, and drivers on their own ways.
+
+    gates: share of what each boundary can let through (-, (B, R, R), [i, h] from i to h)
+    metering: largest rate of trips that may begin in each region (veh/s, (B, R))
+    splits: share of the vehicles in i bound for j that head for h (-, (B, R, R, R), [i, h, j])
+    prices: added share of the travel time through each region (-, (B, R))
+    """
+
+    gates: PerPair | None = None
+    metering: PerRegion | None = None
+    splits: Turns | None = None
+    prices: PerRegion | None = None
+
+
+class LinkState(NamedTuple):
+    """State of B rollouts at the beginning of a control interval.
+
+    interval: its number
+    draw: number of the draw of trips of each rollout (B,)
+    used: of the gates' windows; stages: of max-pressure
+    spent: time spent so far (veh s, (B,))
+    present: vehicles on each link, summed over the last interval (veh s, (B, L))
+    gone: vehicles that left each link in it (veh, (B, L))
+    realised: share of green that each boundary was given in it (-, (B, R, R))
+    """
+
+    interval: int
+    draw: Tensor
+    traffic: Traffic
+    used: Tensor
+    stages: Stages | None
+    spent: Tensor
+    present: Tensor
+    gone: Tensor
+    realised: Tensor
+
+
+class LinkModel:
+    """Rollouts of one city: `start`, then `advance` once per control interval."""
+
+    def __init__(
+        self,
+        network: LinkNetwork,
+        step: float,
+        *,
+        nominal: PerTurn | None = None,
+        numbers: Numbers | None = None,
+        choices: Choices | None = None,
+        dt: float = 3.0,
+        dtype: torch.dtype = torch.float32,
+        device: str = "cpu",
+    ):
+        """step: control interval (s), a multiple of dt
+        dt: time step, a whole number (s)
+        nominal: split ratios without guidance (-, (R, R, R))
+        """
+        self.network = network
+        self.step = step
+        self._choices = choices or Choices()
+        self.flows = Flows(network, numbers or Numbers(), dt=dt, dtype=dtype, device=device)
+        self._steps = round(step / dt)
+        by_pressure = self._choices.signals == MAX_PRESSURE
+        self._gates = Gates(self.flows, by_cycle=by_pressure)
+        self._programmes = Programmes(self.flows, self._gates.opens)
+        self._pressure = None
+        if by_pressure:
+            self._pressure = MaxPressure(self.flows, self._choices.lookahead)
+        self._drivers = Drivers(self.flows, nominal)
+        self._number()
+
+    def _number(self) -> None:
+        """Set regions and boundaries of entries, links and gates."""
+        flows = self.flows
+        network = self.network
+        regions = network.regions
+        region = network.region
+        self._origin = flows.values(network.origin)
+        entry_region = region[network.entry_link]
+        self._pair_of_entry = flows.places(entry_region * regions + network.destination)
+        self._region_of_entry = flows.places(entry_region)
+        self._region_of_link = flows.places(region)
+        entered = np.zeros(flows.movements, dtype=int)
+        entered[network.turn_movement] = region[network.turn_link]
+        gated = self._gates.movements
+        link = network.movement_link[gated]
+        boundary = region[link] * regions + entered[gated]
+        self._boundary_of_gate = flows.places(boundary)
+        self._link_of_gate = flows.places(link)
+        served = network.turn_movement[network.served]
+        lanes = np.bincount(served, minlength=flows.movements)[gated]
+        total = np.bincount(boundary, lanes, regions**2)[boundary]
+        self._weight_of_gate = flows.values(lanes / total)
+
+    def start(self, batch: int, draws: Sequence[int] = (0,)) -> LinkState:
+        """Return the empty city at the beginning of interval 0.
+
+        draws: numbers of the draws of trips; the rollouts take them in turn
+        """
+        regions = self.network.regions
+        draw = np.resize(np.array(draws) % len(self.network.origin), batch)
+        traffic = self.flows.start(batch)
+        return LinkState(
+            interval=0,
+            draw=self.flows.places(draw),
+            traffic=traffic,
+            used=self._gates.start(batch),
+            stages=None if self._pressure is None else self._pressure.start(batch),
+            spent=traffic.inside.new_zeros(batch),
+            present=torch.zeros_like(traffic.inside),
+            gone=torch.zeros_like(traffic.inside),
+            realised=traffic.inside.new_ones(batch, regions, regions),
+        )
+
+    def advance(self, state: LinkState, demand: PerPair, commands: Commands) -> LinkState:
+        """Return the state one control interval later.
+
+        demand: trips that are due (veh/s, (B, R, R))
+        """
+        if torch.is_grad_enabled():
+            return checkpoint(self._advance, state, demand, commands, use_reentrant=False)
+        return self._advance(state, demand, commands)
+
+    def _advance(self, state: LinkState, demand: PerPair, commands: Commands) -> LinkState:
+        flows = self.flows
+        dt = flows.dt
+        traffic = state.traffic
+        used = state.used
+        stages = state.stages
+        origin = self._origin.index_select(0, state.draw)
+        due = demand.flatten(1).index_select(1, self._pair_of_entry) * origin * dt
+        light, yields, opens = self._programmes.read(state.interval * self.step, self._steps)
+        opens = opens[:, self._gates.movements]
+        ways = self._ways(state, commands)
+        share = None
+        mean_share = torch.zeros_like(used)
+        present = torch.zeros_like(traffic.inside)
+        outside = torch.zeros_like(traffic.inside)
+        held = torch.zeros_like(traffic.held)
+        for n in range(self._steps):
+            released = due
+            if commands.metering is not None or n == 0:
+                traffic, released = self._metered(traffic, due, commands.metering)
+            lights = Lights(light[n : n + 1], yields[n : n + 1])
+            if self._pressure is not None and stages is not None:
+                number = state.interval * self._steps + n
+                stages, lights = self._pressure.step(number, stages, traffic.inside, lights)
+            shown = lights.light
+            if commands.gates is not None:
+                share = self._gate_shares(commands.gates, traffic.inside)
+                mean_share = mean_share + share / self._steps
+                shown = shown.expand(len(used), -1)
+                used, shown = self._gates.limit(used, shown, opens[n], share)
+            traffic = flows.step(traffic, released, shown, lights.yields, ways)
+            present = present + traffic.inside
+            outside = outside + traffic.outside
+            if commands.metering is not None:
+                held = held + traffic.held
+        realised = state.realised
+        if commands.gates is not None:
+            realised = self._realised(commands.gates, mean_share)
+        before = state.traffic
+        gone = traffic.left[-1] - before.left[-1] + traffic.completed - before.completed
+        return LinkState(
+            interval=state.interval + 1,
+            draw=state.draw,
+            traffic=traffic,
+            used=used,
+            stages=stages,
+            spent=state.spent + dt * (present.sum(1) + outside.sum(1) + held.sum(1)),
+            present=dt * present,
+            gone=gone,
+            realised=realised,
+        )
+
+    def _ways(self, state: LinkState, commands: Commands) -> Ways:
+        """Return the ways of an interval."""
+        choices = self._choices
+        drivers = self._drivers
+        static = drivers.static(state.draw)
+        compliance = choices.rerouting
+        by_splits = commands.splits is not None and commands.prices is None
+        if by_splits or choices.guided or commands.prices is not None:
+            compliance = choices.compliance
+        cells = static
+        if by_splits:
+            cells = drivers.by_splits(static, commands.splits)
+        elif compliance > 0.0:
+            cells = drivers.by_times(static, state.present, state.gone, commands.prices)
+        cells = static + compliance * (cells - static)
+        return self.flows.ways(cells.to(self.flows.dtype), state.draw)
+
+    def _metered(
+        self, traffic: Traffic, due: Tensor, metering: PerRegion | None
+    ) -> tuple[Traffic, Tensor]:
+        """Return the state, and the trips that may begin, by entry (veh, (B, E))."""
+        held = traffic.held + due
+        if metering is None:
+            return traffic._replace(held=torch.zeros_like(held)), held
+        by_region = self.flows.sums(held, self._region_of_entry, self.network.regions)
+        share = (metering * self.flows.dt / by_region.clamp(min=LEAST)).clamp(max=1.0)
+        released = held * share.index_select(1, self._region_of_entry)
+        return traffic._replace(held=held - released), released
+
+    def _gate_shares(self, gates: PerPair, inside: Tensor) -> Tensor:
+        """Return the share of green of each gate (-, (B, gates)).
+
+        As in cosim.plant.room, a gate opens while its street fills: from half the limit on.
+        """
+        share = gates.flatten(1).index_select(1, self._boundary_of_gate)
+        share = torch.where(share >= OPEN_SHARE, 1.0, share)
+        limit = self._choices.chain_limit
+        if limit:
+            full = (inside / self.flows.storage).index_select(1, self._link_of_gate)
+            share = torch.maximum(share, (2.0 * full / limit - 1.0).clamp(0.0, 1.0))
+        return share
+
+    def _realised(self, gates: PerPair, share: Tensor) -> PerPair:
+        """Return the mean share of green of each boundary.
+
+        It is the command where no gate obeys.
+        """
+        regions = self.network.regions
+        given = self.flows.sums(share * self._weight_of_gate, self._boundary_of_gate, regions**2)
+        obeys = torch.zeros(regions**2, dtype=torch.bool, device=given.device)
+        obeys[self._boundary_of_gate] = True
+        return torch.where(obeys.view(regions, regions), given.view(-1, regions, regions), gates)
+
+    def accumulation(self, state: LinkState) -> PerPair:
+        """Return the vehicles in region i bound for j (veh, (B, R, R))."""
+        under_way = self.flows.under_way(state.traffic)
+        regions = self.network.regions
+        zeros = under_way.new_zeros(len(under_way), regions, regions)
+        return zeros.index_add(1, self._region_of_link, under_way)
+
+    def backlog(self, state: LinkState) -> PerPair:
+        """Return the trips that wait outside i, bound for j (veh, (B, R, R))."""
+        regions = self.network.regions
+        outside = state.traffic.held + state.traffic.due
+        total = self.flows.sums(outside, self._pair_of_entry, regions**2)
+        return total.view(-1, regions, regions)

@@ -1,0 +1,378 @@
+"""The link model: mass, derivatives, capacity, spillback, controls, and the plant around it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from commands import error_line, good
+from commands import nmfd as nmfd_command
+
+from cosim.evaluation.links import link_network, write_links
+from nmfd import api
+from nmfd.errors import InputError
+from nmfd.model.links.flows import REACTION_S, VEHICLE_M
+from nmfd.model.links.model import Choices, Commands, LinkModel
+from nmfd.model.links.network import LinkNetwork, read_links
+from nmfd.model.links.plant import LinkPlant, links_file
+
+SCENARIO = api.load_scenario("grid7_peak")
+CYCLE_S = 60
+GREEN_S = 30
+ONE_LANE = {"lane_link": np.arange(3), "server": np.array([0, 0, 2])}
+SPEED = 10.0  # m/s on junctions
+STEP_S = 90.0
+NOMINAL = np.zeros((3, 3, 3))
+NOMINAL[0, 1, 1] = 0.7
+NOMINAL[0, 2, 1] = 0.3
+NOMINAL[2, 1, 1] = 1.0
+
+
+def triangle(length: float = 300.0) -> LinkNetwork:
+    """Street a in region 0 leads to b in region 1, or by way of d in region 2.
+
+    Trips go from a to b. The signal at the end of a has 30 s of green for a -> b, where a gate is;
+    d -> b gives way to it.
+    """
+    green = np.arange(CYCLE_S) < GREEN_S
+    light = np.concatenate([green, np.ones(2)]).astype(float)
+    return LinkNetwork(
+        regions=3,
+        street=np.array(["a", "b", "d"]),
+        length=np.full(3, length),
+        behind=np.zeros(3),
+        free_time=np.full(3, length / 15.0),
+        region=np.array([0, 1, 2]),
+        lane_link=np.array([0, 0, 1, 2]),
+        movement_link=np.array([0, 0, 2]),
+        speed=np.full(3, SPEED),
+        turn_movement=np.arange(3),
+        turn_link=np.array([1, 2, 1]),
+        served=np.arange(3),
+        server=np.array([0, 1, 3]),
+        entry_link=np.arange(3),
+        destination=np.full(3, 1),
+        ending=np.array([[0.0, 1.0, 0.0]]),
+        origin=np.array([[1.0, 0.0, 0.0]]),
+        cell_turn=np.arange(3),
+        cell_entry=np.array([0, 0, 2]),
+        cell_onward=np.array([1, 2, 1]),
+        cell_share=np.array([[0.7, 0.3, 1.0]]),
+        yielding=np.array([2]),
+        foe=np.array([0]),
+        cycle=np.array([CYCLE_S, 1, 1]),
+        begin=np.array([0, CYCLE_S, CYCLE_S + 1]),
+        light=light,
+        yields=np.concatenate([np.zeros(CYCLE_S + 1), np.ones(1)]),
+        gated=np.array([True, False, False]),
+        signal=np.array([0, -1, -1]),
+        stages=np.array([2]),
+        stage_light=np.array([[1.0, 0.0], [0.0, 0.0], [0.0, 0.0]]),
+        stage_yields=np.zeros((3, 2)),
+        stage_loss=np.full((1, 2, 2), 3.0),
+        stage_least=np.full((1, 2), 5.0),
+        pressure_movement=np.array([0, 0]),
+        pressure_link=np.array([0, 1]),
+        pressure_weight=np.array([0.7, -1.0]),
+        gain_stage=np.array([0]),
+        gain_movement=np.array([0]),
+        gain=np.array([1.0]),
+    )
+
+
+def model_of(network: LinkNetwork | None = None, **choices) -> LinkModel:
+    return LinkModel(
+        network or triangle(),
+        STEP_S,
+        nominal=NOMINAL,
+        choices=Choices(**choices),
+        dtype=torch.float64,
+    )
+
+
+def demand_of(rate) -> torch.Tensor:
+    demand = torch.zeros(1, 3, 3, dtype=torch.float64)
+    return demand.index_put((torch.tensor(0), torch.tensor(0), torch.tensor(1)), rate)
+
+
+def rollout(model, rate, commands=None, intervals=6):
+    """All states; `rate`: of the trips from a to b (veh/s), or its function of the interval."""
+    states = [model.start(1)]
+    for k in range(intervals):
+        now = rate(k) if callable(rate) else rate
+        demand = demand_of(torch.as_tensor(now, dtype=torch.float64))
+        states.append(model.advance(states[-1], demand, commands or Commands()))
+    return states
+
+
+def vehicles(model, state) -> torch.Tensor:
+    """All trips that were due until now, wherever they are."""
+    outside = model.backlog(state).sum()
+    return model.accumulation(state).sum() + outside + state.traffic.completed.sum()
+
+
+def all_commands(gate=0.4, metering=0.3, share=0.5, price=None):
+    gates = torch.ones(1, 3, 3, dtype=torch.float64)
+    gates[0, 0, 1] = gate
+    splits = torch.as_tensor(NOMINAL).unsqueeze(0).clone()
+    splits[0, 0, 1, 1] = share
+    splits[0, 0, 2, 1] = 1.0 - share
+    rates = torch.full((1, 3), metering, dtype=torch.float64)
+    prices = None
+    if price is not None:
+        prices = torch.full((1, 3), price, dtype=torch.float64)
+    return Commands(gates, rates, splits, prices)
+
+
+@pytest.mark.parametrize("signals", ["fixed", "max-pressure"])
+@pytest.mark.parametrize("commands", [None, all_commands(), all_commands(price=2.0)])
+def test_no_vehicle_appears_or_vanishes(signals, commands):
+    model = model_of(signals=signals, guided=commands is None)
+    last = rollout(model, 1.2, commands)[-1]
+    assert float(vehicles(model, last)) == pytest.approx(1.2 * 6 * STEP_S, abs=1e-9)
+    assert float(model.accumulation(last).min()) >= 0.0
+    assert float(model.accumulation(last).sum()) == pytest.approx(
+        float(last.traffic.inside.sum()), abs=1e-9
+    )
+
+
+def test_the_derivative_of_the_mass_is_exact():
+    rate = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
+    model = model_of(guided=True)
+    last = rollout(model, rate)[-1]
+    (slope,) = torch.autograd.grad(vehicles(model, last), rate)
+    assert float(slope) == pytest.approx(6 * STEP_S, abs=1e-9)
+
+
+def test_a_free_trip_takes_its_free_time():
+    """Half of the trips begin at the end of a; all end halfway along b."""
+    model = model_of(replace(triangle(), light=np.ones(CYCLE_S + 2)))
+    rate = 0.02
+    states = rollout(model, rate)
+    by_way_of_d = 0.3
+    expected = 20.0 * (0.5 + 0.5 + by_way_of_d)
+    inside = float(states[-1].traffic.inside.sum())
+    assert inside / rate == pytest.approx(expected, abs=8.0)  # a step on each link
+
+
+def test_a_queue_discharges_at_the_saturation_flow():
+    """All want to go straight on: 30 s of green of every minute."""
+    network = replace(triangle(), cell_share=np.array([[1.0, 0.0, 1.0]]), **ONE_LANE)
+    model = model_of(network)
+    states = rollout(model, 1.0, intervals=16)
+    flow = (states[-1].traffic.left[-1] - states[7].traffic.left[-1])[0, 0] / (9 * STEP_S)
+    saturation = 1.0 / (REACTION_S + VEHICLE_M / SPEED)
+    assert float(flow) == pytest.approx(saturation * GREEN_S / CYCLE_S, rel=0.05)
+
+
+def test_a_blocked_turn_blocks_its_link_and_the_trips_that_begin():
+    network = triangle()
+    light = network.light.copy()
+    light[:CYCLE_S] = 0.0
+    network = replace(network, light=light, **ONE_LANE)
+    model = model_of(network)
+    last = rollout(model, 0.5, intervals=12)[-1]
+    assert float(last.traffic.left[-1][0, 0]) < 10.0
+    assert float(last.traffic.inside[0, 0]) <= float(model.flows.storage[0]) + 1e-9
+    assert float(model.backlog(last).sum()) > 400.0
+
+
+def test_a_gate_leaves_its_share_of_green():
+    network = replace(triangle(), cell_share=np.array([[1.0, 0.0, 1.0]]), **ONE_LANE)
+    model = model_of(network, chain_limit=0.0)
+    states = rollout(model, 1.0, all_commands(gate=0.2, metering=9.0, share=1.0), intervals=16)
+    passed = float((states[-1].traffic.left[-1] - states[7].traffic.left[-1])[0, 0])
+    green = GREEN_S - 0.8 * (GREEN_S - 5.0)
+    saturation = 1.0 / (REACTION_S + VEHICLE_M / SPEED)
+    # The first vehicle of a queue starts late.
+    assert passed / (9 * STEP_S) == pytest.approx(saturation * (green - 1.0) / CYCLE_S, rel=0.05)
+    assert float(states[-1].realised[0, 0, 1]) == pytest.approx(0.2)
+
+
+def test_metering_admits_its_rate():
+    model = model_of()
+    states = rollout(model, 0.5, Commands(metering=torch.full((1, 3), 0.1).double()))
+    entered = 6 * STEP_S * 0.5 - float(model.backlog(states[-1]).sum())
+    assert entered == pytest.approx(6 * STEP_S * 0.1, abs=1.0)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.7, 1.0])
+def test_drivers_head_for_commanded_regions(share):
+    model = model_of()
+    state = rollout(model, 0.1, intervals=1)[-1]
+    cells = model._ways(state, all_commands(share=share)).cells
+    torch.testing.assert_close(cells, torch.tensor([[share, 1.0 - share, 1.0]]).double())
+
+
+def test_drivers_avoid_delay_and_prices():
+    model = model_of(guided=True)
+    free = rollout(model, 0.01, intervals=2)[-1]
+    jammed = rollout(model, 1.2)[-1]
+    before = model._ways(free, Commands()).cells[0]
+    delay = torch.zeros_like(jammed.present)
+    delay[0, 1] = 9000.0
+    delayed = free._replace(present=delay, gone=torch.full_like(delay, 30.0))
+    prices = torch.tensor([[0.0, 0.0, 5.0]]).double()
+    priced = model._ways(free, Commands(prices=prices)).cells[0]
+    assert float(model._ways(delayed, Commands()).cells[0, 0]) == pytest.approx(
+        float(before[0]), 0.1
+    )
+    assert float(priced[1]) < 0.3 * float(before[1])
+
+
+def test_partial_compliance_mixes_the_shares():
+    model = model_of(compliance=0.25)
+    state = rollout(model, 0.1, intervals=1)[-1]
+    cells = model._ways(state, all_commands(share=0.3)).cells
+    assert float(cells[0, 0]) == pytest.approx(0.7 + 0.25 * (0.3 - 0.7))
+
+
+def test_gradients_are_those_of_central_differences():
+    """Gates, metering, splits and prices, where traffic flows and they bind."""
+    model = model_of(chain_limit=0.0, guided=True)
+
+    def spent(numbers):
+        gate, metering, share, price = numbers
+        gates = torch.ones(1, 3, 3, dtype=torch.float64)
+        gates = gates.index_put(tuple(map(torch.tensor, (0, 0, 1))), gate)
+        splits = all_commands().splits.index_put(tuple(map(torch.tensor, (0, 0, 1, 1))), share)
+        splits = splits.index_put(tuple(map(torch.tensor, (0, 0, 2, 1))), 1.0 - share)
+        rates = metering.expand(1, 3)
+        prices = torch.stack([price * 0.0, price * 0.0, price]).unsqueeze(0)
+        by_splits = Commands(gates, rates, splits)
+        by_prices = Commands(gates, rates, None, prices)
+        state = model.start(1)
+        demand = demand_of(torch.tensor(0.45, dtype=torch.float64))
+        for commands in (by_splits, by_splits, by_prices, by_prices, by_prices):
+            state = model.advance(state, demand, commands)
+        return state.spent.sum()
+
+    numbers = torch.tensor([0.5, 0.3, 0.6, 0.5], dtype=torch.float64, requires_grad=True)
+    (gradient,) = torch.autograd.grad(spent(numbers), numbers)
+    differences = []
+    for n in range(4):
+        change = torch.zeros(4, dtype=torch.float64)
+        change[n] = 1e-4
+        with torch.no_grad():
+            rise = spent(numbers + change) - spent(numbers - change)
+        differences.append(float(rise) / 2e-4)
+    cosine = torch.nn.functional.cosine_similarity(gradient, torch.tensor(differences).double(), 0)
+    assert float(cosine) > 0.99
+    assert bool((gradient != 0.0).all())
+
+
+@pytest.mark.slow
+def test_gradients_of_grid7_are_those_of_central_differences():
+    """Metering of each region, a gate around the centre, a price of it: 9 numbers."""
+    scenario = api.loaded("grid7_peak", demand=0.8)
+    network = read_links(links_file(scenario))
+    choices = Choices(chain_limit=0.0)
+    model = LinkModel(network, STEP_S, choices=choices, dtype=torch.float64)
+    demand = torch.as_tensor(scenario.demand)
+
+    def spent(numbers):
+        gates = torch.ones(len(numbers), 7, 7, dtype=torch.float64)
+        gates = gates.index_fill(2, torch.tensor([3]), 0.0)
+        gates = gates + torch.eye(7)[3].double() * numbers[:, 7, None, None]
+        prices = torch.eye(7)[3].double() * numbers[:, 8:9]
+        state = model.start(len(numbers))
+        for k in range(20):
+            due = demand[k].expand(len(numbers), 7, 7)
+            state = model.advance(state, due, Commands(gates, numbers[:, :7], None, prices))
+        return state.spent
+
+    numbers = torch.tensor([[0.3, 0.3, 0.25, 0.3, 0.25, 0.3, 0.3, 0.5, 0.5]]).double()
+    numbers.requires_grad_()
+    (gradient,) = torch.autograd.grad(spent(numbers).sum(), numbers)
+    change = 1e-5 * torch.eye(9, dtype=torch.float64)
+    with torch.no_grad():
+        up, down = spent(torch.cat([numbers + change, numbers - change])).chunk(2)
+    differences = (up - down) / 2e-5
+    torch.testing.assert_close(gradient[0], differences, rtol=1e-3, atol=0.0)
+
+
+def test_a_batch_gives_what_single_rollouts_give():
+    model = model_of()
+    rates = torch.tensor([0.2, 0.9], dtype=torch.float64)
+    demand = torch.cat([demand_of(rate) for rate in rates])
+    state = model.start(2)
+    for _ in range(4):
+        state = model.advance(state, demand, Commands())
+    for number, rate in enumerate((0.2, 0.9)):
+        alone = rollout(model, rate, intervals=4)[-1]
+        assert float(state.spent[number]) == pytest.approx(float(alone.spent[0]), rel=1e-12)
+
+
+@pytest.mark.parametrize("name", ["pi-gating", "dpc-pcrg"])
+def test_controllers_run_on_streets(name):
+    result = api.run("grid7_peak", name, plant="links", steps=4)
+    assert result.data.attrs["plant"] == "links"
+    assert np.isfinite(result.total_time_spent)
+    assert result.total_time_spent > 0.0
+
+
+def test_the_same_seed_gives_the_same_run_and_another_one_other_routes():
+    first, again, other = (
+        api.run("grid7_peak", "no-control", plant="links", steps=4, seed=seed) for seed in (0, 0, 1)
+    )
+    assert np.array_equal(first["accumulation"], again["accumulation"])
+    assert not np.array_equal(first["accumulation"], other["accumulation"])
+
+
+@pytest.mark.parametrize(
+    "key, value", [("signals", "actuated"), ("metering", 1.2), ("measurement", "estimate")]
+)
+def test_what_streets_have_not_is_refused(key, value):
+    scenario = api.load_scenario("grid7_peak", {f"sumo.{key}": value})
+    with pytest.raises(InputError, match=f"sumo.{key}"):
+        LinkPlant(scenario)
+
+
+def test_a_missing_file_names_the_command(tmp_path):
+    failed = nmfd_command(
+        "benchmark", "economic_mpc", "--plant", "links", "--controllers", "greedy"
+    )
+    assert "write it with 'cosim links'" in error_line(failed, "nmfd")
+
+
+def test_a_file_of_another_kind_is_refused(tmp_path):
+    path = tmp_path / "links.npz"
+    path.write_text("no network")
+    with pytest.raises(InputError, match="is no network of links"):
+        read_links(path)
+
+
+def test_the_benchmark_takes_streets(tmp_path):
+    out = tmp_path / "runs"
+    words = ("--plant", "links", "--controllers", "no-control", "--steps", "1")
+    printed = good(nmfd_command("benchmark", "grid7_peak", *words, "--out", out))
+    assert "no-control" in printed
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """The streets of the demo city, and the file that has them."""
+    path = tmp_path_factory.mktemp("links") / "links.npz"
+    scenario = api.load_scenario("demo")
+    write_links(scenario, path, seeds=[1, 2])
+    return link_network(scenario, seeds=[1, 2]), path
+
+
+def test_a_city_is_written_and_read(written):
+    network, path = written
+    again = vars(read_links(path))
+    for name, value in vars(network).items():
+        assert np.array_equal(value, again[name]), name
+
+
+def test_shares_of_a_city_sum_to_one(written):
+    network, _ = written
+    for share in network.cell_share:
+        leaving = np.bincount(network.cell_entry, share)
+        assert np.allclose(leaving[leaving > 0.0], 1.0)
+
+
+def test_each_street_has_room_and_a_lane(written):
+    network, _ = written
+    assert np.array_equal(np.unique(network.lane_link), np.arange(len(network.length)))
+    assert (network.free_time > 0.0).all()
