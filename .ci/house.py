@@ -30,7 +30,7 @@ from pydantic import BaseModel
 
 ROOT = Path(__file__).parents[1]
 PICTURE = Path(__file__).with_name("house.svg")
-# 175,000 was the aim, and 205,000 with all that is to come. A step a line, options that are objects,
+# 175,000 was the aim, 205,000 with all that is to come. A step a line, options that are objects,
 # the guard and what cities do wrong took 25,000 more, the plant of streets 14,000: names and steps
 # were not cut to come under it.
 TOKENS = 220_000
