@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,9 +10,12 @@ import pytest
 from nmfd import api
 from nmfd.api import load_scenario
 from nmfd.closed_loop import run
+from nmfd.controllers.rules import filled
 from nmfd.errors import InputError
 from nmfd.metrics import summary
+from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
+from nmfd.model.regional_model import RegionalModel
 from nmfd.types import Observation, Status
 
 SCENARIO = load_scenario(Path(__file__).parents[1] / "scenarios" / "economic_mpc")
@@ -72,6 +76,47 @@ def test_the_integral_does_not_wind_up(long, then, limit):
         controller.act(seen(then * CRITICAL, intervals))
         gates.append(gate(controller.act(seen(then * CRITICAL, intervals + 1))))
     assert gates[0] == gates[1] != getattr(NETWORK, limit)
+
+
+def pair(bound, **facts):
+    """Two regions; of the trips that begin in 0, the share `bound` goes to 1."""
+    network = RegionalModel(
+        name="pair",
+        region_names=("0", "1"),
+        positions=np.array([[0.0, 0.0], [1000.0, 0.0]]),
+        adjacency=~np.eye(2, dtype=bool),
+        mfds=(NETWORK.mfds[0],) * 2,
+        u_min=0.1,
+        u_max=0.9,
+        **facts,
+    )
+    forecast = np.array([[[1.0 - bound, bound], [0.0, 1.0]]])
+    return SimpleNamespace(network=network, forecast=forecast, step=60.0)
+
+
+@pytest.mark.parametrize("bound", [0.5, 1.0])
+def test_open_gates_fill_a_region_with_what_its_neighbour_sends(bound):
+    largest = NETWORK.mfds[0].capacity
+    assert filled(pair(bound), 1) == pytest.approx(60.0 * bound * largest)
+
+
+def test_a_boundary_lets_in_no_more_than_its_capacity_and_holds_only_at_signals():
+    capacity = np.array([[0.0, 0.3], [0.3, 0.0]])
+    narrow = pair(1.0, capacity=capacity)
+    let_in = 60.0 * narrow.network.open_capacity[0, 1]
+    assert let_in < 60.0 * NETWORK.mfds[0].capacity
+    assert filled(narrow, 1) == pytest.approx(let_in)
+    half = np.array([[0.0, 0.5], [0.5, 0.0]])
+    assert filled(pair(1.0, capacity=capacity, controllable=half), 1) == pytest.approx(0.5 * let_in)
+
+
+def test_default_gains_correct_half_of_an_error_in_an_interval():
+    controller = api.controller("pi-gating", with_options(set_point=[3000.0]))
+    share = filled(planning_model(SCENARIO), CENTRE) / CRITICAL
+    controller.act(seen(3000.0))
+    error = 30.0 / CRITICAL
+    expected = 0.9 - (0.5 + 0.15) * error / share
+    assert gate(controller.act(seen(3030.0, 1))) == pytest.approx(expected)
 
 
 def test_one_step_by_hand():

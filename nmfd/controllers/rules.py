@@ -4,11 +4,17 @@ from typing import ClassVar
 
 import numpy as np
 
+from nmfd.arrays import PerPair, PerRegion
 from nmfd.controllers.base import Options
 from nmfd.errors import InputError
 from nmfd.model.planning import PlanningModel
 from nmfd.runs.config import PositiveNumbers, Problem, got, setting
 from nmfd.types import Controller, Controls, Observation
+
+# PI gating: shares of an error that one control interval corrects, as gates fill the region.
+PROPORTIONAL_SHARE = 0.5
+INTEGRAL_SHARE = 0.15
+LEAST_FILL = 0.05  # of the critical accumulation: larger gains would answer noise
 
 # Excitation.
 HOLD_INTERVALS = (3, 9)  # control intervals between two draws, from and to
@@ -76,9 +82,11 @@ class SetPoint(Options):
 class PiGating(SetPoint):
     """PI control of protected regions by the gates into them.
 
-    The equation is that of nmfd.controllers.rules.PiGate. The default gains are moderate ones: on
-    the benchmark kp from 0 to 5 and ki from 0.01 to 0.1 differ by less than 2 % in total time
-    spent. They are relative to the critical accumulation, so that they carry over to other cities.
+    The equation is that of nmfd.controllers.rules.PiGate. An accumulation answers a gate by the
+    vehicles that enter in one control interval, `filled` critical accumulations b. Larger gains
+    than about 3 / b swing from interval to interval. The default gains follow from the city:
+
+        kp = 0.5 / b,  ki = 0.15 / (b dt)
 
         >>> nmfd.run("economic_mpc", nmfd.PiGating(kp=2.0), steps=1).controller
         'pi-gating(kp=2.0)'
@@ -91,8 +99,12 @@ class PiGating(SetPoint):
         ge=0.1,
         le=1.0,
     )
-    kp: float = setting("proportional gain, per relative error", 1.0, unit="-", ge=0.0)
-    ki: float = setting("integral gain, per relative error", 0.01, unit="1/s", gt=0.0)
+    kp: float | None = setting(
+        "proportional gain, per relative error; by default from the city", None, unit="-", ge=0.0
+    )
+    ki: float | None = setting(
+        "integral gain, per relative error; by default from the city", None, unit="1/s", gt=0.0
+    )
 
     def make(self, planning: PlanningModel) -> "PiGate":
         """Return the controller. Raise InputError without a protected region."""
@@ -102,6 +114,45 @@ class PiGating(SetPoint):
             problem = "pi-gating needs at least one protected region, got none"
             raise InputError(f"{planning.where}: protected: {problem}; {remedy}")
         return PiGate(planning, self)
+
+
+def filled(planning: PlanningModel, region: int) -> float:
+    """Return the vehicles that open gates let into a region in an interval.
+
+    They are the largest flow into the region times the control interval (veh). The neighbours send
+    what the maximum of their MFDs discharges towards the region, by the forecast on nominal routes.
+    All boundaries together pass at most their capacities at u = 1. Of both, the share counts that
+    passes signals under control.
+    """
+    network = planning.network
+    passing = _passing(planning)
+    duration = passing  # share of time in a region, by destination
+    if network.exit_rates is not None:
+        duration = passing / network.exit_rates
+    in_total = duration.sum(axis=1)
+    bound = (network.nominal_splits[:, region] * passing).sum(axis=1)
+    largest = np.array([mfd.capacity for mfd in network.mfds])
+    sent = largest * bound / np.where(in_total > 0.0, in_total, 1.0)
+    obeying = network.adjacency[:, region].astype(float)
+    if network.controllable is not None:
+        obeying = network.controllable[:, region]
+    flow = float(obeying @ sent)
+    if network.open_capacity is not None:
+        flow = min(flow, float(obeying @ network.open_capacity[:, region]))
+    return flow * planning.step
+
+
+def _passing(planning: PlanningModel) -> PerPair:
+    """Return the trips of the forecast in region i bound for j ((R, R)), on nominal routes."""
+    network = planning.network
+    entering = planning.forecast.sum(axis=0)
+    passing = np.zeros_like(entering)
+    for _ in range(network.regions):  # no route passes more of them
+        passing += entering
+        entering = np.einsum("ihj,ij->hj", network.nominal_splits, entering)
+        if not entering.any():
+            break
+    return passing
 
 
 class PiGate:
@@ -116,21 +167,26 @@ class PiGate:
     the accumulation of outflow_share. u_hp(k-1) is the clipped value or, if the city reports it,
     the mean u that its gates realised, so that the integral does not wind up. All other entries
     stay at u_max.
+
+    critical: n_cr (veh, (P,)); that of the MFDs if None
     """
 
     name = "pi-gating"
 
-    def __init__(self, planning: PlanningModel, options: PiGating):
+    def __init__(
+        self, planning: PlanningModel, options: PiGating, critical: PerRegion | None = None
+    ):
         network = planning.network
         mfds = [network.mfds[region] for region in planning.protected]
         self.regions = np.array(planning.protected)
-        self.critical = np.array([mfd.critical for mfd in mfds])
+        if critical is None:
+            critical = np.array([mfd.critical for mfd in mfds])
+        self.critical = critical
         set_point = options.set_point
         if set_point is None:
             set_point = tuple(mfd.reaching(options.outflow_share) for mfd in mfds)
         self.set_point = np.array(set_point)
-        self._kp = options.kp
-        self._ki = options.ki * planning.step
+        self._kp, self._ki = self._gains(planning, options)
         self._open = network.open_perimeter
         self._entries = network.adjacency[:, self.regions]
         self._bounds = network.u_min, network.u_max
@@ -139,6 +195,18 @@ class PiGate:
     def reset(self, seed: int = 0) -> None:
         self._gate = np.full(len(self.regions), self._bounds[1])
         self._before: np.ndarray | None = None
+
+    def _gains(self, planning: PlanningModel, options: PiGating) -> tuple[PerRegion, PerRegion]:
+        """Return kp and ki dt of every protected region ((P,), -)."""
+        vehicles = np.array([filled(planning, region) for region in planning.protected])
+        fill = np.maximum(vehicles / self.critical, LEAST_FILL)
+        kp = PROPORTIONAL_SHARE / fill
+        if options.kp is not None:
+            kp = np.full(len(fill), options.kp)
+        ki = INTEGRAL_SHARE / fill
+        if options.ki is not None:
+            ki = np.full(len(fill), options.ki * planning.step)
+        return kp, ki
 
     def act(self, observation: Observation) -> Controls:
         now = observation.accumulation.sum(axis=1)[self.regions]
@@ -222,8 +290,7 @@ class Excitation:
             middle = tuple(network.mfds[region].critical for region in planning.protected)
         self._gating: PiGate | None = None
         if middle:
-            self._gating = PiGate(planning, PiGating(set_point=middle))
-            self._gating.critical = np.array(middle)
+            self._gating = PiGate(planning, PiGating(set_point=middle), np.array(middle))
         self._open = network.open_perimeter
         self.reset()
 

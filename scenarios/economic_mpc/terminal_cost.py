@@ -24,6 +24,7 @@ from jaxtyping import Float
 from nmfd import closed_loop
 from nmfd.api import load_scenario
 from nmfd.arrays import StatesOverTime
+from nmfd.controllers.base import from_table
 from nmfd.controllers.dpc.policy import DpcController, Policy
 from nmfd.controllers.dpc.policy_file import load_policy
 from nmfd.controllers.dpc.rollout import Demands, Rollout
@@ -87,6 +88,7 @@ def learn(
         def driven(driver: Controller) -> StatesOverTime:
             return closed_loop.run(NmfdPlant(city), driver, city, seed=seed)["accumulation"][:-1]
 
+        gating = from_table(PiGating, planning, "pi-gating")
         mpc = EconomicMpc(guidance=guidance)
         both = [driven(DpcController(after)), driven(mpc.make(planning))]
         for number in range(rounds):
@@ -101,7 +103,7 @@ def learn(
             else:
                 own = [
                     driven(NoControl().make(planning)),
-                    *([driven(PiGating().make(planning))] if planning.protected else []),
+                    *([driven(gating.make(planning))] if planning.protected else []),
                 ]
             visited = torch.tensor(np.stack(both + own), dtype=rollout.dtype)
             seen = 0
