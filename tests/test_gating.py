@@ -110,12 +110,12 @@ def test_a_boundary_lets_in_no_more_than_its_capacity_and_holds_only_at_signals(
     assert filled(pair(1.0, capacity=capacity, controllable=half), 1) == pytest.approx(0.5 * let_in)
 
 
-def test_default_gains_correct_half_of_an_error_in_an_interval():
+def test_default_gains_correct_an_error_within_an_interval():
     controller = api.controller("pi-gating", with_options(set_point=[3000.0]))
     share = filled(planning_model(SCENARIO), CENTRE) / CRITICAL
     controller.act(seen(3000.0))
     error = 30.0 / CRITICAL
-    expected = 0.9 - (0.5 + 0.15) * error / share
+    expected = 0.9 - (1.0 + 0.3) * error / share
     assert gate(controller.act(seen(3030.0, 1))) == pytest.approx(expected)
 
 

@@ -12,8 +12,8 @@ from nmfd.runs.config import PositiveNumbers, Problem, got, setting
 from nmfd.types import Controller, Controls, Observation
 
 # PI gating: shares of an error that one control interval corrects, as gates fill the region.
-PROPORTIONAL_SHARE = 0.5
-INTEGRAL_SHARE = 0.15
+PROPORTIONAL_SHARE = 1.0
+INTEGRAL_SHARE = 0.3
 LEAST_FILL = 0.05  # of the critical accumulation: larger gains would answer noise
 
 # Excitation.
@@ -84,9 +84,9 @@ class PiGating(SetPoint):
 
     The equation is that of nmfd.controllers.rules.PiGate. An accumulation answers a gate by the
     vehicles that enter in one control interval, `filled` critical accumulations b. Larger gains
-    than about 3 / b swing from interval to interval. The default gains follow from the city:
+    than about 2 / b swing from interval to interval. The default gains follow from the city:
 
-        kp = 0.5 / b,  ki = 0.15 / (b dt)
+        kp = 1 / b,  ki = 0.3 / (b dt)
 
         >>> nmfd.run("economic_mpc", nmfd.PiGating(kp=2.0), steps=1).controller
         'pi-gating(kp=2.0)'
