@@ -25,4 +25,4 @@ def front_door(module: nn.Linear) -> None:
     assert_type(cosim.evaluate("demo", ["no-control"]), Table)
     assert_type(cosim.compare("runs"), Table)
     assert_type(cosim.tune("demo", "pi-gating", options={}).table, Table)
-    assert_type(nmfd.PiGating().kp, float)
+    assert_type(nmfd.PiGating().kp, float | None)

@@ -143,7 +143,10 @@ def filled(planning: PlanningModel, region: int) -> float:
 
 
 def _passing(planning: PlanningModel) -> PerPair:
-    """Return the trips of the forecast in region i bound for j ((R, R)), on nominal routes."""
+    """Return the trips of the forecast that pass region i, bound for j.
+
+    They take nominal routes (veh/s, (R, R)).
+    """
     network = planning.network
     entering = planning.forecast.sum(axis=0)
     passing = np.zeros_like(entering)
