@@ -3,7 +3,7 @@
     >>> import nmfd
     >>> result = nmfd.run("economic_mpc", nmfd.PiGating(kp=2.0), seed=1)
     >>> print(f"{result.total_time_spent:.3g} veh s")
-    8.88e+07 veh s
+    8.87e+07 veh s
 
 `run` is one closed loop, `benchmark` many with a run folder; `train` makes a DPC policy. A
 controller is its options (`NoControl`, `PiGating`, `EconomicMpc`, `Dpc`, ...), a name, or any
