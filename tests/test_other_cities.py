@@ -18,6 +18,7 @@ from cosim.importing.quality import left_alone
 from cosim.importing.streets import read_streets
 from cosim.plant.settings import settings
 from cosim.sumo.recorded_trips import draw, read_recorded_trips
+from cosim.sumo.signals import timetabled
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
 
@@ -313,7 +314,8 @@ def test_signals_that_cannot_be_controlled(net, city, tmp_path):
     them."""
     config = city(additional='<tlLogic id="B1" programID="off" type="static" offset="0"/>')
     case = read_sumo_input(config)
-    found = left_alone(read_streets(case.net, case.additional), traffic_of(config).switched)
+    switched = timetabled(case.net, case.additional)
+    found = left_alone(read_streets(case.net, case.additional), switched)
     assert found == {"B1": "switched off"}
     text = re.sub(r'<tlLogic id="C2".*?</tlLogic>', "", net.read_text(), flags=re.DOTALL)
     (tmp_path / "other.net.xml").write_text(text)
@@ -345,6 +347,15 @@ def test_cycles_shorter_than_half_a_second(net, tmp_path):
     assert scenario.step == 90.0
 
 
+def along_roads(folder, nodes, edges):
+    """Import a network of these elements with a thin peak; return the report and the scenario."""
+    (folder / "n.nod.xml").write_text(f"<nodes>{nodes}</nodes>")
+    (folder / "e.edg.xml").write_text(f"<edges>{edges}</edges>")
+    net = folder / "road.net.xml"
+    tiny_city.run("netconvert", "-n", folder / "n.nod.xml", "-e", folder / "e.edg.xml", "-o", net)
+    return imported(net, demand="peak", level=0.2, iterations=1, mesoscopic=True)
+
+
 def test_a_city_along_a_straight_road(tmp_path):
     """It has no width."""
     nodes = "".join(f'<node id="{n}" x="{200 * n}" y="0" type="traffic_light"/>' for n in range(9))
@@ -352,13 +363,7 @@ def test_a_city_along_a_straight_road(tmp_path):
         f'<edge id="f{n}" from="{n}" to="{n + 1}"/><edge id="b{n}" from="{n + 1}" to="{n}"/>'
         for n in range(8)
     )
-    (tmp_path / "n.nod.xml").write_text(f"<nodes>{nodes}</nodes>")
-    (tmp_path / "e.edg.xml").write_text(f"<edges>{edges}</edges>")
-    net = tmp_path / "road.net.xml"
-    tiny_city.run(
-        "netconvert", "-n", tmp_path / "n.nod.xml", "-e", tmp_path / "e.edg.xml", "-o", net
-    )
-    text, scenario = imported(net, demand="peak", level=0.2, iterations=1, mesoscopic=True)
+    text, scenario = along_roads(tmp_path, nodes, edges)
     assert "regions instead of" not in text
     assert scenario.network.adjacency.sum() == 2
     sizes = np.bincount(
@@ -383,13 +388,7 @@ def test_parts_without_a_connection_and_small_regions_are_told(tmp_path):
             one, other = f"{part}.{n}", f"{part}.{n + 1}"
             edges.append(f'<edge id="f{one}" from="{one}" to="{other}"/>')
             edges.append(f'<edge id="b{one}" from="{other}" to="{one}"/>')
-    (tmp_path / "n.nod.xml").write_text(f"<nodes>{''.join(nodes)}</nodes>")
-    (tmp_path / "e.edg.xml").write_text(f"<edges>{''.join(edges)}</edges>")
-    net = tmp_path / "road.net.xml"
-    tiny_city.run(
-        "netconvert", "-n", tmp_path / "n.nod.xml", "-e", tmp_path / "e.edg.xml", "-o", net
-    )
-    text, scenario = imported(net, demand="peak", level=0.2, iterations=1, mesoscopic=True)
+    text, scenario = along_roads(tmp_path, "".join(nodes), "".join(edges))
     assert "the streets fall into 2 parts without a connection; 27" in text
     assert scenario.network.regions == 2
     for region in range(2):

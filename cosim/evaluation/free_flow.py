@@ -26,16 +26,11 @@ def crossing_times(city: City) -> PerRegion:
         inside = city.edge_region == region
         within = streets * inside[:, None] * inside[None, :]
         beyond_first = dijkstra(csr_array(within), indices=begin)[:, end]
-        ways = beyond_first + _edge_times(city)[begin][:, None]
+        ways = beyond_first + city.free_time[begin][:, None]
         used = ways[np.isfinite(ways)]
         if used.size:
             times[region] = np.median(used)
     return times
-
-
-def _edge_times(city: City) -> np.ndarray:
-    """Return the free-flow time on each edge (s, (E,))."""
-    return np.array([city.length[edge] / city.speed[edge] for edge in city.edges])
 
 
 def _street_times(city: City) -> csr_array:
@@ -43,15 +38,7 @@ def _street_times(city: City) -> csr_array:
 
     Its unit is s, its shape (E, E); only successors have an entry.
     """
-    edge_times = _edge_times(city)
-    rows = []
-    columns = []
-    values = []
-    for edge, after in city.successors.items():
-        for other in after:
-            here = city.number[other]
-            rows.append(city.number[edge])
-            columns.append(here)
-            values.append(city.turn_time.get((edge, other), 0.0) + edge_times[here])
+    first, second = city.move_edges.T
+    times = city.move_time + city.free_time[second]
     size = len(city.edges)
-    return csr_array((values, (rows, columns)), shape=(size, size))
+    return csr_array((times, (first, second)), shape=(size, size))

@@ -3,12 +3,11 @@
 import itertools
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
-from cosim.sumo.net import City
-from cosim.sumo.xml_files import attribute, network_root
+from cosim.sumo.net import City, Connection, connections_for_cars
 from nmfd.errors import InputError
 
 Route: TypeAlias = tuple[str, ...]
@@ -17,37 +16,11 @@ Turn: TypeAlias = tuple[Movement, int]  # and the link entered
 Lanes: TypeAlias = frozenset[int]
 
 
-class Connection(NamedTuple):
-    """A lane of a movement, and the lane that it leads to.
-
-    signal: None without one
-    place: in the signal's state
-    """
-
-    lane: int
-    entered: int
-    signal: str | None
-    place: int
-    state: str
-
-
-def read_connections(city: City) -> dict[Movement, list[Connection]]:
-    """Return the connections of each movement between lanes that cars may use."""
-    cars = {lane for lanes in city.lane_ids.values() for lane in lanes}
+def connections_of(city: City) -> dict[Movement, list[Connection]]:
+    """Return the connections of each movement between lanes for cars."""
     connections = defaultdict[Movement, list[Connection]](list)
-    with network_root(city.net_file) as root:
-        for element in root.iterfind("connection"):
-            source, target = attribute(element, "from"), attribute(element, "to")
-            lane, entered = attribute(element, "fromLane"), attribute(element, "toLane")
-            if f"{source}_{lane}" in cars and f"{target}_{entered}" in cars:
-                connection = Connection(
-                    lane=int(lane),
-                    entered=int(entered),
-                    signal=element.get("tl"),
-                    place=int(element.get("linkIndex", "-1")),
-                    state=element.get("state", "M"),
-                )
-                connections[source, target].append(connection)
+    for connection in connections_for_cars(city.net_file):
+        connections[connection.source, connection.target].append(connection)
     return dict(connections)
 
 
@@ -105,7 +78,7 @@ class Streets:
     def ends(self, movement: Movement) -> dict[int, float]:
         """Return link -> share of the lanes that a movement leads to."""
         entered = {
-            self._number[movement[1], connection.entered]
+            self._number[movement[1], connection.to_lane]
             for connection in self.connections[movement]
         }
         total = sum(len(self.links[link][1]) for link in entered)
@@ -118,7 +91,7 @@ class Streets:
         """
         movement, link = turn
         connections = self.connections[movement]
-        lanes = {one.lane for one in connections if one.entered in self.links[link][1]}
+        lanes = {one.lane for one in connections if one.to_lane in self.links[link][1]}
         return sorted(lanes or {one.lane for one in connections})
 
 
@@ -181,13 +154,13 @@ def link_arrays(streets: Streets) -> dict[str, np.ndarray]:
 
 
 def vehicle_arrays(
-    streets: Streets, counts: Counts, draws: Sequence[Counts]
+    streets: Streets, free_time: np.ndarray, counts: Counts, draws: Sequence[Counts]
 ) -> dict[str, np.ndarray]:
     """Return the arrays of turns, entries and cells.
 
+    free_time: of the links (s, (L,))
     counts: of all draws of trips together
     """
-    free_time = link_arrays(streets)["free_time"]
     number_of = {movement: number for number, movement in enumerate(streets.movements)}
     lane_number: dict[tuple[str, int], int] = {}
     for street, lanes in streets.links:

@@ -4,20 +4,19 @@ A link has the lanes of a street that share movements. Shares of turns, origins 
 are counted on the static routes. Lights follow the signal programmes.
 """
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from cosim.evaluation.link_streets import (
-    Connection,
     Counts,
     Movement,
     Route,
     Streets,
+    connections_of,
     link_arrays,
-    read_connections,
     vehicle_arrays,
 )
 from cosim.plant.gates import MIN_GREEN_S, least_times
@@ -25,11 +24,10 @@ from cosim.plant.pressure import Roads
 from cosim.plant.settings import Settings, own_files, settings
 from cosim.plant.stages import stages_of, transition
 from cosim.sumo import recorded_trips as recorded
-from cosim.sumo.net import City, city_of
-from cosim.sumo.session import Phase
-from cosim.sumo.signals import HELD, Signal, phases_of, read_signals
+from cosim.sumo.net import City, Connection, city_of
+from cosim.sumo.signals import HELD, Cycle, Signal, read_cycles, read_signals
 from cosim.sumo.trips import PLANNING_SEEDS, make_trips
-from cosim.sumo.xml_files import attribute, network_root, read_xml
+from cosim.sumo.xml_files import attribute, network_root
 from nmfd.model.links.network import FILE, LinkNetwork
 from nmfd.model.scenario import Scenario
 from nmfd.runs import shipped
@@ -38,13 +36,6 @@ from nmfd.runs import shipped
 CAPACITY = {"G": 1.0, "g": 1.0, "o": 1.0, "O": 1.0, "s": 0.5}
 GIVES_WAY = frozenset("gso")  # lights
 MINOR = frozenset("m=so")  # states of connections without a signal that must give way
-
-
-class Programme(NamedTuple):
-    """Phases of a signal; offset: of its cycle (s)."""
-
-    offset: float
-    phases: Sequence[Phase]
 
 
 class Lights(NamedTuple):
@@ -80,7 +71,7 @@ def link_network(scenario: Scenario, seeds: Sequence[int] = PLANNING_SEEDS) -> L
     city = city_of(scenario.network)
     draws = _draws(scenario, chosen, city, seeds)
     together = [route for routes in draws for route in routes]
-    streets = Streets(city, read_connections(city), together, scenario.where)
+    streets = Streets(city, connections_of(city), together, scenario.where)
     counts = Counts(streets, together)
     files = own_files(scenario, chosen.additional)
     steered, _ = read_signals(city, files, HELD)
@@ -89,11 +80,14 @@ def link_network(scenario: Scenario, seeds: Sequence[int] = PLANNING_SEEDS) -> L
     for gateway in city.gateways:
         if gateway.signal in obeying:
             gated.add((gateway.from_edge, gateway.to_edge))
+    links = link_arrays(streets)
     return LinkNetwork(
         regions=city.regions,
-        **link_arrays(streets),
-        **_movement_arrays(streets, _programmes(city, files), chosen.begin, gated),
-        **vehicle_arrays(streets, counts, [Counts(streets, routes) for routes in draws]),
+        **links,
+        **_movement_arrays(streets, read_cycles(city.net_file, files), chosen.begin, gated),
+        **vehicle_arrays(
+            streets, links["free_time"], counts, [Counts(streets, routes) for routes in draws]
+        ),
         **_stage_arrays(streets, counts, steered),
     )
 
@@ -112,16 +106,6 @@ def _draws(
         if driven and len(edges) > 1 and city.number.keys() >= set(edges):
             routes.append(tuple(edges))
     return [routes]
-
-
-def _programmes(city: City, additional: Iterable[Path]) -> dict[str, Programme]:
-    """Return the programme of each signal, the last one that SUMO reads."""
-    programmes = {}
-    for root in (read_xml(city.net_file), *map(read_xml, additional)):
-        for logic in root.iter("tlLogic"):
-            offset = float(logic.get("offset", 0.0))
-            programmes[attribute(logic, "id")] = Programme(offset, phases_of(logic))
-    return programmes
 
 
 def _foes(city: City) -> set[tuple[Movement, Movement]]:
@@ -150,7 +134,7 @@ def _foes(city: City) -> set[tuple[Movement, Movement]]:
 
 def _movement_arrays(
     streets: Streets,
-    programmes: Mapping[str, Programme],
+    cycles: Mapping[str, Cycle],
     begin: float,
     gated: Collection[Movement],
 ) -> dict[str, np.ndarray]:
@@ -168,7 +152,7 @@ def _movement_arrays(
         if city.inside.get(first) and city.turn_time[movement]:
             speed = min(speed, city.inside[first] / city.turn_time[movement])
         speeds.append(speed)
-        shown = [_shown(one, programmes, begin) for one in streets.connections[movement]]
+        shown = [_shown(one, cycles, begin) for one in streets.connections[movement]]
         cycle = max(len(one.light) for one in shown)
         light = np.mean([np.resize(one.light, cycle) for one in shown], axis=0)
         yields = np.mean([np.resize(one.yields, cycle) for one in shown], axis=0)
@@ -177,32 +161,32 @@ def _movement_arrays(
     for movement, foe in sorted(_foes(city)):
         if movement in number and foe in number:
             pairs.append((number[movement], number[foe]))
-    cycles = [len(one.light) for one in lights]
+    lengths = [len(one.light) for one in lights]
     yielding, foe_of = np.array(pairs, dtype=int).reshape(-1, 2).T
     return {
         "movement_link": np.array([streets.link_of[movement] for movement in streets.movements]),
         "speed": np.array(speeds),
         "yielding": yielding,
         "foe": foe_of,
-        "cycle": np.array(cycles),
-        "begin": np.concatenate([[0], np.cumsum(cycles)[:-1]]),
+        "cycle": np.array(lengths),
+        "begin": np.concatenate([[0], np.cumsum(lengths)[:-1]]),
         "light": np.concatenate([one.light for one in lights]),
         "yields": np.concatenate([one.yields for one in lights]),
         "gated": np.array([movement in gated for movement in streets.movements]),
     }
 
 
-def _shown(connection: Connection, programmes: Mapping[str, Programme], begin: float) -> Lights:
+def _shown(connection: Connection, cycles: Mapping[str, Cycle], begin: float) -> Lights:
     """Return the lights of a connection; one second if it has no signal."""
-    programme = programmes.get(connection.signal or "")
-    if programme is None:
+    known = cycles.get(connection.signal or "")
+    if known is None:
         return Lights(np.ones(1), np.array([float(connection.state in MINOR)]))
-    offset, phases = programme
-    ends = np.cumsum([phase.duration for phase in phases])
+    offset = begin if known.offset == "begin" else float(known.offset)
+    ends = np.cumsum([phase.duration for phase in known.phases])
     cycle = max(round(ends[-1]), 1)
     clock = (begin - offset + np.arange(cycle) + 0.5) % ends[-1]
     number = np.searchsorted(ends, clock, side="right")
-    states = [phases[n].state[connection.place] for n in number]
+    states = [known.phases[n].state[connection.link] for n in number]
     light = np.array([CAPACITY.get(state, 0.0) for state in states])
     yields = np.array([float(state in GIVES_WAY) for state in states])
     for second in range(2 * cycle):  # twice: yellow may begin before the end of the cycle
@@ -231,7 +215,7 @@ def _stage_arrays(
             continue
         own[row] = number
         for stage, phase in enumerate(phases[number]):
-            states = [signals[number].phases[phase].state[one.place] for one in here]
+            states = [signals[number].phases[phase].state[one.link] for one in here]
             light[row, stage] = np.mean([CAPACITY.get(state, 0.0) for state in states])
             yields[row, stage] = np.mean([state in GIVES_WAY for state in states])
     loss = np.zeros((count, most, most))

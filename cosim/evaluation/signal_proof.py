@@ -20,8 +20,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import pandas as pd
 
-from cosim.sumo.signals import seconds_of
-from cosim.sumo.xml_files import attribute, read_xml
+from cosim.sumo.xml_files import attribute, read_xml, seconds_of
 from nmfd.types import Quantity, Result
 
 KINDS = ("static", "actuated", "delay_based")

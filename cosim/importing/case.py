@@ -1,6 +1,5 @@
 """Sources of an import: a sumocfg, a bare network, or OpenStreetMap."""
 
-import math
 import os
 import re
 import xml.etree.ElementTree as ElementTree
@@ -13,11 +12,10 @@ from urllib.parse import unquote
 
 from cosim.importing.osm import LICENCE, Box, convert, fetch
 from cosim.sumo.programs import run_sumo
-from cosim.sumo.xml_files import attribute, read_xml, stream_of
+from cosim.sumo.xml_files import attribute, file_list, is_true, read_xml, seconds_of, stream_of
 from nmfd.errors import InputError
 from nmfd.runs.files import temporary_folder
 
-UNITS_S = (1.0, 60.0, 3600.0, 86400.0)
 ENDLESS_S = 1e9  # a later end is none
 # Groups of options, in SUMO's own words, that change what is shown, but not the traffic.
 SHOWING = {"configuration", "report", "gui_only"}
@@ -96,6 +94,17 @@ class SumoInput:
     devices: tuple[str, ...] = ()
     notice: str = ""
 
+    def sumo_options(self) -> dict[str, object]:
+        """Return SUMO's options but those of vehicles and additional files."""
+        return {
+            "net-file": file_list([self.net.absolute()]),
+            "begin": self.begin,
+            "step-length": self.step_length,
+            "mesosim": str(self.mesoscopic).lower(),
+            **self.options,
+            **self.reading,
+        }
+
 
 @contextmanager
 def sumo_input(
@@ -157,8 +166,8 @@ def read_sumo_input(path: Path) -> SumoInput:
     end = time("end", "-1")
     step_length = time("step-length", "1")
     teleport = time("time-to-teleport", "300")
-    mesoscopic = _is_true(options.pop("mesosim", ""))
-    gaps = _is_true(options.pop("ignore-route-errors", ""))
+    mesoscopic = is_true(options.pop("mesosim", ""))
+    gaps = is_true(options.pop("ignore-route-errors", ""))
     driven = dict(OWN_DEFAULTS)
     reading = {}
     left_out = {}
@@ -267,10 +276,6 @@ def _substituted(text: str) -> str:
     return VARIABLE.sub(lambda name: os.environ.get(name[1], ""), text)
 
 
-def _is_true(value: str) -> bool:
-    return value.lower() in ("true", "1", "yes", "on", "x")
-
-
 def seconds(text: str, where: str) -> float:
     """Convert a SUMO time: seconds or [days:]hours:minutes:seconds.
 
@@ -278,17 +283,9 @@ def seconds(text: str, where: str) -> float:
     Raises: InputError
     """
     try:
-        parts = [float(part) for part in text.split(":")]
-        if not 1 <= len(parts) <= 4 or len(parts) == 2 or not all(map(math.isfinite, parts)):
-            raise ValueError
-    except ValueError:
-        raise InputError(
-            f"{where}: expected seconds or hours:minutes:seconds, got {text!r} instead"
-        ) from None
-    size = 0.0
-    for part, unit in zip(reversed(parts), UNITS_S, strict=False):
-        size += abs(part) * unit
-    return -size if text.startswith("-") else size
+        return seconds_of(text)
+    except ValueError as error:
+        raise InputError(f"{where}: {error}") from None
 
 
 def _root(path: Path) -> ElementTree.Element:

@@ -12,7 +12,7 @@ from cosim.importing import quiet_files
 from cosim.importing.case import SumoInput
 from cosim.sumo.programs import run_sumo
 from cosim.sumo.recorded_trips import MESOSCOPIC
-from cosim.sumo.xml_files import attribute, file_list
+from cosim.sumo.xml_files import attribute
 from nmfd.runs.files import temporary_folder
 
 # Options of SUMO beside tripinfo-output.
@@ -97,19 +97,17 @@ def plain_trips(case: SumoInput, end: float, *, mesoscopic: bool) -> dict[str, T
     mesoscopic: in the model that the import simulates, even if the case has another one
     Raises: InputError with SUMO's own words if it refuses
     """
-    options: dict[str, object] = {
-        "net-file": file_list([case.net.absolute()]),
-        "begin": case.begin,
+    options = case.sumo_options()
+    if mesoscopic and not case.mesoscopic:
+        options |= {**MESOSCOPIC, **case.options, **case.reading}
+    options |= {
         "end": end,
-        "step-length": case.step_length,
         "time-to-teleport": case.time_to_teleport,
         "ignore-route-errors": str(case.gaps).lower(),
-        "mesosim": str(case.mesoscopic).lower(),
         "seed": 0,
+        **QUIET,
+        **ALL_TRIPS,
     }
-    if mesoscopic and not case.mesoscopic:
-        options |= MESOSCOPIC
-    options |= {**case.options, **case.reading, **QUIET, **ALL_TRIPS}
     options |= {name: unquote(value) for name, value in case.left_out.items()}
     with temporary_folder() as folder:
         options |= quiet_files.write(quiet_files.read(case), folder)
@@ -156,7 +154,6 @@ def _shown(
     """Return the private trips that may depart before `end` [s].
 
     They are as known then, and due in the first step in which they may depart.
-    They are due in the first step in which they may depart.
     """
     shown = {}
     for name, trip in trips.items():

@@ -17,7 +17,6 @@ from cosim.importing.streets import Streets
 from cosim.sumo.arrays import PerTrip, TripNumbers
 from cosim.sumo.departures import Departure, Departures, original, read_departures
 from cosim.sumo.recorded_trips import BOUND, QUEUED_AFTER
-from cosim.sumo.xml_files import file_list
 from nmfd.errors import InputError
 from nmfd.runs.files import temporary_folder
 
@@ -52,7 +51,6 @@ class Traffic:
     depart: (N,) [s]; origin, destination: (N,) edges, numbers of Streets
     background: public transport, persons, and vehicles without a fixed departure
     shared: types, routes, stops, programmes and other contents of the additional files
-    switched: signals whose programme a timetable (WAUT) changes
     notes: what was changed or left out -> count
     remarks: examples of what was left out, and SUMO's own words about the files
     left_out: shares of SUMO's vehicles, and of the distance that they would drive [-], that are not
@@ -67,7 +65,6 @@ class Traffic:
     destination: TripNumbers
     background: tuple[Element, ...] = ()
     shared: tuple[Element, ...] = ()
-    switched: tuple[str, ...] = ()
     notes: Mapping[str, int] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
     left_out: tuple[float, float] = (0.0, 0.0)
@@ -116,7 +113,8 @@ class Reading:
     """
 
     def __init__(self, case: SumoInput, streets: Streets):
-        self._case, self._streets = case, streets
+        self._case = case
+        self._streets = streets
         # What the files hold.
         self._files: list[Element] = []  # for SUMO to read
         self._given: dict[str, Element] = {}  # id -> vehicle, trip or flow
@@ -171,15 +169,7 @@ class Reading:
     def departures(self, seed: int) -> Departures:
         """Let SUMO read the vehicles of all files. Raises InputError."""
         case = self._case
-        options: dict[str, object] = {
-            "net-file": file_list([case.net.absolute()]),
-            "begin": case.begin,
-            "step-length": case.step_length,
-            "mesosim": str(case.mesoscopic).lower(),
-            "seed": seed,
-            **case.options,
-            **case.reading,
-        }
+        options = case.sumo_options() | {"seed": seed}
         with temporary_folder() as folder:
             options |= quiet_files.write(self._files, folder)
             return read_departures(
@@ -285,10 +275,6 @@ class Reading:
     def traffic(self, departures: Departures) -> Traffic:
         """Return all that was taken."""
         trips = sorted(self._trips, key=lambda trip: trip.depart)
-        switched = set()
-        for element in self._shared:
-            for part in element.iter("wautJunction"):
-                switched.add(part.get("junctionID", ""))
         self._notes[NO_ROUTE] = len(self._routeless)
         self._notes[ALONE] = len(self._background)
         return Traffic(
@@ -298,7 +284,6 @@ class Reading:
             destination=np.array([trip.last for trip in trips], dtype=int),
             background=tuple(sorted(self._background, key=departure)),
             shared=tuple(self._shared),
-            switched=tuple(sorted(switched - {""})),
             notes={note: count for note, count in self._notes.items() if count},
             remarks=tuple(self._remarks(departures.warnings)),
             left_out=self._left_out(),

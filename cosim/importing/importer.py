@@ -254,7 +254,7 @@ def _imported(request: Request, case: SumoInput, folder: Path, progress: Progres
         progress("simulating the city's own files")
         same = _compared(request, case, traffic, clock, baseline, simulated_meso)
     progress("partition")
-    switched = sorted({*traffic.switched, *timetabled(case.net)})
+    switched = sorted(timetabled(case.net, case.additional))
     everywhere = without_effect(case.options, mesoscopic)
     left = quality.left_alone(streets, switched, everywhere)
     if given is not None:

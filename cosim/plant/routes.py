@@ -46,23 +46,20 @@ class TravelTimes:
     def __init__(self, city: City, *, lanes: bool = True):
         """lanes: False in the mesoscopic model"""
         self._lanes = lanes
-        names = [
-            (edge, after) for edge, next_ones in city.successors.items() for after in next_ones
-        ]
-        pairs = [(city.number[edge], city.number[after]) for edge, after in names]
+        self.first, self.second = city.move_edges.T
+        pairs = zip(self.first.tolist(), self.second.tolist(), strict=True)
         self.move = {pair: n for n, pair in enumerate(pairs)}
-        self.first, self.second = np.array(pairs).T
         self._length = np.array([city.length[edge] for edge in city.edges])
         self._limit = np.array([city.speed[edge] for edge in city.edges])
-        self.free = self._length / self._limit
-        self.free_turns = np.array([city.turn_time[move] for move in names])
+        self.free = city.free_time
+        self.free_turns = city.move_time
         self.edges = self.free.copy()
         self.turns = self.free_turns.copy()
         self._longest = np.array(list(city.inside.values())) / STANDING_M_S
         # Pairs of moves and internal edges that they lead over, which several moves may share.
         inside = {edge: n for n, edge in enumerate(city.inside)}
         over = []
-        for n, move in enumerate(names):
+        for n, move in enumerate(city.moves):
             over += [(n, inside[edge]) for edge in city.over.get(move, ()) if edge in inside]
         self._move, self._via = np.array(over, dtype=int).reshape(-1, 2).T
         # Weighted sums on edges: time [veh s] and distance [veh m].

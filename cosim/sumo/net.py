@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from cosim.sumo.arrays import PerEdge, Points
+from cosim.sumo.arrays import PerEdge, PerMove, Points
 from cosim.sumo.xml_files import attribute, network_root
 from nmfd.errors import InputError
 from nmfd.model.regional_model import RegionalModel
@@ -116,6 +116,30 @@ class City:
         """Length times lanes of each edge (m, (E,))."""
         return np.array([self.length[edge] * self.lanes[edge] for edge in self.edges])
 
+    @cached_property
+    def free_time(self) -> PerEdge:
+        """Free-flow time on each edge (s, (E,))."""
+        return np.array([self.length[edge] / self.speed[edge] for edge in self.edges])
+
+    @cached_property
+    def moves(self) -> tuple[tuple[str, str], ...]:
+        """All M pairs of an edge and a following one."""
+        pairs = []
+        for edge, after in self.successors.items():
+            pairs += [(edge, other) for other in after]
+        return tuple(pairs)
+
+    @cached_property
+    def move_edges(self) -> Int[np.ndarray, "M 2"]:
+        """Numbers of the edges that each move joins."""
+        numbers = [(self.number[edge], self.number[other]) for edge, other in self.moves]
+        return np.array(numbers, dtype=int).reshape(-1, 2)
+
+    @cached_property
+    def move_time(self) -> PerMove:
+        """Free-flow time of each move over its junction (s, (M,))."""
+        return np.array([self.turn_time[move] for move in self.moves], dtype=float)
+
     @property
     def room(self) -> PerEdge:
         """Standing vehicles that fit on each edge (veh, (E,))."""
@@ -137,12 +161,13 @@ class _Crossing(NamedTuple):
     length: float
 
 
-class _Connection(NamedTuple):
+class Connection(NamedTuple):
     """A connection from lane to lane.
 
     via: lane on the junction; None if there is none
     signal, link: the signal that controls it, and its index in the signal's state
     lane, to_lane: numbers of the lanes of `source` and `target`
+    state: SUMO's letter of the right of way
     """
 
     source: str
@@ -152,6 +177,7 @@ class _Connection(NamedTuple):
     link: int
     lane: int
     to_lane: int
+    state: str
 
 
 class _Net(NamedTuple):
@@ -163,7 +189,7 @@ class _Net(NamedTuple):
 
     lanes_of: dict[str, list[_Lane]]
     internal: dict[str, _Crossing]
-    connections: list[_Connection]
+    connections: list[Connection]
 
 
 def network_folder(network: RegionalModel) -> Path:
@@ -340,7 +366,7 @@ def _read_net(path: Path) -> _Net:
     """Read a SUMO network. Raises InputError."""
     lanes_of: dict[str, list[_Lane]] = {}
     internal: dict[str, _Crossing] = {}
-    connections: list[_Connection] = []
+    connections: list[Connection] = []
     with network_root(path) as root:
         for element in root.iterfind("edge"):
             edge = attribute(element, "id")
@@ -359,7 +385,7 @@ def _read_net(path: Path) -> _Net:
             via = element.get("via")
             if via and _stem(via) not in internal:
                 raise LookupError(f"connection from {source} by way of {via}: no such edge")
-            connection = _Connection(
+            connection = Connection(
                 source=source,
                 target=attribute(element, "to"),
                 via=via,
@@ -367,6 +393,7 @@ def _read_net(path: Path) -> _Net:
                 link=int(element.get("linkIndex", "-1")),
                 lane=int(attribute(element, "fromLane")),
                 to_lane=int(attribute(element, "toLane")),
+                state=element.get("state", "M"),
             )
             connections.append(connection)
     if not lanes_of:
@@ -435,7 +462,15 @@ def read_regions(path: Path, regions: int = 10**6) -> dict[str, int]:
     return region_of
 
 
-def _links_for_cars(net: _Net) -> list[_Connection]:
+def connections_for_cars(net_file: Path) -> list[Connection]:
+    """Return the connections from a lane for cars to a lane for cars.
+
+    Raises: InputError
+    """
+    return _links_for_cars(_read_net(net_file))
+
+
+def _links_for_cars(net: _Net) -> list[Connection]:
     """Return the connections from a lane for cars to a lane for cars."""
     cars: set[str] = set()
     for lanes in net.lanes_of.values():
@@ -470,7 +505,7 @@ def _internal_regions(net: _Net, region_of: Mapping[str, int]) -> dict[str, int]
 
 
 def _turns_over_junctions(
-    links: Sequence[_Connection], connections: Sequence[_Connection]
+    links: Sequence[Connection], connections: Sequence[Connection]
 ) -> dict[tuple[str, str], tuple[str, ...]]:
     """Return (from_edge, to_edge) -> internal edges in between.
 
@@ -492,9 +527,9 @@ def _turns_over_junctions(
     return over
 
 
-def _gateways(links: Sequence[_Connection], region_of: Mapping[str, int]) -> tuple[Gateway, ...]:
+def _gateways(links: Sequence[Connection], region_of: Mapping[str, int]) -> tuple[Gateway, ...]:
     """Return the links from region to region, those of a turn together."""
-    movements: dict[tuple[int, int, str, str], list[_Connection]] = {}
+    movements: dict[tuple[int, int, str, str], list[Connection]] = {}
     for link in links:
         source = region_of[link.source]
         target = region_of[link.target]
@@ -515,7 +550,7 @@ def _gateways(links: Sequence[_Connection], region_of: Mapping[str, int]) -> tup
     return tuple(gateways)
 
 
-def _common_signal(links: list[_Connection]) -> str | None:
+def _common_signal(links: list[Connection]) -> str | None:
     """Return the signal of all links of a movement, None without one."""
     signals = {link.signal for link in links}
     return signals.pop() if len(signals) == 1 else None

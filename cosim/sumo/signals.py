@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from cosim.sumo.net import City, Gateway
 from cosim.sumo.session import Phase, Programme
-from cosim.sumo.xml_files import attribute, read_xml
+from cosim.sumo.xml_files import attribute, is_true, read_xml, seconds_of
 from nmfd.errors import InputError
 
 GREEN = frozenset("Gg")
@@ -79,6 +79,16 @@ class Logic:
     programme: str
     kind: str
     states: tuple[str, ...]
+
+
+class Cycle(NamedTuple):
+    """Phases of a signal in order.
+
+    offset: as in the file, seconds or "begin"
+    """
+
+    offset: str
+    phases: tuple[Phase, ...]
 
 
 class _File(NamedTuple):
@@ -155,9 +165,9 @@ def without_effect(options: Mapping[str, str], mesoscopic: bool) -> str:
 
     mesoscopic: SUMO's queue model, in which signals belong to the junction control
     """
-    if _is_on(options.get("tls.all-off", "false")):
+    if is_true(options.get("tls.all-off", "false")):
         return SWITCHED_OFF
-    if mesoscopic and not _is_on(options.get("meso-junction-control", "true")):
+    if mesoscopic and not is_true(options.get("meso-junction-control", "true")):
         return "mesoscopic model without junction control"
     return ""
 
@@ -165,6 +175,14 @@ def without_effect(options: Mapping[str, str], mesoscopic: bool) -> str:
 def read_logics(net: Path, additional: Iterable[Path] = ()) -> dict[str, Logic]:
     """Return signal -> the programme that runs. Raises InputError."""
     return {name: _logic(element) for name, element in _read(net, additional).programmes.items()}
+
+
+def read_cycles(net: Path, additional: Iterable[Path] = ()) -> dict[str, Cycle]:
+    """Return signal -> cycle of the programme that runs. Raises InputError."""
+    cycles = {}
+    for name, logic in _read(net, additional).programmes.items():
+        cycles[name] = Cycle(logic.get("offset", "0"), phases_of(logic))
+    return cycles
 
 
 def read_links(net: Path) -> Mapping[str, Sequence[Link]]:
@@ -304,18 +322,3 @@ def _not_simple(element: ElementTree.Element, kinds: Collection[str]) -> str:
     for light in sorted(set("".join(logic.states)) - SIMPLE):
         return FREE.get(light, f"light {light}")
     return ""
-
-
-def _is_on(value: str) -> bool:
-    return value.lower() in ("true", "1", "yes", "on", "x", "t")
-
-
-def seconds_of(text: str) -> float:
-    """Convert a time of SUMO: seconds, or days:hours:minutes:seconds.
-
-    Raises ValueError.
-    """
-    total = 0.0
-    for part, unit in zip(reversed(text.split(":")), (1.0, 60.0, 3600.0, 86400.0), strict=False):
-        total += unit * float(part)
-    return total

@@ -210,19 +210,13 @@ def routes_in(
     noise: Float[np.ndarray, "classes E"],
 ) -> list[tuple[str, ...]]:
     """Return `fastest_routes` in a city, as ids of edges."""
-    links: list[tuple[int, int]] = []
-    turns: list[float] = []
-    for edge, after in city.successors.items():
-        for other in after:
-            links.append((city.number[edge], city.number[other]))
-            turns.append(city.turn_time[edge, other])
     routes = fastest_routes(
         ends,
         tastes,
         noise,
-        time=np.array([city.length[edge] / city.speed[edge] for edge in city.edges]),
-        links=np.array(links, dtype=int).reshape(-1, 2),
-        turn=np.array(turns),
+        time=city.free_time,
+        links=city.move_edges,
+        turn=city.move_time,
     )
     return [tuple(city.edges[edge] for edge in route) for route in routes]
 

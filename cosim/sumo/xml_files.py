@@ -2,6 +2,7 @@
 
 import gzip
 import io
+import math
 import xml.etree.ElementTree as ElementTree
 import zlib
 from collections.abc import Iterator, Sequence
@@ -13,6 +14,7 @@ from nmfd.runs.files import check_file, check_name
 
 # Errors of a file that is cut off, no XML, in an unknown encoding, or without an attribute.
 BROKEN = (OSError, EOFError, zlib.error, ElementTree.ParseError, LookupError, TypeError, ValueError)
+UNITS_S = (1.0, 60.0, 3600.0, 86400.0)  # of the parts of a time, the last one first
 MAX_INCLUDE_DEPTH = 20  # of files that include each other
 
 
@@ -30,6 +32,33 @@ def child(element: ElementTree.Element, tag: str) -> ElementTree.Element:
     if below is None:
         raise ValueError(f"{element.tag}: {tag}: missing")
     return below
+
+
+def is_true(value: str) -> bool:
+    """Return True for a word that SUMO takes as true."""
+    return value.lower() in ("true", "1", "yes", "on", "x", "t")
+
+
+def seconds_of(text: str) -> float:
+    """Convert a time of SUMO: seconds, or [days:]hours:minutes:seconds.
+
+    Raises: ValueError
+    """
+    parts = [_number(part) for part in text.split(":")]
+    if len(parts) not in (1, 3, 4) or not all(map(math.isfinite, parts)):
+        raise ValueError(f"expected seconds or hours:minutes:seconds, got {text!r} instead")
+    size = 0.0
+    for part, unit in zip(reversed(parts), UNITS_S, strict=False):
+        size += abs(part) * unit
+    return -size if text.startswith("-") else size
+
+
+def _number(text: str) -> float:
+    """Return a number, NaN for a text that is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 def read_xml(path: Path, depth: int = 0) -> ElementTree.Element:

@@ -3,8 +3,8 @@
     python scenarios/grid7_peak/links.py runs/links
 
 The folder has SUMO results, *.nc, with open gates in a city with words such as +max-pressure, or
-with a constant rate of metering: cosim.run("grid7_peak", Rate(network, 0.5), city="metering"). The
-link model has the routes of the trips of the same seed. No number is fitted.
+with a constant rate of metering: cosim.run("grid7_peak", metered(network, 0.5), city="metering").
+The link model has the routes of the trips of the same seed.
 """
 
 from pathlib import Path
@@ -17,25 +17,19 @@ import nmfd
 from cosim.evaluation.links import link_network
 from nmfd import closed_loop
 from nmfd.api import loaded
+from nmfd.controllers.rules import Constant
 
 LOCKED = 0.05  # share of the trips that are not finished at the end
 
 
-class Rate:
-    """Open gates, and a constant rate of metering."""
+def metered(network: nmfd.RegionalModel, rate: float) -> nmfd.Controller:
+    """Return open gates, and a constant rate of metering.
 
-    def __init__(self, network: nmfd.RegionalModel, rate: float):
-        """rate: veh/s in each region"""
-        self.name = f"rate-{rate:g}"
-        self._open = network.u_max * network.adjacency
-        self._rate = np.full(network.regions, rate)
-
-    def reset(self, seed: int = 0) -> None:
-        """Do nothing."""
-
-    def act(self, observation: nmfd.Observation) -> nmfd.Controls:
-        """Return the constant command."""
-        return nmfd.Controls(perimeter=self._open, metering=self._rate)
+    rate: in each region (veh/s)
+    """
+    metering = np.full(network.regions, rate)
+    controls = nmfd.Controls(perimeter=network.open_perimeter, metering=metering)
+    return Constant(f"rate-{rate:g}", controls)
 
 
 def in_links(run: nmfd.Result) -> nmfd.Result:
@@ -50,7 +44,7 @@ def in_links(run: nmfd.Result) -> nmfd.Result:
     network = link_network(scenario, [run.seed])
     controller = nmfd.controller("no-control", scenario)
     if name.startswith("rate-"):
-        controller = Rate(scenario.network, float(name.removeprefix("rate-")))
+        controller = metered(scenario.network, float(name.removeprefix("rate-")))
     plant = nmfd.LinkPlant(scenario, network=network)
     return closed_loop.run(plant, controller, scenario, seed=0)
 

@@ -196,6 +196,7 @@ class LinkModel:
         held = torch.zeros_like(traffic.held)
         for n in range(self._steps):
             released = due
+            # Without metering, trips that were held begin in the first step.
             if commands.metering is not None or n == 0:
                 traffic, released = self._metered(traffic, due, commands.metering)
             lights = Lights(light[n : n + 1], yields[n : n + 1])

@@ -24,7 +24,6 @@ DECISION_PERIOD_S = 5.0
 LONGEST_GREEN_S = 50.0  # under max-pressure while others wait
 LONGEST_RED_S = 120.0  # then a stage with vehicles comes first
 CALLED_VEH = 0.2  # vehicles that call a stage
-FIXED = "fixed"
 MAX_PRESSURE = "max-pressure"
 
 
