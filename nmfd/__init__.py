@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     )
     from nmfd.controllers.base import Options
     from nmfd.controllers.dpc.compact import GatingRule, PricingRule
+    from nmfd.controllers.dpc.constant import ConstantControl
     from nmfd.controllers.dpc.options import Dpc
     from nmfd.controllers.dpc.policy import ModuleController, PerimeterLayer, SplitsLayer
     from nmfd.controllers.dpc.rollout import Trajectories
@@ -59,6 +60,7 @@ _MODULES = {
     ),
     "controllers.base": ("Options",),
     "controllers.dpc.compact": ("GatingRule", "PricingRule"),
+    "controllers.dpc.constant": ("ConstantControl",),
     "controllers.dpc.options": ("Dpc",),
     "controllers.dpc.policy": ("ModuleController", "PerimeterLayer", "SplitsLayer"),
     "controllers.dpc.rollout": ("Trajectories",),

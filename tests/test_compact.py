@@ -13,6 +13,7 @@ from nmfd.api import load_scenario
 from nmfd.controllers import training
 from nmfd.controllers.base import from_table
 from nmfd.controllers.dpc.compact import FILL_TIME_S, CompactPolicy, Numbers
+from nmfd.controllers.dpc.constant import ConstantControl
 from nmfd.controllers.dpc.policy import Architecture, DpcController
 from nmfd.controllers.dpc.policy_file import load_policy
 from nmfd.controllers.dpc.rollout import Rollout
@@ -210,6 +211,40 @@ def test_it_is_trained_and_kept_in_a_file(tmp_path):
             tmp_path / "out",
         )
     )
+
+
+def test_constant_control_measures_nothing():
+    scenario = load_scenario("grid7_peak")
+    options = ConstantControl(numbers=(0.5, 1.0, 0.25, 0.8), metering=True)
+    controller = options.make(planning_model(scenario))
+    network = scenario.network
+    others = np.arange(network.regions) != 3
+    for vehicles in (0.0, 500.0):
+        full = np.full(network.adjacency.shape, vehicles)
+        controls = controller.act(Observation(step=0, time=0.0, accumulation=full, backlog=full))
+        middle = 0.5 * (network.u_min + network.u_max)
+        assert controls.perimeter[0, 3] == pytest.approx(middle)
+        opened = network.open_perimeter[:, others]
+        assert controls.perimeter[:, others] == pytest.approx(opened)
+        assert controls.prices == pytest.approx(np.where(others, 0.25, 1.0))
+        assert controls.metering == pytest.approx(0.8 * network.critical / FILL_TIME_S)
+
+
+@pytest.mark.parametrize(
+    "numbers, protected, problem",
+    [
+        ([1.2, 0.0, 0.0, 1.0], (3,), "numbers: expected 4 numbers >= 0, the first at most 1"),
+        ([0.5] * 3, (3,), "numbers: should have at least 4"),
+        ([0.5] * 4, (), "numbers: expected a scenario with protected regions"),
+    ],
+)
+def test_wrong_numbers_of_constant_control(numbers, protected, problem):
+    options = {"constant": {"numbers": numbers}}
+    scenario = replace(
+        load_scenario("economic_mpc"), protected=protected, controller_options=options
+    )
+    with pytest.raises(InputError, match=f"controllers.constant.{problem}"):
+        parse("constant").make(scenario)
 
 
 @pytest.mark.parametrize(

@@ -24,6 +24,7 @@ from nmfd.controllers import custom
 from nmfd.controllers.base import Options, check_fit
 from nmfd.controllers.dpc import policy_file
 from nmfd.controllers.dpc.compact import GatingRule, PricingRule
+from nmfd.controllers.dpc.constant import ConstantControl
 from nmfd.controllers.dpc.options import Dpc
 from nmfd.controllers.mpc.controller import EconomicMpc
 from nmfd.controllers.open_loop import Bound
@@ -111,6 +112,7 @@ CONTROLLERS: Mapping[str, BuiltIn] = dict(
             "prices of ways through regions, and gates, by numbers tuned in SUMO",
             PricingRule,
         ),
+        _named("constant", "gates, prices and departure rates that never change", ConstantControl),
         *_pair("dpc-{}", "trained policy", Dpc),
         *_pair("bound-{}", "best plan with all demand known (nmfd bound)", Bound),
     ]
