@@ -47,6 +47,7 @@ def truth():
         exit_rates=rates / rates.mean(axis=1, keepdims=True),
         capacity=np.where(network.adjacency, 8.0, 0.0),
         storage=np.full(7, 8000.0),
+        equal_ways=True,
     )
 
 

@@ -197,6 +197,34 @@ def test_exit_rates_scale_what_leaves():
     torch.testing.assert_close(scaled[1], plain[1] * torch.from_numpy(rates)[:, None, :])
 
 
+def test_ways_in_use_take_the_same_time_in_free_flow():
+    """From 0 to 2 straight, or by 1: of four rates only the mean time to 2 is left to the ways."""
+    network = replace(
+        load_network("two_regions"),
+        region_names=("0", "1", "2"),
+        positions=np.zeros((3, 2)),
+        adjacency=~np.eye(3, dtype=bool),
+        mfds=(NETWORK.mfds[0],) * 3,
+        observed_split_ratios={(0, 2): {1: 0.5, 2: 0.5}},
+        exit_rates=np.array([[1.0, 2.0, 1.0], [1.0, 1.0, 2.0], [1.0, 1.0, 1.0]]),
+        equal_ways=True,
+    )
+    # Times in units of 1 / q: 1 in region 0 on the way to 2, and 0.5 more in region 1 for half.
+    detours = network.detours
+    assert detours is not None
+    assert detours[0, :, 2] == pytest.approx([0.0, -0.25, 0.25])
+    p = dynamics.parameters(network)
+    x = torch.zeros(3, 3, dtype=torch.float64)
+    x[0, 2] = 1.0
+    splits = torch.tensor(network.nominal_splits)
+    perimeter = torch.tensor(network.open_perimeter) / network.u_max
+    q = dynamics.rate(p, x.sum(-1))[0]
+    for share, time in ((0.5, 1.0), (0.0, 1.25), (1.0, 0.75)):
+        splits[0, :, 2] = torch.tensor([0.0, share, 1.0 - share])
+        _, transfers = dynamics.flows(p, x, perimeter, splits)
+        assert float(transfers.sum()) == pytest.approx(float(q) / time)
+
+
 @pytest.mark.parametrize("integrator", dynamics.SCHEMES)
 def test_an_interval_that_counts_is_the_same_interval(integrator):
     """And what it counts is what is missing at its end."""

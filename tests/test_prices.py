@@ -13,6 +13,7 @@ from nmfd import closed_loop
 from nmfd.api import load_scenario, run
 from nmfd.controllers.dpc.policy import Architecture, Policy
 from nmfd.controllers.dpc.rollout import Rollout
+from nmfd.model.answer import Answer
 from nmfd.model.plant import NmfdPlant
 from nmfd.studies.benchmark import lower_bound
 from nmfd.types import Observation
@@ -83,3 +84,15 @@ def test_mpc_of_grid7_has_the_outputs_of_the_policy():
     assert controls.prices.argmax() == 3
     assert controls.prices[3] > 0.5
     assert controls.metering[3] < 3.0 < controls.metering[2]
+
+
+def test_a_price_everywhere_diverts_nobody_from_ways_that_take_the_same_time():
+    """Prices of all regions are proportional to times, so that only unequal times divert."""
+    network = tiny.limited(load_scenario("economic_mpc").network)
+    network = replace(network, exit_rates=np.ones((7, 7)))
+    x = torch.zeros(7, 7)
+    nominal = torch.tensor(network.nominal_splits, dtype=torch.float32)
+    alike = Answer(network)(x, torch.full((7,), 1.4))
+    other = Answer(network)(x, torch.tensor([0.0, 0.0, 0.0, 1.4, 0.0, 0.0, 0.0]))
+    torch.testing.assert_close(alike, nominal, atol=1e-4, rtol=0.0)
+    assert (other - nominal).abs().max() > 0.1

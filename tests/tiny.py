@@ -83,12 +83,13 @@ def write(folder: Path, *, scenario: str = SCENARIO, network: str | None = None)
 
 
 def limited(network: RegionalModel, *, seed: int = 0) -> RegionalModel:
-    """`network` with exit rates, boundary capacities and storage, all of a size that matters."""
+    """`network` with exit rates, detours, capacities and storage, all of a size that matters."""
     random, shape = np.random.default_rng(seed), network.adjacency.shape
     most = max(mfd.capacity for mfd in network.mfds)
     return replace(
         network,
         exit_rates=random.uniform(0.5, 1.5, shape),
+        equal_ways=True,
         capacity=random.uniform(0.1, 0.6, shape) * most * network.adjacency,
         storage=random.uniform(0.8, 1.6, network.regions) * np.array([m.jam for m in network.mfds]),
     )

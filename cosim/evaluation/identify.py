@@ -460,6 +460,7 @@ def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool)
         exit_rates=None,
         capacity=None,
         storage=None,
+        equal_ways=False,
         critical_above={},
         held_out=None,
     )

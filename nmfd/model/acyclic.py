@@ -52,6 +52,7 @@ class Acyclic:
     fallback: least-bad move of each cell; -1 where the trip ends (int, (C,))
     mfd: of all regions
     exit_rates: (-, (C,))
+    detours: of each move (-, (M,)), or None
     capacity: under u = 1 (veh/s, (R, R)), or None
     storage: (veh, (R,)), or None
     """
@@ -68,6 +69,7 @@ class Acyclic:
     fallback: CellIndex
     mfd: Mfd
     exit_rates: PerCell
+    detours: PerMove | None
     capacity: PerPair | None
     storage: PerRegion | None
 
@@ -106,6 +108,9 @@ def build(network: RegionalModel) -> Acyclic:
     rates = network.exit_rates
     if rates is None:
         rates = np.ones(network.adjacency.shape)
+    detours = network.detours
+    if detours is not None:
+        detours = detours[region[move_from], move_next, destination[move_from]]
     return Acyclic(
         origin=origin,
         previous=previous,
@@ -119,6 +124,7 @@ def build(network: RegionalModel) -> Acyclic:
         fallback=np.array([fallback.get(n, -1) for n in range(len(cells))]),
         mfd=stacked(network.mfds, np.array),
         exit_rates=rates[region, destination],
+        detours=detours,
         capacity=network.open_capacity,
         storage=network.storage,
     )
@@ -147,10 +153,17 @@ def shares(model: Acyclic, splits: PerTurn) -> tuple[PerMove, Bool[np.ndarray, "
     return theta, forced
 
 
-def outflow(model: Acyclic, x: PerCell) -> PerCell:
-    """Return the desired outflow (C,) [veh/s] of the state x (C,) [veh]."""
+def outflow(model: Acyclic, x: PerCell, theta: PerMove) -> PerCell:
+    """Return the desired outflow of each cell (veh/s, (C,)).
+
+    x: accumulations of the cells (veh, (C,))
+    theta: share of each move (-, (M,))
+    """
     accumulation = np.bincount(model.region, x, minlength=len(model.start))
-    return model.exit_rates * model.mfd.rate(accumulation)[model.region] * x
+    leaving = model.exit_rates * model.mfd.rate(accumulation)[model.region] * x
+    if model.detours is None:
+        return leaving
+    return leaving / (1.0 + np.bincount(model.move_from, theta * model.detours, len(x)))
 
 
 def derivative(
@@ -163,7 +176,7 @@ def derivative(
     perimeter: (-, (R, R))
     theta: share of each move (-, (M,))
     """
-    leaving = outflow(model, x)
+    leaving = outflow(model, x, theta)
     ends = model.region == model.destination
     passing = transfers(model, x, leaving, perimeter, theta)
     change = -np.where(ends, leaving, 0.0)

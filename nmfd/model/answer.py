@@ -7,8 +7,13 @@ the nominal theta0, with the dispersion s (RegionalModel):
     theta_ihj ~ theta0_ihj exp(-e_hj / s)
     e_hj = c_h t_hj + sum_g theta0_hgj e_gj        for h != j, otherwise 0
 
-t_hj is the mean time to leave h on the way to j, so that e_hj is what the prices add from h on. The
-answer is differentiable.
+t_hj is the mean time to leave h on the way to j, so that e_hj is what the prices add from h on.
+Where the time in a region depends on the next one (RegionalModel.detours), so does its price:
+
+    theta_ihj ~ theta0_ihj exp(-(e_hj + c_i t_ij detour_ihj) / s)
+    e_hj = c_h t_hj (1 + sum_g theta0_hgj detour_hgj) + sum_g theta0_hgj e_gj
+
+The answer is differentiable.
 """
 
 import torch
@@ -46,11 +51,17 @@ class Answer(nn.Module):
         if p.exit_rates is not None:
             leaving = leaving * p.exit_rates
         here = prices.unsqueeze(-1) / leaving * p.off_diagonal
+        longer = None
+        if p.detours is not None:
+            longer = here.unsqueeze(-2) * p.detours
+            here = here + (self.own * longer).sum(-2)
         # After as many rounds as the longest way has boundaries, e_hj holds every way to j.
         extra = here
         for _ in range(self._hops):
             extra = here + torch.einsum("hgj,...gj->...hj", self.own, extra) * p.off_diagonal
         costs = extra.unsqueeze(-3) + torch.zeros_like(self.own)
+        if longer is not None:
+            costs = costs + longer
         # Only differences matter: from the least one no exponential is too small.
         least = torch.where(self.own > 0, costs, torch.inf).amin(-2, keepdim=True)
         least = torch.where(least.isfinite(), least, 0.0)

@@ -3,13 +3,15 @@
 It has exit rates by destination, and MFDs with a plateau. In an interval with accumulations x_ij
 the regional model lets
 
-    k_ij q_i x_ij s_ij,    s_ij: share that boundaries let pass,
+    k_ij q_i x_ij s_ij / D_ij,    s_ij: share that boundaries let pass,
+                                  D_ij: mean time in i by the next regions, 1 for j = i
 
-vehicles a second leave region i towards j. The runs tell how many left, E_ij: those that crossed
-a boundary, or for j = i ended their trip. So the rates are ratios of sums over the intervals,
+vehicles a second leave region i towards j (nmfd.model.dynamics). The runs tell how many left, E_ij:
+those that crossed a boundary, or for j = i ended their trip. So the rates are ratios of sums over
+the intervals,
 
-    q_i(n) = sum E_ij / sum k_ij x_ij s_ij  over j and the intervals with about n vehicles,
-    k_ij   = sum E_ij / sum q_i x_ij s_ij   over the flowing intervals.
+    q_i(n) = sum E_ij / sum k_ij x_ij s_ij / D_ij  over j and the intervals with about n vehicles,
+    k_ij   = sum E_ij / sum q_i x_ij s_ij / D_ij   over the flowing intervals.
 
 The largest flow of a boundary is that of its signals, or less where its crossings show a limit.
 Only the storage of regions that locked cannot be counted: it is the one that predicts best.
@@ -101,6 +103,7 @@ def counted(
         exit_rates=np.ones(network.adjacency.shape),
         capacity=np.where(network.adjacency, saturation, 0.0),
         storage=np.maximum(JAM_DENSITY * lane_km, most),
+        equal_ways=True,
         critical_above={},
     )
     model = _counted(start, counts, fastest, lane_km)
@@ -155,8 +158,14 @@ def _rates(model: RegionalModel, counts: Counts) -> np.ndarray:
 
 
 def _wishes(model: RegionalModel, counts: Counts) -> np.ndarray:
-    """Return k_ij q_i x_ij, the outflow without boundaries (veh/s, (N, R, R))."""
-    return model.exit_rates * _rates(model, counts)[..., None] * counts.inside
+    """Return k_ij q_i x_ij / D_ij, the outflow without boundaries (veh/s, (N, R, R))."""
+    wishes = model.exit_rates * _rates(model, counts)[..., None] * counts.inside
+    return wishes / _durations(model, counts)
+
+
+def _durations(model: RegionalModel, counts: Counts) -> np.ndarray:
+    """Return D_ij, the mean time in i by the next regions (-, (N, R, R))."""
+    return 1.0 + (counts.splits * model.detours).sum(axis=2)
 
 
 def _boundary_shares(model: RegionalModel, counts: Counts, wish: np.ndarray) -> np.ndarray:
@@ -173,12 +182,12 @@ def _desired_flows(model: RegionalModel, counts: Counts) -> np.ndarray:
 
 
 def _passed(model: RegionalModel, counts: Counts) -> np.ndarray:
-    """Return s_ij, which boundaries let pass (-, (N, R, R))."""
+    """Return s_ij / D_ij, which leave in the mean time (-, (N, R, R))."""
     shares = _boundary_shares(model, counts, _desired_flows(model, counts))
     passed = np.einsum("nihj,nih->nij", counts.splits, shares)
     own = np.arange(model.regions)
     passed[:, own, own] = 1.0
-    return passed
+    return passed / _durations(model, counts)
 
 
 def _with_mfds(

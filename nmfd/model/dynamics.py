@@ -43,6 +43,7 @@ class Parameters:
     mfd: of all regions
     adjacency, off_diagonal: 0 or 1 ((R, R))
     exit_rates: (-, (R, R)), or None
+    detours: (-, (R, R, R)), or None
     capacity: under u = 1 (veh/s, (R, R)), or None
     storage: (veh, (R,)), or None
     """
@@ -51,6 +52,7 @@ class Parameters:
     adjacency: PerPair
     off_diagonal: PerPair
     exit_rates: PerPair | None = None
+    detours: PerTurn | None = None
     capacity: PerPair | None = None
     storage: PerRegion | None = None
 
@@ -73,6 +75,7 @@ def parameters(
         adjacency=tensor(network.adjacency),
         off_diagonal=1.0 - torch.eye(network.regions, dtype=dtype, device=device),
         exit_rates=tensor(network.exit_rates),
+        detours=tensor(network.detours),
         capacity=tensor(network.open_capacity),
         storage=tensor(network.storage),
     )
@@ -92,12 +95,15 @@ def flows(
     """Return trip completions (..., R) and transfer flows (..., R, R, R).
 
     As published, they are m_ii and u_ih m_ihj [veh/s]. Extensions: exit rates k_ij multiply m_ihj
-    and m_ii; with capacities, `passing` replaces u_ih.
+    and m_ii; detours r_ihj divide m_ihj by 1 + sum_h theta_ihj r_ihj, the mean time in i; with
+    capacities, `passing` replaces u_ih.
     """
     accumulation = x.sum(-1)
     leaving = rate(p, accumulation).unsqueeze(-1) * x
     if p.exit_rates is not None:
         leaving = leaving * p.exit_rates
+    if p.detours is not None:
+        leaving = leaving / (1.0 + (splits * p.detours).sum(-2))
     completions = torch.diagonal(leaving, dim1=-2, dim2=-1)
     onward = (leaving * p.off_diagonal).unsqueeze(-2)
     if p.capacity is None:

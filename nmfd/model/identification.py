@@ -294,6 +294,7 @@ def _network(network: RegionalModel, model: _Model, runs: Sequence[Observed]) ->
         network,
         mfds=tuple(mfds),
         exit_rates=rates / mean[:, None],
+        equal_ways=False,
         capacity=p.capacity.double().numpy() * network.u_max * network.adjacency,
         storage=p.storage.double().numpy(),
     )

@@ -144,7 +144,7 @@ class AcyclicPlant(NmfdPlant):
         model = self._model
         theta, forced = acyclic.shares(model, splits)
         if forced.any():
-            leaving = acyclic.outflow(model, self._x)
+            leaving = acyclic.outflow(model, self._x, theta)
             passing = acyclic.transfers(model, self._x, leaving, perimeter, theta)
             moved = float(passing[model.fallback[forced]].sum())
             self.forced_moves += self._scenario.step * moved

@@ -95,6 +95,8 @@ class RegionalModel:
         unknown
     critical_above: {region: largest accumulation [veh]} where data show no falling branch; the MFD
         is a guess beyond
+    equal_ways: ways in use take the same time in free flow, whichever region comes next (see
+        `detours`); False: the time in a region does not depend on the next one
     dispersion: of the logit by which guided drivers answer prices, see nmfd.model.answer (s)
     placeholder: the MFDs are guesses that no run has measured
     doubts: warnings about the fit of each region; () if unknown
@@ -117,6 +119,7 @@ class RegionalModel:
     storage: PerRegion | None = None
     controllable: PerPair | None = None
     critical_above: Mapping[int, float] = field(default_factory=dict)
+    equal_ways: bool = False
     dispersion: float = DISPERSION_S
     placeholder: bool = False
     doubts: tuple[tuple[str, ...], ...] = ()
@@ -186,6 +189,34 @@ class RegionalModel:
         theta /= np.where(sums > 0, sums, 1.0)  # in place: large for hundreds of regions
         return theta
 
+    @cached_property
+    def detours(self) -> PerTurn | None:
+        """Time in i by the next region h (R, R, R) [-], [i, h, j]; None without `equal_ways`.
+
+        It is relative to the mean time of vehicles in i bound for j, less 1. The dynamics alone
+        would let a detour cost nothing in i. But drivers choose the fastest way, so that ways in
+        use take about the same time: with the mean time t_ij in i in free flow, and W_ij from i to
+        the boundary of j,
+
+            W_ij = t_ij + sum_h theta0_ihj W_hj
+            detour_ihj = max(W_ij - W_hj, least) / t_ij - 1
+
+        `least` is the least t_ij of region i, and t_ij where nobody goes that way.
+        """
+        if not self.equal_ways:
+            return None
+        free = np.array([mfd.rate_up_to_jam(0.0) for mfd in self.mfds])
+        rates = np.ones(self.adjacency.shape) if self.exit_rates is None else self.exit_rates
+        time = 1.0 / (rates * free[:, None])
+        elsewhere = ~np.eye(self.regions, dtype=bool)
+        onward = np.zeros(time.shape)
+        for _ in range(self.regions):  # no way has more boundaries
+            onward = (time + np.einsum("ihj,hj->ij", self.nominal_splits, onward)) * elsewhere
+        used = self.nominal_splits > 0
+        least = np.where(used, time.min(axis=1)[:, None, None], time[:, None, :])
+        in_region = np.maximum(onward[:, None, :] - onward[None, :, :], least)
+        return np.where(self.split_mask, in_region / time[:, None, :] - 1.0, 0.0)
+
     @property
     def misleads(self) -> str:
         """Text that says where "as now" predicts better, "" if unknown."""
@@ -230,6 +261,8 @@ class RegionalModel:
             numbers = getattr(self, name)
             if numbers is not None:
                 content.append([name, numbers.tolist()])
+        if self.equal_ways:
+            content.append("equal_ways")
         if self.dispersion != DISPERSION_S:
             content.append(["dispersion", self.dispersion])
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
@@ -386,6 +419,9 @@ class NetworkTable(Settings):
         "MFDs are guesses from lanes and speed limits; no policy is trained on them", False
     )
     perimeter: PerimeterTable = setting("bounds of the control")
+    equal_ways: bool = setting(
+        "ways in use take the same time in free flow, whichever region comes next", False
+    )
     dispersion: float = setting(
         "spread of travel times by which guided drivers answer prices (logit)",
         DISPERSION_S,
@@ -505,6 +541,7 @@ def _network(table: NetworkTable, folder: Path) -> RegionalModel:
         storage=_by_region(rows, "storage"),
         controllable=_by_boundary(rows, "controllable"),
         critical_above=critical_above,
+        equal_ways=table.equal_ways,
         dispersion=table.dispersion,
         placeholder=table.placeholder,
         doubts=doubts,

@@ -289,6 +289,9 @@ def lower_bound(scenario: Scenario, *, guidance: bool) -> float:
     if scenario.process_std:
         problem = f"expected 0 for a lower bound, got {scenario.process_std:g}"
         raise InputError(f"{scenario.where}: process_std: {problem}; add --set process_std=0")
+    if scenario.network.equal_ways:
+        problem = "equal_ways: there is no lower bound for times that depend on the next region"
+        raise InputError(f"{scenario.network.name}: {problem}; remove the key from network.toml")
     if not (scenario.demand.any() or scenario.start.any()):
         return 0.0
     lp = relaxation(scenario, guidance=guidance)

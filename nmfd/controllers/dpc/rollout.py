@@ -296,6 +296,8 @@ class Rollout:
         leaving = dynamics.rate(p, x.sum(-1)).unsqueeze(-1) * x
         if p.exit_rates is not None:
             leaving = leaving * p.exit_rates
+        if p.detours is not None:
+            leaving = leaving / (1.0 + (splits * p.detours).sum(-2))
         return 0.5 * (splits - self.nominal_splits).abs().sum(-2) * leaving
 
 

@@ -48,6 +48,7 @@ class Turns:
     ends: cells in which trips end (i = j), (C,)
     mfd: of all regions
     exit_rates: (-, (C,))
+    detours: of every turn (-, (V,)) or None
     capacity: under u = 1 (veh/s, (E,)) or None
     storage: (veh, (R,)) or None
     step: control interval (s)
@@ -67,6 +68,7 @@ class Turns:
     ends: Bool[np.ndarray, " C"]
     mfd: Mfd
     exit_rates: PerCell
+    detours: PerTurn | None
     capacity: PerEdge | None
     storage: PerRegion | None
     step: float
@@ -91,7 +93,9 @@ class Record(NamedTuple):
     """Intermediate results of `derivative`, for its gradient.
 
     x, leaving: vehicles in the cells and their outflow (C,)
-    rate, slope: outflow per vehicle (C,), and its derivative (R,)
+    rate, slope: outflow per vehicle (C,), and the derivative of q_i (R,)
+    duration: mean time of a cell's vehicles in a region by their next ones (C,); None without
+        detours
     wish: desired flow of every turn (V,)
     share: of it that passes each edge (E,)
     boundary: None without capacities
@@ -101,6 +105,7 @@ class Record(NamedTuple):
     leaving: PerCell
     rate: PerCell
     slope: PerRegion
+    duration: PerCell | None
     wish: PerTurn
     share: PerEdge
     boundary: Boundary | None
@@ -127,11 +132,15 @@ def build(
     rates = network.exit_rates
     if rates is None:
         rates = np.ones(network.adjacency.shape)
+    detours = network.detours
+    if detours is not None:
+        detours = detours[here, onward, bound]
     capacity = network.open_capacity
     if capacity is not None:
         capacity = capacity[tuple(edges.T)]
     return Turns(
         exit_rates=rates[:, destinations].ravel(),
+        detours=detours,
         storage=network.storage,
         capacity=capacity,
         destinations=destinations,
@@ -177,6 +186,10 @@ def derivative(
     accumulation = x.reshape(len(model.mfd.jam), -1).sum(axis=1)
     per_region, slope = rate(model, accumulation)
     q = model.exit_rates * per_region[model.region]
+    duration = None
+    if model.detours is not None:
+        duration = 1.0 + np.bincount(model.source, splits * model.detours, cells)
+        q = q / duration
     leaving = q * x
     wish = splits * leaving[model.source]
     boundary = None
@@ -189,7 +202,7 @@ def derivative(
     change = demand - np.where(model.ends, leaving, 0.0)
     change -= np.bincount(model.source, transfers, cells)
     change += np.bincount(model.target, transfers, cells)
-    return change, Record(x, leaving, q, slope, wish, share, boundary)
+    return change, Record(x, leaving, q, slope, duration, wish, share, boundary)
 
 
 def _boundary(model: Turns, wish: PerEdge, perimeter: PerEdge, accumulation: PerRegion) -> Boundary:
@@ -238,10 +251,16 @@ def pull_derivative(
         of_accumulation = np.bincount(model.edges[:, 1], of_share * boundary.by_ahead, regions)
     of_leaving = np.bincount(model.source, splits * of_wish, len(record.x))
     of_leaving = of_leaving - np.where(model.ends, adjoint, 0.0)
-    of_rate = (of_leaving * model.exit_rates * record.x).reshape(regions, -1).sum(axis=1)
+    of_rates = of_leaving * model.exit_rates * record.x
+    of_splits = of_wish * record.leaving[model.source]
+    if model.detours is not None:
+        of_rates = of_rates / record.duration
+        of_duration = -of_leaving * record.leaving / record.duration
+        of_splits = of_splits + of_duration[model.source] * model.detours
+    of_rate = of_rates.reshape(regions, -1).sum(axis=1)
     of_region = of_accumulation + record.slope * of_rate
     of_x = record.rate * of_leaving + of_region[model.region]
-    return of_x, of_perimeter, of_wish * record.leaving[model.source]
+    return of_x, of_perimeter, of_splits
 
 
 def advance(

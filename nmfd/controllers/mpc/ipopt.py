@@ -137,11 +137,16 @@ class Ipopt:
 def parameters(network: RegionalModel) -> Parameters:
     """Return `dynamics.parameters` as constants.
 
-    They are vectors (R, 1), but storage (1, R). adjacency is 1 or a structural zero.
+    They are vectors (R, 1), but storage (1, R), and detours R matrices (R, R). adjacency is 1 or a
+    structural zero.
     """
     p = Parameters(mfd=stacked(network.mfds, lambda numbers: ca.DM(list(numbers))))
     for name, values in vars(dynamics.parameters(network)).items():
-        if name != "mfd":
+        if name == "mfd":
+            continue
+        if values is not None and name == "detours":
+            p.detours = [ca.DM(of_region) for of_region in values.numpy()]
+        else:
             setattr(p, name, None if values is None else ca.DM(values.numpy()))
     p.adjacency = ca.sparsify(p.adjacency)
     if p.storage is not None:
@@ -169,6 +174,9 @@ def flows(
     leaving = ca.repmat(rate(p, accumulation), 1, regions) * x
     if p.exit_rates is not None:
         leaving *= p.exit_rates
+    if p.detours is not None:
+        longer = [ca.sum1(splits[i] * p.detours[i]) for i in range(regions)]
+        leaving /= 1.0 + ca.vertcat(*longer)
     completions = ca.diag(leaving)
     wishing = leaving - ca.diag(completions)
     wishes = [splits[i] * ca.repmat(wishing[i, :], regions, 1) for i in range(regions)]
