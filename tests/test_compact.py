@@ -17,6 +17,15 @@ from nmfd.controllers.dpc.constant import ConstantControl
 from nmfd.controllers.dpc.policy import Architecture, DpcController
 from nmfd.controllers.dpc.policy_file import load_policy
 from nmfd.controllers.dpc.rollout import Rollout
+from nmfd.controllers.dpc.single_changes import (
+    DOUBLED,
+    GATE,
+    HALVED,
+    OPEN,
+    UNMETERED,
+    UNPRICED,
+    changed_policies,
+)
 from nmfd.controllers.rules import PiGating
 from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
@@ -191,7 +200,7 @@ def test_it_is_trained_and_kept_in_a_file(tmp_path):
     trained, content = load_policy(scenario / "dpc-pcrg.pt", loaded.network)
     rule = parse("gating-rule").make(loaded)
     assert rule.policy.numbers.tolist() == pytest.approx(
-        [1.0, 2.0, 0.0, 0.0, 0.6, 0.0, 0.6, 1.5, 0.0, 0.0, 1.0]
+        [1.0, 2.0, 0.0, 0.0, 0.6, 0.0, 0.6, 1.5, 0.0, 0.0, 1.0, 1.0]
     )
     assert isinstance(trained, CompactPolicy)
     assert (trained.numbers != rule.policy.numbers).any()
@@ -211,6 +220,36 @@ def test_it_is_trained_and_kept_in_a_file(tmp_path):
             tmp_path / "out",
         )
     )
+
+
+def test_descent_from_a_saturated_gate_takes_the_single_change_that_gains(tmp_path):
+    """A gate far above the critical accumulation has no gradient, and one there would gain."""
+    scenario = load_scenario("economic_mpc")
+    table = {"compact": True, "numbers": [50.0, 2.0, 0.0, 0.0, 0.6, 0.0, 0.6, 1.5], "steps": 2}
+    scenario = replace(scenario, protected=(CENTRE,), controller_options={"dpc-pc": table})
+    out = training.train(scenario, parse("dpc-pc"), seed=0, out=tmp_path / "p.pt")
+    policy, content = load_policy(out, scenario.network)
+    assert policy.numbers.tolist()[0] == pytest.approx(1.0, abs=0.01)
+    planning = planning_model(scenario)
+    rollout = Rollout(planning)
+    setup = training.settings(scenario, parse("dpc-pc"))
+    best = content["configuration"]["validation_veh_s"]
+    scores = {}
+    for name, changed in changed_policies(policy, planning):
+        scores[name] = training.validate(changed, rollout, 0, setup)
+    assert min(scores.values()) > (1.0 - training.CHANGE_WORTH) * best
+    assert scores[OPEN] > 1.1 * best
+
+
+def test_a_kept_number_is_not_changed():
+    planning = planning_model(load_scenario("grid7_peak"))
+    policy = CompactPolicy(
+        planning.network, Architecture(guidance=True, compact=(CENTRE,), metering=True)
+    )
+    names = [name for name, _ in changed_policies(policy, planning)]
+    assert names == [GATE, OPEN, HALVED, DOUBLED, UNPRICED, UNMETERED]
+    left = [name for name, _ in changed_policies(policy, planning, ["set_point", "metering"])]
+    assert left == [HALVED, DOUBLED, UNPRICED]
 
 
 def test_constant_control_measures_nothing():
@@ -250,7 +289,7 @@ def test_wrong_numbers_of_constant_control(numbers, protected, problem):
 @pytest.mark.parametrize(
     "numbers, protected, problem",
     [
-        ([-1.0] * 8, (3,), "numbers: expected 8 to 11 numbers >= 0"),
+        ([-1.0] * 8, (3,), "numbers: expected 8 to 12 numbers >= 0"),
         ([1.0] * 7, (3,), "numbers: should have at least 8"),
         ([1.0] * 8, (), "numbers: expected a scenario with protected regions"),
     ],

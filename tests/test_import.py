@@ -205,10 +205,16 @@ def test_signals_that_are_left_alone(config, tmp_path):
     assert settings(scenario).leave_signals == ("C2",)
 
 
-def test_mesoscopic_keeps_the_ledger(imported):
+def test_mesoscopic_models_keep_the_ledger_and_differ(imported):
     scenario = load_scenario(imported[0] / "scenarios" / "tiny")
-    with tiny_city.played(scenario, 4, 0.5, mesoscopic=True) as (_, _, record):
-        assert record.crossings.sum() > 0
+    crossings = []
+    for model in (True, "ltm"):
+        with tiny_city.played(scenario, 4, 0.5, mesoscopic=model) as (_, _, record):
+            crossings.append(record.crossings)
+    classic, ltm = crossings
+    assert classic.sum() > 0
+    assert ltm.sum() > 0
+    assert (classic != ltm).any()
 
 
 @pytest.mark.parametrize("key, value", [("signals", "max-pressure"), ("measurement", "estimate")])

@@ -252,6 +252,7 @@ def test_the_best_validation_is_kept(tmp_path, scenario, monkeypatch):
     scores, notes = iter([7.0, 5.0, 6.0]), []
     monkeypatch.setattr(training, "VALIDATION_PERIOD", 2)
     monkeypatch.setattr(training, "validate", lambda *_: next(scores))
+    monkeypatch.setattr(training, "changed_policies", lambda *_: [])
     out = training.train(
         scenario,
         parse("dpc-pc"),
@@ -289,6 +290,15 @@ def test_a_resumed_training_ends_as_if_it_had_never_stopped(tmp_path, scenario, 
     expected = torch.load(whole, weights_only=True)["weights"]
     for name, weight in torch.load(out, weights_only=True)["weights"].items():
         assert torch.equal(weight, expected[name]), name
+
+
+def test_a_network_that_misses_a_single_change_says_so(tmp_path, scenario, monkeypatch, capsys):
+    """After two steps its gates are half open, on roads that never fill."""
+    training.train(scenario, parse("dpc-pc"), seed=0, out=tmp_path / "p.pt", steps=2)
+    assert "misses a single change: gates open would take" in capsys.readouterr().err
+    monkeypatch.setattr(training, "CHANGE_WORTH", 0.5)
+    training.train(scenario, parse("dpc-pc"), seed=0, out=tmp_path / "p.pt", steps=2)
+    assert "single change" not in capsys.readouterr().err
 
 
 def test_a_training_that_diverges_is_an_error(tmp_path, scenario, monkeypatch):

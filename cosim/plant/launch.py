@@ -123,6 +123,8 @@ class Launch:
         others = dict(settings.options)
         if settings.mesoscopic:
             others = recorded.MESOSCOPIC | others
+        if settings.mesoscopic == "ltm":
+            others["meso-ltm"] = "true"
         for key, value in others.items():
             if f"--{key}" not in options and key not in GIVEN:
                 chosen.setdefault(key, value)

@@ -96,7 +96,7 @@ def _left_alone(
     city: City, settings: Settings, additional: Sequence[Path], signals: Iterable[str]
 ) -> dict[str, str]:
     """Return which of `signals` perimeter control does not use, and why."""
-    everywhere = without_effect(settings.options, settings.mesoscopic)
+    everywhere = without_effect(settings.options, bool(settings.mesoscopic))
     if everywhere:
         return dict.fromkeys(signals, everywhere)
     reasons = dict.fromkeys(settings.leave_signals, "left alone by the scenario")

@@ -81,8 +81,10 @@ class Settings(config.Settings):
         "waiting time before SUMO moves a vehicle on; -1: never", -1.0, unit="s", ge=-1.0
     )
     begin: Seconds = setting("simulation time at which interval 0 begins", 0.0)
-    mesoscopic: bool = setting(
-        "SUMO's queue model without lanes, about ten times as fast; for quick studies", False
+    mesoscopic: bool | Literal["ltm"] = setting(
+        "SUMO's queue model without lanes, about ten times as fast; ltm: its link transmission "
+        "model; for quick studies",
+        False,
     )
     routes: Texts = setting(
         "route files of recorded trips; without any, trips are drawn from the demand", ()

@@ -65,7 +65,7 @@ class City:
             setup = settings(city)
             additional = own_files(city, setup.additional)
             left = setup.leave_signals
-            switched_off = without_effect(setup.options, setup.mesoscopic)
+            switched_off = without_effect(setup.options, bool(setup.mesoscopic))
         else:
             self.network = city
         built = net.city_of(self.network)

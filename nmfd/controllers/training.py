@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -24,6 +24,7 @@ from nmfd.controllers.dpc.keepers import FileKeeper, Keeper, ModuleKeeper, State
 from nmfd.controllers.dpc.options import Dpc
 from nmfd.controllers.dpc.policy import ModuleController, Policy
 from nmfd.controllers.dpc.rollout import Demands, Rollout, States, Trajectories, compiled_step
+from nmfd.controllers.dpc.single_changes import changed_policies
 from nmfd.controllers.strategy import Strategy
 from nmfd.errors import InputError, RunFailed
 from nmfd.model.authority import NO_GATEWAY
@@ -44,6 +45,10 @@ WORTH_COMPILING = 200  # Adam steps
 # gates have this logit, which is open in every state.
 WORTH = 0.03
 OPEN_LOGIT = 12.0
+# A single change that is better by CHANGE_WORTH after training begins another descent of a compact
+# policy.
+CHANGE_WORTH = 0.005
+RESTARTS = 2
 
 
 def settings(scenario: Scenario, strategy: Strategy, steps: int | None = None) -> Dpc:
@@ -195,25 +200,51 @@ def train(
         keeper.resume(run.restore)
     else:
         run.prepare()
-    while run.done < setup.steps:
-        run.step()
-        if run.done % VALIDATION_PERIOD == 0 or run.done == setup.steps:
-            run.validate()
-            keeper.save(run.state())
-        if progress:
-            unit = "" if task.own else " veh s"
-            best = f"best {run.best:.4g}{unit}" if math.isfinite(run.best) else "no validation yet"
-            progress(run.done, setup.steps, best)
-    if run.best == run.bar:
-        print(
-            f"nmfd: no policy gained {WORTH:.0%} on the model: its gates stay open", file=sys.stderr
-        )
+    while True:
+        _descend(run, setup.steps, progress)
+        if run.best == run.bar:
+            problem = f"no policy gained {WORTH:.0%} on the model: its gates stay open"
+            print(f"nmfd: {problem}", file=sys.stderr)
+            break
+        change = run.better_change()
+        if change is None:
+            break
+        if not run.restart(change):
+            problem = f"{change.name} would take {change.gain:.1%} less time on the model"
+            print(f"nmfd: the policy misses a single change: {problem}", file=sys.stderr)
+            break
     if not math.isfinite(run.best):
         raise RunFailed(
             f"{strategy.name}: every validation of {setup.steps} steps diverged; "
             "lower the learning rate"
         )
     return keeper.finish()
+
+
+def _descend(
+    run: "TrainingRun", steps: int, progress: Callable[[int, int, str], None] | None
+) -> None:
+    """Take the steps of one descent that are left."""
+    while run.done < steps:
+        run.step()
+        if run.done % VALIDATION_PERIOD == 0 or run.done == steps:
+            run.validate()
+            run.save()
+        if progress:
+            unit = "" if run.own else " veh s"
+            best = f"best {run.best:.4g}{unit}" if math.isfinite(run.best) else "no validation yet"
+            progress(run.done, steps, best)
+
+
+class Change(NamedTuple):
+    """Single change of a policy that is better on its own objective.
+
+    gain: share of the total time spent that it saves (-)
+    """
+
+    name: str
+    policy: Policy
+    gain: float
 
 
 def _configuration(
@@ -253,7 +284,7 @@ def _check_module(module: nn.Module, scenario: Scenario) -> None:
 class TrainingRun:
     """Gradient descent of one policy, with validations and a state.
 
-    done: steps taken
+    done: steps of this descent
     best: lowest validation, total time spent (veh s) or cost of the task; infinite before the first
     bar: what a validation must fall below; None if the policy does not begin as no control
     """
@@ -272,6 +303,8 @@ class TrainingRun:
         self.best = math.inf
         self.bar: float | None = None
         self._keeper = keeper
+        self._restarts = 0
+        self._best_weights: State = {}
         self._setup = setup
         self._recipe = setup.recipe
         self._task = task
@@ -290,14 +323,32 @@ class TrainingRun:
         )
         step = self._rollout.step
         self._advance = compiled_step(step) if compiled else step
-        self._optimizer = Adam(
+        self._optimizer = self._new_optimizer()
+
+    def _new_optimizer(self) -> Adam:
+        return Adam(
             self._policy.parameters(),
-            lr=setup.learning_rate,
+            lr=self._setup.learning_rate,
             weight_decay=self._recipe.weight_decay,
         )
 
+    @property
+    def own(self) -> bool:
+        """True if the cost is the user's own."""
+        return bool(self._task.own)
+
     def prepare(self) -> None:
-        """Begin like a gate or like no control if the settings say so."""
+        """Begin as the settings say: like a gate, or like no control.
+
+        A compact policy begins with the best of its single changes, not in a corner where descent
+        finds nothing.
+        """
+        if isinstance(self._policy, CompactPolicy) and not self.own:
+            self.validate()
+            change = self.better_change()
+            while change is not None:
+                self._take(change)
+                change = self.better_change()
         if self._setup.from_gating:
             begin_as_gate(self._policy, self._rollout, self._generator)
         if self._setup.from_no_control and not self._task.own:
@@ -410,13 +461,57 @@ class TrainingRun:
             score = validate(self._policy, self._rollout, self._seed, self._setup)
         if score < self.best:
             self.best = score
+            self._best_weights = copy.deepcopy(self._policy.state_dict())
             self._keeper.keep({key: score})
+
+    def better_change(self) -> Change | None:
+        """Return the best single change of the best policy, if it gains enough.
+
+        There is none for a cost or a module of the user's own, whose outputs are unknown.
+        """
+        policy = self._policy
+        if self.own or not isinstance(policy, Policy) or not self._best_weights:
+            return None
+        best = copy.deepcopy(policy)
+        best.load_state_dict(self._best_weights)
+        found = None
+        least = self.best * (1.0 - CHANGE_WORTH)
+        for name, changed in changed_policies(best, self._rollout.planning, self._setup.kept):
+            score = validate(changed, self._rollout, self._seed, self._setup)
+            if score < least:
+                least = score
+                found = Change(name=name, policy=changed, gain=1.0 - score / self.best)
+        return found
+
+    def _take(self, change: Change) -> None:
+        """Go on from a single change."""
+        self._policy.load_state_dict(change.policy.state_dict())
+        self.validate()
+
+    def restart(self, change: Change) -> bool:
+        """Begin another descent of a compact policy from a single change.
+
+        Return False for a network, or after RESTARTS.
+        """
+        if not isinstance(self._policy, CompactPolicy) or self._restarts == RESTARTS:
+            return False
+        self._restarts += 1
+        self._take(change)
+        self._optimizer = self._new_optimizer()
+        self.done = 0
+        return True
+
+    def save(self) -> None:
+        """Save the state of the training."""
+        self._keeper.save(self.state())
 
     def state(self) -> State:
         """Return all that `restore` needs."""
         return {
             "step": self.done,
             "best": self.best,
+            "best_weights": self._best_weights,
+            "restarts": self._restarts,
             "policy": self._policy.state_dict(),
             "optimizer": self._optimizer.state_dict(),
             "generator": self._generator.get_state(),
@@ -429,6 +524,8 @@ class TrainingRun:
         self._generator.set_state(state["generator"])
         self.done = int(state["step"])
         self.best = float(state["best"])
+        self._best_weights = state["best_weights"]
+        self._restarts = int(state["restarts"])
 
 
 def validate(policy: Policy, rollout: Rollout, seed: int, setup: Dpc) -> float:

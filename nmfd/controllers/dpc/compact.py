@@ -16,7 +16,7 @@ All other entries are open. `relief` opens a gate for a region beyond its own cr
 With metering,
 
     r_i = n_cr,i max(min(a_i, b), 0) / FILL_TIME_S
-    a_i = metering - z_i
+    a_i = metering_slope (metering - z_i)
     b   = metering_gain (metering_protected - max_p z_p)
 
 trips may begin in region i per second. `metering_protected` = 0 omits b. A gate moves a queue into
@@ -37,7 +37,7 @@ The regional model answers prices by a logit (nmfd.model.answer). The policy is 
 network.
 """
 
-from typing import Annotated, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -63,7 +63,7 @@ from nmfd.tensors import PerPair, PerRegion
 class Numbers(NamedTuple):
     """Parameters of a compact policy (-).
 
-    The last three may be omitted in scenario.toml.
+    The last four may be omitted in scenario.toml.
     """
 
     set_point: float = 1.0
@@ -77,19 +77,21 @@ class Numbers(NamedTuple):
     integral: float = 0.0
     metering_protected: float = 0.0
     metering_gain: float = 1.0
+    metering_slope: float = 1.0
 
 
-NumbersOption = Annotated[config.Numbers, Field(min_length=8, max_length=11)]
+NumbersOption = Annotated[config.Numbers, Field(min_length=8, max_length=12)]
 MEANING = (
     "set_point, gain, relief, price, price_from, elsewhere, elsewhere_from, metering, "
-    "integral (0), metering_protected (0), metering_gain (1); see nmfd/controllers/dpc/compact.py"
+    "integral (0), metering_protected (0), metering_gain (1), metering_slope (1); "
+    "see nmfd/controllers/dpc/compact.py"
 )
 
 
 class CompactPolicy(Policy):
     """Policy with a few numbers for its protected regions.
 
-    numbers: a tensor of Numbers (11,)
+    numbers: a tensor of Numbers (12,)
     held: True for a protected region (R,)
     """
 
@@ -149,7 +151,7 @@ class CompactPolicy(Policy):
             return None
         numbers = self._read()
         full = self._full(x)
-        room = numbers.metering - full
+        room = numbers.metering_slope * (numbers.metering - full)
         if numbers.metering_protected:
             fullest = torch.where(self.held, full, torch.zeros_like(full)).amax(-1, keepdim=True)
             left = numbers.metering_gain * (numbers.metering_protected - fullest)
@@ -160,6 +162,13 @@ class CompactPolicy(Policy):
         """Set negative numbers to 0."""
         with torch.no_grad():
             self.numbers.clamp_(min=0.0)
+
+    def load_state_dict(self, weights: Any, *args: Any, **options: Any) -> Any:
+        """Load weights; those of an older file lack the last numbers."""
+        given = weights["numbers"]
+        missing = torch.tensor(Numbers()[len(given) :], dtype=given.dtype)
+        weights = {**weights, "numbers": torch.cat([given, missing])}
+        return super().load_state_dict(weights, *args, **options)
 
     def _read(self) -> Numbers:
         return Numbers(*self.numbers.clamp(min=0.0))
@@ -181,7 +190,7 @@ class GatingRule(Options):
     def misfit(self, planning: PlanningModel) -> Problem | None:
         """Return negative numbers, or no protected region, as a problem."""
         if min(self.numbers) < 0.0:
-            return Problem("numbers", config.got("8 to 11 numbers >= 0", list(self.numbers)))
+            return Problem("numbers", config.got("8 to 12 numbers >= 0", list(self.numbers)))
         if not planning.protected:
             return Problem("numbers", "expected a scenario with protected regions; name them")
         return None

@@ -151,7 +151,7 @@ class Dpc(Options):
             )
         if self.numbers and not (self.compact and min(self.numbers) >= 0.0):
             raise Problem(
-                "numbers", "expected 8 to 11 numbers >= 0 of a compact policy; add compact = true"
+                "numbers", "expected 8 to 12 numbers >= 0 of a compact policy; add compact = true"
             )
         if self.kept and not (self.compact and set(self.kept) <= set(Numbers._fields)):
             names = got(
