@@ -13,7 +13,7 @@ from nmfd.model.commands import admissible
 from nmfd.model.scenario import Scenario
 from nmfd.runs.pool import Watchdog
 from nmfd.tensors import one_thread
-from nmfd.types import Controller, Controls, Observation, Plant, Result, State, Status
+from nmfd.types import EXPECTED, Controller, Controls, Observation, Plant, Result, State, Status
 
 PATIENCE = 10.0  # deadlines after which a decision ends the process of a run
 LEAST_PATIENCE_S = 10.0
@@ -93,7 +93,8 @@ def run(
         "wall_time": time.perf_counter() - begin,
     }
     nothing = np.zeros((network.regions, network.regions))
-    return Result.make(
+    splits = _column(controls, "splits", network.nominal_splits)
+    result = Result.make(
         about,
         network.region_names,
         accumulation=_column(states, "accumulation"),
@@ -103,12 +104,18 @@ def run(
         observed=_column(observations, "accumulation"),
         observed_backlog=_column(observations, "backlog"),
         perimeter=_column(controls, "perimeter"),
-        splits=_column(controls, "splits", network.nominal_splits),
+        splits=splits,
         prices=_column(controls, "prices", nothing[0]),
         status=np.array([command.status.value for command in controls]),
         note=_column(controls, "note"),
         decision_time=np.array(decision_time),
     )
+    priced = np.array([command.prices is not None for command in controls])
+    if not priced.any() or not getattr(plant, "guides_by_prices", False):
+        return result
+    nobody_obeys = priced[:, None, None, None]
+    commanded = np.where(nobody_obeys, network.nominal_splits, splits)
+    return result.assign(splits=commanded).add({}, EXPECTED, expected_splits=splits)
 
 
 def _column(rows: Sequence[object], name: str, default: object = None) -> np.ndarray:

@@ -131,7 +131,8 @@ class Controls:
 class Plant(Protocol):
     """City, regional or microscopic.
 
-    `step` is one control interval. A method `close` releases what the plant holds.
+    `step` is one control interval. A method `close` releases what the plant holds. A plant whose
+    drivers answer `Controls.prices` instead of obeying `splits` has `guides_by_prices` True.
     """
 
     def reset(self, seed: int) -> State:
@@ -206,6 +207,14 @@ VARIABLES: dict[str, Quantity] = {
     "decision_time": Quantity(
         ("interval",), "s", "processor time of Controller.act, of all threads of the process"
     ),
+}
+# Of a run in which drivers answered prices instead of obeying splits.
+EXPECTED = {
+    "expected_splits": Quantity(
+        _TURNS,
+        "1",
+        "splits, or with prices the drivers' answer that the controller's model expects",
+    )
 }
 SHOWN_FACTS = 30  # in the representation of a result
 SHOWN_CHARACTERS = 60  # of a fact

@@ -8,6 +8,7 @@ import tiny
 import torch
 from commands import good, nmfd
 
+from cosim.evaluation.model_validation import expected_splits
 from cosim.plant.strategy import parse
 from nmfd import closed_loop
 from nmfd.api import load_scenario, run
@@ -96,3 +97,24 @@ def test_a_price_everywhere_diverts_nobody_from_ways_that_take_the_same_time():
     other = Answer(network)(x, torch.tensor([0.0, 0.0, 0.0, 1.4, 0.0, 0.0, 0.0]))
     torch.testing.assert_close(alike, nominal, atol=1e-4, rtol=0.0)
     assert (other - nominal).abs().max() > 0.1
+
+
+class AnsweringPlant(NmfdPlant):
+    guides_by_prices = True
+
+
+def test_expected_splits_are_written_as_commanded_only_where_they_are_obeyed():
+    scenario = load_scenario("grid7_peak")
+    scenario = replace(scenario, steps=3, demand=scenario.demand[:3])
+    rule = parse("pricing-rule(numbers=[1.0,1.0,0.0,9.0,0.0,0.0,0.6,1.5])")
+    x = np.where(scenario.network.split_mask.any(axis=1), 50.0, 0.0)
+    scenario = replace(scenario, initial=x)
+    obeyed = closed_loop.run(NmfdPlant(scenario), rule.make(scenario), scenario, seed=0)
+    assert "expected_splits" not in obeyed
+    nominal = scenario.network.nominal_splits
+    assert np.abs(obeyed["splits"][0] - nominal).max() > 0.1
+    answered = closed_loop.run(AnsweringPlant(scenario), rule.make(scenario), scenario, seed=0)
+    np.testing.assert_array_equal(answered["expected_splits"][0], obeyed["splits"][0])
+    np.testing.assert_array_equal(answered["splits"][0], nominal)
+    np.testing.assert_array_equal(expected_splits(answered), answered["expected_splits"])
+    np.testing.assert_array_equal(expected_splits(obeyed), obeyed["splits"])

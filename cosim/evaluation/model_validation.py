@@ -51,10 +51,20 @@ def observed(result: Result) -> Observed:
         accumulation=result["accumulation"],
         demand=result["departures"] / result.step,
         perimeter=result["perimeter"],
-        splits=result["splits"],
+        splits=expected_splits(result),
         crossings=crossings.sum(axis=3),
         exits=exits,
     )
+
+
+def expected_splits(result: Result) -> np.ndarray:
+    """Return the split ratios that a model takes for a run (-, (T, R, R, R)).
+
+    They are the commanded ones or, with prices, the answer that the controller expected.
+    """
+    if "expected_splits" in result:
+        return result["expected_splits"]
+    return result["splits"]
 
 
 def net_crossings(result: Result) -> np.ndarray:
@@ -78,7 +88,7 @@ def predict(scenario: Scenario, result: Result) -> Result:
     """
     known = parameters(scenario.network)
     states = [torch.from_numpy(result["accumulation"][0])]
-    given = (result["departures"] / scenario.step, result["perimeter"], result["splits"])
+    given = (result["departures"] / scenario.step, result["perimeter"], expected_splits(result))
     for interval in zip(*map(torch.from_numpy, given), strict=True):
         states.append(advance(known, states[-1], *interval, **scenario.scheme))
     return result.assign(

@@ -59,6 +59,8 @@ class SumoPlant:
     meter, actuation: of the run; after `trip_facts` all trips have their whole time losses
     """
 
+    guides_by_prices = True
+
     def __init__(
         self,
         scenario: Scenario,
