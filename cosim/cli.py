@@ -427,8 +427,10 @@ def import_(source: Path | None, bbox: str | None, **options: Any) -> None:
     "--levels",
     "levels",
     type=listed(LEVEL),
-    default="0.6,0.8,1",
-    help="Factors that multiply the demand.",
+    default="",
+    show_default=False,
+    help="Factors that multiply the demand. [default: 0.6,0.8,1, then more in steps of "
+    "0.15 until fewer trips end, at most 2]",
 )
 @click.option("--seeds", type=COUNT, default=2, help="Loading runs per level, from seed 1000.")
 @click.option(

@@ -1,6 +1,7 @@
 """Comparison and identification on records whose truth is known: made by the regional model
 itself."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -298,3 +299,23 @@ def test_the_same_command_goes_on_after_ctrl_c_in_the_second_model(tmp_path, mon
     assert [task.scenario.protected for task in tasks] == [(1,), (0, 2)] * 2
     assert [task.out for task in tasks] == [out, out / "guided"] * 2
     assert load_scenario(folder).protected == (0, 2)
+
+
+@pytest.mark.parametrize(
+    "arrivals, levels, text",
+    [
+        ([60, 80, 100, 90], (0.6, 0.8, 1.0, 1.15), "breaks at 1.15 .*: 90 trips end, 100 at 1"),
+        ([60, 50, 80, 100], (0.6, 0.8, 1.0), "breaks at 0.8 .*: 50 trips end, 60 at 0.6"),
+        (range(60, 200), (*np.arange(0.6, 1, 0.2), *np.arange(1, 2, 0.15), 2.0), "Up to 2 times"),
+    ],
+)
+def test_a_city_is_loaded_until_it_breaks(monkeypatch, arrivals, levels, text):
+    def loading_runs(task, stage):
+        return [SimpleNamespace(completed_trips=n) for n in arrivals[: len(task.levels)]]
+
+    monkeypatch.setattr(identify.Task, "loading_runs", loading_runs)
+    fields = dict.fromkeys(identify.Task.__dataclass_fields__)
+    task, runs = identify.Task(**fields).until_broken()
+    assert task.levels == pytest.approx(levels)
+    found = identify.breaking_text(task.levels, task.mean_arrivals(runs))
+    assert re.search(text, found)

@@ -13,6 +13,7 @@ import re
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -42,6 +43,10 @@ from nmfd.types import Result
 PATHS = ("net", "regions")  # keys of [sumo] in network.toml
 UNGUIDED_STAGES = ("no-control", "probing-pc")
 GUIDED_STAGES = ("route-guidance", "probing-pcrg")
+# Factors on the demand: the first ones, and from the last one up until the city breaks.
+FIRST_LEVELS = (0.6, 0.8, 1.0)
+LEVEL_STEP = 0.15
+HIGHEST_LEVEL = 2.0
 LEAST_FLOW = 1e-3  # veh/s, of a boundary whose signals are never green
 SATURATION = 0.5  # vehicles a second and lane that pass a green signal
 COUNTED, FITTED = "counted", "fitted"
@@ -56,7 +61,7 @@ class Task:
 
     guided: with route guidance, first towards the drivers' own split ratios, then probing
     options: words of the strategies, such as max-pressure
-    levels: factors on the demand
+    levels: factors on the demand; () for as many as the city needs to break
     iterations: of the fit
     out: folder of the loading runs
     """
@@ -89,6 +94,23 @@ class Task:
         show = self._progress(f"loading runs {stage + 1} of 2; ")
         raise_failures(run_many(runs, self.out, workers=self.workers, progress=show))
         return [Result.read(self.out / run.file) for run in runs]
+
+    def until_broken(self) -> tuple["Task", list[Result]]:
+        """Return the task with the levels up to where the city breaks, and their runs."""
+        task = replace(self, levels=FIRST_LEVELS)
+        while True:
+            runs = task.loading_runs(0)
+            highest = task.levels[-1]
+            broken = breaking_level(task.levels, task.mean_arrivals(runs))
+            if broken is not None or highest >= HIGHEST_LEVEL:
+                return task, runs
+            further = round(min(highest + LEVEL_STEP, HIGHEST_LEVEL), 2)
+            task = replace(task, levels=(*task.levels, further))
+
+    def mean_arrivals(self, runs: Sequence[Result]) -> list[float]:
+        """Return the completed trips at each level, mean over the seeds."""
+        trips = np.array([run.completed_trips for run in runs])
+        return trips.reshape(len(self.levels), -1).mean(axis=1).tolist()
 
     def model(self, method: str, static: RegionalModel, runs: Sequence[Result]) -> RegionalModel:
         """Return the model of runs.
@@ -282,7 +304,7 @@ def identify(
     scenario: Path | str,
     *,
     settings: Mapping[str, Any] | None = None,
-    levels: Sequence[float] = (0.6, 0.8, 1.0),
+    levels: Sequence[float] = (),
     seeds: int = 2,
     city: str | None = None,
     network: Path | None = None,
@@ -296,7 +318,8 @@ def identify(
     It returns a report. The same call continues after an interruption.
 
     scenario: a scenario, or a network with a scenario of its name beside it; name or folder
-    levels: factors on the demand of the loading runs
+    levels: factors on the demand of the loading runs; 0.6, 0.8, 1 and, in steps of 0.15, up to
+        where fewer trips end, or 2, if ()
     seeds: loading runs per level, from seed 1000
     city: strategy options of the loading runs, such as "guided+max-pressure" or "own"; own, then
         guided, if None
@@ -334,7 +357,7 @@ def identify(
                     scenario=loaded,
                     guided=guided,
                     options=options,
-                    levels=levels,
+                    levels=sorted(levels),
                     seeds=range(1000, 1000 + seeds),
                     iterations=iterations,
                     out=folder,
@@ -392,7 +415,10 @@ def _target(
 def identified(task: Task) -> Identified:
     """Load a city, and fit a regional model to the runs."""
     scenario = task.scenario
-    first = task.loading_runs(0)
+    if task.levels:
+        first = task.loading_runs(0)
+    else:
+        task, first = task.until_broken()
     static = static_model(scenario, first, guided=task.guided)
     set_point = tuple(static.mfds[region].critical for region in scenario.protected)
     runs = first + task.loading_runs(1, set_point=set_point)
@@ -413,6 +439,9 @@ def identified(task: Task) -> Identified:
         held_out=fit_quality.held_out(trial.errors),
     )
     verdict = run_verdict(scenario, model, first)
+    answer, *grounds = verdict.sentences
+    breaks = breaking_text(task.levels, task.mean_arrivals(first))
+    verdict = replace(verdict, sentences=(answer, breaks, *grounds))
     return Identified(
         task=task,
         model=replace(model, controllable=verdict.boundaries.shares),
@@ -521,6 +550,31 @@ def as_it_was(
     rates = np.where(alone[:, None], 1.0, model.exit_rates)
     storage = np.where(alone, np.maximum(model.storage, [mfd.jam for mfd in mfds]), model.storage)
     return replace(model, mfds=tuple(mfds), exit_rates=rates, storage=storage)
+
+
+def breaking_level(levels: Sequence[float], arrivals: Sequence[float]) -> float | None:
+    """Return the lowest demand with fewer completed trips than the one before.
+
+    levels: factors on the demand, rising
+    arrivals: completed trips at each
+    """
+    for (_, before), (level, now) in pairwise(zip(levels, arrivals, strict=True)):
+        if now < before:
+            return level
+    return None
+
+
+def breaking_text(levels: Sequence[float], arrivals: Sequence[float]) -> str:
+    """Return the demand at which a city breaks, as a sentence.
+
+    Arguments as of `breaking_level`.
+    """
+    level = breaking_level(levels, arrivals)
+    if level is None:
+        return f"Up to {max(levels):g} times its demand the city does not break."
+    at = list(levels).index(level)
+    trips = f"{arrivals[at]:,.0f} trips end, {arrivals[at - 1]:,.0f} at {levels[at - 1]:g}"
+    return f"The city breaks at {level:g} times its demand: {trips}."
 
 
 def run_verdict(
