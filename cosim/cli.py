@@ -427,8 +427,6 @@ def import_(source: Path | None, bbox: str | None, **options: Any) -> None:
     "--levels",
     "levels",
     type=listed(LEVEL),
-    default="",
-    show_default=False,
     help="Factors that multiply the demand. [default: 0.6,0.8,1, then more in steps of "
     "0.15 until fewer trips end, at most 2]",
 )

@@ -304,7 +304,7 @@ def identify(
     scenario: Path | str,
     *,
     settings: Mapping[str, Any] | None = None,
-    levels: Sequence[float] = (),
+    levels: Sequence[float] | None = None,
     seeds: int = 2,
     city: str | None = None,
     network: Path | None = None,
@@ -319,7 +319,7 @@ def identify(
 
     scenario: a scenario, or a network with a scenario of its name beside it; name or folder
     levels: factors on the demand of the loading runs; 0.6, 0.8, 1 and, in steps of 0.15, up to
-        where fewer trips end, or 2, if ()
+        where fewer trips end, or 2, if None
     seeds: loading runs per level, from seed 1000
     city: strategy options of the loading runs, such as "guided+max-pressure" or "own"; own, then
         guided, if None
@@ -357,7 +357,7 @@ def identify(
                     scenario=loaded,
                     guided=guided,
                     options=options,
-                    levels=sorted(levels),
+                    levels=sorted(levels or ()),
                     seeds=range(1000, 1000 + seeds),
                     iterations=iterations,
                     out=folder,
