@@ -109,6 +109,8 @@ def summary(result: Result) -> dict[str, float | int | str]:
     row["final_accumulation_veh"] = float(inside[-1])
     row["max_accumulation_veh"] = float(inside.max())  # at the ends of intervals
     row["completed_veh"] = float(facts.pop("completed_veh", result["completed"][-1]))
+    row["gate_range"] = float(np.ptp(result["perimeter"], axis=0).max())
+    row["price_range"] = float(np.ptp(result["prices"], axis=0).max())
     # Processor times, of all threads.
     row["evaluation_time_s"] = float(result["decision_time"].sum())
     row["control_step_ms_first"] = float(decision_ms[0])
