@@ -240,7 +240,7 @@ def test_an_empty_region_keeps_its_model_in_identification(scenario, result):
         **{name: result[name].copy() for name in ("accumulation", "crossings", "arrivals")}
     )
     alone.accumulation[:, 0], alone.crossings[:, 0], alone.arrivals[:, 0] = 0.0, 0.0, 0.0
-    static = static_model(scenario, [alone], guided=False)
+    static = static_model(scenario, [alone])
     assert static.mfds[0] == network.mfds[0]
     assert static.mfds[3] != network.mfds[3]
     samples = outflow_samples(network, [alone])
@@ -319,3 +319,14 @@ def test_a_city_is_loaded_until_it_breaks(monkeypatch, arrivals, levels, text):
     assert task.levels == pytest.approx(levels)
     found = identify.breaking_text(task.levels, task.mean_arrivals(runs))
     assert re.search(text, found)
+
+
+def test_guidance_shifts_what_drivers_choose():
+    """Commanded: 0.3 more by region 1 than without a command, where drivers take 0.9 by it."""
+    own, reference, splits = np.zeros((3, 3, 3, 3))
+    own[0, :, 2] = [0.0, 0.9, 0.1]
+    reference[0, :, 2] = [0.0, 0.5, 0.5]
+    splits[0, :, 2] = [0.0, 0.8, 0.2]
+    both = identify.shifted(np.stack([splits, reference]), reference, own)
+    assert both[0, 0, :, 2] == pytest.approx([0.0, 1.0, 0.0])
+    np.testing.assert_allclose(both[1], own)

@@ -30,6 +30,7 @@ from nmfd.arrays import PerPair, PerRegion
 from nmfd.errors import InputError
 from nmfd.metrics import largest_accumulation
 from nmfd.model import authority, counting, identification, mfd
+from nmfd.model.identification import Observed
 from nmfd.model.planning import GUIDED
 from nmfd.model.regional_model import RegionalModel, network_toml
 from nmfd.model.scenario import Scenario
@@ -121,7 +122,7 @@ class Task:
         samples = outflow_samples(static, runs)
         empty = fit_quality.nearly_empty(samples)
         states = [run["accumulation"] for run in runs]
-        seen = [observed(run) for run in runs]
+        seen = self.observed(static, runs)
         lane_km = lane_kilometres(static)
         fastest = self.fastest(static)
         if method == COUNTED:
@@ -149,6 +150,15 @@ class Task:
         model = as_it_was(static, model, empty)
         return fit_quality.with_guesses(model, samples, lane_km, states, fastest=fastest)
 
+    def observed(self, static: RegionalModel, runs: Sequence[Result]) -> list[Observed]:
+        """Return the data of runs, with split ratios relative to those of `static`."""
+        found = []
+        for run in runs:
+            commanded = parse(run.controller).planning(self.scenario).network.nominal_splits
+            splits = shifted(run["splits"], commanded, static.nominal_splits)
+            found.append(observed(run.assign(splits=splits)))
+        return found
+
     def fastest(self, network: RegionalModel) -> PerRegion:
         """Return one region crossing in free flow as a rate (1/s, (R,))."""
         scenario = self.scenario
@@ -167,7 +177,7 @@ class Task:
         unseen = self.held_out(runs)
         without = self.model(method, static, [run for run in runs if run not in unseen])
         errors = fit_quality.predictions(
-            without, list(map(observed, unseen)), self.scenario.scheme, model.known_critical
+            without, self.observed(static, unseen), self.scenario.scheme, model.known_critical
         )
         return Trial(method=method, model=model, errors=errors)
 
@@ -340,7 +350,6 @@ def identify(
     report: list[str] = []
     try:
         for guided in [False, True] if both else [strategy.guides]:
-            # The second model takes the split ratios of the first.
             loaded = replace(load_scenario(scenario, settings), protected=protected)
             folder = main
             if guided and out is None:
@@ -419,7 +428,7 @@ def identified(task: Task) -> Identified:
         first = task.loading_runs(0)
     else:
         task, first = task.until_broken()
-    static = static_model(scenario, first, guided=task.guided)
+    static = static_model(scenario, first)
     set_point = tuple(static.mfds[region].critical for region in scenario.protected)
     runs = first + task.loading_runs(1, set_point=set_point)
     samples = outflow_samples(static, runs)
@@ -479,8 +488,8 @@ def _write_protected(scenario: Scenario, regions: tuple[int, ...]) -> None:
     files.write_text(path, changed)
 
 
-def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool) -> RegionalModel:
-    """Return the network with fitted MFDs, and own splits unless guided.
+def static_model(scenario: Scenario, results: Sequence[Result]) -> RegionalModel:
+    """Return the network with fitted MFDs, and the split ratios of runs without commands.
 
     Raises: InputError for empty runs
     """
@@ -506,11 +515,21 @@ def static_model(scenario: Scenario, results: Sequence[Result], *, guided: bool)
             points = fit_quality.own_points(cloud)
             mfds[region] = mfd.fit(*points.T, max_rate=fastest)
     network = replace(network, mfds=tuple(mfds))
-    if guided:  # the reference of theta stays that of the plant (cosim.plant.guidance)
-        return network
     crossings = sum(result["crossings"].sum(axis=0) for result in results)
     ratios = identification.observed_split_ratios(network, crossings)
     return replace(network, observed_split_ratios=ratios)
+
+
+def shifted(splits: np.ndarray, reference: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """Return commanded split ratios as those of drivers who take `own` without a command.
+
+    Guidance shifts what drivers choose by the difference to `reference`.
+
+    splits: (-, (T, R, R, R)); reference, own: (-, (R, R, R))
+    """
+    moved = np.clip(splits + (own - reference), 0.0, None)
+    sums = moved.sum(axis=2, keepdims=True)
+    return moved / np.where(sums > 0.0, sums, 1.0)
 
 
 def lane_kilometres(network: RegionalModel) -> PerRegion:

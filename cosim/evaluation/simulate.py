@@ -6,7 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -77,16 +77,18 @@ def simulate(
     with ExitStack() as stack:
         trip_file = stack.enter_context(atomic(job.trip_file)) if job.trip_file else None
         chosen = strategy.settings(scenario)
+        planning = strategy.planning(scenario)
         plant = SumoPlant(
             scenario,
             settings=chosen,
             trip_file=trip_file,
-            planning=strategy.planning(scenario),
+            planning=planning,
             observer=observer,
             gui=gui,
         )
         stack.callback(plant.close)
-        result = closed_loop.run(plant, controller, scenario, seed=job.seed, progress=progress)
+        believed = replace(scenario, network=planning.network)
+        result = closed_loop.run(plant, controller, believed, seed=job.seed, progress=progress)
         used = scenario.settings | {"sumo": chosen.model_dump(mode="json", exclude_defaults=True)}
         about = {"controller": strategy.name, "plant": "sumo", "settings": json.dumps(used)}
         result = result.add(about, RECORD, **plant.record())

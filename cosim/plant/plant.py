@@ -76,7 +76,8 @@ class SumoPlant:
         settings: instead of the table [sumo]
         trip_file: for SUMO's tripinfo, complete after `trip_facts`
         gui: show the run in sumo-gui
-        planning: model of the estimator; that of the scenario if None
+        planning: model of the controller and the estimator, whose nominal split ratios stand for
+            drivers without a command; that of the scenario if None
         Raises InputError for a city that does not fit the scenario's network or the settings.
         """
         self._scenario = scenario
@@ -139,7 +140,7 @@ class SumoPlant:
         self._guide = Guide(
             session,
             city,
-            scenario.network.nominal_splits,
+            self._planning.network.nominal_splits,
             compliance=settings.compliance,
             ways_return=settings.ways_return,
             period=settings.guidance_period,
@@ -303,7 +304,7 @@ class SumoPlant:
         """
         by_travel_times = controls.splits is None and self._settings.guided
         if controls.prices is not None or by_travel_times:
-            return self._scenario.network.nominal_splits
+            return self._planning.network.nominal_splits
         return controls.splits
 
     def _end_session(self) -> None:
