@@ -164,3 +164,20 @@ def test_the_best_is_the_best_on_the_seeds_that_all_have():
     assert "no-control 2, pi-gating 2, dpc-pc 2, mpc-pc 1" in warning
     apart = rows_of({(1.0, "a"): {1: 1.0, 2: 1.0}, (1.0, "b"): {2: 1.0}, (1.0, "c"): {3: 1.0}})
     assert set(statistics.on_common_seeds(apart)["controller"]) == {"a", "b"}
+
+
+def test_the_floor_is_the_time_of_trips_without_delay():
+    table = pd.DataFrame(
+        {
+            "controller": ["locked", "served", "detour"],
+            "trips": [100.0, 100.0, 100.0],
+            "completed_veh": [90.0, 100.0, 100.0],
+            "mean_trip_time_s": [900.0, 300.0, 310.0],
+            "mean_departure_delay_s": [100.0, 20.0, 0.0],
+            "mean_time_loss_s": [700.0, 80.0, 90.0],
+        }
+    )
+    assert (
+        statistics.floor(table) == "Floor: on the ways of served, without any delay, 2e+04 veh s."
+    )
+    assert statistics.floor(table[:1]) == ""

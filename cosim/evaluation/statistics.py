@@ -171,6 +171,23 @@ def warnings(table: pd.DataFrame) -> list[str]:
     return found
 
 
+def floor(table: pd.DataFrame) -> str:
+    """Return the time spent if nobody waited or slowed down, as a sentence.
+
+    It is the least one over strategies whose trips all ended; "" without any.
+
+    table: `statistics` of one demand level
+    """
+    served = table[(table["completed_veh"] >= table["trips"]) & (table["trips"] > 0)]
+    if served.empty:
+        return ""
+    lost = served["mean_departure_delay_s"] + served["mean_time_loss_s"]
+    free = served["trips"] * (served["mean_trip_time_s"] - lost)
+    least = free.idxmin()
+    name = served["controller"][least]
+    return f"Floor: on the ways of {name}, without any delay, {free[least]:.4g} veh s."
+
+
 def _listed(table: pd.DataFrame, values: pd.Series) -> str:
     """Return controllers with a number each."""
     pairs = zip(table["controller"], values, strict=True)
@@ -267,8 +284,9 @@ def text(rows: pd.DataFrame) -> str:
         lines.append(f"Demand times {level:g}")
         for part in shown(table):
             lines += [text_table(part.to_dict("records")), ""]
-        for warning in warnings(table):
-            lines += [*wrapped(warning), ""]
+        for note in (floor(table), *warnings(table)):
+            if note:
+                lines += [*wrapped(note), ""]
     return "\n".join([*lines, *wrapped(CAPTION)])
 
 
@@ -279,7 +297,7 @@ def markdown(rows: pd.DataFrame) -> str:
         parts.append(f"## Demand times {level:g}")
         for part in shown(table):
             parts.append(markdown_table(list(part), part.to_numpy().tolist()))
-        parts += warnings(table)
+        parts += [note for note in (floor(table), *warnings(table)) if note]
     return "\n\n".join([*parts, CAPTION]) + "\n"
 
 
