@@ -11,13 +11,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import torch
-from jaxtyping import Bool
 
 from cosim.evaluation.results import Finished
 from cosim.evaluation.simulate import regional_outflow
 from cosim.plant.strategy import of_finished
-from cosim.sumo.arrays import Points, RegionCounts
-from nmfd.arrays import Adjacency
+from cosim.sumo.arrays import Points
+from nmfd.model.counting import held_up
 from nmfd.model.dynamics import advance, parameters
 from nmfd.model.identification import Observed
 from nmfd.model.regional_model import RegionalModel
@@ -28,7 +27,6 @@ from nmfd.studies.benchmark import draw_accumulations
 from nmfd.studies.fit_quality import SITUATIONS, SPILLBACK, predictions
 from nmfd.types import Result
 
-COLLAPSED_SHARE = 0.7  # of the largest outflow so far, below which a denser region is collapsed
 FEWEST_VEHICLES = 5.0  # in a region during an interval that counts as a sample
 CAPTION = (
     "RMSE of the accumulation predicted from the start of a run, and from every recorded state, "
@@ -212,24 +210,3 @@ def outflow_samples(network: RegionalModel, results: Sequence[Result]) -> list[d
             for label, mask in masks.items():
                 clouds[label].append(points[mask[:, region], region])
     return [{label: np.concatenate(parts) for label, parts in clouds.items()} for clouds in samples]
-
-
-def held_up(
-    accumulation: RegionCounts, outflow: RegionCounts, adjacency: Adjacency
-) -> Bool[np.ndarray, "T R"]:
-    """Mark intervals in which a neighbour holds up a region's outflow.
-
-    The neighbour has collapsed, and did so before the region. A collapsed region holds more
-    vehicles than when its outflow was largest so far, and lets out less than COLLAPSED_SHARE of
-    that. Its queues spill back and lower the outflow of the region behind.
-
-    accumulation, outflow: (veh), (veh/s), both (T, R)
-    """
-    largest = np.maximum.accumulate(outflow)
-    interval = np.arange(len(outflow))[:, None]
-    best = np.maximum.accumulate(np.where(outflow == largest, interval, 0))
-    fuller = accumulation > np.take_along_axis(accumulation, best, axis=0)
-    collapsed = fuller & (outflow < COLLAPSED_SHARE * largest)
-    onset = np.where(collapsed.any(axis=0), collapsed.argmax(axis=0), len(outflow))
-    earlier = adjacency & (onset[None, :] < onset[:, None])
-    return (collapsed[:, None, :] & earlier[None]).any(axis=2)

@@ -22,8 +22,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Real
 
-from nmfd.arrays import PerPair, PerRegion
+from nmfd.arrays import Adjacency, PerPair, PerRegion
 from nmfd.metrics import largest_accumulation
 from nmfd.model.identification import HORIZON, Observed, prediction_errors
 from nmfd.model.mfd import JAM_DENSITY, RoundedLinear, guess_beyond
@@ -41,7 +42,10 @@ FALLS = (0.95, 0.5, 0.1, 0.01)  # of the largest outflow: points of the branch o
 LIMITS = np.geomspace(1.0, 0.02, 60)  # of the capacity of a boundary, of which one is chosen
 LOCKED = 0.5  # of the largest outflow: with less at the end of its data, a region has locked
 STORAGES = (1.0, 0.8, 0.7, 0.6)  # of the largest accumulation of a region that locked
+COLLAPSED_SHARE = 0.7  # of the largest outflow so far, below which a denser region is collapsed
 TELLING = 0.98  # of the squared error: a limit that lowers it to less is believed
+
+OverTime = Real[np.ndarray, "T R"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,6 +57,7 @@ class Counts:
     flows: over boundaries (veh/s, (N, R, R))
     perimeter: (-, (N, R, R))
     splits: (-, (N, R, R, R))
+    held_up: True where a neighbour holds up the outflow (bool, (N, R))
     step: control interval (s)
     """
 
@@ -61,18 +66,26 @@ class Counts:
     flows: np.ndarray
     perimeter: np.ndarray
     splits: np.ndarray
+    held_up: np.ndarray
     step: float
 
     @classmethod
-    def of(cls, runs: Sequence[Observed], step: float) -> "Counts":
+    def of(cls, runs: Sequence[Observed], step: float, adjacency: Adjacency) -> "Counts":
         """Return the intervals of all runs.
 
         step: control interval (s)
         """
-        states = [run.accumulation for run in runs]
+        inside = []
+        held = []
+        for run in runs:
+            assert run.exits is not None
+            mean = 0.5 * (run.accumulation[1:] + run.accumulation[:-1])
+            inside.append(mean)
+            held.append(held_up(mean.sum(axis=2), run.exits.sum(axis=2) / step, adjacency))
         return cls(
             step=step,
-            inside=np.concatenate([0.5 * (state[1:] + state[:-1]) for state in states]),
+            inside=np.concatenate(inside),
+            held_up=np.concatenate(held),
             exits=np.concatenate([run.exits for run in runs]) / step,
             flows=np.concatenate([run.crossings for run in runs]) / step,
             perimeter=np.concatenate([run.perimeter for run in runs]),
@@ -96,7 +109,7 @@ def counted(
     saturation: largest flow over each boundary that its signals allow (veh/s, (R, R))
     lane_km: lane-kilometres (km, (R,))
     """
-    counts = Counts.of(runs, scheme["step"])
+    counts = Counts.of(runs, scheme["step"], network.adjacency)
     most = largest_accumulation(run.accumulation for run in runs)
     start = replace(
         network,
@@ -165,7 +178,9 @@ def _wishes(model: RegionalModel, counts: Counts) -> np.ndarray:
 
 def _durations(model: RegionalModel, counts: Counts) -> np.ndarray:
     """Return D_ij, the mean time in i by the next regions (-, (N, R, R))."""
-    return 1.0 + (counts.splits * model.detours).sum(axis=2)
+    detours = model.detours
+    assert detours is not None
+    return 1.0 + (counts.splits * detours).sum(axis=2)
 
 
 def _boundary_shares(model: RegionalModel, counts: Counts, wish: np.ndarray) -> np.ndarray:
@@ -201,7 +216,7 @@ def _with_mfds(
     flowing = np.zeros(n.shape, dtype=bool)
     critical_above = {}
     for i in range(model.regions):
-        used = ready[:, i] > 0
+        used = (ready[:, i] > 0) & ~counts.held_up[:, i]
         if used.sum() < FEWEST_INTERVALS:
             critical_above[i] = float(n[:, i].max(initial=0.0))
             continue
@@ -293,6 +308,27 @@ def _pooled(n: np.ndarray, exits: np.ndarray, ready: np.ndarray) -> tuple[np.nda
     rates = np.bincount(bins, exits)[used] / weight
     falling = isotonic_regression(rates, weights=weight, increasing=False).x
     return middle, middle * falling
+
+
+def held_up(
+    accumulation: OverTime, outflow: OverTime, adjacency: Adjacency
+) -> Bool[np.ndarray, "T R"]:
+    """Mark intervals in which a neighbour holds up a region's outflow.
+
+    The neighbour has collapsed, and did so before the region. A collapsed region holds more
+    vehicles than when its outflow was largest so far, and lets out less than COLLAPSED_SHARE of
+    that. Its queues spill back and lower the outflow of the region behind.
+
+    accumulation, outflow: (veh), (veh/s), both (T, R)
+    """
+    largest = np.maximum.accumulate(outflow)
+    interval = np.arange(len(outflow))[:, None]
+    best = np.maximum.accumulate(np.where(outflow == largest, interval, 0))
+    fuller = accumulation > np.take_along_axis(accumulation, best, axis=0)
+    collapsed = fuller & (outflow < COLLAPSED_SHARE * largest)
+    onset = np.where(collapsed.any(axis=0), collapsed.argmax(axis=0), len(outflow))
+    earlier = adjacency & (onset[None, :] < onset[:, None])
+    return (collapsed[:, None, :] & earlier[None]).any(axis=2)
 
 
 def _with_rates(
