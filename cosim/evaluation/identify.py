@@ -182,11 +182,16 @@ class Task:
         return Trial(method=method, model=model, errors=errors)
 
     def best(self, static: RegionalModel, runs: Sequence[Result]) -> "Trial":
-        """Return the counted model, or a fitted one if that is better."""
+        """Return the counted model, or a fitted one if only that is good.
+
+        If none is good, the one that is better while traffic flows is returned.
+        """
         counted = self.trial(COUNTED, static, runs)
         if counted.good:
             return counted
         fitted = self.trial(FITTED, static, runs)
+        if fitted.good:
+            return fitted
         return min(counted, fitted, key=lambda trial: trial.error)
 
     def _progress(self, stage: str) -> Callable[..., None] | None:
@@ -220,13 +225,12 @@ class Trial(NamedTuple):
 
     @property
     def error(self) -> float:
-        """Return the RMSE over all states (veh)."""
-        squares = 0.0
-        for name in fit_quality.SITUATIONS:
-            count = self.errors[f"{name}_states"].iloc[0]
-            if count:
-                squares += count * (self.errors[f"{name}_rmse_veh"] ** 2).mean()
-        return float(np.sqrt(squares))
+        """Return the RMSE while traffic flows, else of all states (veh)."""
+        found = fit_quality.held_out(self.errors)
+        if found.flowing is not None:
+            return found.flowing.model
+        assert found.congested is not None
+        return found.congested.model
 
 
 @dataclass(frozen=True, kw_only=True)
