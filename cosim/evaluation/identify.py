@@ -97,7 +97,7 @@ class Task:
         return [Result.read(self.out / run.file) for run in runs]
 
     def until_broken(self) -> tuple["Task", list[Result]]:
-        """Return the task with the levels up to where the city breaks, and their runs."""
+        """Return the task with levels up to where the city breaks; their runs."""
         task = replace(self, levels=FIRST_LEVELS)
         while True:
             runs = task.loading_runs(0)
@@ -151,7 +151,7 @@ class Task:
         return fit_quality.with_guesses(model, samples, lane_km, states, fastest=fastest)
 
     def observed(self, static: RegionalModel, runs: Sequence[Result]) -> list[Observed]:
-        """Return the data of runs, with split ratios relative to those of `static`."""
+        """Return the data of runs, with split ratios as `static` has them."""
         found = []
         for run in runs:
             commanded = parse(run.controller).planning(self.scenario).network.nominal_splits
@@ -493,7 +493,9 @@ def _write_protected(scenario: Scenario, regions: tuple[int, ...]) -> None:
 
 
 def static_model(scenario: Scenario, results: Sequence[Result]) -> RegionalModel:
-    """Return the network with fitted MFDs, and the split ratios of runs without commands.
+    """Return the network with fitted MFDs and observed split ratios.
+
+    results: of runs without commands of split ratios
 
     Raises: InputError for empty runs
     """
@@ -525,11 +527,12 @@ def static_model(scenario: Scenario, results: Sequence[Result]) -> RegionalModel
 
 
 def shifted(splits: np.ndarray, reference: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """Return commanded split ratios as those of drivers who take `own` without a command.
+    """Return commanded split ratios for drivers with other own ways.
 
     Guidance shifts what drivers choose by the difference to `reference`.
 
-    splits: (-, (T, R, R, R)); reference, own: (-, (R, R, R))
+    splits: (-, (T, R, R, R))
+    reference, own: what is commanded for no shift, and what drivers then take (-, (R, R, R))
     """
     moved = np.clip(splits + (own - reference), 0.0, None)
     sums = moved.sum(axis=2, keepdims=True)

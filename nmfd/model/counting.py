@@ -171,7 +171,7 @@ def _rates(model: RegionalModel, counts: Counts) -> np.ndarray:
 
 
 def _wishes(model: RegionalModel, counts: Counts) -> np.ndarray:
-    """Return k_ij q_i x_ij / D_ij, the outflow without boundaries (veh/s, (N, R, R))."""
+    """Return k_ij q_i x_ij / D_ij (veh/s, (N, R, R)), as if nothing limits."""
     wishes = model.exit_rates * _rates(model, counts)[..., None] * counts.inside
     return wishes / _durations(model, counts)
 

@@ -191,12 +191,12 @@ class RegionalModel:
 
     @cached_property
     def detours(self) -> PerTurn | None:
-        """Time in i by the next region h (R, R, R) [-], [i, h, j]; None without `equal_ways`.
+        """Time in i by the next region h (R, R, R) [-]; None without `equal_ways`.
 
-        It is relative to the mean time of vehicles in i bound for j, less 1. The dynamics alone
-        would let a detour cost nothing in i. But drivers choose the fastest way, so that ways in
-        use take about the same time: with the mean time t_ij in i in free flow, and W_ij from i to
-        the boundary of j,
+        [i, h, j] is relative to the mean time of vehicles in i bound for j, less 1. The dynamics
+        alone would let a detour cost nothing in i. But drivers choose the fastest way, so that ways
+        in use take about the same time: with the mean time t_ij in i in free flow, and W_ij from i
+        to the boundary of j,
 
             W_ij = t_ij + sum_h theta0_ihj W_hj
             detour_ihj = max(W_ij - W_hj, least) / t_ij - 1
