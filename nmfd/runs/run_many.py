@@ -71,6 +71,7 @@ class Run:
         can be pickled, by value if it is the user's
     folder: folder below that of all runs
     expected: wall time (s), 0 if unknown
+    modules: those that its process needs besides that of its job
     """
 
     name: str
@@ -78,6 +79,7 @@ class Run:
     job: Callable[[], Any]
     folder: str = ""
     expected: float = 0.0
+    modules: tuple[str, ...] = ()
 
     @property
     def limit(self) -> float:
@@ -202,8 +204,10 @@ def _outcomes(
         for run in todo:
             yield run, attempt(run.job)
     else:
+        jobs = [run.job for run in todo]
         limits = [time_limit or run.limit for run in todo]
-        for number, outcome in in_processes([run.job for run in todo], workers, limits):
+        modules = {name for run in todo for name in run.modules}
+        for number, outcome in in_processes(jobs, workers, limits, modules=modules):
             yield todo[number], outcome
 
 
