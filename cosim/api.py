@@ -261,18 +261,21 @@ def evaluate(
         rows = evaluation.evaluate(
             runs,
             out,
+            _draw_all,
             workers=workers,
             scheduler=scheduler,
             time_limit=time_limit,
             overwrite=overwrite,
             progress=progress,
         )
-        from cosim.reporting import figures
-
-        for name in dict.fromkeys(results.finished_rows(rows).get("scenario", ())):
-            figures.draw_all(results.read(out, name))
     rows.attrs["folder"] = str(out)
     return rows
+
+
+def _draw_all(finished: results.Finished) -> None:
+    from cosim.reporting import figures
+
+    figures.draw_all(finished)
 
 
 def planned(

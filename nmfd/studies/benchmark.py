@@ -22,7 +22,8 @@ from nmfd.controllers.strategy import Strategy
 from nmfd.errors import InputError
 from nmfd.metrics import COUNTED, decision_ms, percent_change, summary
 from nmfd.model.scenario import Scenario, perturbed
-from nmfd.runs.files import file_hash, run_name
+from nmfd.runs.files import file_hash, is_newer, run_name
+from nmfd.runs.run_many import TABLE
 from nmfd.runs.tables import text_columns, text_table
 from nmfd.types import Plant, Result
 
@@ -50,6 +51,7 @@ IMPOSSIBLE_CAPTION = (
 )
 SIGMAS_VEH_S = (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0)  # of the noise on the demand
 SPREADS = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4)  # of the MFDs and trip lengths
+LAST_FIGURE = "region_accumulation.png"  # of draw_accumulations
 BOUND_TOLERANCE = 1e-6  # of the solver of the bound
 PERTURBED_PLANT = "acyclic"
 KEPT = (
@@ -193,20 +195,27 @@ def with_bounds(rows: "Table", lower: Mapping[tuple[str, float], float], level: 
 
 
 def draw(folder: Path, scenarios: Mapping[float, Scenario], rows: "pd.DataFrame") -> None:
-    """Draw the finished runs of a benchmark, and its scenario."""
+    """Draw the finished runs of a benchmark, and its scenario.
+
+    Figures of runs that are newer than runs.csv stay: it changes with every run.
+    """
     done = rows[rows["failure"] == ""]
     if done.empty:
         return
     several = len(scenarios) > 1
     for level, scenario in scenarios.items():
         below = f"demand-{level:g}" if several else ""
+        prefix = f"{below}-" if below else ""
+        if is_newer(folder / f"{prefix}{LAST_FIGURE}", folder / TABLE):
+            continue
         results = []
         for row in done.to_dict("records"):
             if row.get("folder", "") == below:
                 name = run_name(row["controller"], row["seed"])
-                results.append(Result.read(folder / below / f"{name}.nc"))
+                file = folder / below / f"{name}.nc"
+                results.append(Result.read(file, only=("accumulation", "backlog")))
         if results:
-            draw_accumulations(folder, scenario, results, prefix=f"{below}-" if below else "")
+            draw_accumulations(folder, scenario, results, prefix=prefix)
     draw_scenario(folder, next(iter(scenarios.values())))
 
 
@@ -313,7 +322,7 @@ def draw_accumulations(
         plots.region_accumulation(ax, network, region, trajectories, seed)
     drawing.suptitle(title, fontsize="medium")
     plots.legend_below(drawing, axes, columns=3)
-    plots.save(drawing, folder / f"{prefix}region_accumulation.png")
+    plots.save(drawing, folder / f"{prefix}{LAST_FIGURE}")
 
 
 def draw_scenario(folder: Path, scenario: Scenario) -> list[Path]:
