@@ -95,6 +95,10 @@ class Finished:
         for name, file in (("net_file_hash", files.net_file), ("regions_hash", files.regions_csv)):
             if self.levels[0].key[name] != file_hash(file):
                 raise InputError(f"{self.path}: {file} has changed since the runs; run them again")
+        return self._city
+
+    @cached_property
+    def _city(self) -> City:
         return scenario_city(self.scenario, settings(self.scenario))
 
     def level(self, demand: float = 1.0) -> Level:
