@@ -7,7 +7,7 @@
 
 `run` is one closed loop in SUMO, `evaluate` many in a folder, `read_run` reads one of them. A city
 is the scenario's, changed by `Settings`; `City` shows it. Names here are imported at their first
-use; `cosim.api` has a function for every command.
+use; `cosim.api` has functions of the other commands.
 """
 
 from collections.abc import Iterable
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
         catalogue,
         compare,
         evaluate,
-        identify,
-        import_city,
         report,
         run,
         tune,
     )
+    from cosim.evaluation.identify import identify
     from cosim.evaluation.results import read_run
+    from cosim.importing.importer import import_city
     from cosim.plant.plant import SumoPlant
     from cosim.plant.settings import Settings, settings
     from cosim.plant.strategy import Strategy
@@ -40,13 +40,13 @@ _MODULES = {
         "catalogue",
         "compare",
         "evaluate",
-        "identify",
-        "import_city",
         "report",
         "run",
         "tune",
     ),
+    "cosim.evaluation.identify": ("identify",),
     "cosim.evaluation.results": ("read_run",),
+    "cosim.importing.importer": ("import_city",),
     "cosim.plant.plant": ("SumoPlant",),
     "cosim.plant.settings": ("Settings", "settings"),
     "cosim.plant.strategy": ("Strategy",),

@@ -1,7 +1,7 @@
 """Python interface of `cosim`: functions for commands and single runs.
 
-Studies return tables; the command line prints them. Bokeh and Optuna are imported in the functions
-that need them: they take a second.
+Studies return tables; the command line prints them. What takes a second to import, such as Bokeh,
+Matplotlib, Optuna and torch, is imported in the functions that need it.
 """
 
 import os
@@ -14,18 +14,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cosim.evaluation import evaluate as evaluation
-from cosim.evaluation import model_validation, results
-from cosim.evaluation.identify import identify as identify
-from cosim.evaluation.links import write_links
+from cosim.evaluation import results
 from cosim.evaluation.runs import runs_of
 from cosim.evaluation.signal_proof import sheets
 from cosim.evaluation.simulate import Simulation, simulate
 from cosim.importing import get as cities
-from cosim.importing.importer import import_city as import_city
 from cosim.plant import strategy as strategies_of
 from cosim.plant.settings import Settings
 from cosim.plant.strategy import Strategy, parse
-from cosim.reporting import figures
 from cosim.sumo.trips import PLANNING_SEEDS
 from nmfd.api import (
     Controllers,
@@ -265,16 +261,21 @@ def evaluate(
         rows = evaluation.evaluate(
             runs,
             out,
+            _draw_all,
             workers=workers,
             scheduler=scheduler,
             time_limit=time_limit,
             overwrite=overwrite,
             progress=progress,
         )
-        for name in dict.fromkeys(results.finished_rows(rows).get("scenario", ())):
-            figures.draw_all(results.read(out, name))
     rows.attrs["folder"] = str(out)
     return rows
+
+
+def _draw_all(finished: results.Finished) -> None:
+    from cosim.reporting import figures
+
+    figures.draw_all(finished)
 
 
 def planned(
@@ -321,6 +322,8 @@ def compare(folder: Path | str) -> Table:
 
     A table and figures are written beside the runs.
     """
+    from cosim.evaluation import model_validation
+
     folder = Path(folder)
     finished = results.read(folder)
     with locked(folder):
@@ -439,6 +442,8 @@ def links(
     out: file, SCENARIO/links.npz if None
     seeds: of the draws of trips, if these are not recorded
     """
+    from cosim.evaluation.links import write_links
+
     return write_links(loaded(scenario), None if out is None else Path(out), seeds)
 
 

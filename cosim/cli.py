@@ -417,7 +417,7 @@ def import_(source: Path | None, bbox: str | None, **options: Any) -> None:
     place = bbox if source is None else source
     if place is None or (source is not None and bbox is not None):
         raise InputError("cosim import: expected either a file or --bbox; give one of them")
-    click.echo(cosim.api.import_city(place, **options))
+    click.echo(cosim.import_city(place, **options))
 
 
 @main.command()
@@ -458,7 +458,7 @@ def identify(scenario: Path, **options: Any) -> None:
     Example:
       cosim identify grid7_peak --with guided+max-pressure --network networks/grid7_max_pressure
     """
-    click.echo(cosim.api.identify(scenario, **options))
+    click.echo(cosim.identify(scenario, **options))
 
 
 @main.command()

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from nmfd.api import (
         benchmark,
         controller,
-        identify,
         load_scenario,
         options,
         robustness,
@@ -27,9 +26,7 @@ if TYPE_CHECKING:
         train,
     )
     from nmfd.controllers.base import Options
-    from nmfd.controllers.dpc.compact import GatingRule, PricingRule
-    from nmfd.controllers.dpc.constant import ConstantControl
-    from nmfd.controllers.dpc.options import Dpc
+    from nmfd.controllers.dpc.options import ConstantControl, Dpc, GatingRule, PricingRule
     from nmfd.controllers.dpc.policy import ModuleController, PerimeterLayer, SplitsLayer
     from nmfd.controllers.dpc.rollout import Trajectories
     from nmfd.controllers.mpc.controller import EconomicMpc
@@ -43,7 +40,7 @@ if TYPE_CHECKING:
     from nmfd.model.plant import AcyclicPlant, NmfdPlant
     from nmfd.model.regional_model import RegionalModel, load_network
     from nmfd.model.scenario import Scenario
-    from nmfd.studies.measured import Identified
+    from nmfd.studies.measured import Identified, identify
     from nmfd.types import Controller, Controls, Observation, Plant, Result, State, Status
 
 __version__ = "0.2.0"  # of the package perimeter-cosim, nmfd and cosim alike
@@ -51,7 +48,6 @@ _MODULES = {
     "api": (
         "benchmark",
         "controller",
-        "identify",
         "load_scenario",
         "options",
         "robustness",
@@ -59,9 +55,7 @@ _MODULES = {
         "train",
     ),
     "controllers.base": ("Options",),
-    "controllers.dpc.compact": ("GatingRule", "PricingRule"),
-    "controllers.dpc.constant": ("ConstantControl",),
-    "controllers.dpc.options": ("Dpc",),
+    "controllers.dpc.options": ("ConstantControl", "Dpc", "GatingRule", "PricingRule"),
     "controllers.dpc.policy": ("ModuleController", "PerimeterLayer", "SplitsLayer"),
     "controllers.dpc.rollout": ("Trajectories",),
     "controllers.mpc.controller": ("EconomicMpc",),
@@ -75,7 +69,7 @@ _MODULES = {
     "model.plant": ("AcyclicPlant", "NmfdPlant"),
     "model.regional_model": ("RegionalModel", "load_network"),
     "model.scenario": ("Scenario",),
-    "studies.measured": ("Identified",),
+    "studies.measured": ("Identified", "identify"),
     "types": ("Controller", "Controls", "Observation", "Plant", "Result", "State", "Status"),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}

@@ -1,4 +1,7 @@
-"""Functions behind the commands of `nmfd`; exported by the package `nmfd`."""
+"""Functions behind the commands of `nmfd`; exported by the package `nmfd`.
+
+What takes seconds to import, such as torch, is imported in the functions that need it.
+"""
 
 import re
 import sys
@@ -10,9 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, overload
 
 from nmfd import closed_loop
-from nmfd.controllers import open_loop, training
+from nmfd.controllers import open_loop
 from nmfd.controllers.base import Options
-from nmfd.controllers.dpc import rollout
 from nmfd.controllers.strategy import (
     CONTROLLERS,
     ControllerLike,
@@ -29,19 +31,19 @@ from nmfd.runs.progress import Progress, watched
 from nmfd.runs.run_many import Run, locked, run_many
 from nmfd.runs.run_many import raise_failures as raise_failures
 from nmfd.studies import benchmark as benchmark_study
-from nmfd.studies import bound as bound_study
 from nmfd.studies.benchmark import (
+    MODULES,
     PLANTS,
     REFERENCE,
     SIGMAS_VEH_S,
     SPREADS,
     closed_loop_of,
     key_of,
+    plant_of,
     workers_for,
 )
 from nmfd.studies.benchmark import improvement_table as improvement_table
 from nmfd.studies.benchmark import summary_table as summary_table
-from nmfd.studies.measured import identify as identify
 from nmfd.types import Controller, Plant, Result
 
 if TYPE_CHECKING:
@@ -195,7 +197,7 @@ def run(
     name = type(plant).__name__
     if isinstance(plant, str):
         name = plant
-        plant = PLANTS[plant](scenario)
+        plant = plant_of(plant, scenario)
     with watched(strategy.name, progress) as show:
         result = closed_loop.run(plant, acting, scenario, seed=seed, progress=show)
     return result.assign(controller=strategy.name, plant=name, demand=float(demand))
@@ -269,7 +271,8 @@ def benchmark(
                     demand=level,
                 )
                 name = run_name(strategy.name, seed)
-                runs.append(Run(name, key(strategy.name), job, folder))
+                run = Run(name, key(strategy.name), job, folder, modules=MODULES)
+                runs.append(run)
     out = default_folder(first.name) if out is None else Path(out)
     with locked(out):
         rows = run_many(
@@ -335,7 +338,8 @@ def robustness(
                 )
                 own_key = {**key(strategy.name), "kind": kind, "sigma": sigma}
                 name = run_name(strategy.name, number)
-                runs.append(Run(name, own_key, job, folder=f"{kind}-{sigma:g}"))
+                folder = f"{kind}-{sigma:g}"
+                runs.append(Run(name, own_key, job, folder, modules=MODULES))
     out = default_folder(scenario.name) if out is None else Path(out)
     with locked(out):
         rows = run_many(
@@ -421,6 +425,9 @@ def train(
         gateway can be controlled
     progress: see `benchmark`
     """
+    from nmfd.controllers import training
+    from nmfd.controllers.dpc import rollout
+
     scenario = loaded(scenario)
     strategy = parse(controller)
     if policy is not None and (out or resume):
@@ -465,17 +472,21 @@ def bound(
     controller: str,
     *,
     out: Path | str | None = None,
-    iterations: int = bound_study.ITERATIONS,
+    iterations: int | None = None,
     progress: Progress = None,
 ) -> open_loop.Plan:
     """Find the best plan for known demand, and a lower bound.
 
     controller: "bound-pc" or, with route guidance, "bound-pcrg"
     out: plan file, SCENARIO/NAME.npz if None
-    iterations: Adam steps
+    iterations: Adam steps; those of nmfd.studies.bound if None
     """
+    from nmfd.studies import bound as bound_study
+
     scenario = loaded(scenario)
     file = _file(scenario, f"{controller}.npz", out)
+    if iterations is None:
+        iterations = bound_study.ITERATIONS
     with watched(controller, progress) as show:
         plan = bound_study.compute(scenario, controller, iterations=iterations, progress=show)
     open_loop.write(plan, scenario, file)

@@ -546,6 +546,6 @@ def identify(counts: Path, out: Path, **options: Any) -> None:
     Example:
       nmfd identify counts.csv --detectors detectors.csv --out networks/mine
     """
-    click.echo(nmfd.api.identify(counts, out=out, **options).text)
+    click.echo(nmfd.identify(counts, out=out, **options).text)
     next_step = f'a scenario.toml with network = "{out}"'
     click.echo(f"Written to {out}: see mfd.png and identify.txt; next: {next_step}")

@@ -2,8 +2,10 @@
 
 import copy
 import json
+import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -12,14 +14,25 @@ from nmfd import __version__, faults
 from nmfd.model.commands import admissible
 from nmfd.model.scenario import Scenario
 from nmfd.runs.pool import Watchdog
-from nmfd.tensors import one_thread
 from nmfd.types import EXPECTED, Controller, Controls, Observation, Plant, Result, State, Status
 
 PATIENCE = 10.0  # deadlines after which a decision ends the process of a run
 LEAST_PATIENCE_S = 10.0
 
 
-@one_thread()
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Let torch compute on one thread, if controller or plant have loaded it."""
+    if "torch" not in sys.modules:
+        yield
+        return
+    from nmfd.tensors import one_thread
+
+    with one_thread():
+        yield
+
+
+@_one_thread()
 def run(
     plant: Plant,
     controller: Controller,

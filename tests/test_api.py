@@ -50,6 +50,13 @@ def test_importing_the_packages_imports_nothing_heavy():
     assert json.loads(subprocess.check_output([sys.executable, "-c", code], text=True)) == []
 
 
+@pytest.mark.parametrize("module", ["nmfd.api", "cosim.api", "cosim.evaluation.simulate"])
+def test_runs_without_policies_load_neither_torch_nor_figures(module):
+    heavy = ("torch", "casadi", "matplotlib", "bokeh", "optuna", "sklearn", "distributed")
+    code = f"import sys, {module}; print(*(name for name in {heavy} if name in sys.modules))"
+    assert subprocess.check_output([sys.executable, "-c", code], text=True) == "\n"
+
+
 @pytest.mark.parametrize("package", [nmfd, cosim])
 def test_every_public_name_is_there_with_help_and_types(package):
     for name in package.__all__:

@@ -15,6 +15,7 @@ from nmfd.controllers import open_loop
 from nmfd.errors import InputError
 from nmfd.metrics import total_time_spent
 from nmfd.model import dynamics
+from nmfd.model.integration import SCHEMES
 from nmfd.model.plant import NmfdPlant
 from nmfd.model.scenario import with_demand
 from nmfd.studies import bound
@@ -119,7 +120,7 @@ def unit_vector(lp, scenario, controls):
     """The variables of `lp` along the plant's trajectory under controls (T, R, R), (T, R, R, R),
     and its TTS."""
     p, x = dynamics.parameters(scenario.network), torch.from_numpy(scenario.start)
-    weights, places = dynamics.SCHEMES[scenario.integrator]
+    weights, places = SCHEMES[scenario.integrator]
     here, onward, to = lp.turns.T
     states, outflows, transfers, spent = [], [], [], 0.0
     for k, (u, theta) in enumerate(zip(*map(torch.from_numpy, controls), strict=True)):

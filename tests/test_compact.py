@@ -12,8 +12,9 @@ from commands import good, nmfd
 from nmfd.api import load_scenario
 from nmfd.controllers import training
 from nmfd.controllers.base import from_table
-from nmfd.controllers.dpc.compact import FILL_TIME_S, CompactPolicy, Numbers
-from nmfd.controllers.dpc.constant import ConstantControl
+from nmfd.controllers.dpc.compact import FILL_TIME_S, CompactPolicy
+from nmfd.controllers.dpc.numbers import Numbers
+from nmfd.controllers.dpc.options import ConstantControl
 from nmfd.controllers.dpc.policy import Architecture, DpcController
 from nmfd.controllers.dpc.policy_file import load_policy
 from nmfd.controllers.dpc.rollout import Rollout

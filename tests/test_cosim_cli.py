@@ -14,6 +14,7 @@ import torch
 from commands import cosim, error_line, good
 
 from cosim import api
+from cosim.evaluation.identify import identify
 from cosim.evaluation.model_validation import predict
 from cosim.plant.strategy import parse
 from nmfd.api import load_scenario
@@ -129,7 +130,7 @@ def test_identify_writes_a_network_that_loads(small, tmp_path):
     )
     before, out = load_network(network), tmp_path / "identify"
     options = {"levels": [1.0], "seeds": 2, "settings": {"steps": 7}, "out": out}
-    api.identify(scenario, iterations=5, **options)
+    identify(scenario, iterations=5, **options)
     after = load_network(network)
     assert after.hash != before.hash
     assert (after.adjacency == before.adjacency).all()

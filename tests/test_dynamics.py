@@ -12,6 +12,7 @@ from tiny import random_controls
 
 from nmfd.controllers.mpc import ipopt
 from nmfd.model import dynamics
+from nmfd.model.integration import SCHEMES
 from nmfd.model.mfd import Cubic
 from nmfd.model.regional_model import LEAST_ROOM, load_network
 
@@ -35,7 +36,7 @@ def random_tensors(seed, *, filling, batch=()):
 
 
 @KINDS
-@pytest.mark.parametrize("integrator", dynamics.SCHEMES)
+@pytest.mark.parametrize("integrator", SCHEMES)
 def test_no_vehicle_is_negative_or_lost_inside(integrator, network):
     """Without trips that end, the vehicles only move: their number grows by the demand exactly."""
     p = dynamics.parameters(network)
@@ -116,7 +117,7 @@ def test_order_of_convergence(integrator, order):
 
 @KINDS
 @pytest.mark.parametrize("filling", [3000.0, 30_000.0], ids=["free", "jammed"])
-@pytest.mark.parametrize("integrator", dynamics.SCHEMES)
+@pytest.mark.parametrize("integrator", SCHEMES)
 def test_gradients_against_finite_differences(integrator, filling, network):
     """In vehicles by the thousand, so that one step of differences suits states and controls."""
     x, demand, perimeter, splits = random_tensors(5, filling=filling)
@@ -225,7 +226,7 @@ def test_ways_in_use_take_the_same_time_in_free_flow():
         assert float(transfers.sum()) == pytest.approx(float(q) / time)
 
 
-@pytest.mark.parametrize("integrator", dynamics.SCHEMES)
+@pytest.mark.parametrize("integrator", SCHEMES)
 def test_an_interval_that_counts_is_the_same_interval(integrator):
     """And what it counts is what is missing at its end."""
     x, demand, perimeter, splits = random_tensors(9, filling=6000.0)

@@ -11,7 +11,8 @@ import torch
 
 from nmfd.api import load_scenario
 from nmfd.model import dynamics, estimation
-from nmfd.model.estimation import Estimator, Instruments, Readings, bounded
+from nmfd.model.estimation import Estimator, bounded
+from nmfd.model.instruments import Instruments, Readings
 from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
 from nmfd.types import Controls

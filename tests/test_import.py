@@ -13,7 +13,7 @@ import pytest
 import tiny_city
 from commands import cosim, error_line, good, nmfd
 
-from cosim import api
+from cosim.evaluation.identify import identify
 from cosim.importing.case import read_sumo_input
 from cosim.importing.demand import read_traffic
 from cosim.importing.streets import graph, read_streets
@@ -396,7 +396,7 @@ def test_identification_gives_both_models_and_the_import_takes_the_second_away(
     network, scenario = tmp_path / "networks" / "tiny", tmp_path / "scenarios" / "tiny"
     file = scenario / "scenario.toml"
     file.write_text(re.sub(r"\nsteps = \d+", "\nsteps = 10", file.read_text()))
-    text = api.identify(network, levels=[1, 2], seeds=1, iterations=3, out=tmp_path / "loading")
+    text = identify(network, levels=[1, 2], seeds=1, iterations=3, out=tmp_path / "loading")
     assert f"Written to {network / 'guided' / 'network.toml'}" in text
     assert (tmp_path / "loading" / "guided" / "level-2" / "probing-pcrg-1000.nc").is_file()
     loaded = load_scenario(scenario)

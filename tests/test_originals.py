@@ -13,6 +13,7 @@ from cosim.sumo.recorded_trips import (
     write_held_trips,
     write_recorded_trips,
 )
+from cosim.sumo.xml_files import xml_text
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.model.regional_model import load_network
@@ -53,6 +54,19 @@ def test_seed_moves_departures_and_nothing_else(originals, tmp_path):
     assert np.abs(shift).max() <= 10.01
     assert shift.std() > 3.0
     assert min(departs.values()) >= 100.0
+
+
+def test_elements_are_written_as_by_the_library():
+    text = (
+        '<vehicle id="a&amp;&quot;b" name="&lt;\'&#10;&#9;&#13;é"> x &lt; y <route edges="a b"/>z'
+        "<param key='k'>v</param><stop><param/></stop>\n</vehicle>"
+    )
+    element = ElementTree.fromstring(text)
+    assert xml_text(element) == ElementTree.tostring(element, encoding="unicode")
+    element.set("id", "other")
+    element.set("depart", "1")
+    changed = xml_text(ElementTree.fromstring(text), {"id": "other", "depart": "1"})
+    assert changed == ElementTree.tostring(element, encoding="unicode")
 
 
 MIXED = """<routes>

@@ -30,7 +30,7 @@ from nmfd.errors import InputError, RunFailed
 from nmfd.model.plant import NmfdPlant
 from nmfd.runs import files
 from nmfd.runs import run_many as module
-from nmfd.runs.run_many import Run, raise_failures, read_manifest, run_many
+from nmfd.runs.run_many import Run, finished_table, raise_failures, read_manifest, run_many
 from nmfd.types import VARIABLES, Controls, Result
 
 
@@ -290,6 +290,68 @@ def test_a_run_that_is_cut_off_is_done_again(tmp_path):
     file.write_bytes(file.read_bytes()[:100])
     assert len(run_many([run_of("a", calls=calls)], file.parent, workers=0)) == 1
     assert len(calls) == 2
+
+
+@pytest.fixture
+def two_runs(tmp_path):
+    """Two runs and their folder."""
+    runs, out = [run_of("b"), run_of("a")], tmp_path / "out"
+    run_many(runs, out, workers=0)
+    return runs, out
+
+
+def test_finished_runs_are_not_read_again(two_runs, monkeypatch):
+    runs, out = two_runs
+    written = (out / "runs.csv").stat().st_mtime_ns
+    expected = pd.read_csv(out / "runs.csv")
+    monkeypatch.setattr(Result, "read", None)
+    again = run_many(runs, out, workers=0)
+    assert again["controller"].tolist() == ["b", "a"]
+    pd.testing.assert_frame_equal(finished_table(out), expected)
+    assert (out / "runs.csv").stat().st_mtime_ns == written
+
+
+@pytest.mark.parametrize("damaged", ["runs.csv", ".rows.json"])
+@pytest.mark.parametrize("content", [None, "", "controller,seed\nb,x\n", '{"runs": {}}'])
+def test_tables_that_do_not_match_the_files_are_repaired(two_runs, damaged, content):
+    runs, out = two_runs
+    expected = (out / "runs.csv").read_text()
+    (out / damaged).unlink()
+    if content is not None:
+        (out / damaged).write_text(content)
+    assert sorted(finished_table(out)["controller"]) == ["a", "b"]
+    run_many(runs, out, workers=0)
+    assert (out / "runs.csv").read_text() == expected
+
+
+def test_rows_are_those_of_files_that_have_changed(two_runs):
+    runs, out = two_runs
+    stamp = (out / "a-0.nc").stat()
+    Result.read(out / "a-0.nc").assign(completed=np.full(5, 7.0)).write(out / "a-0.nc")
+    os.utime(out / "a-0.nc", ns=(stamp.st_atime_ns, stamp.st_mtime_ns + 1))
+    assert finished_table(out)["completed_veh"].tolist()[1] == 7.0
+    assert run_many(runs, out, workers=0)["completed_veh"].tolist()[1] == 7.0
+    (out / "b-0.nc").unlink()
+    assert finished_table(out)["controller"].tolist() == ["a"]
+
+
+def test_rows_of_other_code_are_made_again(two_runs):
+    runs, out = two_runs
+    known = json.loads((out / ".rows.json").read_text())
+    known["runs"]["a-0.nc"][0]["completed_veh"] = 7.0
+    (out / ".rows.json").write_text(json.dumps(known))
+    assert run_many(runs, out, workers=0)["completed_veh"].tolist()[1] == 7.0
+    (out / ".rows.json").write_text(json.dumps({**known, "made_by": "older"}))
+    assert run_many(runs, out, workers=0)["completed_veh"].tolist()[1] != 7.0
+
+
+def test_some_arrays_are_those_of_the_whole_file(two_runs):
+    _, out = two_runs
+    whole = Result.read(out / "a-0.nc")
+    some = Result.read(out / "a-0.nc", only=("accumulation", "other"))
+    np.testing.assert_array_equal(some["accumulation"], whole["accumulation"])
+    assert some.data.attrs == whole.data.attrs
+    assert list(some.data) == ["accumulation"]
 
 
 def test_levels_have_folders_of_their_own(tmp_path):

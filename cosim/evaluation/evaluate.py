@@ -13,7 +13,7 @@ A suite is a TOML file: `seeds = [2000, 2001]` and a table [scenarios] of demand
 """
 
 import random
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
@@ -60,15 +60,25 @@ def read_suite(
     return scenarios, suite.seeds
 
 
-def evaluate(runs: Sequence[Run], out: Path, **how: Any) -> Table:
+def evaluate(
+    runs: Sequence[Run],
+    out: Path,
+    draw: Callable[[results.Finished], None] | None = None,
+    **how: Any,
+) -> Table:
     """Do the runs that are not in `out`, write tables, return a row per run.
 
+    draw: called with the finished runs of every scenario
     how: see nmfd.runs.run_many
     """
     rows = run_many(runs, out, **how)
     done = results.finished_rows(rows)
     if len(done):
-        files.write_text(out / "evaluate.md", report(out, done))
+        finished = {name: results.read(out, name) for name in done["scenario"].unique()}
+        files.write_text(out / "evaluate.md", report(done, finished))
+        if draw:
+            for one in finished.values():
+                draw(one)
     return rows
 
 
@@ -100,15 +110,13 @@ def plan(
     return sorted(runs, key=lambda run: seeds.index(int(run.name.rpartition("-")[2])))
 
 
-def report(out: Path, rows: pd.DataFrame) -> str:
-    """Return evaluate.md for the finished runs."""
-    names = rows["scenario"].unique()
-    several = len(names) > 1
+def report(rows: pd.DataFrame, scenarios: Mapping[str, results.Finished]) -> str:
+    """Return evaluate.md for the finished runs of scenarios."""
+    several = len(scenarios) > 1
     parts = []
     if several:
         parts.append(statistics.ranking(rows))
-    for name in names:
-        finished = results.read(out, name)
+    for name, finished in scenarios.items():
         if several:
             parts.append(f"# {name}")
         parts.append(statistics.markdown(finished.rows))

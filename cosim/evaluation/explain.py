@@ -63,7 +63,7 @@ def city(level: Level, finished: Finished) -> str:
     network = finished.scenario.network
     names = network.region_names
     against = statistics.compared_with(level.rows)
-    peak, beyond = load(network, level.results(against))
+    peak, beyond = load(network, level.measures(against))
     hot = [
         f"{names[r]} ({beyond[r]:.0%} of the time, up to {peak[r]:.1f} times)"
         for r in np.flatnonzero(beyond > SMALL_SHARE)
@@ -129,8 +129,8 @@ def _reasons(
 ) -> list[str]:
     """Return what a controller did, and what limits it if it does not gain."""
     network = scenario.network
-    runs = level.results(name)
-    reference = level.results(against)
+    runs = level.measures(name)
+    reference = level.measures(against)
     strategy = of_finished(name)
     trips = max(sum(run["departures"].sum() for run in runs), 1)
     acts = strategy.controller.name != ALONE

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import pandas as pd
@@ -15,8 +16,21 @@ from nmfd.controllers.strategy import ControllerLike
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
 from nmfd.runs.files import file_hash, file_name, run_name
-from nmfd.runs.run_many import TABLE, read_manifest
+from nmfd.runs.run_many import finished_table, read_manifest
 from nmfd.types import Result
+
+# Arrays of a run that tables and figures of many runs are made of.
+MEASURES = (
+    "accumulation",
+    "backlog",
+    "co2",
+    "crossings",
+    "departures",
+    "guided",
+    "perimeter",
+    "queue_max",
+    "trip_time_by_origin",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,6 +54,18 @@ class Level:
         if controllers:
             rows = rows[rows["controller"].isin(controllers)]
         return [self.read(row.controller, row.seed) for row in rows.itertuples()]
+
+    def measures(self, *controllers: str) -> list[Result]:
+        """Return `results` with the arrays MEASURES only; each file is read once."""
+        return [run for run in self._measures if not controllers or run.controller in controllers]
+
+    @cached_property
+    def _measures(self) -> list[Result]:
+        runs = []
+        for row in self.rows.itertuples():
+            file = self.folder / f"{run_name(row.controller, row.seed)}.nc"
+            runs.append(Result.read(file, only=MEASURES))
+        return runs
 
     def read(self, controller: str, seed: int) -> Result:
         return Result.read(self.folder / f"{run_name(controller, seed)}.nc")
@@ -69,6 +95,10 @@ class Finished:
         for name, file in (("net_file_hash", files.net_file), ("regions_hash", files.regions_csv)):
             if self.levels[0].key[name] != file_hash(file):
                 raise InputError(f"{self.path}: {file} has changed since the runs; run them again")
+        return self._city
+
+    @cached_property
+    def _city(self) -> City:
         return scenario_city(self.scenario, settings(self.scenario))
 
     def level(self, demand: float = 1.0) -> Level:
@@ -82,9 +112,7 @@ def read(path: Path, scenario: str | None = None) -> Finished:
     scenario: name of one of several scenarios, the first if None
     Raises: InputError if it holds none in SUMO
     """
-    rows = pd.DataFrame()
-    if (path / TABLE).is_file():
-        rows = finished_rows(pd.read_csv(path / TABLE))
+    rows = finished_rows(finished_table(path))
     if rows.empty or "sumo" not in set(rows["plant"]):
         remedy = "give a folder of `cosim run` or `cosim evaluate`"
         raise InputError(f"{path}: holds no finished runs in SUMO; {remedy}")

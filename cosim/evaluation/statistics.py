@@ -339,7 +339,7 @@ def common_runs(level: Level, names: Sequence[str]) -> list[list[Result]]:
     """
     runs = []
     for name in names:
-        results = level.results(name)
+        results = level.measures(name)
         runs.append({run.seed: run for run in results if "trip_time_by_origin" in run})
     seeds = sorted(set.intersection(*map(set, runs)))
     return [[of[seed] for seed in seeds] for of in runs]

@@ -20,7 +20,7 @@ from cosim.sumo.arrays import GatewayMask
 from cosim.sumo.net import City
 from cosim.sumo.session import Session
 from nmfd.arrays import PerPair
-from nmfd.model.estimation import Estimator, Instruments, Readings
+from nmfd.model.instruments import Instruments, Readings
 from nmfd.model.planning import PlanningModel
 from nmfd.types import Controls
 
@@ -160,6 +160,8 @@ class Estimation:
         self._known = known
         self._layout = layout
         self._city = city
+        from nmfd.model.estimation import Estimator  # torch takes two seconds
+
         self._filter = Estimator(planning, known)
         self.accumulation = self._filter.accumulation
         loops = _loops(city, layout)

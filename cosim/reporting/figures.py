@@ -65,15 +65,14 @@ def draw_level(out: Path, finished: Finished, level: Level) -> None:
     network = finished.scenario.network
     # The first seed that most controllers have.
     seed = int(rows["seed"].value_counts().sort_index().idxmax())
-    runs = level.results()
+    runs = level.measures()
     title = f"seed {seed}"
     if rows["seed"].nunique() > 1:
         title += ", shaded: all seeds"
     draw_accumulations(out, finished.scenario, runs, seed=seed, title=title)
-    there = {run.controller: run for run in runs if run.seed == seed}
     samples: list[dict] = [{} for _ in range(network.regions)]
     for name in pair(rows[rows["seed"] == seed]):
-        clouds = model_validation.outflow_samples(network, [there[name]])
+        clouds = model_validation.outflow_samples(network, [level.read(name, seed)])
         for of_region, cloud in zip(samples, clouds, strict=True):
             of_region[name] = np.concatenate([*cloud.values()])
     plots.draw_mfds(out / "mfd.png", network, samples)

@@ -6,7 +6,7 @@ Those of files are varied by seed and demand factor.
 import math
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
@@ -25,7 +25,7 @@ from cosim.sumo.trips import (
     perception,
     routes_in,
 )
-from cosim.sumo.xml_files import attribute, read_xml
+from cosim.sumo.xml_files import attribute, read_xml, xml_text
 from nmfd.errors import InputError
 from nmfd.runs import files
 
@@ -283,10 +283,10 @@ def draw(
 
 def write_recorded_trips(originals: RecordedTrips, drawn: Sequence[DrawnTrip], path: Path) -> None:
     """Write the vehicles of one run to a SUMO route file."""
-    elements = list(originals.types)
+    texts = [xml_text(element) for element in originals.types]
     for depart, n, name in drawn:
-        elements.append(_departing(originals.elements[n], name, depart))
-    _write(path, elements)
+        texts.append(_departing(originals.elements[n], name, depart))
+    _write(path, texts)
 
 
 def run_files(path: Path, beside: Sequence[Path], seed: int) -> list[Path]:
@@ -327,8 +327,8 @@ def merge(path: Path, beside: Sequence[Path], rest: Path) -> list[Path]:
                 place = float(attribute(parameter, "value"))
             queue.append((float(time), place, element))
     queue.sort(key=lambda row: row[:2])
-    _write(path, [element for _, _, element in queue])
-    _write(rest, others)
+    _write(path, [xml_text(element) for _, _, element in queue])
+    _write(rest, map(xml_text, others))
     return [rest, path]
 
 
@@ -345,7 +345,7 @@ def write_held_trips(
     or attributes that libsumo.vehicle.add does not take is not metered.
     shared: `read_routes`; region_of: edge -> region
     """
-    elements = list(originals.types)
+    texts = [xml_text(element) for element in originals.types]
     written = set[int]()
     departs: list[float] = []
     origins: list[int] = []
@@ -355,12 +355,12 @@ def write_held_trips(
         element = originals.elements[n]
         route = _meterable_route(element, shared)
         if not route:
-            elements.append(_departing(element, name, depart))
+            texts.append(_departing(element, name, depart))
             continue
         known = element.get("route", f"{HELD}{n}")
         if "route" not in element.attrib and n not in written:
             written.add(n)
-            elements.append(ElementTree.Element("route", id=known, edges=" ".join(route)))
+            texts.append(xml_text(ElementTree.Element("route", id=known, edges=" ".join(route))))
         order = {"vehID": name, "routeID": known}
         for key, value in element.attrib.items():
             if key in ORDERED:
@@ -369,7 +369,7 @@ def write_held_trips(
         departs.append(depart)
         origins.append(region_of[route[0]])
         destinations.append(region_of[route[-1]])
-    _write(path, elements)
+    _write(path, texts)
     return HeldTrips(
         depart=np.array(departs, dtype=float),
         origin=np.array(origins, dtype=int),
@@ -401,19 +401,11 @@ def _meterable_route(
     return ()
 
 
-def _departing(element: ElementTree.Element, name: str, depart: float) -> ElementTree.Element:
-    """Return a vehicle under another name, at another time [s]."""
-    own = {"id": name, "depart": f"{depart:.10g}"}
-    copy = ElementTree.Element(element.tag, element.attrib | own)
-    copy.extend(element)
-    copy.text = element.text
-    return copy
+def _departing(element: ElementTree.Element, name: str, depart: float) -> str:
+    """Return a vehicle under another name, at another time [s], as text."""
+    return xml_text(element, {"id": name, "depart": f"{depart:.10g}"})
 
 
-def _write(path: Path, elements: Sequence[ElementTree.Element]) -> None:
-    lines = ["<routes>\n"]
-    for element in elements:
-        text = ElementTree.tostring(element, encoding="unicode")
-        lines.append(f"  {text.strip()}\n")
-    lines.append("</routes>\n")
-    files.write_text(path, "".join(lines))
+def _write(path: Path, texts: Iterable[str]) -> None:
+    lines = [f"  {text.strip()}\n" for text in texts]
+    files.write_text(path, f"<routes>\n{''.join(lines)}</routes>\n")

@@ -5,9 +5,10 @@ import io
 import math
 import xml.etree.ElementTree as ElementTree
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from xml.sax.saxutils import escape
 
 from nmfd.errors import InputError
 from nmfd.runs.files import check_file, check_name
@@ -15,6 +16,7 @@ from nmfd.runs.files import check_file, check_name
 # Errors of a file that is cut off, no XML, in an unknown encoding, or without an attribute.
 BROKEN = (OSError, EOFError, zlib.error, ElementTree.ParseError, LookupError, TypeError, ValueError)
 UNITS_S = (1.0, 60.0, 3600.0, 86400.0)  # of the parts of a time, the last one first
+IN_ATTRIBUTES = {'"': "&quot;", "\r": "&#13;", "\n": "&#10;", "\t": "&#09;"}
 MAX_INCLUDE_DEPTH = 20  # of files that include each other
 
 
@@ -81,6 +83,22 @@ def read_xml(path: Path, depth: int = 0) -> ElementTree.Element:
             parts.append(part)
     root[:] = parts
     return root
+
+
+def xml_text(element: ElementTree.Element, own: Mapping[str, str] = {}) -> str:
+    """Return an element as ElementTree.tostring writes it, in a fraction of its time.
+
+    own: attributes instead of those of the element
+    """
+    attributes = ""
+    for key, value in {**element.attrib, **own}.items():
+        attributes += f' {key}="{escape(value, IN_ATTRIBUTES)}"'
+    content = escape(element.text or "")
+    for part in element:
+        content += xml_text(part) + escape(part.tail or "")
+    if not content:
+        return f"<{element.tag}{attributes} />"
+    return f"<{element.tag}{attributes}>{content}</{element.tag}>"
 
 
 @contextmanager

@@ -22,10 +22,7 @@ import numpy as np
 
 from nmfd.controllers import custom
 from nmfd.controllers.base import Options, check_fit
-from nmfd.controllers.dpc import policy_file
-from nmfd.controllers.dpc.compact import GatingRule, PricingRule
-from nmfd.controllers.dpc.constant import ConstantControl
-from nmfd.controllers.dpc.options import Dpc
+from nmfd.controllers.dpc.options import ConstantControl, Dpc, GatingRule, PricingRule
 from nmfd.controllers.mpc.controller import EconomicMpc
 from nmfd.controllers.open_loop import Bound
 from nmfd.controllers.rules import Greedy, NoControl, PiGating, Probing, RouteGuidance
@@ -372,6 +369,8 @@ class Strategy:
         kind = self.controller
         if not isinstance(kind, BuiltIn) or kind.options is not Dpc:
             return ""
+        from nmfd.controllers.dpc import policy_file  # torch takes two seconds
+
         file = self.file(scenario, policy)
         assert file is not None  # Dpc reads one
         return policy_file.outside_training(policy_file.read_file(file), level)

@@ -18,9 +18,10 @@ from torch import Generator, nn
 from torch.optim import Adam
 
 from nmfd.controllers.base import check_fit
-from nmfd.controllers.dpc.compact import CompactPolicy, Numbers
+from nmfd.controllers.dpc.compact import CompactPolicy
 from nmfd.controllers.dpc.first_policy import begin_as_gate, begin_as_no_control, first_policy
 from nmfd.controllers.dpc.keepers import FileKeeper, Keeper, ModuleKeeper, State
+from nmfd.controllers.dpc.numbers import Numbers
 from nmfd.controllers.dpc.options import Dpc
 from nmfd.controllers.dpc.policy import ModuleController, Policy
 from nmfd.controllers.dpc.rollout import Demands, Rollout, States, Trajectories, compiled_step

@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from nmfd.arrays import PerPair, PerRegion, PerTurn
-from nmfd.model.dynamics import counted
+from nmfd.model.integration import counted
 from nmfd.model.mfd import Mfd, stacked
 from nmfd.model.regional_model import LEAST_ROOM, RegionalModel, passing_share
 
@@ -221,6 +221,6 @@ def advance_counted(
     """Return x after one control interval and the completed trips [veh].
 
     step: length of the interval, in which all inputs are constant (s)
-    scheme: integrator and substeps (nmfd.model.dynamics.integrated)
+    scheme: integrator and substeps (nmfd.model.integration.integrated)
     """
     return counted(lambda x: derivative(model, x, demand, perimeter, theta), x, step, **scheme)

@@ -23,14 +23,16 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Real
+from jaxtyping import Float
 from scipy.optimize import nnls
 from torch import Tensor
 
 from nmfd.arrays import PerPair, PerRegion, PerTurn
 from nmfd.model import dynamics
+from nmfd.model.instruments import Instruments, Readings
 from nmfd.model.planning import PlanningModel
 from nmfd.model.regional_model import RegionalModel
+from nmfd.tensors import one_thread
 from nmfd.types import Controls
 
 Vector = Float[np.ndarray, " N"]
@@ -50,42 +52,6 @@ FLOOR = 0.01  # [veh^2], variance of an exact reading
 DIFFERENCE = 1e-5  # of the Jacobian [veh] or [-]
 LEAST_ERROR = -0.95  # of the relative errors
 SAME_READINGS = 3  # of a detector, one after the other, show that it is stuck
-
-
-@dataclass(frozen=True, kw_only=True)
-class Instruments:
-    """Coverage and errors of the instruments.
-
-    detector_share: share of the lane length of each region covered by loop detectors (-, (R,))
-    detector_error, detector_noise: standard deviations of the lasting and of the white relative
-        error of the expanded accumulation (-, (R,))
-    counted_share: [i, h]: share of the lanes over that boundary that are counted (-, (R, R))
-    counted_gateways: [i, h]: number of gateways that are counted ((R, R))
-    probe_share: share of all vehicles (-)
-    """
-
-    detector_share: PerRegion
-    detector_error: PerRegion
-    detector_noise: PerRegion
-    counted_share: PerPair
-    counted_gateways: Real[np.ndarray, "R R"]
-    probe_share: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class Readings:
-    """Measurements of one control interval; NaN where there is none.
-
-    accumulation: mean over the interval, expanded from the detectors to the region (veh, (R,))
-    crossings: [i, h] counted during the interval, expanded to all gateways (veh, (R, R))
-    probes: [i, j] in region i bound for j at the end of the interval, not expanded (veh, (R, R))
-    probe_departures: [i, j] departed during the interval, not expanded (veh, (R, R))
-    """
-
-    accumulation: PerRegion
-    crossings: PerPair
-    probes: PerPair
-    probe_departures: PerPair
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,6 +188,7 @@ class Estimator:
     def accumulation(self) -> PerPair:
         return self.belief.mean[self._x].reshape(self._regions, self._regions).copy()
 
+    @one_thread()
     def step(self, controls: Controls, readings: Readings) -> PerPair:
         """Return the estimate (R, R) [veh] after an interval under `controls`."""
         demand = self._planning.forecast[min(self._k, self._planning.steps - 1)]

@@ -191,7 +191,7 @@ def fit(
 
     network: its MFDs are the initial guess, their critical accumulations the scale of the errors
     step: control interval (s)
-    substeps, integrator: of the integration (nmfd.model.dynamics.integrated)
+    substeps, integrator: of the integration (nmfd.model.integration.integrated)
     fastest: largest rate of any vehicle (1/s, (R,)); that of the integration if None
     seed: of the batches
     progress: takes iterations done, all, and a note

@@ -80,6 +80,17 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
+def is_newer(path: Path, than: Path) -> bool:
+    """Return True if `path` is a file that was written after `than`."""
+    return path.is_file() and path.stat().st_mtime_ns > than.stat().st_mtime_ns
+
+
+def write_if_changed(path: Path, text: str) -> None:
+    """Write `text` to `path` unless it is there already, so that its time is that of a change."""
+    if not path.is_file() or path.read_text(encoding="utf-8", errors="replace") != text:
+        write_text(path, text)
+
+
 def write_table(path: Path, frame: "pd.DataFrame", **options: str) -> None:
     """Write `frame` as a csv file, whole or not at all.
 

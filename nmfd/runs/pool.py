@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import contextmanager
 from multiprocessing import context, forkserver, resource_tracker
@@ -32,6 +32,7 @@ NEVER_ANSWERED = 124  # exit status of a process whose controller does not answe
 WATCH_S = 1.0  # between two looks at a decision
 POLL_S = 0.2  # longest wait without a look at Ctrl-C, which Windows needs
 PRELOADED = ("xarray",)
+ALSO_THERE = ("torch", "casadi")  # preloaded if this process has them, as its jobs then need them
 NAME = "run"  # of the processes
 STARTING = threading.Lock()  # held while a process starts
 
@@ -80,13 +81,18 @@ def attempt(job: Job) -> Any:
 
 
 def in_processes(
-    jobs: Sequence[Job], workers: int, limits: Sequence[float | None], folder: str = ""
+    jobs: Sequence[Job],
+    workers: int,
+    limits: Sequence[float | None],
+    folder: str = "",
+    modules: Collection[str] = (),
 ) -> Generator[tuple[int, Any]]:
     """Yield the number and the outcome of each job, as they end.
 
     workers: jobs at a time
     limits: time after which a job is ended (s), None for none
     folder: current folder of the processes
+    modules: imported once for all of them, if their server is not running yet
     """
     waiting = list(range(len(jobs)))
     live: dict[Future, int] = {}
@@ -94,7 +100,7 @@ def in_processes(
         while waiting or live:
             while waiting and len(live) < workers:
                 number = waiting.pop(0)
-                future = _start(jobs[number], limits[number], os.path.abspath(folder))
+                future = _start(jobs[number], limits[number], os.path.abspath(folder), modules)
                 live[future] = number
             done, _ = wait(live, timeout=POLL_S, return_when=FIRST_COMPLETED)
             for future in done:
@@ -145,13 +151,14 @@ def died(status: int) -> str:
     return f"its process died (status {status}{meaning})"
 
 
-def _start(job: Job, limit: float | None, folder: str) -> Future:
+def _start(job: Job, limit: float | None, folder: str, modules: Collection[str]) -> Future:
     """Start the process of a job."""
     with STARTING, uninterrupted():
         here = _Context()
         if hasattr(os, "fork"):
-            module = getattr(job, "func", job).__module__
-            here.set_forkserver_preload([__name__, *PRELOADED, module])
+            of_job = getattr(job, "func", job).__module__
+            there = [name for name in ALSO_THERE if name in sys.modules]
+            here.set_forkserver_preload([__name__, *PRELOADED, *there, *modules, of_job])
             _start_server()
         # Only as a decorator, and by this name, does pebble take the context.
         decorated = concurrent.process(name=NAME, timeout=limit, context=here)

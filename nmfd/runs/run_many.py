@@ -4,9 +4,12 @@ Finished ones are skipped. Each result is written whole or not at all.
 
 <folder>/manifest.json    keys of all runs; commands, commits, versions and seeds of all sessions
 <folder>/runs.csv         one row per run (nmfd.metrics.summary), the reason of a failure last
+<folder>/.rows.json       rows and keys of finished runs, with size and time of their files
 <folder>/[<subfolder>/]<controller>-<seed>.nc    Dataset of a run (nmfd.types.Result)
 """
 
+import csv
+import io
 import json
 import os
 import platform
@@ -29,19 +32,28 @@ from urllib.parse import unquote
 from filelock import FileLock, Timeout
 from pydantic import BaseModel, Field
 
-from nmfd import __version__
+from nmfd import __version__, metrics
 from nmfd.errors import InputError, RunFailed, need
-from nmfd.metrics import summary
-from nmfd.runs.files import check_file, check_name, write_table, write_text
+from nmfd.runs.files import (
+    check_file,
+    check_name,
+    file_hash,
+    run_name,
+    write_if_changed,
+    write_text,
+)
 from nmfd.runs.pool import attempt, in_processes, in_subprocess
 from nmfd.runs.progress import Progress, watched
 from nmfd.types import Result
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from nmfd.runs.frame import Table
 
 MANIFEST = "manifest.json"
 TABLE = "runs.csv"
+ROWS = ".rows.json"
 LOCK = ".lock"
 DASK_PATIENCE_S = 10.0  # for the scheduler to answer
 RUN_FILE = re.compile(r"((?P<folder>.+)/)?(?P<controller>[^/]+)-(?P<seed>\d+)\.nc")
@@ -71,6 +83,7 @@ class Run:
         can be pickled, by value if it is the user's
     folder: folder below that of all runs
     expected: wall time (s), 0 if unknown
+    modules: those that its process needs besides that of its job
     """
 
     name: str
@@ -78,6 +91,7 @@ class Run:
     job: Callable[[], Any]
     folder: str = ""
     expected: float = 0.0
+    modules: tuple[str, ...] = ()
 
     @property
     def limit(self) -> float:
@@ -97,7 +111,7 @@ class Run:
     @property
     def file(self) -> str:
         """Path of its file below the folder of all runs."""
-        return f"{self.folder}/{self.name}.nc" if self.folder else f"{self.name}.nc"
+        return file_of(self.folder, self.name)
 
 
 def run_many(
@@ -129,19 +143,19 @@ def run_many(
     out = Path(out)
     with locked(out):
         check_names(runs)
-        kept = _kept_runs(out, runs)
+        kept = _kept_runs(out, [run.file for run in runs])
         if not overwrite:
             _check_kept(out, runs, kept)
         keys = _write_manifest(out, runs, workers, kept)
-        rows = {}
-        for file, key in keys.items():
-            if file not in kept:
+        rows: dict[str, dict[str, Any]] = {}
+        for name, key in keys.items():
+            if name not in kept:
                 continue
-            changed = _differing(kept[file].key, key)
+            changed = _differing(kept[name].key, key)
             if changed:
-                _say(f"{out / file}: out of date, {changed} changed")
+                _say(f"{out / name}: out of date, {changed} changed")
             else:
-                rows[file] = kept[file].row
+                rows[name] = kept[name].row
         todo = [run for run in runs if run.file not in rows]
         minutes = sum(run.expected for run in todo) / max(workers, 1) / 60.0
         said = minutes > 0.5 and scheduler is None
@@ -156,20 +170,50 @@ def run_many(
                 if show and todo:
                     show(0, len(todo), "")
                 for done, (run, outcome) in enumerate(ended, 1):
+                    row = _row(run.file, outcome)
                     if isinstance(outcome, Result):
-                        outcome = outcome.assign(key=json.dumps(keys[run.file]))
-                        (out / run.file).parent.mkdir(parents=True, exist_ok=True)
-                        outcome.write(out / run.file)
-                    rows[run.file] = _row(run.file, outcome)
+                        key = keys[run.file]
+                        file = out / run.file
+                        file.parent.mkdir(parents=True, exist_ok=True)
+                        outcome.assign(key=json.dumps(key)).write(file)
+                        kept[run.file] = Kept(row, key, Stamp.of(file))
+                    rows[run.file] = row
                     if show:
                         show(done, len(todo), run.name)
         except KeyboardInterrupt:
             left = f"finished runs are in {out}; the same command with --out {out} goes on"
             raise KeyboardInterrupt(left) from None
         finally:
-            table = _table([rows[file] for file in keys if file in rows])
-            write_table(out / TABLE, table)
+            table = _table([rows[name] for name in keys if name in rows])
+            _write_rows(out, kept)
+            write_if_changed(out / TABLE, table.to_csv(index=False))
     return table
+
+
+def finished_table(out: Path) -> "pd.DataFrame":
+    """Return the finished runs in a folder as a table that was read from runs.csv.
+
+    Only the order is that of runs.csv: a row is that of ROWS if size and time of its file are as
+    they were, else it is made of the file.
+    """
+    import pandas as pd  # takes half a second
+
+    kept = _kept_runs(out, _files_in(out / TABLE))
+    rows = []
+    for name, key in _keys(_manifest(out)["folders"], kept).items():
+        if not _differing(kept[name].key, key):
+            rows.append(kept[name].row)
+    return pd.read_csv(io.StringIO(_table(rows).to_csv(index=False)))
+
+
+def _files_in(table: Path) -> list[str]:
+    """Return the files of the runs in runs.csv, as far as it can be read."""
+    names = []
+    with suppress(OSError, KeyError, TypeError, ValueError, csv.Error):
+        for row in csv.DictReader(table.read_text(encoding="utf-8").splitlines()):
+            run = run_name(row["controller"], int(row["seed"]))
+            names.append(file_of(row.get("folder", ""), run))
+    return names
 
 
 def check_names(runs: Sequence[Run]) -> None:
@@ -202,8 +246,10 @@ def _outcomes(
         for run in todo:
             yield run, attempt(run.job)
     else:
+        jobs = [run.job for run in todo]
         limits = [time_limit or run.limit for run in todo]
-        for number, outcome in in_processes([run.job for run in todo], workers, limits):
+        modules = {name for run in todo for name in run.modules}
+        for number, outcome in in_processes(jobs, workers, limits, modules=modules):
             yield todo[number], outcome
 
 
@@ -313,8 +359,16 @@ def _write_manifest(
     seeds = sorted({run.place.seed for run in runs})
     manifest["sessions"].append({**provenance(), "seeds": seeds, "workers": workers})
     write_text(out / MANIFEST, json.dumps(manifest, indent=2) + "\n")
+    return _keys(folders, (*(run.file for run in runs), *kept))
+
+
+def _keys(folders: Mapping[str, Mapping], names: Iterable[str]) -> dict[str, dict]:
+    """Return file -> key of the runs that a manifest knows.
+
+    folders: its entry of that name
+    """
     keys = {}
-    for name in (*(run.file for run in runs), *kept):
+    for name in names:
         folder, controller, _ = place_of(name)
         entry = folders[folder]
         if controller in entry["controllers"]:
@@ -332,34 +386,87 @@ def _manifest(out: Path) -> dict[str, Any]:
     return {"folders": {}, "sessions": []}
 
 
+class Stamp(NamedTuple):
+    """Size and time of the last change (ns) of a file."""
+
+    size: int
+    time: int
+
+    @classmethod
+    def of(cls, file: Path) -> "Stamp":
+        """Return the stamp of a file."""
+        about = file.stat()
+        return cls(about.st_size, about.st_mtime_ns)
+
+
 class Kept(NamedTuple):
-    """A finished run: its row of the table, and everything that it depends on."""
+    """A finished run.
+
+    row: its row of the table
+    key: everything that it depends on
+    stamp: of its file
+    """
 
     row: dict[str, Any]
     key: dict[str, Any]
+    stamp: Stamp
 
 
-def _kept_runs(out: Path, runs: Sequence[Run]) -> dict[str, Kept]:
-    """Return the finished runs in the folder: those of `runs`, then others."""
-    names = [run.file for run in runs]
+def _write_rows(out: Path, kept: Mapping[str, Kept]) -> None:
+    """Write the rows of finished runs for the next call."""
+    text = json.dumps({"made_by": _made_by(), "runs": kept}, default=lambda number: number.item())
+    write_text(out / ROWS, text)
+
+
+def _known_rows(out: Path) -> dict[str, Kept]:
+    """Return the rows of finished runs from an earlier call by file.
+
+    There are none if another version of `nmfd.metrics` has made them.
+    """
+    try:
+        content = json.loads((out / ROWS).read_bytes())
+        if content["made_by"] != _made_by():
+            return {}
+        found = {}
+        for file, (row, key, stamp) in content["runs"].items():
+            found[file] = Kept(row, key, Stamp(*stamp))
+        return found
+    except (OSError, ValueError, TypeError, KeyError):  # missing or damaged
+        return {}
+
+
+@cache
+def _made_by() -> str:
+    """Return a fingerprint of the code that makes the rows."""
+    return file_hash(Path(metrics.__file__))
+
+
+def _kept_runs(out: Path, names: Sequence[str]) -> dict[str, Kept]:
+    """Return the finished runs in the folder: the files `names`, then others."""
+    names = list(names)
+    known = _known_rows(out)
     for folder in _manifest(out)["folders"]:
         for path in sorted((out / folder).glob("[!.]*-*.nc")):
             names.append(path.relative_to(out).as_posix())
     found = {}
     for name in dict.fromkeys(names):
-        kept = _kept(out / name, name)
+        kept = _kept(out / name, name, known.get(name))
         if kept is not None:
             found[name] = kept
     return found
 
 
-def _kept(path: Path, name: str) -> Kept | None:
+def _kept(path: Path, name: str, known: Kept | None) -> Kept | None:
     """Return the finished run in `path`.
 
     None if there is none, or one of another controller or seed than its name says.
+    known: from an earlier call, right if the file still has its size and time
     """
     if not path.is_file() or not RUN_FILE.fullmatch(name):
         return None
+    stamp = Stamp.of(path)
+    if known is not None and known.stamp == stamp:
+        return known
     try:
         result = Result.read(path)
         key = json.loads(result.data.attrs["key"])
@@ -369,7 +476,7 @@ def _kept(path: Path, name: str) -> Kept | None:
     if found != place_of(name)[1:]:
         _say(f"{path}: is the run of {found[0]} with seed {found[1]}, not that of its name")
         return None
-    return Kept(_row(name, result), key)
+    return Kept(_row(name, result), key, stamp)
 
 
 def _check_kept(out: Path, runs: Sequence[Run], kept: Mapping[str, Kept]) -> None:
@@ -399,7 +506,12 @@ def _row(file: str, outcome: Result | str) -> dict:
     row = place_of(file)._asdict()
     if isinstance(outcome, str):
         return {**row, "failure": outcome}
-    return {**row, **summary(outcome), "failure": ""}
+    return {**row, **metrics.summary(outcome), "failure": ""}
+
+
+def file_of(folder: str, name: str) -> str:
+    """Return the path of the file of a run below the folder of all runs."""
+    return f"{folder}/{name}.nc" if folder else f"{name}.nc"
 
 
 def place_of(file: str) -> Place:

@@ -21,12 +21,10 @@ from nmfd.controllers import open_loop
 from nmfd.controllers.strategy import Strategy
 from nmfd.errors import InputError
 from nmfd.metrics import COUNTED, decision_ms, percent_change, summary
-from nmfd.model.links.plant import LinkPlant, links_file
-from nmfd.model.plant import AcyclicPlant, NmfdPlant
 from nmfd.model.scenario import Scenario, perturbed
-from nmfd.runs.files import file_hash, run_name
+from nmfd.runs.files import file_hash, is_newer, run_name
+from nmfd.runs.run_many import TABLE
 from nmfd.runs.tables import text_columns, text_table
-from nmfd.studies import plots
 from nmfd.types import Plant, Result
 
 if TYPE_CHECKING:
@@ -35,11 +33,8 @@ if TYPE_CHECKING:
     from nmfd.runs.frame import Table
 
 LINKS = "links"
-PLANTS: dict[str, Callable[[Scenario], Plant]] = {
-    "nmfd": NmfdPlant,
-    "acyclic": AcyclicPlant,
-    LINKS: LinkPlant,
-}
+PLANTS = ("nmfd", "acyclic", LINKS)
+MODULES = ("nmfd.model.plant", "nmfd.model.links.plant")  # of PLANTS, with torch
 REFERENCE = "no-control"
 CAPTION = (
     "TTS: total time spent, mean over seeds ± 95 % interval; change: of TTS against {against}; "
@@ -56,6 +51,7 @@ IMPOSSIBLE_CAPTION = (
 )
 SIGMAS_VEH_S = (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0)  # of the noise on the demand
 SPREADS = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4)  # of the MFDs and trip lengths
+LAST_FIGURE = "region_accumulation.png"  # of draw_accumulations
 BOUND_TOLERANCE = 1e-6  # of the solver of the bound
 PERTURBED_PLANT = "acyclic"
 KEPT = (
@@ -81,6 +77,18 @@ def compared_with(controllers: Iterable[str]) -> str:
     return REFERENCE if REFERENCE in names else names[0]
 
 
+def plant_of(name: str, scenario: Scenario) -> Plant:
+    """Return one of PLANTS."""
+    from nmfd.model.links.plant import LinkPlant  # torch takes two seconds
+    from nmfd.model.plant import AcyclicPlant, NmfdPlant
+
+    if name == LINKS:
+        return LinkPlant(scenario)
+    if name == "acyclic":
+        return AcyclicPlant(scenario)
+    return NmfdPlant(scenario)
+
+
 def closed_loop_of(
     strategy: Strategy,
     seed: int,
@@ -98,7 +106,7 @@ def closed_loop_of(
     """
     controller = strategy.make(scenario, policy)
     actual = actual or scenario
-    result = closed_loop.run(PLANTS[plant](actual), controller, actual, seed=seed)
+    result = closed_loop.run(plant_of(plant, actual), controller, actual, seed=seed)
     return result.assign(controller=strategy.name, plant=plant, demand=demand)
 
 
@@ -137,6 +145,8 @@ def key_of(
         "plant": plant,
     }
     if plant == LINKS:
+        from nmfd.model.links.plant import LinkPlant, links_file
+
         LinkPlant(scenario)  # or its error before the first run
         shared["links_hash"] = file_hash(links_file(scenario))
     return lambda name: {**shared, "controller": own[name]}
@@ -185,20 +195,27 @@ def with_bounds(rows: "Table", lower: Mapping[tuple[str, float], float], level: 
 
 
 def draw(folder: Path, scenarios: Mapping[float, Scenario], rows: "pd.DataFrame") -> None:
-    """Draw the finished runs of a benchmark, and its scenario."""
+    """Draw the finished runs of a benchmark, and its scenario.
+
+    Figures of runs that are newer than runs.csv stay: it changes with every run.
+    """
     done = rows[rows["failure"] == ""]
     if done.empty:
         return
     several = len(scenarios) > 1
     for level, scenario in scenarios.items():
         below = f"demand-{level:g}" if several else ""
+        prefix = f"{below}-" if below else ""
+        if is_newer(folder / f"{prefix}{LAST_FIGURE}", folder / TABLE):
+            continue
         results = []
         for row in done.to_dict("records"):
             if row.get("folder", "") == below:
                 name = run_name(row["controller"], row["seed"])
-                results.append(Result.read(folder / below / f"{name}.nc"))
+                file = folder / below / f"{name}.nc"
+                results.append(Result.read(file, only=("accumulation", "backlog")))
         if results:
-            draw_accumulations(folder, scenario, results, prefix=f"{below}-" if below else "")
+            draw_accumulations(folder, scenario, results, prefix=prefix)
     draw_scenario(folder, next(iter(scenarios.values())))
 
 
@@ -292,6 +309,8 @@ def draw_accumulations(
     title: text above both pictures
     prefix: begins the names of the files
     """
+    from nmfd.studies import plots  # Matplotlib takes half a second
+
     network = scenario.network
     drawing = plots.figure(8.0, 4.6)
     ax = plots.total_accumulation(drawing.subplots(), trajectories, seed)
@@ -303,11 +322,13 @@ def draw_accumulations(
         plots.region_accumulation(ax, network, region, trajectories, seed)
     drawing.suptitle(title, fontsize="medium")
     plots.legend_below(drawing, axes, columns=3)
-    plots.save(drawing, folder / f"{prefix}region_accumulation.png")
+    plots.save(drawing, folder / f"{prefix}{LAST_FIGURE}")
 
 
 def draw_scenario(folder: Path, scenario: Scenario) -> list[Path]:
     """Draw spawn matrix, region map and MFDs; return the png files."""
+    from nmfd.studies import plots
+
     demand = plots.figure(11.0, 4.8)
     left, right = demand.subplots(1, 2)
     plots.spawn_matrix(left, scenario)
@@ -368,6 +389,8 @@ def improvements(rows: "pd.DataFrame", controller: str) -> dict[float, tuple[flo
 
 def draw_robustness(folder: Path, rows: "pd.DataFrame") -> None:
     """Draw the improvement over sigma as robustness.png in `folder`."""
+    from nmfd.studies import plots
+
     drawing = plots.figure(8.0, 4.8)
     ax = drawing.subplots()
     ax.axhline(0.0, color=plots.COLOURS[REFERENCE], linewidth=1.0)

@@ -47,6 +47,7 @@ from nmfd.controllers.open_loop import NAMES, Plan
 from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
 from nmfd.model import dynamics
+from nmfd.model.integration import SCHEMES
 from nmfd.model.mfd import Mfd
 from nmfd.model.plant import NmfdPlant
 from nmfd.model.regional_model import LEAST_LIMIT, RegionalModel
@@ -330,7 +331,7 @@ def relaxation(scenario: Scenario, *, guidance: bool) -> Relaxation:
     vehicles = max(1.0, float(scenario.start.sum() + scenario.step * scenario.demand.sum()))
     slopes, change = _integration(scenario)
     points = slopes.shape[1]
-    per_interval = len(dynamics.SCHEMES[scenario.integrator][0]) * scenario.substeps
+    per_interval = len(SCHEMES[scenario.integrator][0]) * scenario.substeps
     interval = np.arange(points) // per_interval  # of each point
 
     # The change of x follows from the trips that end, the transfer flows and the demand.
@@ -383,7 +384,7 @@ def _integration(scenario: Scenario) -> tuple[sparse.sparray, sparse.sparray]:
     Row n of the first has the weights of the derivatives that lead from the begin of the substep to
     point n + 1; row n of the second is the difference of the states there.
     """
-    weights, places = dynamics.SCHEMES[scenario.integrator]
+    weights, places = SCHEMES[scenario.integrator]
     stages = len(weights)
     along = np.diag([*places[1:], 0.0])
     along[-1] = weights

@@ -16,7 +16,7 @@ import click
 import pandas as pd
 
 import nmfd
-from nmfd.controllers.dpc.compact import Numbers
+from nmfd.controllers.dpc.numbers import Numbers
 
 OVER = "+max-pressure+guidance-period-60"
 SCENARIO, MODEL = nmfd.load_scenario("grid7_peak"), nmfd.load_network("grid7_max_pressure")

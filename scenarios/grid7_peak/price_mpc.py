@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from nmfd.controllers.dpc.compact import Numbers
+from nmfd.controllers.dpc.numbers import Numbers
 from nmfd.controllers.dpc.policy import FILL_TIME_S
 from nmfd.controllers.dpc.rollout import Rollout
 from nmfd.model.answer import Answer

@@ -37,14 +37,13 @@ The regional model answers prices by a logit (nmfd.model.answer). The policy is 
 network.
 """
 
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
-from pydantic import Field
 from torch import nn
 
-from nmfd.controllers.base import Options
+from nmfd.controllers.dpc.numbers import Numbers
 from nmfd.controllers.dpc.policy import (
     DTYPE,
     FILL_TIME_S,
@@ -55,37 +54,7 @@ from nmfd.controllers.dpc.policy import (
 )
 from nmfd.model.planning import PlanningModel
 from nmfd.model.regional_model import RegionalModel
-from nmfd.runs import config
-from nmfd.runs.config import Problem, setting
 from nmfd.tensors import PerPair, PerRegion
-
-
-class Numbers(NamedTuple):
-    """Parameters of a compact policy (-).
-
-    The last four may be omitted in scenario.toml.
-    """
-
-    set_point: float = 1.0
-    gain: float = 2.0
-    relief: float = 0.0
-    price: float = 1.0
-    price_from: float = 0.6
-    elsewhere: float = 0.0
-    elsewhere_from: float = 0.6
-    metering: float = 1.5
-    integral: float = 0.0
-    metering_protected: float = 0.0
-    metering_gain: float = 1.0
-    metering_slope: float = 1.0
-
-
-NumbersOption = Annotated[config.Numbers, Field(min_length=8, max_length=12)]
-MEANING = (
-    "set_point, gain, relief, price, price_from, elsewhere, elsewhere_from, metering, "
-    "integral (0), metering_protected (0), metering_gain (1), metering_slope (1); "
-    "see nmfd/controllers/dpc/compact.py"
-)
 
 
 class CompactPolicy(Policy):
@@ -174,40 +143,11 @@ class CompactPolicy(Policy):
         return Numbers(*self.numbers.clamp(min=0.0))
 
 
-class GatingRule(Options):
-    """Gates by numbers that were tuned in SUMO."""
-
-    guidance: ClassVar[bool] = False
-    name: ClassVar[str] = "gating-rule"
-
-    numbers: NumbersOption = setting(MEANING, Numbers(), unit="-")
-    metering: bool = setting("trips wait while regions are full; for +metering", False)
-
-    @property
-    def guides(self) -> bool:
-        return self.guidance
-
-    def misfit(self, planning: PlanningModel) -> Problem | None:
-        """Return negative numbers, or no protected region, as a problem."""
-        if min(self.numbers) < 0.0:
-            return Problem("numbers", config.got("8 to 12 numbers >= 0", list(self.numbers)))
-        if not planning.protected:
-            return Problem("numbers", "expected a scenario with protected regions; name them")
-        return None
-
-    def make(self, planning: PlanningModel) -> DpcController:
-        architecture = Architecture(
-            guidance=self.guidance, compact=planning.protected, metering=self.metering
-        )
-        policy = CompactPolicy(planning.network, architecture)
-        policy.numbers.data.copy_(torch.tensor(Numbers(*self.numbers), dtype=DTYPE))
-        controller = DpcController(policy)
-        controller.name = self.name
-        return controller
-
-
-class PricingRule(GatingRule):
-    """Prices of ways through regions, and gates, with numbers tuned in SUMO."""
-
-    guidance: ClassVar[bool] = True
-    name: ClassVar[str] = "pricing-rule"
+def rule(
+    planning: PlanningModel, numbers: Numbers, *, guidance: bool, metering: bool
+) -> DpcController:
+    """Return the controller of these numbers for the protected regions."""
+    architecture = Architecture(guidance=guidance, compact=planning.protected, metering=metering)
+    policy = CompactPolicy(planning.network, architecture)
+    policy.numbers.data.copy_(torch.tensor(numbers, dtype=DTYPE))
+    return DpcController(policy)

@@ -3,37 +3,15 @@
 It is the floor under every policy: one that does not beat the best constant only needs it.
 """
 
-from typing import Annotated, ClassVar, NamedTuple
-
 import torch
-from pydantic import Field
 from torch import nn
 
-from nmfd.controllers.base import Options
 from nmfd.controllers.dpc.compact import CompactPolicy
+from nmfd.controllers.dpc.numbers import Levels
 from nmfd.controllers.dpc.policy import DTYPE, FILL_TIME_S, Architecture, DpcController, Memory
 from nmfd.model.planning import PlanningModel
 from nmfd.model.regional_model import RegionalModel
-from nmfd.runs.config import Numbers, Problem, got, setting
 from nmfd.tensors import PerPair, PerRegion
-
-
-class Levels(NamedTuple):
-    """Numbers of constant control (-).
-
-    gate: opening of the boundaries into protected regions, from 0 (u_min) to 1 (u_max)
-    price, elsewhere: prices of protected and of other regions
-    metering: departures of a region in FILL_TIME_S, as a share of its critical accumulation
-    """
-
-    gate: float = 1.0
-    price: float = 0.0
-    elsewhere: float = 0.0
-    metering: float = 1.0
-
-
-LevelsOption = Annotated[Numbers, Field(min_length=4, max_length=4)]
-MEANING = "gate, price, elsewhere, metering; see nmfd/controllers/dpc/constant.py"
 
 
 class ConstantPolicy(CompactPolicy):
@@ -74,34 +52,11 @@ class ConstantPolicy(CompactPolicy):
         return Levels(*self.numbers)
 
 
-class ConstantControl(Options):
-    """Gates, prices and departure rates that never change."""
-
-    numbers: LevelsOption = setting(MEANING, Levels(), unit="-")
-    guidance: bool = setting("prices guide drivers", True)
-    metering: bool = setting("trips wait beyond a rate; for +metering", False)
-    name: ClassVar[str] = "constant"
-
-    @property
-    def guides(self) -> bool:
-        return self.guidance
-
-    def misfit(self, planning: PlanningModel) -> Problem | None:
-        """Return negative numbers, a gate above 1, or no protected region."""
-        levels = Levels(*self.numbers)
-        if min(levels) < 0.0 or levels.gate > 1.0:
-            expected = "4 numbers >= 0, the first at most 1"
-            return Problem("numbers", got(expected, list(self.numbers)))
-        if not planning.protected:
-            return Problem("numbers", "expected a scenario with protected regions; name them")
-        return None
-
-    def make(self, planning: PlanningModel) -> DpcController:
-        architecture = Architecture(
-            guidance=self.guidance, compact=planning.protected, metering=self.metering
-        )
-        policy = ConstantPolicy(planning.network, architecture)
-        policy.numbers.data.copy_(torch.tensor(self.numbers, dtype=DTYPE))
-        controller = DpcController(policy)
-        controller.name = self.name
-        return controller
+def constant(
+    planning: PlanningModel, levels: Levels, *, guidance: bool, metering: bool
+) -> DpcController:
+    """Return the controller of these levels for the protected regions."""
+    architecture = Architecture(guidance=guidance, compact=planning.protected, metering=metering)
+    policy = ConstantPolicy(planning.network, architecture)
+    policy.numbers.data.copy_(torch.tensor(levels, dtype=DTYPE))
+    return DpcController(policy)

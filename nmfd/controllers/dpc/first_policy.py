@@ -6,7 +6,8 @@ from torch import Generator
 from torch.optim import Adam
 
 from nmfd.controllers.base import from_table
-from nmfd.controllers.dpc.compact import CompactPolicy, Numbers
+from nmfd.controllers.dpc.compact import CompactPolicy
+from nmfd.controllers.dpc.numbers import Numbers
 from nmfd.controllers.dpc.options import Dpc
 from nmfd.controllers.dpc.policy import Architecture, Policy
 from nmfd.controllers.dpc.policy_file import new_policy

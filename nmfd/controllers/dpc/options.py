@@ -1,20 +1,31 @@
-"""Options of DPC policies and of their training."""
+"""Options of DPC policies, of their training, and of rules.
+
+Policies and torch, which takes two seconds, are imported where one is made.
+"""
 
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from pydantic import model_validator
 
 from nmfd.controllers.base import FileKind, Options
-from nmfd.controllers.dpc.compact import MEANING, Numbers, NumbersOption
-from nmfd.controllers.dpc.policy import DpcController
-from nmfd.controllers.dpc.policy_file import guided_by, load, read_file
+from nmfd.controllers.dpc.numbers import (
+    LEVELS_MEANING,
+    MEANING,
+    Levels,
+    LevelsOption,
+    Numbers,
+    NumbersOption,
+)
 from nmfd.model.planning import PlanningModel
 from nmfd.model.scenario import Scenario
-from nmfd.runs import shipped
+from nmfd.runs import config, shipped
 from nmfd.runs.config import Flow, Problem, Share, Text, Texts, got, setting, whole
+
+if TYPE_CHECKING:
+    from nmfd.controllers.dpc.policy import DpcController
 
 POLICY = FileKind("policy", ".pt", "nmfd train {folder} --controller {name}")
 
@@ -183,6 +194,8 @@ class Dpc(Options):
     def guides(self) -> bool:
         if self.guidance is not None or self.policy is None:
             return self.guidance is not False
+        from nmfd.controllers.dpc.policy_file import guided_by, read_file
+
         file = read_file(shipped.found(self.policy, shipped.SCENARIO))
         return guided_by(file)
 
@@ -194,7 +207,9 @@ class Dpc(Options):
     def file(self) -> str | Path | None:
         return self.policy
 
-    def load(self, file: Path, planning: PlanningModel, scenario: Scenario) -> DpcController:
+    def load(self, file: Path, planning: PlanningModel, scenario: Scenario) -> "DpcController":
+        from nmfd.controllers.dpc.policy_file import load
+
         return load(file, planning, guidance=self.guides)
 
     @property
@@ -210,3 +225,71 @@ class Dpc(Options):
             return None
         key = "compact" if self.compact else "from_gating"
         return Problem(key, "expected a scenario with protected regions; name them, or omit it")
+
+
+class GatingRule(Options):
+    """Gates by numbers that were tuned in SUMO."""
+
+    guidance: ClassVar[bool] = False
+    name: ClassVar[str] = "gating-rule"
+
+    numbers: NumbersOption = setting(MEANING, Numbers(), unit="-")
+    metering: bool = setting("trips wait while regions are full; for +metering", False)
+
+    @property
+    def guides(self) -> bool:
+        return self.guidance
+
+    def misfit(self, planning: PlanningModel) -> Problem | None:
+        """Return negative numbers, or no protected region, as a problem."""
+        if min(self.numbers) < 0.0:
+            return Problem("numbers", config.got("8 to 12 numbers >= 0", list(self.numbers)))
+        if not planning.protected:
+            return Problem("numbers", "expected a scenario with protected regions; name them")
+        return None
+
+    def make(self, planning: PlanningModel) -> "DpcController":
+        from nmfd.controllers.dpc.compact import rule
+
+        numbers = Numbers(*self.numbers)
+        controller = rule(planning, numbers, guidance=self.guidance, metering=self.metering)
+        controller.name = self.name
+        return controller
+
+
+class PricingRule(GatingRule):
+    """Prices of ways through regions, and gates, with numbers tuned in SUMO."""
+
+    guidance: ClassVar[bool] = True
+    name: ClassVar[str] = "pricing-rule"
+
+
+class ConstantControl(Options):
+    """Gates, prices and departure rates that never change."""
+
+    numbers: LevelsOption = setting(LEVELS_MEANING, Levels(), unit="-")
+    guidance: bool = setting("prices guide drivers", True)
+    metering: bool = setting("trips wait beyond a rate; for +metering", False)
+    name: ClassVar[str] = "constant"
+
+    @property
+    def guides(self) -> bool:
+        return self.guidance
+
+    def misfit(self, planning: PlanningModel) -> Problem | None:
+        """Return negative numbers, a gate above 1, or no protected region."""
+        levels = Levels(*self.numbers)
+        if min(levels) < 0.0 or levels.gate > 1.0:
+            expected = "4 numbers >= 0, the first at most 1"
+            return Problem("numbers", got(expected, list(self.numbers)))
+        if not planning.protected:
+            return Problem("numbers", "expected a scenario with protected regions; name them")
+        return None
+
+    def make(self, planning: PlanningModel) -> "DpcController":
+        from nmfd.controllers.dpc.constant import constant
+
+        levels = Levels(*self.numbers)
+        controller = constant(planning, levels, guidance=self.guidance, metering=self.metering)
+        controller.name = self.name
+        return controller

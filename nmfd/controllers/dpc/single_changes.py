@@ -11,7 +11,8 @@ from typing import Any
 
 import torch
 
-from nmfd.controllers.dpc.compact import CompactPolicy, Numbers
+from nmfd.controllers.dpc.compact import CompactPolicy
+from nmfd.controllers.dpc.numbers import Numbers
 from nmfd.controllers.dpc.policy import Policy
 from nmfd.model.planning import PlanningModel
 from nmfd.tensors import PerPair, PerRegion

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from pydantic import model_validator
@@ -30,7 +30,6 @@ from nmfd.controllers.mpc.edge_model import (
     Turns,
     affected_vehicles,
 )
-from nmfd.controllers.mpc.ipopt import Ipopt
 from nmfd.controllers.mpc.projected_gradient import AT_REST, TIME_LIMIT, Late, Minimum, minimise
 from nmfd.controllers.mpc.terminal import Terminal, read
 from nmfd.controllers.rules import PiGate, PiGating
@@ -39,6 +38,9 @@ from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs.config import Problem, setting, whole
 from nmfd.types import Controls, Observation, Status
+
+if TYPE_CHECKING:
+    from nmfd.controllers.mpc.ipopt import Ipopt
 
 MAX_ITERATIONS = 1000  # of the solver, per decision
 # Width of the rounded kink of the MFDs in the solver, as a share of the smallest jam accumulation.
@@ -256,6 +258,8 @@ class MpcController:
         self.deadline = planning.step  # s: a later answer is of no use
         self._ipopt = None
         if self.options.solver == "ipopt":
+            from nmfd.controllers.mpc.ipopt import Ipopt  # with CasADi and torch
+
             limits = {"max_iter": MAX_ITERATIONS, "max_wall_time": DEADLINE_SHARE * self.deadline}
             self._ipopt = Ipopt(planning, guidance=guidance, horizon=horizon, limits=limits)
         self.reset()
@@ -357,7 +361,7 @@ class MpcController:
             seconds=deadline - time.perf_counter(),
         )
 
-    def _by_ipopt(self, solver: Ipopt, start: PerCell, demand: Demands) -> Minimum:
+    def _by_ipopt(self, solver: "Ipopt", start: PerCell, demand: Demands) -> Minimum:
         """Return the plan of IPOPT, made admissible.
 
         IPOPT meets bounds and sums to its tolerance only.

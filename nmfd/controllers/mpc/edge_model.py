@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 
 from nmfd.arrays import PerRegion
 from nmfd.controllers.mpc.projected_gradient import Late
-from nmfd.model.dynamics import SCHEMES
+from nmfd.model.integration import SCHEMES
 from nmfd.model.mfd import Mfd, stacked
 from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, RegionalModel
 
@@ -52,7 +52,7 @@ class Turns:
     capacity: under u = 1 (veh/s, (E,)) or None
     storage: (veh, (R,)) or None
     step: control interval (s)
-    substeps, integrator: integration steps in it, and their scheme (dynamics.SCHEMES)
+    substeps, integrator: integration steps in it, and their scheme (integration.SCHEMES)
     rounding: width of the rounded kink of the MFDs at the jam accumulation (veh); 0 for the exact
         model
     """

@@ -19,6 +19,7 @@ import numpy as np
 
 from nmfd.arrays import PairsOverTime, PerPair, TurnsOverTime
 from nmfd.model import dynamics
+from nmfd.model.integration import integrated
 from nmfd.model.mfd import stacked
 from nmfd.model.planning import PlanningModel
 from nmfd.model.regional_model import LEAST_ROOM, RegionalModel, passing_share
@@ -220,8 +221,6 @@ def advance(
     """Return x after one control interval under constant inputs.
 
     step: control interval (s)
-    scheme: as of `dynamics.integrated`
+    scheme: as of `integration.integrated`
     """
-    return dynamics.integrated(
-        lambda x: derivative(p, x, demand, perimeter, splits), x, step, **scheme
-    )
+    return integrated(lambda x: derivative(p, x, demand, perimeter, splits), x, step, **scheme)
