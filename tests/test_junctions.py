@@ -12,10 +12,11 @@ LENGTH, EDGES = 5.0, (":x_1", ":x_2", ":x_10", ":y_1", "a", "b")
 
 class Streets:
     """A session: vehicles on junction x, since when they stand, and what is free of lanes a_0 and
-    b_0 [m]."""
+    b_0, 50 m long unless told otherwise [m]."""
 
-    def __init__(self, standing, room):
+    def __init__(self, standing, room, length=50.0):
         self.standing, self.free, self.set_on = standing, room, {}
+        self.length = length
         self.at = {"first": ":x_1_0", "second": ":x_2_0", "third": ":x_2_0"}
 
     def halting(self, edge):
@@ -35,6 +36,9 @@ class Streets:
 
     def next_lane(self, lane):
         return {":x_1_0": "a_0", ":x_2_0": ":x_10_0", ":x_10_0": "b_0"}[lane]
+
+    def lane(self, lane):
+        return self.length, frozenset()
 
     def room(self, lane):
         return self.free[lane]
@@ -72,3 +76,11 @@ def test_vehicles_are_set_down_where_all_have_room(standing, room, expected):
     junctions.free()
     assert streets.set_on == {vehicle: (lane, LENGTH + GAP_M) for vehicle, lane in expected.items()}
     assert junctions.freed == len(expected)
+
+
+@pytest.mark.parametrize("room, expected", [(0.2, {"first": ("a_0", 0.2)}), (-4.8, {})])
+def test_on_a_street_too_short_for_a_vehicle_it_is_set_at_the_end(room, expected):
+    """A second vehicle, whose end is 4.8 m before the street, leaves no room there."""
+    streets = Streets({"first": 130.0}, {"a_0": room}, length=0.2)
+    Junctions(streets, SimpleNamespace(region_of=dict.fromkeys(EDGES, 0))).free()
+    assert streets.set_on == expected

@@ -9,8 +9,9 @@ turn is left, and the city locks.
 
 On a junction, vehicles give way to each other, also to standing ones. Such a ring never ends
 without teleports. So vehicles that have stood on a junction for long are put on the streets behind
-it, if all of them have room there. A junction that is blocked by a full street stays blocked: that
-is gridlock, and it counts.
+it, if all of them have room there. On a street shorter than a vehicle it is put at the end, if
+nobody else is there. A junction that is blocked by a full street stays blocked: that is gridlock,
+and it counts.
 """
 
 from collections import defaultdict
@@ -109,13 +110,18 @@ class Junctions:
         lanes: dict[str, str] = {}  # lane behind the junction -> first vehicle that goes there
         for vehicle in vehicles:
             lane = self._behind(self._session.place(vehicle)[0])
-            length = self._session.vehicle_length(vehicle)
-            if self._session.room(lane) < length + 2.0 * GAP_M:
+            needed = self._session.vehicle_length(vehicle) + 2.0 * GAP_M
+            if self._session.room(lane) < min(needed, self._length(lane)):
                 return
             lanes.setdefault(lane, vehicle)
         for lane, vehicle in lanes.items():
             position = self._session.vehicle_length(vehicle) + GAP_M
+            position = min(position, self._length(lane))
             self.freed += self._session.set_down(vehicle, lane, position)
+
+    def _length(self, lane: str) -> float:
+        """Return the length of a lane (m)."""
+        return self._session.lane(lane)[0]
 
     def _street_behind(self, lane: str) -> str:
         """Return the lane of a street that a lane on a junction leads to."""
