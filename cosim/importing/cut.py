@@ -61,7 +61,7 @@ def cut(plan: Plan, folder: Path, out: Path) -> None:
     """
     streets = read_streets(folder / plan.net)
     around = [read_streets(folder / net) for net in plan.around]
-    trips = []
+    trips: list[Trip] = []
     for name in plan.trips:
         trips += read_trips(folder / f"{name}.rou.xml", folder / f"{name}_vehicles.add.xml")
     inside = trips_inside(trips, streets, around)
@@ -98,8 +98,8 @@ def trips_inside(
     the time on the edges before.
     around: streets outside whose lengths and speeds are known
     """
-    lengths = {}
-    times = {}
+    lengths: dict[str, float] = {}
+    times: dict[str, float] = {}
     for part in (*around, streets):
         lengths.update(zip(part.edges, part.length, strict=True))
         times.update(zip(part.edges, part.length / part.speed, strict=True))
@@ -123,7 +123,7 @@ def trips_inside(
 def longest_stretch(
     edges: Sequence[str], known: Mapping[str, int], links: set[tuple[str, str]]
 ) -> range:
-    """Return the numbers of the longest stretch of known edges that links join.
+    """Return the numbers of the longest stretch of edges that links join.
 
     It is the first of equals.
     """
