@@ -33,7 +33,7 @@ def publish(monkeypatch, tmp_path):
         (tmp_path / "archive.zip").write_bytes(content)
         source = source or (tmp_path / "archive.zip").as_uri()
         city = dict(
-            about="a city", licence="MIT", source=source, folder="top-1/city", start="a.sumocfg"
+            about="a city", licence="MIT", sources=[source], folder="top-1/city", start="a.sumocfg"
         )
         monkeypatch.setattr(get, "published", lambda: {"there": city})
 

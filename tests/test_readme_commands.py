@@ -65,7 +65,7 @@ def instead(words: list[str]) -> list[str]:
     if "--demand" in words:
         return ["city.sumocfg", "--mesoscopic", "--out", str(out)]
     if not city.exists():
-        city.parent.mkdir(exist_ok=True)
+        city.parent.mkdir(parents=True, exist_ok=True)
         tiny_city.city(city.parent).rename(city)
     return words
 

@@ -8,7 +8,9 @@ import urllib.request
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
+from typing import Any
 
+from cosim.importing.cut import Plan, cut
 from nmfd.errors import InputError, did_you_mean
 from nmfd.runs import config
 from nmfd.runs.files import temporary_folder
@@ -17,7 +19,7 @@ SERVER_TIME_LIMIT_S = 60.0  # without a byte
 
 
 @cache
-def published() -> Mapping[str, Mapping[str, str]]:
+def published() -> Mapping[str, Mapping[str, Any]]:
     """Return name -> entry of cities.toml, whose comments explain the fields."""
     return config.read(Path(__file__).with_name("cities.toml"))
 
@@ -38,25 +40,18 @@ def get(name: str, out: Path) -> str:
         raise InputError(f"--out: {out} exists; choose another folder, or remove it")
     city = cities[name]
     out.parent.mkdir(parents=True, exist_ok=True)
-    source = city["source"]
     contents = city["folder"]
-    notice = f"{name}: {city['about']}\nLicence: {city['licence']}\nFetched from {source}\n"
+    notice = f"{name}: {city['about']}\nLicence: {city['licence']}\n"
     with temporary_folder(f".{out.name}-", where=out.parent) as folder:
-        archive = folder / "archive.whl"
-        pip = [sys.executable, "-m", "pip", "download", "--no-deps", "--only-binary", ":all:"]
         try:
-            if "://" in source:
-                with urllib.request.urlopen(source, timeout=SERVER_TIME_LIMIT_S) as answer:
-                    archive.write_bytes(answer.read())
-            else:
-                subprocess.run(
-                    [*pip, "--dest", str(folder), source],
-                    check=True,
-                    capture_output=True,
-                    text=True,
-                )
-                archive = next(folder.glob("*.whl"))
-            shutil.unpack_archive(archive, folder, "zip")
+            for source in city["sources"]:
+                notice += f"Fetched from {source}\n"
+                _fetch(source, folder)
+            if "cut" in city:
+                cut(Plan(**city["cut"]), folder, folder / contents)
+            if "regions" in city:
+                table = city["regions"]
+                shutil.copy(Path(__file__).with_name(table), folder / contents / table)
             (folder / contents / "NOTICE.cosim.txt").write_text(notice, encoding="utf-8")
             os.replace(folder / contents, out)
         except (OSError, StopIteration, subprocess.CalledProcessError) as error:
@@ -66,7 +61,26 @@ def get(name: str, out: Path) -> str:
                 f"{name}: {contents} of {source} cannot be fetched ({reason}); try again with "
                 "internet access"
             ) from None
-    return f"{notice}Next: cosim import {out / city['start']} --out networks/{name}"
+    start = str(out / city["start"])
+    if "regions" in city:
+        start += f" --regions {out / city['regions']}"
+    return f"{notice}Next: cosim import {start} --out networks/{name}"
+
+
+def _fetch(source: str, folder: Path) -> None:
+    """Download an .xml file into a folder, or unpack an archive there."""
+    if "://" in source:
+        file = folder / source.rpartition("/")[2]
+        with urllib.request.urlopen(source, timeout=SERVER_TIME_LIMIT_S) as answer:
+            file.write_bytes(answer.read())
+    else:
+        pip = [sys.executable, "-m", "pip", "download", "--no-deps", "--only-binary", ":all:"]
+        subprocess.run(
+            [*pip, "--dest", str(folder), source], check=True, capture_output=True, text=True
+        )
+        file = next(folder.glob("*.whl"))
+    if file.suffix != ".xml":
+        shutil.unpack_archive(file, folder, "zip")
 
 
 def listed() -> str:

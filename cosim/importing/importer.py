@@ -258,7 +258,7 @@ def _imported(request: Request, case: SumoInput, folder: Path, progress: Progres
     everywhere = without_effect(case.options, mesoscopic)
     left = quality.left_alone(streets, switched, everywhere)
     if given is not None:
-        labels = finish(streets, given, renumber=False)
+        labels = finish(streets, given, own=True)
     else:
         labels = partition(streets, baseline, request.count or 0, uncontrollable=left)
     if labels.max() < 1:
@@ -469,8 +469,8 @@ def _report(
         moved = (city.given != city.labels)[city.streets.drivable & (city.given >= 0)].sum()
         if moved:
             lines.append(
-                f"{moved:,} streets are in other regions than in {request.regions}: regions must "
-                "be connected"
+                f"{moved:,} streets are in other regions than in {request.regions}: each region "
+                "must be reached from each"
             )
     return [*lines, *verdict.sentences]
 

@@ -4,7 +4,7 @@ The aims are those of Ji and Geroliminis, "On the spatial partitioning of urban 
 networks" (2012): regions that are homogeneous in density, connected and compact. Perimeter control
 needs more: boundaries at signals. So streets that much traffic joins without a controllable signal
 merge first. In the end every region is connected and can be reached from each other, and every edge
-is in one (`finish`).
+is in one (`finish`). Regions of the user's own may be in several pieces.
 """
 
 from collections import Counter
@@ -226,32 +226,46 @@ def _opposite(streets: Streets) -> list[tuple[int, int]]:
     return pairs
 
 
-def finish(streets: Streets, labels: EdgeNumbers, *, renumber: bool = True) -> EdgeNumbers:
+def finish(streets: Streets, labels: EdgeNumbers, *, own: bool = False) -> EdgeNumbers:
     """Return a region for every edge from labels, -1 for none.
 
     Regions become connected, and each can be reached from each; those that fail join a neighbour.
-    Other edges join an adjoining region or the nearest. Regions are numbered from north to south,
-    or in the order of the labels.
+    Other edges join an adjoining region or the nearest. Regions are numbered from north to south.
+
+    own: the labels are the user's own; regions may be in several pieces, and keep their order
     """
     regions = labels.copy()
     regions[~streets.drivable] = -1
     regions = _spread(streets, regions, streets.links, streets.drivable)
-    regions = connect(streets, regions)
-    victim = _not_reachable(streets, regions)
-    while victim is not None:
+    while True:
+        if not own:
+            regions = connect(streets, regions)
+        victim = _not_reachable(streets, regions)
+        if victim is None:
+            break
         # The region joins the neighbour with the most connections.
         pairs = regions[streets.links]
         beyond = np.concatenate([pairs[pairs[:, 0] == victim, 1], pairs[pairs[:, 1] == victim, 0]])
         beyond = beyond[(beyond != victim) & (beyond >= 0)]
         regions = np.where(regions == victim, np.argmax(np.bincount(beyond)), regions)
-        regions = connect(streets, regions)
-        victim = _not_reachable(streets, regions)
     everywhere = np.ones(len(streets.edges), dtype=bool)
     regions = _spread(streets, regions, streets.all_links, everywhere)
-    if renumber:
+    if not own:
         return _numbered(streets, regions)
     _, numbers = np.unique(regions, return_inverse=True)
     return numbers
+
+
+def pieces_of(streets: Streets, regions: EdgeNumbers) -> EdgeNumbers:
+    """Return the number of the piece of a region in which every edge lies.
+
+    The connections of the main part join the edges of a piece.
+    """
+    inside = streets.main_part
+    links = streets.links[inside[streets.links].all(axis=1)]
+    kept = links[regions[links[:, 0]] == regions[links[:, 1]]]
+    _, piece = connected_components(graph(kept, len(regions)), directed=False)
+    return piece
 
 
 def connect(streets: Streets, regions: EdgeNumbers) -> EdgeNumbers:
@@ -263,8 +277,7 @@ def connect(streets: Streets, regions: EdgeNumbers) -> EdgeNumbers:
     inside = streets.main_part
     links = streets.links[inside[streets.links].all(axis=1)]
     for _ in range(len(regions)):
-        kept = links[regions[links[:, 0]] == regions[links[:, 1]]]
-        _, piece = connected_components(graph(kept, len(regions)), directed=False)
+        piece = pieces_of(streets, regions)
         weight = np.bincount(piece, streets.lane_metres)
         loose = np.zeros(len(regions), dtype=bool)
         for region in np.unique(regions[inside]):

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from cosim.importing.baseline import INTERVAL_S, Baseline
+from cosim.importing.partition import pieces_of
 from cosim.importing.streets import Streets
 from cosim.sumo.arrays import EdgeMask, EdgeNumbers, PerTrip
 from cosim.sumo.net import City, Gateway
@@ -110,7 +111,7 @@ def _gateway(
 
 
 def doubts(streets: Streets, regions: EdgeNumbers, names: Sequence[str]) -> list[str]:
-    """Return sentences about streets apart and small regions."""
+    """Return sentences about streets apart, and small or torn regions."""
     sentences = []
     total = streets.lane_metres.sum()
     apart = streets.drivable & ~streets.main_part
@@ -120,7 +121,14 @@ def doubts(streets: Streets, regions: EdgeNumbers, names: Sequence[str]) -> list
             f"the streets fall into {streets.parts} parts without a connection; {away / total:.1%} "
             "of the lanes lie outside the largest, and count for the region nearest to them"
         )
+    piece = pieces_of(streets, regions)
     for region, name in enumerate(names):
+        count = len(np.unique(piece[streets.main_part & (regions == region)]))
+        if count > 1:
+            sentences.append(
+                f"region {region} {name} is in {count} pieces, as in your own table; trips between "
+                "these cross other regions"
+            )
         lane_km = streets.lane_metres[regions == region].sum() / 1000.0
         if lane_km < SMALLEST_LANE_KM:
             sentences.append(

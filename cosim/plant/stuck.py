@@ -9,8 +9,9 @@ turn is left, and the city locks.
 
 On a junction, vehicles give way to each other, also to standing ones. Such a ring never ends
 without teleports. So vehicles that have stood on a junction for long are put on the streets behind
-it, if all of them have room there. A junction that is blocked by a full street stays blocked: that
-is gridlock, and it counts.
+it, if all of them have room there. On a street shorter than a vehicle it is put at the end, if
+nobody else is there. Who stands on such a street stands on the junction, too. A junction that is
+blocked by a full street stays blocked: that is gridlock, and it counts.
 """
 
 from collections import defaultdict
@@ -25,6 +26,7 @@ LEADER_M = 10.0  # before the end of a lane: the first vehicle stands there
 LEADER_PATIENCE_S = 60.0
 JUNCTION_PATIENCE_S = 120.0  # longer than any green, and than any wait for a gap
 GAP_M = 2.5  # behind and before a vehicle that is put on a street
+SHORT_STREET_M = 5.0  # a car that stands on a shorter one blocks the junctions at both ends
 
 
 class Lanes:
@@ -86,7 +88,10 @@ class Junctions:
         for edge in sorted(city.region_of):
             if edge.startswith(":"):
                 self._inside[edge[1:].rpartition("_")[0]].append(edge)
-        self._behind = cache(self._street_behind)
+        for (edge, _), lanes in sorted(city.turn_lanes.items()):
+            junction = lanes[0][1:].rsplit("_", 2)[0]
+            if city.length[edge] < SHORT_STREET_M and edge not in self._inside[junction]:
+                self._inside[junction].append(edge)
 
     def free(self) -> None:
         """Free the vehicles of all junctions, those first that have stood longest."""
@@ -108,17 +113,32 @@ class Junctions:
         """
         lanes: dict[str, str] = {}  # lane behind the junction -> first vehicle that goes there
         for vehicle in vehicles:
-            lane = self._behind(self._session.place(vehicle)[0])
-            length = self._session.vehicle_length(vehicle)
-            if self._session.room(lane) < length + 2.0 * GAP_M:
+            lane = self._lane_behind(vehicle)
+            if lane is None:
+                return
+            needed = self._session.vehicle_length(vehicle) + 2.0 * GAP_M
+            if self._session.room(lane) < min(needed, self._length(lane)):
                 return
             lanes.setdefault(lane, vehicle)
         for lane, vehicle in lanes.items():
             position = self._session.vehicle_length(vehicle) + GAP_M
+            position = min(position, self._length(lane))
             self.freed += self._session.set_down(vehicle, lane, position)
 
-    def _street_behind(self, lane: str) -> str:
-        """Return the lane of a street that a lane on a junction leads to."""
-        while lane.startswith(":"):
-            lane = self._session.next_lane(lane)
-        return lane
+    def _length(self, lane: str) -> float:
+        """Return the length of a lane (m)."""
+        return self._session.lane(lane)[0]
+
+    def _lane_behind(self, vehicle: str) -> str | None:
+        """Return the lane of a vehicle's next street; None if its own leads elsewhere."""
+        session = self._session
+        lane, _ = session.place(vehicle)
+        ways = session.next_lanes(lane)
+        while ways and ways[0].startswith(":"):
+            ways = session.next_lanes(ways[0])
+        street = session.route_index(vehicle) + 1
+        following = session.route(vehicle)[street : street + 1]
+        for onward in ways:
+            if onward.rpartition("_")[0] in following:
+                return onward
+        return None

@@ -269,12 +269,12 @@ class Session:
         onward = {libsumo.lane.getEdgeID(link[0]) for link in libsumo.lane.getLinks(lane)}
         return libsumo.lane.getLength(lane), frozenset(onward)
 
-    def next_lane(self, lane: str) -> str:
-        """Return the lane that a lane on a junction leads to.
+    def next_lanes(self, lane: str) -> list[str]:
+        """Return the lanes that a lane leads to.
 
-        It may lie on the junction, too.
+        Behind a lane on a junction there is one, which may lie on the junction, too.
         """
-        return libsumo.lane.getLinks(lane)[0][0]
+        return [link[0] for link in libsumo.lane.getLinks(lane)]
 
     def first_on(self, lane: str) -> str | None:
         """Return the vehicle nearest to the end of a lane, None without one."""
