@@ -58,6 +58,7 @@ WORKERS = click.option(
     help="Parallel runs.",
 )
 RUNNING = combined(WORKERS, SCHEDULER, TIME_LIMIT, OVERWRITE)
+EXPLAIN = click.option("--explain", is_flag=True, help="Print what the columns mean.")
 
 
 def span(text: str) -> tuple[float, float]:
@@ -122,6 +123,7 @@ def demo(out: Path) -> None:
     metavar="FILE",
     help="Policy file of --controller. [default: SCENARIO/NAME.pt]",
 )
+@EXPLAIN
 @out_option("runs/SCENARIO-TIME")
 def run(
     scenario: Path,
@@ -129,6 +131,7 @@ def run(
     controller: str,
     against: str | None,
     policy: Path | None,
+    explain: bool,
     **options: Any,
 ) -> None:
     """Run one controller, or two on the same trips.
@@ -149,7 +152,7 @@ def run(
         loaded, _both(controller, against), policies=policies, **options
     )
     out = rows.attrs["folder"]
-    click.echo(text(rows))
+    click.echo(text(rows, explain=explain))
     for row in rows.to_dict("records"):
         if row["signal_violations"]:
             table = f"{out}/signals.csv"
@@ -213,6 +216,7 @@ def watch(
 @click.option(
     "--check", type=COUNT, metavar="N", help="Only repeat N random runs of --out, and compare."
 )
+@EXPLAIN
 @out_option("runs/SCENARIO-evaluate")
 def evaluate(
     scenario: Path,
@@ -221,6 +225,7 @@ def evaluate(
     seeds: int | tuple[int, ...],
     first_seed: int,
     check: int | None,
+    explain: bool,
     **options: Any,
 ) -> None:
     """Compare controllers over seeds and demand levels.
@@ -257,7 +262,7 @@ def evaluate(
     for name in names:
         if len(names) > 1:
             click.echo(name)
-        click.echo(statistics.text(done[done["scenario"] == name]))
+        click.echo(statistics.text(done[done["scenario"] == name], explain=explain))
     nmfd.api.raise_failures(rows)
     click.echo(f"Written to {out}: see evaluate.md and the figures; a page: cosim report {out}")
 
@@ -374,7 +379,7 @@ def get(name: str | None) -> None:
     "--regions",
     required=True,
     metavar="N|CSV",
-    help="Number of regions to find, or a table edge,region.",
+    help="Number of regions to find, auto, or a table edge,region.",
 )
 @click.option(
     "--routes",

@@ -264,10 +264,10 @@ def test_the_regions_to_protect_are_proposed_and_written(tmp_path):
     (line,) = identify._proposal(loaded, (0, 2), written=False)
     assert "protected = [0, 2] instead of [1] in" in line
     assert file.read_text() == before
-    identify._write_protected(loaded, (0, 2))
+    identify.write_protected(loaded, (0, 2))
     assert file.read_text() == before.replace("protected = [1]", "protected = [0, 2]")
     file.write_text(before.replace("protected = [1]\n", ""))
-    identify._write_protected(loaded, (2,))
+    identify.write_protected(loaded, (2,))
     assert load_scenario(loaded.folder).protected == (2,)
 
 

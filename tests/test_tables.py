@@ -164,3 +164,16 @@ def test_the_best_is_the_best_on_the_seeds_that_all_have():
     assert "no-control 2, pi-gating 2, dpc-pc 2, mpc-pc 1" in warning
     apart = rows_of({(1.0, "a"): {1: 1.0, 2: 1.0}, (1.0, "b"): {2: 1.0}, (1.0, "c"): {3: 1.0}})
     assert set(statistics.on_common_seeds(apart)["controller"]) == {"a", "b"}
+
+
+@pytest.mark.parametrize("name", ["pi-gating", "route-guidance+max-pressure+guidance-period-60"])
+def test_the_table_of_the_terminal_is_narrow_and_has_a_legend_on_demand(name):
+    seeds = {seed: 1.0e6 + seed for seed in range(3)}
+    rows = rows_of({(1.0, "no-control"): seeds, (1.0, name): seeds})
+    text = statistics.text(rows)
+    explained = statistics.text(rows, explain=True)
+    assert max(map(len, explained.splitlines())) <= 100
+    assert len(statistics.brief(statistics.statistics(rows)).columns) <= 10
+    assert explained.startswith(text)
+    assert "\nTTS: " in explained
+    assert "\nTTS: " not in text

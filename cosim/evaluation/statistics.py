@@ -17,7 +17,7 @@ from cosim.sumo.net import City
 from nmfd.arrays import PerRegion
 from nmfd.metrics import COUNTED, decision_ms, percent_change
 from nmfd.runs import config
-from nmfd.runs.tables import markdown_table, text_table, wrapped
+from nmfd.runs.tables import WIDTH, markdown_table, text_table, wrapped
 from nmfd.studies import benchmark
 from nmfd.studies.benchmark import REFERENCE, interval
 from nmfd.types import Result
@@ -37,6 +37,8 @@ PAIR_COLUMNS = [
     "half_interval_percent",
     "significant",
 ]
+# Of the table in the terminal, after controller, seeds, TTS and change.
+BRIEF = ["completed", "trip [s]", "backlog [veh]", "teleports", "removed [veh]", "CO2 [kg]"]
 CAPTION = "; ".join(f"{heading}: {text}" for heading, text in COLUMNS.items())
 
 
@@ -260,16 +262,44 @@ def _change(row: Mapping) -> str:
     return f"{percent:+.1f}{spread} %{star}"
 
 
-def text(rows: pd.DataFrame) -> str:
-    """Return the tables of one scenario for the terminal."""
+def brief(table: pd.DataFrame) -> pd.DataFrame:
+    """Return the first columns of `shown`, and as many of BRIEF as fit a terminal.
+
+    table: `statistics` of one demand level
+    """
+    outcomes, costs = shown(table)
+    whole = outcomes.merge(costs, on="controller")
+    first = list(outcomes)[:4]
+    columns = [*first, *BRIEF]
+    while len(columns) > len(first) and text_width(whole[columns]) > WIDTH:
+        columns.pop()
+    return whole[columns]
+
+
+def text_width(table: pd.DataFrame) -> int:
+    """Return the width of a table as text (characters)."""
+    return max(map(len, text_table(table.to_dict("records")).splitlines()))
+
+
+def text(rows: pd.DataFrame, *, explain: bool = False) -> str:
+    """Return the table of one scenario for the terminal.
+
+    explain: with the meanings of its columns
+    """
     lines = []
+    headings: dict[str, None] = {}
     for level, table in statistics(rows).groupby("demand", sort=True):
-        lines.append(f"Demand times {level:g}")
-        for part in shown(table):
-            lines += [text_table(part.to_dict("records")), ""]
+        part = brief(table)
+        lines += [f"Demand times {level:g}", text_table(part.to_dict("records")), ""]
         for warning in warnings(table):
             lines += [*wrapped(warning), ""]
-    return "\n".join([*lines, *wrapped(CAPTION)])
+        for heading in part:
+            headings[heading.partition(" [")[0]] = None
+    if explain:
+        for heading in headings:
+            if heading in COLUMNS:
+                lines += wrapped(f"{heading}: {COLUMNS[heading]}")
+    return "\n".join(lines).rstrip()
 
 
 def markdown(rows: pd.DataFrame) -> str:
