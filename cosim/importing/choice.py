@@ -13,6 +13,7 @@ from cosim.sumo.arrays import EdgeNumbers
 
 FEWEST_REGIONS = 2
 MOST_REGIONS = 6
+CHOSEN = "regions chosen: "  # how the reason begins
 
 
 class Choice(NamedTuple):
@@ -79,5 +80,5 @@ def choose(
     held, labels = found[best]
     others = [f"{found[regions][0]:,} with {regions}" for regions in found if regions != best]
     than = f", rather than {', '.join(others)}" if others else ""
-    reason = f"{best} regions: gates into the densest one meet {held:,} vehicles{than}"
+    reason = f"{CHOSEN}{best} regions: gates into the densest one meet {held:,} vehicles{than}"
     return Choice(labels=labels, reason=reason)

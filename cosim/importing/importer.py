@@ -18,7 +18,7 @@ from cosim.importing import maps, model, quality, report
 from cosim.importing.assignment import ITERATIONS, Assigned, assign
 from cosim.importing.baseline import Baseline, averaged_runs
 from cosim.importing.case import Progress, SumoInput, seconds, sumo_input
-from cosim.importing.choice import choose, densest_region
+from cosim.importing.choice import CHOSEN, choose, densest_region
 from cosim.importing.comparison import Comparison, compare, plain_trips
 from cosim.importing.demand import Traffic, read_traffic, wrapped
 from cosim.importing.generated import morning_peak
@@ -47,6 +47,10 @@ FILES = {
     "background": "background.rou.xml.gz",
     "additional": "city.add.xml.gz",
 }
+REPORT = "import.txt"
+# How its lines begin: on the comparison with plain SUMO, and on the number of regions.
+COMPARISONS = ("same city", "not the same city", "not compared")
+CHOICES = (CHOSEN,)
 TYPES = ("vType", "vTypeDistribution")
 COMMENT = """Imported from {}. The MFDs are PLACEHOLDERS from lane length and speed limits:
 # cosim identify replaces them by measured ones."""
@@ -436,7 +440,7 @@ def _write(city: City, network_folder: Path, scenario_folder: Path) -> list[str]
         network_folder / "network.toml": network_toml(
             network, {"net": NET, "regions": REGIONS}, comment
         ),
-        network_folder / "import.txt": "\n".join(lines) + "\n",
+        network_folder / REPORT: "\n".join(lines) + "\n",
         network_folder / authority.FILE: verdict.text(),
         scenario_folder / "scenario.toml": _scenario_text(city, network),
     }
@@ -491,6 +495,19 @@ def _report(
                 "be connected"
             )
     return [*lines, *verdict.sentences]
+
+
+def reported(network: Path, beginnings: tuple[str, ...]) -> str:
+    """Return the line of the report of an import that begins so, "" without one.
+
+    network: folder of the network
+    beginnings: such as COMPARISONS
+    """
+    file = network / REPORT
+    lines = []
+    if file.is_file():
+        lines = file.read_text(encoding="utf-8").splitlines()
+    return next((line for line in lines if line.startswith(beginnings)), "")
 
 
 def _scenario_text(city: City, network: RegionalModel) -> str:

@@ -1,0 +1,88 @@
+"""Conduct of a study, from a SUMO configuration to one page."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from cosim.studying import page, stages
+from cosim.studying.page import Study
+from cosim.studying.stages import EVERYWHERE, GATES, Level, Runner
+from nmfd.api import load_scenario
+from nmfd.errors import InputError
+from nmfd.runs.files import file_name, write_text
+from nmfd.runs.run_many import locked
+
+ABOUT = "study.json"
+
+
+def conducted(
+    source: Path,
+    *,
+    regions: str,
+    routes: Sequence[Path],
+    most_seeds: int,
+    out: Path | None,
+    workers: int,
+) -> Study:
+    """Do all stages that are not done, and write the page; see `cosim.api.study`."""
+    own = source.is_file()
+    name = source.name.partition(".")[0]
+    folder = out or Path("runs") / f"{file_name(name)}-study"
+    about = {
+        "source": str(source.absolute()) if own else str(source),
+        "regions": regions,
+        "routes": ",".join(str(path.absolute()) for path in routes),
+    }
+    _check_folder(folder, about)
+    if own:
+        scenario = stages.imported(source, folder, regions, routes)
+    else:
+        scenario = load_scenario(source)
+    runner = Runner(scenario=scenario, out=folder / "runs", workers=workers)
+    try:
+        with locked(runner.out):
+            write_text(folder / ABOUT, json.dumps(about, indent=1) + "\n")
+            load = stages.loading(runner)
+            found = stages.gates(runner, load, own=own)
+            runner = replace(runner, scenario=found.scenario)
+            levels = []
+            for level in dict.fromkeys((1.0, load.under)):
+                levels.append(_level(runner, level, found.reason, most_seeds))
+            finished = Study(
+                source=str(source),
+                scenario=found.scenario,
+                load=load,
+                levels=tuple(levels),
+                no_gates=found.reason,
+                out=folder,
+            )
+            page.write(finished)
+    except KeyboardInterrupt:
+        remedy = f"the same command with --out {folder} goes on"
+        raise KeyboardInterrupt(f"finished runs are in {folder}; {remedy}") from None
+    return finished
+
+
+def _level(runner: Runner, level: float, no_gates: str, most_seeds: int) -> Level:
+    """Judge all strategies that can run at a demand level, and that may change something."""
+    skipped = runner.impossible([*EVERYWHERE])
+    names = [name for name in EVERYWHERE if name not in skipped]
+    reason = no_gates or stages.far_from_critical(runner, level)
+    if reason:
+        skipped |= dict.fromkeys(GATES, reason)
+    else:
+        names += GATES
+    return stages.level_of(runner, level, names, skipped, most_seeds)
+
+
+def _check_folder(folder: Path, about: Mapping[str, str]) -> None:
+    """Raise InputError if a folder holds another study."""
+    file = folder / ABOUT
+    if not file.is_file():
+        return
+    kept = json.loads(file.read_text(encoding="utf-8"))
+    changed = [key for key, value in about.items() if kept.get(key) != value]
+    if changed:
+        problem = f"holds another study ({', '.join(changed)} changed)"
+        raise InputError(f"{folder}: {problem}; choose another folder with --out")
