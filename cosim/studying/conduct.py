@@ -1,6 +1,7 @@
 """Conduct of a study, from a SUMO configuration to one page."""
 
 import json
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -46,11 +47,16 @@ def conducted(
             load = stages.loading(runner)
             found = stages.gates(runner, load, own=own)
             runner = replace(runner, scenario=found.scenario)
+            skipped = runner.impossible()
             levels = []
             for level in dict.fromkeys((1.0, load.under)):
-                levels.append(_level(runner, level, found.reason, most_seeds))
+                levels.append(_level(runner, level, found.reason, skipped, most_seeds))
+            place = str(source)
+            if own:
+                place = os.path.relpath(found.scenario.folder or folder)
             finished = Study(
                 source=str(source),
+                place=place,
                 scenario=found.scenario,
                 load=load,
                 levels=tuple(levels),
@@ -64,9 +70,11 @@ def conducted(
     return finished
 
 
-def _level(runner: Runner, level: float, no_gates: str, most_seeds: int) -> Level:
+def _level(
+    runner: Runner, level: float, no_gates: str, impossible: Mapping[str, str], most_seeds: int
+) -> Level:
     """Judge all strategies that can run at a demand level, and that may change something."""
-    skipped = runner.impossible([*EVERYWHERE])
+    skipped = dict(impossible)
     names = [name for name in EVERYWHERE if name not in skipped]
     reason = no_gates or stages.far_from_critical(runner, level)
     if reason:

@@ -11,7 +11,7 @@ from cosim.evaluation import results, statistics
 from cosim.importing.importer import COMPARISONS, reported
 from cosim.reporting import html
 from cosim.studying.stages import LABELS, Level, Loading, Outcome
-from cosim.studying.verdict import FEWEST_SEEDS, NOTHING_PERCENT, Answer
+from cosim.studying.verdict import FEWEST_SEEDS, NOTHING_PERCENT, Answer, Verdict
 from cosim.sumo.net import network_folder
 from nmfd.model.scenario import Scenario
 from nmfd.runs import files
@@ -21,7 +21,7 @@ from nmfd.studies.benchmark import REFERENCE
 
 PAGE = "study.html"
 HALF_RANGE = 50.0  # of the drawn changes (%); larger ones end there
-NO_COMPARISON = "not compared with plain SUMO: the scenario was not imported by this study"
+NO_COMPARISON = "Not compared with plain SUMO: the scenario was not imported by this study"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,11 +29,13 @@ class Study:
     """Finished study.
 
     source: as the user gave it
+    place: name or folder of the scenario, for commands
     no_gates: why gates and metering were left out, "" if they were not
     out: folder of the page; the runs are in its folder runs
     """
 
     source: str
+    place: str
     scenario: Scenario
     load: Loading
     levels: tuple[Level, ...]
@@ -103,9 +105,10 @@ def answer(study: Study) -> str:
         level, one = best
         assert one.verdict is not None
         saved = one.verdict.change.removeprefix("-")
+        chance = f"the odds are {_chance(one.verdict.odds.gains)} that it is more than"
         return (
-            f"Yes: {one.label} saves {saved} of the time spent {_at(level)} "
-            f"({_chance(one.verdict.odds.gains)} that it saves more than {NOTHING_PERCENT:g} %)."
+            f"Yes: {one.label} would save {saved} of the time spent {_at(level)}; "
+            f"{chance} {NOTHING_PERCENT:g} %."
         )
     if study.undecided:
         labels = dict.fromkeys(one.label for _, one in study.undecided)
@@ -115,14 +118,12 @@ def answer(study: Study) -> str:
 
 def next_line(study: Study) -> str:
     """Return what to do next, from the verdict."""
-    place = study.scenario.folder or study.scenario.name
     best = study.recommended
     if best is not None:
         level, one = best
         demand = "" if level.demand == 1.0 else f" --demand {level.demand:g}"
-        return (
-            f"Next: cosim watch {place} --controller {one.strategy} --against {REFERENCE}{demand}"
-        )
+        command = f"cosim watch {study.place} --controller {one.strategy}"
+        return f"Next: {command} --against {REFERENCE}{demand}"
     needed = [one.verdict.needed for _, one in study.undecided if one.verdict is not None]
     possible = [seeds for seeds in needed if seeds is not None]
     if possible:
@@ -169,9 +170,10 @@ def trust(study: Study) -> list[str]:
     network = study.scenario.network
     lines = [sameness(study)]
     seeds = [one.verdict.seeds for level in study.levels for one in level.outcomes if one.verdict]
+    number = f"{min(seeds)}" if min(seeds) == max(seeds) else f"{min(seeds)} to {max(seeds)}"
     lines.append(
-        f"{min(seeds)} to {max(seeds)} seeds per strategy; with the same seed all strategies have "
-        "the same trips. Intervals hold for 95 % of such sets of seeds."
+        f"{number} seeds per strategy; with the same seed all strategies have the same trips. "
+        "Intervals hold for 95 % of such sets of seeds."
     )
     lines.append(broken(study.load))
     unseen = [network.titles[region] for region in sorted(network.critical_above)]
@@ -186,7 +188,7 @@ def trust(study: Study) -> list[str]:
         lines.append(f"Teleports a run {_at(level)}: {said}.")
         rows = results.read(study.runs).level(level.demand).rows
         table = statistics.statistics(statistics.on_common_seeds(rows))
-        lines += [f"{_at(level)}: {text}" for text in statistics.warnings(table)]
+        lines += [f"{_title(level)}: {text}" for text in statistics.warnings(table)]
     return lines
 
 
@@ -195,7 +197,7 @@ def sameness(study: Study) -> str:
     found = reported(network_folder(study.scenario.network), COMPARISONS)
     if not found:
         return f"{NO_COMPARISON}."
-    return f"{found[0].upper()}{found[1:]}."
+    return f"{found[0].upper()}{found[1:].rstrip('.')}."
 
 
 def broken(load: Loading) -> str:
@@ -208,7 +210,11 @@ def broken(load: Loading) -> str:
 
 
 def _at(level: Level) -> str:
-    return "at its own demand" if level.demand == 1.0 else f"at demand times {level.demand:g}"
+    return "at today's demand" if level.demand == 1.0 else f"at demand times {level.demand:g}"
+
+
+def _title(level: Level) -> str:
+    return "Today's demand" if level.demand == 1.0 else f"Demand times {level.demand:g}"
 
 
 def _chance(share: float) -> str:
@@ -241,7 +247,7 @@ def text(study: Study) -> str:
     """Return the study for the terminal."""
     lines = []
     for level in study.levels:
-        lines.append(f"Demand times {level.demand:g}; min: minutes per trip")
+        lines.append(f"{_title(level)}; min: minutes per trip")
         lines.append(text_table([row(one) for one in level.outcomes]))
         for line in details(level):
             lines += wrapped(line)
@@ -289,7 +295,7 @@ def write(study: Study) -> Path:
 def _shown(level: Level) -> dict[str, object]:
     """Return what the page shows of a demand level."""
     return {
-        "title": f"Demand times {level.demand:g}",
+        "title": _title(level),
         "rows": [_page_row(one) for one in level.outcomes],
         "notes": details(level),
     }
@@ -303,27 +309,39 @@ def _page_row(one: Outcome) -> dict[str, object]:
     delay = means.get("public_transport_delay_s", math.nan)
     cells["bus"] = "–" if math.isnan(delay) else f"{delay:,.0f}"
     cells["co2"] = f"{means['co2_kg'] / 1000.0:,.2f}"
+    cells["seeds"] = ""
+    cells["answer"] = ""
+    cells["chance"] = ""
     tone = ""
     bar: Mapping[str, float] = {}
-    cells["seeds"] = ""
     if one.verdict is not None:
         cells["seeds"] = str(one.verdict.seeds)
-        tone = one.verdict.answer.name.lower()
-        half = 0.0 if math.isnan(one.verdict.half) else one.verdict.half
-        bar = _bar(one.verdict.percent, half)
+        cells["answer"] = one.verdict.answer.value
+        if one.verdict.answer is not Answer.UNKNOWN:
+            cells["chance"] = _chance(one.verdict.chance)
+        if one.serves:
+            tone = one.verdict.answer.name.lower()
+        bar = _bar(one.verdict)
     return {**cells, "tone": tone, "bar": bar}
 
 
-def _bar(percent: float, half: float) -> dict[str, float]:
-    """Return left end, width and mean of an interval, in percent of the width of the bar."""
+def _bar(verdict: Verdict) -> dict[str, float]:
+    """Return where the change and its interval lie on the bar.
 
-    def place(value: float) -> float:
-        clipped = min(max(value, -HALF_RANGE), HALF_RANGE)
-        return 50.0 + 50.0 * clipped / HALF_RANGE
-
-    start = place(percent - half)
+    They are left ends and widths, in percent of its width.
+    """
+    half = 0.0 if math.isnan(verdict.half) else verdict.half
+    mean = _place(verdict.percent)
+    low = _place(verdict.percent - half)
     return {
-        "start": round(start, 1),
-        "width": round(max(place(percent + half) - start, 1.0), 1),
-        "mean": round(place(percent), 1),
+        "start": min(mean, 50.0),
+        "width": abs(mean - 50.0),
+        "low": low,
+        "spread": max(_place(verdict.percent + half) - low, 1.0),
     }
+
+
+def _place(percent: float) -> float:
+    """Return where a change lies on the bar, in percent of its width."""
+    clipped = min(max(percent, -HALF_RANGE), HALF_RANGE)
+    return round(50.0 + 50.0 * clipped / HALF_RANGE, 1)

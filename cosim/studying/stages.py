@@ -85,8 +85,8 @@ class Runner:
     out: Path
     workers: int
 
-    def planned(self, names: Sequence[str], level: float, seeds: int) -> list[Run]:
-        """Return runs at one demand level with the first seeds.
+    def planned(self, names: Sequence[str], levels: Sequence[float], seeds: int) -> list[Run]:
+        """Return runs with the first seeds.
 
         The expected time of a run comes from finished ones, if there are any.
 
@@ -94,7 +94,7 @@ class Runner:
         """
         strategies = [parse(name) for name in names]
         chosen = range(FIRST_SEED, FIRST_SEED + seeds)
-        runs = evaluation.plan([(self.scenario, [level])], strategies, chosen)
+        runs = evaluation.plan([(self.scenario, levels)], strategies, chosen)
         pace = self._seconds_per_trip() / SECONDS_PER_TRIP
         return [replace(run, expected=run.expected * pace) for run in runs]
 
@@ -109,24 +109,16 @@ class Runner:
         spent = rows["wall_time_s"] + rows["setup_time_s"]
         return float(spent.sum() / max(rows["trips"].sum(), 1))
 
-    def minutes(self, names: Sequence[str], level: float, seeds: int) -> float:
-        """Return the expected wall time of runs that are not finished."""
-        left = 0.0
-        for run in self.planned(names, level, seeds):
-            if not (self.out / run.file).is_file():
-                left += run.expected
-        return left / self.workers / 60.0
-
-    def done(self, names: Sequence[str], level: float, seeds: int) -> pd.DataFrame:
+    def done(self, names: Sequence[str], levels: Sequence[float], seeds: int) -> pd.DataFrame:
         """Do the runs that are not finished; return a row for each.
 
         Raises: InputError, and RunFailed if a run failed
         """
-        runs = self.planned(names, level, seeds)
+        runs = self.planned(names, levels, seeds)
         rows = run_many(runs, self.out, workers=self.workers)
         raise_failures(rows)
         rows = results.finished_rows(rows)
-        wanted = rows["controller"].isin(names) & (rows["demand"] == level)
+        wanted = rows["controller"].isin(names) & rows["demand"].isin(levels)
         last = FIRST_SEED + seeds - 1
         return rows[wanted & rows["seed"].between(FIRST_SEED, last)]
 
@@ -134,12 +126,12 @@ class Runner:
         """Return the first run without control at a demand level."""
         return results.read_run(self.out, REFERENCE, FIRST_SEED, demand=level)
 
-    def impossible(self, names: Sequence[str]) -> dict[str, str]:
+    def impossible(self) -> dict[str, str]:
         """Return the strategies that cannot run in this city, with the reason."""
         reasons = {}
-        for name in names:
+        for name in EVERYWHERE:
             try:
-                self.planned([name], 1.0, 1)
+                self.planned([name], LEVELS[:1], 1)
             except InputError as error:
                 reasons[name] = str(error)
         return reasons
@@ -168,16 +160,20 @@ def loading(runner: Runner) -> Loading:
     under = LEVELS[0]
     arrived = 0.0
     say(f"Loading without control, until the city breaks: demand times {_listed(LEVELS)}")
-    for level in LEVELS:
-        row = runner.done([REFERENCE], level, 1).iloc[0]
-        left[level] = unfinished(row) / max(row["trips"], 1)
-        breaks = left[level] > STANDING_SHARE or row["completed_veh"] < arrived
-        said = f"demand times {level:g}: {row['completed_veh']:,.0f} of {row['trips']:,.0f} trips"
-        say(f"{said} completed" + (", the city breaks" if breaks else ""))
-        if breaks:
-            return Loading(left, under, level)
-        under = level
-        arrived = row["completed_veh"]
+    for first in range(0, len(LEVELS), runner.workers):
+        levels = LEVELS[first : first + runner.workers]
+        rows = runner.done([REFERENCE], levels, 1).set_index("demand")
+        for level in levels:
+            row = rows.loc[level]
+            left[level] = unfinished(row) / max(row["trips"], 1)
+            breaks = left[level] > STANDING_SHARE or row["completed_veh"] < arrived
+            counts = f"{row['completed_veh']:,.0f} of {row['trips']:,.0f} trips completed"
+            broken = ", the city breaks" if breaks else ""
+            say(f"demand times {level:g}: {counts}{broken}")
+            if breaks:
+                return Loading(left, under, level)
+            under = level
+            arrived = row["completed_veh"]
     return Loading(left, under, None)
 
 
@@ -306,13 +302,12 @@ def level_of(
 
     most: seeds of a strategy
     """
-    minutes = runner.minutes([REFERENCE, *names], level, FEWEST_SEEDS)
-    say(
-        f"Strategies at demand times {level:g}: {len(names)} and no control, "
-        f"{FEWEST_SEEDS} seeds first, about {minutes:.0f} min"
-    )
     seeds = FEWEST_SEEDS
-    rows = runner.done([REFERENCE, *names], level, seeds)
+    say(
+        f"Strategies at demand times {level:g}: no control and {len(names)} others, "
+        f"{seeds} seeds first"
+    )
+    rows = runner.done([REFERENCE, *names], [level], seeds)
     outcomes = {name: outcome(rows, level, name) for name in [REFERENCE, *names]}
     while True:
         undecided = []
@@ -323,12 +318,10 @@ def level_of(
             return Level(demand=level, outcomes=tuple(outcomes.values()), skipped=skipped)
         seeds = more_seeds(seeds, [outcomes[name].verdict for name in undecided], most)
         labels = ", ".join(LABELS[name] for name in undecided)
-        minutes = runner.minutes([REFERENCE, *undecided], level, seeds)
-        say(f"Not decided: {labels}; {seeds} seeds, about {minutes:.0f} min")
-        rows = runner.done([REFERENCE, *undecided], level, seeds)
-        for name in undecided:
+        say(f"Not decided: {labels}; now with {seeds} seeds")
+        rows = runner.done([REFERENCE, *undecided], [level], seeds)
+        for name in (REFERENCE, *undecided):
             outcomes[name] = outcome(rows, level, name)
-        outcomes[REFERENCE] = outcome(rows, level, REFERENCE)
 
 
 def more_seeds(seeds: int, undecided: Sequence[Verdict | None], most: int) -> int:

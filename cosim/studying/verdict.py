@@ -60,7 +60,8 @@ class Verdict:
             return "-"
         digits = 0 if self.half >= 10.0 else 1
         spread = "" if math.isnan(self.half) else f" ± {self.half:.{digits}f}"
-        return f"{self.percent:+.{digits}f}{spread} %"
+        mean = round(self.percent, digits) + 0.0  # no -0.0
+        return f"{mean:+.{digits}f}{spread} %"
 
     @property
     def chance(self) -> float:
