@@ -60,7 +60,6 @@ def conducted(
                 scenario=found.scenario,
                 load=load,
                 levels=tuple(levels),
-                no_gates=found.reason,
                 out=folder,
             )
             page.write(finished)

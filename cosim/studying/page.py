@@ -30,7 +30,6 @@ class Study:
 
     source: as the user gave it
     place: name or folder of the scenario, for commands
-    no_gates: why gates and metering were left out, "" if they were not
     out: folder of the page; the runs are in its folder runs
     """
 
@@ -39,7 +38,6 @@ class Study:
     scenario: Scenario
     load: Loading
     levels: tuple[Level, ...]
-    no_gates: str
     out: Path
 
     @property
@@ -143,8 +141,11 @@ def details(level: Level) -> list[str]:
         if not one.serves:
             more = one.more_left * one.means["trips"]
             lines.append(f"{one.label}: leaves {more:,.0f} trips more unserved; not recommended")
+    skipped: dict[str, list[str]] = {}
     for name, reason in level.skipped.items():
-        lines.append(f"{LABELS[name]}: not tried; {reason}")
+        skipped.setdefault(reason, []).append(LABELS[name])
+    for reason, labels in skipped.items():
+        lines.append(f"{', '.join(labels)}: not tried; {reason}")
     return lines
 
 
@@ -280,7 +281,6 @@ def write(study: Study) -> Path:
         next=next_line(study),
         levels=[_shown(level) for level in study.levels],
         trust=trust(study),
-        no_gates=study.no_gates,
         map=shown,
         map_demand=demand,
         map_names=" and ".join(LABELS[name] for name in names),
