@@ -25,6 +25,7 @@ if TYPE_CHECKING:
         import_city,
         report,
         run,
+        study,
         tune,
     )
     from cosim.evaluation.results import read_run
@@ -44,6 +45,7 @@ _MODULES = {
         "import_city",
         "report",
         "run",
+        "study",
         "tune",
     ),
     "cosim.evaluation.results": ("read_run",),

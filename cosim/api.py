@@ -422,8 +422,8 @@ def tune(
 def study(
     source: Path | str,
     *,
-    regions: str = "auto",
-    routes: Sequence[Path] = (),
+    regions: int | Path | str = "auto",
+    routes: Sequence[Path | str] = (),
     most_seeds: int = 10,
     out: Path | str | None = None,
     workers: int = 1,
@@ -443,8 +443,8 @@ def study(
 
     return conducted(
         Path(source),
-        regions=regions,
-        routes=routes,
+        regions=str(regions),
+        routes=[Path(file) for file in routes],
         most_seeds=most_seeds,
         out=None if out is None else Path(out),
         workers=workers,

@@ -263,7 +263,9 @@ def _change(row: Mapping) -> str:
 
 
 def brief(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the first columns of `shown`, and as many of BRIEF as fit a terminal.
+    """Return the columns of `shown` that fit a terminal.
+
+    They are the first four, and of BRIEF as many as there is room for.
 
     table: `statistics` of one demand level
     """

@@ -1,4 +1,4 @@
-"""Automatic number of regions: the partition whose gates can hold most vehicles."""
+"""Number of regions: the partition whose gates can hold most vehicles."""
 
 from collections.abc import Collection, Mapping
 from typing import NamedTuple

@@ -498,10 +498,10 @@ def _report(
 
 
 def reported(network: Path, beginnings: tuple[str, ...]) -> str:
-    """Return the line of the report of an import that begins so, "" without one.
+    """Return a line of the report of an import, "" without one.
 
     network: folder of the network
-    beginnings: such as COMPARISONS
+    beginnings: how it may begin, such as COMPARISONS
     """
     file = network / REPORT
     lines = []

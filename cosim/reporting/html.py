@@ -54,7 +54,11 @@ class Figure(NamedTuple):
 
 
 class Map(NamedTuple):
-    """Maps with a slider over time: seed of the runs, HTML, and scripts for the end of the page."""
+    """Maps with a slider over time.
+
+    seed: of the runs
+    div: HTML; scripts: for the end of the page
+    """
 
     seed: int
     div: str

@@ -26,7 +26,7 @@ def conducted(
     out: Path | None,
     workers: int,
 ) -> Study:
-    """Do all stages that are not done, and write the page; see `cosim.api.study`."""
+    """Do what is not done, and write the page; see `cosim.api.study`."""
     own = source.is_file()
     name = source.name.partition(".")[0]
     folder = out or Path("runs") / f"{file_name(name)}-study"
@@ -72,7 +72,7 @@ def conducted(
 def _level(
     runner: Runner, level: float, no_gates: str, impossible: Mapping[str, str], most_seeds: int
 ) -> Level:
-    """Judge all strategies that can run at a demand level, and that may change something."""
+    """Judge the strategies that may change something at a demand level."""
     skipped = dict(impossible)
     names = [name for name in EVERYWHERE if name not in skipped]
     reason = no_gates or stages.far_from_critical(runner, level)

@@ -1,4 +1,4 @@
-"""Answer of a study: its sentences, the table of the terminal, and the HTML page."""
+"""Answer of a study: sentences, table of the terminal, HTML page."""
 
 import math
 from collections.abc import Mapping
@@ -52,9 +52,9 @@ class Study:
 
     @property
     def recommended(self) -> tuple[Level, Outcome] | None:
-        """The best strategy that can be recommended, at the lowest demand at which there is one.
+        """The best strategy that can be recommended, and its demand.
 
-        It gains, leaves no more trips unserved, and does neither harm nor leave more at another
+        That is the lowest at which there is one. It gains, leaves no more trips unserved, and does neither harm nor leave more at another
         demand.
         """
         for level in self.levels:
@@ -104,8 +104,9 @@ def answer(study: Study) -> str:
         assert one.verdict is not None
         saved = one.verdict.change.removeprefix("-")
         chance = f"the odds are {_chance(one.verdict.odds.gains)} that it is more than"
+        begins = "Yes" if level is study.levels[0] else "Not today, but with more traffic"
         return (
-            f"Yes: {one.label} would save {saved} of the time spent {_at(level)}; "
+            f"{begins}: {one.label} would save {saved} of the time spent {_at(level)}; "
             f"{chance} {NOTHING_PERCENT:g} %."
         )
     if study.undecided:
@@ -302,7 +303,7 @@ def _shown(level: Level) -> dict[str, object]:
 
 
 def _page_row(one: Outcome) -> dict[str, object]:
-    """Return a row of the page: texts, and the interval of the change as a bar."""
+    """Return a row of the page: texts, and the change as a bar."""
     means = one.means
     cells = row(one)
     cells["time"] = f"{means[statistics.TTS] / 3600.0:,.0f}"

@@ -183,7 +183,7 @@ def unfinished(row: Mapping) -> float:
 
 
 class Gates(NamedTuple):
-    """What is known about gates.
+    """Answer to the question if gates can help.
 
     scenario: with critical accumulations, if they could be measured
     reason: why gates and metering are left out, "" if they are not

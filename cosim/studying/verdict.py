@@ -27,7 +27,7 @@ class Answer(Enum):
 
 
 class Odds(NamedTuple):
-    """Probabilities that the mean change is a gain, nothing, or harm; NaN for one seed."""
+    """Probabilities of gain, nothing and harm; NaN for one seed."""
 
     gains: float
     nothing: float
