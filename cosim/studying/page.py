@@ -54,8 +54,8 @@ class Study:
     def recommended(self) -> tuple[Level, Outcome] | None:
         """The best strategy that can be recommended, and its demand.
 
-        That is the lowest at which there is one. It gains, leaves no more trips unserved, and does neither harm nor leave more at another
-        demand.
+        That is the lowest demand at which there is one. It gains there, and neither harms nor
+        leaves more trips unserved at any demand.
         """
         for level in self.levels:
             sound = [one for one in level.outcomes if self._sound(one)]
