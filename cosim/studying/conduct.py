@@ -1,7 +1,6 @@
 """Conduct of a study, from a SUMO configuration to one page."""
 
 import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -53,7 +52,7 @@ def conducted(
                 levels.append(_level(runner, level, found.reason, skipped, most_seeds))
             place = str(source)
             if own:
-                place = os.path.relpath(found.scenario.folder or folder)
+                place = str(folder / "scenarios" / found.scenario.name)
             finished = Study(
                 source=str(source),
                 place=place,
@@ -74,12 +73,10 @@ def _level(
 ) -> Level:
     """Judge the strategies that may change something at a demand level."""
     skipped = dict(impossible)
-    names = [name for name in EVERYWHERE if name not in skipped]
     reason = no_gates or stages.far_from_critical(runner, level)
     if reason:
         skipped |= dict.fromkeys(GATES, reason)
-    else:
-        names += GATES
+    names = [name for name in (*EVERYWHERE, *GATES) if name not in skipped]
     return stages.level_of(runner, level, names, skipped, most_seeds)
 
 

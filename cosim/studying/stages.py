@@ -129,7 +129,7 @@ class Runner:
     def impossible(self) -> dict[str, str]:
         """Return the strategies that cannot run in this city, with the reason."""
         reasons = {}
-        for name in EVERYWHERE:
+        for name in (*EVERYWHERE, *GATES):
             try:
                 self.planned([name], LEVELS[:1], 1)
             except InputError as error:
