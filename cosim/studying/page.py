@@ -306,7 +306,8 @@ def _page_row(one: Outcome) -> dict[str, object]:
     """Return a row of the page: texts, and the change as a bar."""
     means = one.means
     cells = row(one)
-    cells["time"] = f"{means[statistics.TTS] / 3600.0:,.0f}"
+    hours = means[statistics.TTS] / 3600.0
+    cells["time"] = f"{hours:,.0f}" if hours >= 100.0 else f"{hours:.1f}"
     delay = means.get("public_transport_delay_s", math.nan)
     cells["bus"] = "–" if math.isnan(delay) else f"{delay:,.0f}"
     cells["co2"] = f"{means['co2_kg'] / 1000.0:,.2f}"
