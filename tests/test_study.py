@@ -32,6 +32,8 @@ def ran(monkeypatch):
         done.append((strategy.name, demand, seed))
         if len(done) == made.interrupted:
             raise KeyboardInterrupt
+        if strategy.name == "metering":
+            return "the disk is full"
         left = LEFT.get(strategy.name, 0.0) + 100.0 * (demand > 1.0)
         facts = {"completed_veh": 600.0 - left, "removed_veh": 0.0, "teleports": 0}
         run = made_up.result(scenario, strategy, seed=seed, demand=demand, city=city)
@@ -63,11 +65,13 @@ def test_from_a_scenario_to_a_page(ran, tmp_path):
     assert verdicts["guidance"].startswith("gains")
     assert verdicts["actuated signals"].startswith("harms")
     assert "guidance: leaves 30 trips more unserved; not recommended" in text
+    assert "metering: not judged; a run failed, for the reason in runs.csv" in text
     assert "Yes: max-pressure signals would save" in text
     assert "breaks at demand times 1.3: 16.7% of its trips" in " ".join(text.split())
     assert text.splitlines()[-1].startswith(f"Next: cosim watch demo --controller {PRESSURE} ")
     shown = (out / "study.html").read_text(encoding="utf-8")
     assert all(f"<td>{label}</td>" in shown for label in EVERYWHERE.values())
+    assert "metering: not judged" in shown
 
 
 def test_a_folder_holds_one_study(tmp_path):
@@ -138,6 +142,6 @@ def test_from_a_sumo_configuration_to_a_page(tmp_path, monkeypatch):
     source = tiny_city.city(tmp_path)
     text = good(cosim("study", source, "--most-seeds", 3, "--workers", 2, "--out", out))
     assert "Never seen beyond their critical accumulation" in text
-    assert f"{', '.join(GATES.values())}: not tried; " in text
+    assert f"{', '.join(GATES.values())}: not judged; " in text
     assert (out / "study.html").is_file()
     assert (out / "scenarios" / "city" / "scenario.toml").is_file()

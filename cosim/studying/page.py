@@ -146,7 +146,7 @@ def details(level: Level) -> list[str]:
     for name, reason in level.skipped.items():
         skipped.setdefault(reason, []).append(LABELS[name])
     for reason, labels in skipped.items():
-        lines.append(f"{', '.join(labels)}: not tried; {reason}")
+        lines.append(f"{', '.join(labels)}: not judged; {reason}")
     return lines
 
 

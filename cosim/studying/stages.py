@@ -43,6 +43,7 @@ EVERYWHERE = {
 }
 GATES = {"pi-gating": "PI gates", "metering": "metering"}
 LABELS = {REFERENCE: "no control"} | EVERYWHERE | GATES
+FAILED = f"a run failed, for the reason in {TABLE}"
 MODEL_COMMENT = "Written by cosim study from runs of {} without control, demand times {}."
 
 
@@ -110,13 +111,13 @@ class Runner:
         return float(spent.sum() / max(rows["trips"].sum(), 1))
 
     def done(self, names: Sequence[str], levels: Sequence[float], seeds: int) -> pd.DataFrame:
-        """Do the runs that are not finished; return a row for each.
+        """Do the runs that are not finished; return a row for each that did not fail.
 
-        Raises: InputError, and RunFailed if a run failed
+        Raises: InputError, and RunFailed if a run without control failed
         """
         runs = self.planned(names, levels, seeds)
         rows = run_many(runs, self.out, workers=self.workers)
-        raise_failures(rows)
+        raise_failures(rows[rows["controller"] == REFERENCE])
         rows = results.finished_rows(rows)
         wanted = rows["controller"].isin(names) & rows["demand"].isin(levels)
         last = FIRST_SEED + seeds - 1
@@ -308,14 +309,20 @@ def level_of(
         f"{seeds} seeds first"
     )
     rows = runner.done([REFERENCE, *names], [level], seeds)
-    outcomes = {name: outcome(rows, level, name) for name in [REFERENCE, *names]}
+    outcomes = {}
+    left_out = dict(skipped)
+    for name in (REFERENCE, *names):
+        if (rows["controller"] == name).sum() == seeds:
+            outcomes[name] = outcome(rows, level, name)
+        else:
+            left_out[name] = FAILED
     while True:
         undecided = []
         for name, one in outcomes.items():
             if one.verdict is not None and not one.verdict.decided:
                 undecided.append(name)
         if not undecided or seeds >= most:
-            return Level(demand=level, outcomes=tuple(outcomes.values()), skipped=skipped)
+            return Level(demand=level, outcomes=tuple(outcomes.values()), skipped=left_out)
         seeds = more_seeds(seeds, [outcomes[name].verdict for name in undecided], most)
         labels = ", ".join(LABELS[name] for name in undecided)
         say(f"Not decided: {labels}; now with {seeds} seeds")
