@@ -138,6 +138,9 @@ def test_more_seeds_at_most_double():
 @pytest.mark.slow
 def test_from_a_sumo_configuration_to_a_page(tmp_path, monkeypatch):
     monkeypatch.setattr(stages, "LEVELS", (1.0,))
+    for name in [*EVERYWHERE]:
+        if name != PRESSURE:
+            monkeypatch.delitem(EVERYWHERE, name)
     out = tmp_path / "out"
     source = tiny_city.city(tmp_path)
     text = good(cosim("study", source, "--most-seeds", 3, "--workers", 2, "--out", out))

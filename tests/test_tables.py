@@ -175,5 +175,6 @@ def test_the_table_of_the_terminal_is_narrow_and_has_a_legend_on_demand(name):
     assert max(map(len, explained.splitlines())) <= 100
     assert len(statistics.brief(statistics.statistics(rows)).columns) <= 10
     assert explained.startswith(text)
+    assert " completed " in text
     assert "\nTTS: " in explained
     assert "\nTTS: " not in text

@@ -4,6 +4,7 @@ They hold means over seeds, changes paired by seed with 95 % intervals, and meas
 """
 
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from itertools import permutations
 from pathlib import Path
@@ -37,6 +38,7 @@ PAIR_COLUMNS = [
     "half_interval_percent",
     "significant",
 ]
+NAME_WIDTH = 28  # characters, beyond which a name continues in the next line
 # Of the table in the terminal, after controller, seeds, TTS and change.
 BRIEF = ["completed", "trip [s]", "backlog [veh]", "teleports", "removed [veh]", "CO2 [kg]"]
 CAPTION = "; ".join(f"{heading}: {text}" for heading, text in COLUMNS.items())
@@ -271,11 +273,19 @@ def brief(table: pd.DataFrame) -> pd.DataFrame:
     """
     outcomes, costs = shown(table)
     whole = outcomes.merge(costs, on="controller")
+    whole["controller"] = whole["controller"].map(_in_lines)
     first = list(outcomes)[:4]
     columns = [*first, *BRIEF]
     while len(columns) > len(first) and text_width(whole[columns]) > WIDTH:
         columns.pop()
     return whole[columns]
+
+
+def _in_lines(name: str) -> str:
+    """Return the name of a strategy with line breaks before some of its words."""
+    words = name.replace("+", " +")
+    lines = textwrap.wrap(words, NAME_WIDTH, break_long_words=False, break_on_hyphens=False)
+    return "\n".join(line.replace(" +", "+") for line in lines)
 
 
 def text_width(table: pd.DataFrame) -> int:
