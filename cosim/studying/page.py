@@ -179,7 +179,9 @@ def trust(study: Study) -> list[str]:
     )
     lines.append(broken(study.load))
     unseen = [network.titles[region] for region in sorted(network.critical_above)]
-    if unseen:
+    if network.placeholder:
+        lines.append("The critical accumulations of the regions were not measured.")
+    elif unseen:
         lines.append(f"Never seen beyond their critical accumulation: {', '.join(unseen)}.")
     for level in study.levels:
         teleports = []

@@ -11,6 +11,7 @@ import pandas as pd
 
 from cosim.evaluation import evaluate as evaluation
 from cosim.evaluation import identify, results, statistics
+from cosim.evaluation.model_validation import outflow_samples
 from cosim.evaluation.runs import SECONDS_PER_TRIP
 from cosim.importing.importer import CHOICES, COMPARISONS, import_city, reported
 from cosim.plant.strategy import parse
@@ -24,6 +25,7 @@ from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs.files import file_name
 from nmfd.runs.run_many import TABLE, Run, raise_failures, run_many
+from nmfd.studies import fit_quality
 from nmfd.studies.benchmark import REFERENCE
 from nmfd.types import Result
 
@@ -205,6 +207,9 @@ def gates(runner: Runner, load: Loading, *, own: bool) -> Gates:
         reason = "the critical accumulations of the scenario are guesses"
         return Gates(scenario, f"{reason}; measure them: cosim identify {scenario.name}")
     if scenario.network.placeholder:
+        empty = fit_quality.nearly_empty(outflow_samples(scenario.network, runs))
+        if len(empty) == scenario.network.regions:
+            return Gates(scenario, "every region was nearly empty in all runs without control")
         network = measured(runner, load, runs)
         folder = network_folder(scenario.network)
         comment = MODEL_COMMENT.format(scenario.name, _listed(load.left))
