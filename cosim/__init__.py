@@ -23,6 +23,7 @@ if TYPE_CHECKING:
         evaluate,
         report,
         run,
+        study,
         tune,
     )
     from cosim.evaluation.identify import identify
@@ -42,6 +43,7 @@ _MODULES = {
         "evaluate",
         "report",
         "run",
+        "study",
         "tune",
     ),
     "cosim.evaluation.identify": ("identify",),

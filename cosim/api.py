@@ -44,6 +44,7 @@ from nmfd.studies.benchmark import REFERENCE, draw_accumulations
 from nmfd.types import Result
 
 if TYPE_CHECKING:
+    from cosim.studying.page import Study
     from nmfd.controllers.base import Options
 
 DEMO = "demo"  # a shipped scenario
@@ -419,6 +420,38 @@ def tune(
     best = strategy.options(tuning.best_of(order, table))
     text = (order.out / "tune.toml").read_text(encoding="utf-8")
     return Tuned(table=Table(table), best=best, text=text, folder=order.out)
+
+
+def study(
+    source: Path | str,
+    *,
+    regions: int | Path | str = "auto",
+    routes: Sequence[Path | str] = (),
+    most_seeds: int = 10,
+    out: Path | str | None = None,
+    workers: int = 1,
+) -> "Study":
+    """Study whether gates, guidance or other signals would help in a city.
+
+    source: sumocfg, net.xml or file of OpenStreetMap; or a scenario, by name or folder
+    regions: number of regions of an import, "auto", or a table edge,region
+    routes: files with vehicles beside those of the source
+    most_seeds: seeds of a strategy whose verdict is open; all have three
+    out: folder of import, runs and page, runs/NAME-study if None
+    workers: runs at a time
+
+    The same call continues after an interruption. Raises: InputError, and RunFailed if a run failed
+    """
+    from cosim.studying.conduct import conducted
+
+    return conducted(
+        Path(source),
+        regions=str(regions),
+        routes=[Path(file) for file in routes],
+        most_seeds=most_seeds,
+        out=None if out is None else Path(out),
+        workers=workers,
+    )
 
 
 def get(name: str | None, out: Path | str | None = None) -> str:

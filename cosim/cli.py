@@ -58,6 +58,14 @@ WORKERS = click.option(
     help="Parallel runs.",
 )
 RUNNING = combined(WORKERS, SCHEDULER, TIME_LIMIT, OVERWRITE)
+ROUTES = click.option(
+    "--routes",
+    type=FILE,
+    multiple=True,
+    metavar="FILE",
+    help="File of vehicles or flows. May be repeated.",
+)
+EXPLAIN = click.option("--explain", is_flag=True, help="Print what the columns mean.")
 
 
 def span(text: str) -> tuple[float, float]:
@@ -72,7 +80,7 @@ def span(text: str) -> tuple[float, float]:
     context_settings={"show_default": True},
     sections={
         "Runs": ("demo", "run", "watch", "evaluate", "compare", "report", "tune"),
-        "A city of your own": ("get", "import", "identify", "links"),
+        "A city of your own": ("study", "get", "import", "identify", "links"),
     },
     elsewhere={"list": "nmfd show"} | {name: f"nmfd {name}" for name in nmfd.cli.main.commands},
 )
@@ -122,6 +130,7 @@ def demo(out: Path) -> None:
     metavar="FILE",
     help="Policy file of --controller. [default: SCENARIO/NAME.pt]",
 )
+@EXPLAIN
 @out_option("runs/SCENARIO-TIME")
 def run(
     scenario: Path,
@@ -129,6 +138,7 @@ def run(
     controller: str,
     against: str | None,
     policy: Path | None,
+    explain: bool,
     **options: Any,
 ) -> None:
     """Run one controller, or two on the same trips.
@@ -149,7 +159,7 @@ def run(
         loaded, _both(controller, against), policies=policies, **options
     )
     out = rows.attrs["folder"]
-    click.echo(text(rows))
+    click.echo(text(rows, explain=explain))
     for row in rows.to_dict("records"):
         if row["signal_violations"]:
             table = f"{out}/signals.csv"
@@ -213,6 +223,7 @@ def watch(
 @click.option(
     "--check", type=COUNT, metavar="N", help="Only repeat N random runs of --out, and compare."
 )
+@EXPLAIN
 @out_option("runs/SCENARIO-evaluate")
 def evaluate(
     scenario: Path,
@@ -221,6 +232,7 @@ def evaluate(
     seeds: int | tuple[int, ...],
     first_seed: int,
     check: int | None,
+    explain: bool,
     **options: Any,
 ) -> None:
     """Compare controllers over seeds and demand levels.
@@ -257,7 +269,7 @@ def evaluate(
     for name in names:
         if len(names) > 1:
             click.echo(name)
-        click.echo(statistics.text(done[done["scenario"] == name]))
+        click.echo(statistics.text(done[done["scenario"] == name], explain=explain))
     nmfd.api.raise_failures(rows)
     click.echo(f"Written to {out}: see evaluate.md and the figures; a page: cosim report {out}")
 
@@ -374,15 +386,9 @@ def get(name: str | None) -> None:
     "--regions",
     required=True,
     metavar="N|CSV",
-    help="Number of regions to find, or a table edge,region.",
+    help="Number of regions to find, auto, or a table edge,region.",
 )
-@click.option(
-    "--routes",
-    type=FILE,
-    multiple=True,
-    metavar="FILE",
-    help="File of vehicles or flows. May be repeated.",
-)
+@ROUTES
 @click.option(
     "--demand",
     type=click.Choice(["peak"]),
@@ -418,6 +424,39 @@ def import_(source: Path | None, bbox: str | None, **options: Any) -> None:
     if place is None or (source is not None and bbox is not None):
         raise InputError("cosim import: expected either a file or --bbox; give one of them")
     click.echo(cosim.import_city(place, **options))
+
+
+@main.command()
+@click.argument("source", type=click.Path(path_type=Path), metavar="SUMOCFG|NET|SCENARIO")
+@click.option(
+    "--regions",
+    default="auto",
+    metavar="N|auto|CSV",
+    help="Number of regions of an import, auto, or a table edge,region.",
+)
+@ROUTES
+@click.option(
+    "--most-seeds",
+    type=click.IntRange(min=3),
+    default=10,
+    help="Seeds of a strategy whose verdict is open; all have three.",
+)
+@WORKERS
+@out_option("runs/NAME-study", "Folder of import, runs and page; finished runs are not repeated.")
+def study(source: Path, **options: Any) -> None:
+    """Find out if gates, guidance or other signals would help.
+
+    Imports the city, loads it until it breaks, compares strategies over seeds, and writes one page
+    with a verdict on each. The same command continues after an interruption.
+
+    \b
+    Examples:
+      cosim study city.sumocfg
+      cosim study grid7_peak --most-seeds 5 --out runs/peak
+    """
+    from cosim.studying.page import text
+
+    click.echo(text(cosim.api.study(source, **options)))
 
 
 @main.command()

@@ -9,6 +9,7 @@ import tiny_city
 from tiny_city import pieces
 
 from cosim.importing.baseline import INTERVAL_S, Baseline
+from cosim.importing.choice import choose, densest_region, holdable
 from cosim.importing.partition import finish, make_blocks, own_regions, partition
 from cosim.importing.quality import doubts
 from cosim.importing.streets import read_streets
@@ -151,3 +152,21 @@ def test_mistakes_in_a_table_of_regions(streets, tmp_path, text, expected):
     (tmp_path / "own.csv").write_text(text)
     with pytest.raises(InputError, match=expected):
         own_regions(streets, tmp_path / "own.csv")
+
+
+def test_the_chosen_partition_is_the_one_whose_gates_hold_most(tmp_path):
+    """Six junctions of a grid have signals, and every turn is made once."""
+    streets = read_streets(tiny_city.network(tmp_path))
+    density = np.where(streets.centre[:, 0] < 250.0, 0.08, 0.01)
+    run = baseline(streets, density)
+    moves = {(int(a), int(b)): 1 for a, b in streets.links}
+    choice = choose(streets, run, moves)
+    two = partition(streets, run, 2)
+    held = holdable(streets, run, moves, choice.labels, ())
+    assert held > holdable(streets, run, moves, two, ()) > 0
+    assert np.bincount(choice.labels, streets.lane_metres).min() >= 3000.0
+    assert f"chosen: 3 regions: gates into the densest one meet {held} vehicles" in choice.reason
+    signals = {signal for signal in streets.link_signals if signal}
+    assert holdable(streets, run, moves, choice.labels, signals) == 0
+    densest = choice.labels == densest_region(streets, run, choice.labels)
+    assert density[densest].mean() > density[~densest].mean()

@@ -24,6 +24,7 @@ REDUCED = {
 }
 NOT_RUN = {  # what takes long or needs more, and where it is tested
     "cosim watch": "test_view.py",
+    "cosim study": "test_study.py",
     "cosim tune": "test_tuning.py",
     "nmfd bound": "test_bound.py",
     "nmfd robustness": "test_robustness.py",

@@ -181,3 +181,17 @@ def test_the_floor_is_the_time_of_trips_without_delay():
         statistics.floor(table) == "Floor: on the ways of served, without any delay, 2e+04 veh s."
     )
     assert statistics.floor(table[:1]) == ""
+
+
+@pytest.mark.parametrize("name", ["pi-gating", "route-guidance+max-pressure+guidance-period-60"])
+def test_the_table_of_the_terminal_is_narrow_and_has_a_legend_on_demand(name):
+    seeds = {seed: 1.0e6 + seed for seed in range(3)}
+    rows = rows_of({(1.0, "no-control"): seeds, (1.0, name): seeds})
+    text = statistics.text(rows)
+    explained = statistics.text(rows, explain=True)
+    assert max(map(len, explained.splitlines())) <= 100
+    assert len(statistics.brief(statistics.statistics(rows)).columns) <= 10
+    assert explained.startswith(text)
+    assert " completed " in text
+    assert "\nTTS: " in explained
+    assert "\nTTS: " not in text

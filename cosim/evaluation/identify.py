@@ -284,13 +284,7 @@ class Identified:
         files.write_table(out / "samples.csv", table, float_format="%.6g")
         plots.draw_mfds(out / "mfd.png", self.model, self.samples)
         own = network_folder(self.task.scenario.network)
-        sumo = config.read(own / "network.toml").get("sumo", {})
-        for key in PATHS:
-            if isinstance(sumo.get(key), str):
-                sumo[key] = files.relative(own / sumo[key], target)
-        target.mkdir(parents=True, exist_ok=True)
-        text = network_toml(self.model, sumo, self._comment())
-        files.write_text(target / "network.toml", text)
+        write_model(self.model, own, target, self._comment())
         files.write_text(target / authority.FILE, self.verdict.text())
 
     def _comment(self) -> str:
@@ -304,6 +298,21 @@ class Identified:
             f"# rates and MFDs are {self.method}; loading runs: demand times {times}, "
             f"seeds {min(seeds)} to {max(seeds)}."
         )
+
+
+def write_model(model: RegionalModel, own: Path, target: Path, comment: str) -> None:
+    """Write a model of a city as network.toml.
+
+    own: folder of the network of the city
+    target: folder of the model
+    comment: above the model
+    """
+    sumo = config.read(own / "network.toml").get("sumo", {})
+    for key in PATHS:
+        if isinstance(sumo.get(key), str):
+            sumo[key] = files.relative(own / sumo[key], target)
+    target.mkdir(parents=True, exist_ok=True)
+    files.write_text(target / "network.toml", network_toml(model, sumo, comment))
 
 
 def without_model(scenario: Scenario) -> bool:
@@ -394,7 +403,7 @@ def identify(
         raise KeyboardInterrupt(f"finished runs are in {main}; the same command goes on") from None
     # Last, so that the same command finds the same scenario after an interruption.
     if protected != first.protected:
-        _write_protected(first, protected)
+        write_protected(first, protected)
     report.append(f"Next: cosim run {scenario} --controller pi-gating --against no-control")
     return "\n".join(report)
 
@@ -477,7 +486,7 @@ def _proposal(scenario: Scenario, regions: tuple[int, ...], *, written: bool) ->
     return [f"Protect {names}: {instead} in {Path(scenario.where)}; {what}."]
 
 
-def _write_protected(scenario: Scenario, regions: tuple[int, ...]) -> None:
+def write_protected(scenario: Scenario, regions: tuple[int, ...]) -> None:
     """Write the regions to protect into the scenario. Raises InputError."""
     path = Path(scenario.where)
     line = f"protected = {list(regions)}"

@@ -4,6 +4,7 @@ They hold means over seeds, changes paired by seed with 95 % intervals, and meas
 """
 
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from itertools import permutations
 from pathlib import Path
@@ -17,7 +18,7 @@ from cosim.sumo.net import City
 from nmfd.arrays import PerRegion
 from nmfd.metrics import COUNTED, decision_ms, percent_change
 from nmfd.runs import config
-from nmfd.runs.tables import markdown_table, text_table, wrapped
+from nmfd.runs.tables import WIDTH, markdown_table, text_table, wrapped
 from nmfd.studies import benchmark
 from nmfd.studies.benchmark import REFERENCE, interval
 from nmfd.types import Result
@@ -37,6 +38,9 @@ PAIR_COLUMNS = [
     "half_interval_percent",
     "significant",
 ]
+NAME_WIDTH = 28  # characters, beyond which a name continues in the next line
+# Of the table in the terminal, after controller, seeds, TTS and change.
+BRIEF = ["completed", "trip [s]", "backlog [veh]", "teleports", "removed [veh]", "CO2 [kg]"]
 CAPTION = "; ".join(f"{heading}: {text}" for heading, text in COLUMNS.items())
 
 
@@ -277,17 +281,55 @@ def _change(row: Mapping) -> str:
     return f"{percent:+.1f}{spread} %{star}"
 
 
-def text(rows: pd.DataFrame) -> str:
-    """Return the tables of one scenario for the terminal."""
+def brief(table: pd.DataFrame) -> pd.DataFrame:
+    """Return the columns of `shown` that fit a terminal.
+
+    They are the first four, and of BRIEF as many as there is room for.
+
+    table: `statistics` of one demand level
+    """
+    outcomes, costs = shown(table)
+    whole = outcomes.merge(costs, on="controller")
+    whole["controller"] = whole["controller"].map(_in_lines)
+    first = list(outcomes)[:4]
+    columns = [*first, *BRIEF]
+    while len(columns) > len(first) and text_width(whole[columns]) > WIDTH:
+        columns.pop()
+    return whole[columns]
+
+
+def _in_lines(name: str) -> str:
+    """Return the name of a strategy with line breaks before some of its words."""
+    words = name.replace("+", " +")
+    lines = textwrap.wrap(words, NAME_WIDTH, break_long_words=False, break_on_hyphens=False)
+    return "\n".join(line.replace(" +", "+") for line in lines)
+
+
+def text_width(table: pd.DataFrame) -> int:
+    """Return the width of a table as text (characters)."""
+    return max(map(len, text_table(table.to_dict("records")).splitlines()))
+
+
+def text(rows: pd.DataFrame, *, explain: bool = False) -> str:
+    """Return the table of one scenario for the terminal.
+
+    explain: with the meanings of its columns
+    """
     lines = []
+    headings: dict[str, None] = {}
     for level, table in statistics(rows).groupby("demand", sort=True):
-        lines.append(f"Demand times {level:g}")
-        for part in shown(table):
-            lines += [text_table(part.to_dict("records")), ""]
+        part = brief(table)
+        lines += [f"Demand times {level:g}", text_table(part.to_dict("records")), ""]
         for note in (floor(table), *warnings(table)):
             if note:
                 lines += [*wrapped(note), ""]
-    return "\n".join([*lines, *wrapped(CAPTION)])
+        for heading in part:
+            headings[heading.partition(" [")[0]] = None
+    if explain:
+        for heading in headings:
+            if heading in COLUMNS:
+                lines += wrapped(f"{heading}: {COLUMNS[heading]}")
+    return "\n".join(lines).rstrip()
 
 
 def markdown(rows: pd.DataFrame) -> str:

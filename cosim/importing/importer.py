@@ -3,9 +3,11 @@
 import gzip
 import os
 import shutil
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -16,6 +18,7 @@ from cosim.importing import maps, model, quality, report
 from cosim.importing.assignment import ITERATIONS, Assigned, assign
 from cosim.importing.baseline import Baseline, averaged_runs
 from cosim.importing.case import Progress, SumoInput, seconds, sumo_input
+from cosim.importing.choice import CHOSEN, choose, densest_region
 from cosim.importing.comparison import Comparison, compare, plain_trips
 from cosim.importing.demand import Traffic, read_traffic, wrapped
 from cosim.importing.generated import morning_peak
@@ -37,12 +40,17 @@ from nmfd.studies import plots
 # For cars: beyond, the run without control is mesoscopic, so that it takes a minute.
 LARGE_CITY_EDGES = 5000
 NET = "city.net.xml.gz"
+AUTO = "auto"  # number of regions: cosim.importing.choice
 REGIONS = "regions.csv"
 FILES = {
     "routes": "vehicles.rou.xml.gz",
     "background": "background.rou.xml.gz",
     "additional": "city.add.xml.gz",
 }
+REPORT = "import.txt"
+# How its lines begin: on the comparison with plain SUMO, and on the number of regions.
+COMPARISONS = ("same city", "not the same city", "not compared")
+CHOICES = (CHOSEN,)
 TYPES = ("vType", "vTypeDistribution")
 COMMENT = """Imported from {}. The MFDs are PLACEHOLDERS from lane length and speed limits:
 # cosim identify replaces them by measured ones."""
@@ -52,7 +60,7 @@ COMMENT = """Imported from {}. The MFDs are PLACEHOLDERS from lane length and sp
 class Request:
     """Arguments of `import_city`, checked.
 
-    count: number of regions to find, None if `regions` is a table
+    count: number of regions to find, None if `regions` is a table or AUTO
     begin, end: instead of the sumocfg's [s]
     """
 
@@ -78,6 +86,7 @@ class City:
 
     case: from its beginning on; labels: (E,) region of every edge
     given: regions of the user's own table (E,), -1 where it has none; None without a table
+    chosen: why there are so many regions, "" if the user said how many
     left: signals that perimeter control does not use -> reason
     switched: of these, signals whose programme a timetable changes
     factor: of the demand [-]; mesoscopic: the scenario's model
@@ -93,6 +102,7 @@ class City:
     baseline: Baseline
     labels: EdgeNumbers
     given: EdgeNumbers | None
+    chosen: str
     left: Mapping[str, str]
     switched: tuple[str, ...]
     factor: float
@@ -124,7 +134,7 @@ def import_city(
     source: a sumocfg, a net.xml, a file of OpenStreetMap, or a box "W,S,E,N" of it as text
     out: new folder of the network
     scenario: new folder of the scenario; scenarios/NAME beside the folder of networks if None
-    regions: number of regions to find, or the user's own table edge,region
+    regions: number of regions to find, "auto", or the user's own table edge,region
     routes: files with vehicles beside those of the sumocfg
     demand: "peak" generates a morning peak instead
     level: multiplies the vehicles or the peak [-]
@@ -229,7 +239,9 @@ def _imported(request: Request, case: SumoInput, folder: Path, progress: Progres
     folder: its vehicles are written there
     """
     streets = read_streets(case.net, case.additional)
-    given = None if request.count is not None else own_regions(streets, request.regions)
+    given = None
+    if request.count is None and str(request.regions) != AUTO:
+        given = own_regions(streets, request.regions)
     traffic = read_traffic(case, streets, request.seed)
     mesoscopic = request.mesoscopic or case.mesoscopic
     simulated_meso = bool(mesoscopic or streets.drivable.sum() > LARGE_CITY_EDGES)
@@ -257,10 +269,15 @@ def _imported(request: Request, case: SumoInput, folder: Path, progress: Progres
     switched = sorted(timetabled(case.net, case.additional))
     everywhere = without_effect(case.options, mesoscopic)
     left = quality.left_alone(streets, switched, everywhere)
+    chosen = ""
     if given is not None:
         labels = finish(streets, given, own=True)
+    elif request.count is not None:
+        labels = partition(streets, baseline, request.count, uncontrollable=left)
     else:
-        labels = partition(streets, baseline, request.count or 0, uncontrollable=left)
+        choice = choose(streets, baseline, traffic.moves, uncontrollable=left)
+        labels = choice.labels
+        chosen = choice.reason
     if labels.max() < 1:
         raise InputError(
             f"{streets.path}: no two regions can be made that can be reached from each other"
@@ -274,6 +291,7 @@ def _imported(request: Request, case: SumoInput, folder: Path, progress: Progres
         baseline=baseline,
         labels=labels,
         given=given,
+        chosen=chosen,
         left=left,
         switched=tuple(switched),
         factor=factor,
@@ -331,12 +349,14 @@ def _peak(
             time_to_teleport=case.time_to_teleport,
             progress=progress,
         )
+    moves = Counter[tuple[int, int]]()
     for vehicle in traffic.vehicles:
         route = vehicle.find("route")
         edges = assigned.routes.get(vehicle.get("id", ""))
         if route is not None and edges is not None:
             route.set("edges", " ".join(edges))
-    return traffic, assigned
+            moves.update(pairwise(streets.number[edge] for edge in edges))
+    return replace(traffic, moves=moves), assigned
 
 
 def _write_traffic(folder: Path, traffic: Traffic) -> dict[str, list[str]]:
@@ -420,7 +440,7 @@ def _write(city: City, network_folder: Path, scenario_folder: Path) -> list[str]
         network_folder / "network.toml": network_toml(
             network, {"net": NET, "regions": REGIONS}, comment
         ),
-        network_folder / "import.txt": "\n".join(lines) + "\n",
+        network_folder / REPORT: "\n".join(lines) + "\n",
         network_folder / authority.FILE: verdict.text(),
         scenario_folder / "scenario.toml": _scenario_text(city, network),
     }
@@ -460,6 +480,8 @@ def _report(
     lines += quality.doubts(city.streets, city.labels, network.region_names)
     lines += quality.short_demand(traffic.depart, clock.begin, clock.step)
     if city.given is None:
+        if city.chosen:
+            lines.append(city.chosen)
         if network.regions < (request.count or 0):
             lines.append(
                 f"{network.regions} regions instead of {request.count}: others could not be "
@@ -475,12 +497,23 @@ def _report(
     return [*lines, *verdict.sentences]
 
 
+def reported(network: Path, beginnings: tuple[str, ...]) -> str:
+    """Return a line of the report of an import, "" without one.
+
+    network: folder of the network
+    beginnings: how it may begin, such as COMPARISONS
+    """
+    file = network / REPORT
+    lines = []
+    if file.is_file():
+        lines = file.read_text(encoding="utf-8").splitlines()
+    return next((line for line in lines if line.startswith(beginnings)), "")
+
+
 def _scenario_text(city: City, network: RegionalModel) -> str:
     """Return the scenario.toml of a city."""
     request = city.request
-    lanes = city.streets.lane_metres
-    vehicles = np.bincount(city.labels, city.baseline.density(city.streets) * lanes)
-    densest = int(np.argmax(vehicles / np.bincount(city.labels, lanes)))
+    densest = densest_region(city.streets, city.baseline, city.labels)
     return model.scenario_text(
         network,
         city.clock,

@@ -53,6 +53,18 @@ class Figure(NamedTuple):
     better: bool | None = None
 
 
+class Map(NamedTuple):
+    """Maps with a slider over time.
+
+    seed: of the runs
+    div: HTML; scripts: for the end of the page
+    """
+
+    seed: int
+    div: str
+    scripts: list[str]
+
+
 def write_page(path: Path, runs: Sequence[Finished], *, seed: int | None = None) -> Path:
     """Write the page of the runs, and return its path.
 
@@ -61,7 +73,7 @@ def write_page(path: Path, runs: Sequence[Finished], *, seed: int | None = None)
     seed: of the runs on the map; the first that both have if None
     Raises: InputError if there is no run with this seed
     """
-    shown, script, div = _map(runs[0], seed)
+    shown = map_of(runs[0], seed=seed)
     loader = PackageLoader("cosim.reporting", ".")
     environment = Environment(
         loader=loader, autoescape=True, trim_blocks=True, undefined=StrictUndefined
@@ -69,23 +81,38 @@ def write_page(path: Path, runs: Sequence[Finished], *, seed: int | None = None)
     page = environment.get_template("report.html.j2").render(
         name=", ".join(dict.fromkeys(run.scenario.name for run in runs)),
         runs=[_run(run) for run in runs],
-        seed=shown,
-        map_div=div,
-        scripts=[*Resources(mode="inline", components=["bokeh", "bokeh-widgets"]).js_raw, script],
-        style=(Path(__file__).parent / "report.css").read_text(encoding="utf-8"),
+        seed=shown.seed,
+        map_div=shown.div,
+        scripts=shown.scripts,
+        style=style(),
         caption=statistics.CAPTION,
     )
     files.write_text(path, page)
     return path
 
 
-def _map(run: Finished, seed: int | None) -> tuple[int, str, str]:
-    """Return seed, script and HTML of the map with a slider over time.
+def style() -> str:
+    """Return the style sheet of the page."""
+    return (Path(__file__).parent / "report.css").read_text(encoding="utf-8")
 
-    It shows the best run beside its reference.
+
+def map_of(
+    run: Finished,
+    *,
+    seed: int | None = None,
+    demand: float = 1.0,
+    names: Sequence[str] = (),
+) -> Map:
+    """Return the map of one or two runs with a slider over time.
+
+    seed: of the runs; the first that all have if None
+    demand: the nearest level is shown
+    names: controllers; the reference and the best one if empty
+    Raises: InputError if there is no run with this seed
     """
-    level = run.level()
-    names = figures.pair(level.rows)
+    level = run.level(demand)
+    if not names:
+        names = figures.pair(level.rows)
     seeds = [set(statistics.by_seed(level.rows, level.demand, name)) for name in names]
     common = sorted(set.intersection(*seeds))
     if not common:
@@ -103,7 +130,9 @@ def _map(run: Finished, seed: int | None) -> tuple[int, str, str]:
     picture = replace(picture, steps=max(map(len, whole.values())) - 1)
     layers = totals(picture, list(results.values()))
     tones = plots.colours(run.rows["controller"])
-    return seed, *components(with_slider(picture, whole, tones, layers), wrap_script=False)
+    script, div = components(with_slider(picture, whole, tones, layers), wrap_script=False)
+    bokeh = Resources(mode="inline", components=["bokeh", "bokeh-widgets"])
+    return Map(seed=seed, div=div, scripts=[*bokeh.js_raw, script])
 
 
 def _run(run: Finished) -> dict:
@@ -117,8 +146,6 @@ def _run(run: Finished) -> dict:
         pictures = _pictures(partial(figures.draw_levels, rows=rows), LEVEL_PICTURES)
     minutes = level.key["steps"] * level.key["step_s"] / 60
     seeds = ", ".join(map(str, sorted(set(rows["seed"]))))
-    made = {"runs": level.key, "controllers": level.controllers, "sessions": run.sessions}
-    manifest = json.dumps(made, indent=1)
     return {
         "name": run.path.resolve().name,
         "heading": heading,
@@ -129,8 +156,15 @@ def _run(run: Finished) -> dict:
         "With the same seed every controller has the same trips.",
         "pictures": pictures,
         "levels": [_level(run, level) for level in run.levels],
-        "manifest": re.sub(r"(?<![\w.])/(?:[^/\s\"']+/)+", "", manifest),  # no folders of a machine
+        "manifest": made_by(run),
     }
+
+
+def made_by(run: Finished) -> str:
+    """Return what runs depend on as text, without the folders of a machine."""
+    level = run.level()
+    made = {"runs": level.key, "controllers": level.controllers, "sessions": run.sessions}
+    return re.sub(r"(?<![\w.])/(?:[^/\s\"']+/)+", "", json.dumps(made, indent=1))
 
 
 def card(rows: pd.DataFrame) -> tuple[str, list[Figure], str]:

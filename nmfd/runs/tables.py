@@ -7,7 +7,7 @@ from functools import partial
 
 from tabulate import tabulate
 
-WIDTH = 120  # characters of a line below a table
+WIDTH = 100  # characters of a line below a table, and of a table that can be narrower
 NUMBER = re.compile(r"[-+]?\d.*|-|nan|")  # also with a unit, an interval or a second number
 
 

@@ -1,0 +1,1 @@
+"""From a SUMO configuration to an answer: `cosim study`."""

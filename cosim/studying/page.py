@@ -1,0 +1,351 @@
+"""Answer of a study: sentences, table of the terminal, HTML page."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from cosim.evaluation import results, statistics
+from cosim.importing.importer import COMPARISONS, reported
+from cosim.reporting import html
+from cosim.studying.stages import LABELS, Level, Loading, Outcome
+from cosim.studying.verdict import FEWEST_SEEDS, NOTHING_PERCENT, Answer, Verdict
+from cosim.sumo.net import network_folder
+from nmfd.model.scenario import Scenario
+from nmfd.runs import files
+from nmfd.runs.run_many import TABLE
+from nmfd.runs.tables import text_table, wrapped
+from nmfd.studies.benchmark import REFERENCE
+
+PAGE = "study.html"
+HALF_RANGE = 50.0  # of the drawn changes (%); larger ones end there
+NO_COMPARISON = "Not compared with plain SUMO: the scenario was not imported by this study"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study:
+    """Finished study.
+
+    source: as the user gave it
+    place: name or folder of the scenario, for commands
+    out: folder of the page; the runs are in its folder runs
+    """
+
+    source: str
+    place: str
+    scenario: Scenario
+    load: Loading
+    levels: tuple[Level, ...]
+    out: Path
+
+    @property
+    def runs(self) -> Path:
+        """Folder of the runs."""
+        return self.out / "runs"
+
+    @property
+    def page(self) -> Path:
+        """The HTML page."""
+        return self.out / PAGE
+
+    @property
+    def recommended(self) -> tuple[Level, Outcome] | None:
+        """The best strategy that can be recommended, and its demand.
+
+        That is the lowest demand at which there is one. It gains there, and neither harms nor
+        leaves more trips unserved at any demand.
+        """
+        for level in self.levels:
+            sound = [one for one in level.outcomes if self._sound(one)]
+            if sound:
+                return level, min(sound, key=_percent)
+        return None
+
+    def _sound(self, candidate: Outcome) -> bool:
+        """Return True if a strategy gains here and does no harm anywhere."""
+        verdict = candidate.verdict
+        if verdict is None or verdict.answer is not Answer.GAINS:
+            return False
+        for level in self.levels:
+            for one in level.outcomes:
+                if one.strategy == candidate.strategy and (harmful(one) or not one.serves):
+                    return False
+        return True
+
+    @property
+    def undecided(self) -> list[tuple[Level, Outcome]]:
+        """Strategies whose verdict is open, at their demand."""
+        found = []
+        for level in self.levels:
+            for one in level.outcomes:
+                if one.verdict is not None and one.verdict.answer is Answer.UNKNOWN:
+                    found.append((level, one))
+        return found
+
+
+def harmful(one: Outcome) -> bool:
+    """Return True if harm is the verdict, or likelier than not."""
+    if one.verdict is None:
+        return False
+    return one.verdict.answer is Answer.HARMS or one.verdict.odds.harms > 0.5
+
+
+def _percent(one: Outcome) -> float:
+    return math.nan if one.verdict is None else one.verdict.percent
+
+
+def answer(study: Study) -> str:
+    """Return the answer to the engineer's question in one sentence."""
+    best = study.recommended
+    if best is not None:
+        level, one = best
+        assert one.verdict is not None
+        saved = one.verdict.change.removeprefix("-")
+        chance = f"the odds are {_chance(one.verdict.odds.gains)} that it is more than"
+        begins = "Yes" if level is study.levels[0] else "Not today, but with more traffic"
+        return (
+            f"{begins}: {one.label} would save {saved} of the time spent {_at(level)}; "
+            f"{chance} {NOTHING_PERCENT:g} %."
+        )
+    if study.undecided:
+        labels = dict.fromkeys(one.label for _, one in study.undecided)
+        return f"Cannot say yet: {', '.join(labels)} may help or not; nothing else does."
+    return "No: nothing that was tried saves time without leaving more trips unserved."
+
+
+def next_line(study: Study) -> str:
+    """Return what to do next, from the verdict."""
+    best = study.recommended
+    if best is not None:
+        level, one = best
+        demand = "" if level.demand == 1.0 else f" --demand {level.demand:g}"
+        command = f"cosim watch {study.place} --controller {one.strategy}"
+        return f"Next: {command} --against {REFERENCE}{demand}"
+    needed = [one.verdict.needed for _, one in study.undecided if one.verdict is not None]
+    possible = [seeds for seeds in needed if seeds is not None]
+    if possible:
+        return f"Next: cosim study {study.source} --most-seeds {min(possible)} --out {study.out}"
+    return "Next: nothing; keep the signals as they are."
+
+
+def details(level: Level) -> list[str]:
+    """Return a sentence for every strategy that needs one."""
+    lines = []
+    for one in level.outcomes:
+        verdict = one.verdict
+        if verdict is None:
+            continue
+        if verdict.answer is Answer.UNKNOWN:
+            lines.append(f"{one.label}: {open_verdict(one)}")
+        if not one.serves:
+            more = one.more_left * one.means["trips"]
+            lines.append(f"{one.label}: leaves {more:,.0f} trips more unserved; not recommended")
+    skipped: dict[str, list[str]] = {}
+    for name, reason in level.skipped.items():
+        skipped.setdefault(reason, []).append(LABELS[name])
+    for reason, labels in skipped.items():
+        lines.append(f"{', '.join(labels)}: not judged; {reason}")
+    return lines
+
+
+def open_verdict(one: Outcome) -> str:
+    """Return the odds of an open verdict, and how many seeds would decide it."""
+    verdict = one.verdict
+    assert verdict is not None
+    if math.isnan(verdict.odds.gains):
+        return f"cannot say; {FEWEST_SEEDS} seeds at least"
+    odds = verdict.odds
+    chances = (
+        f"{odds.gains:.0%} that it gains, {odds.nothing:.0%} that it changes nothing, "
+        f"{odds.harms:.0%} that it harms"
+    )
+    more = "many more seeds would be needed"
+    if verdict.needed is not None:
+        more = f"about {max(verdict.needed, verdict.seeds + 1)} seeds would decide"
+    return f"cannot say: {chances}; {more}"
+
+
+def trust(study: Study) -> list[str]:
+    """Return sentences on how far the verdict can be trusted."""
+    network = study.scenario.network
+    lines = [sameness(study)]
+    seeds = [one.verdict.seeds for level in study.levels for one in level.outcomes if one.verdict]
+    number = f"{min(seeds)}" if min(seeds) == max(seeds) else f"{min(seeds)} to {max(seeds)}"
+    lines.append(
+        f"{number} seeds per strategy; with the same seed all strategies have the same trips. "
+        "Intervals hold for 95 % of such sets of seeds."
+    )
+    lines.append(broken(study.load))
+    unseen = [network.titles[region] for region in sorted(network.critical_above)]
+    if network.placeholder:
+        lines.append("The critical accumulations of the regions were not measured.")
+    elif unseen:
+        lines.append(f"Never seen beyond their critical accumulation: {', '.join(unseen)}.")
+    for level in study.levels:
+        teleports = []
+        for one in level.outcomes:
+            if one.means["teleports"] > 0:
+                teleports.append(f"{one.label} {one.means['teleports']:.1f}")
+        said = ", ".join(teleports) if teleports else "none"
+        lines.append(f"Teleports a run {_at(level)}: {said}.")
+        rows = results.read(study.runs).level(level.demand).rows
+        table = statistics.statistics(statistics.on_common_seeds(rows))
+        lines += [f"{_title(level)}: {text}" for text in statistics.warnings(table)]
+    return lines
+
+
+def sameness(study: Study) -> str:
+    """Return the comparison of the import with plain SUMO."""
+    found = reported(network_folder(study.scenario.network), COMPARISONS)
+    if not found:
+        return f"{NO_COMPARISON}."
+    return f"{found[0].upper()}{found[1:].rstrip('.')}."
+
+
+def broken(load: Loading) -> str:
+    """Return up to which demand the city serves its trips without control."""
+    if load.broken is None:
+        return f"Without control the city serves all trips up to demand times {load.under:g}."
+    left = load.left[load.broken]
+    more = f"{left:.1%} of its trips are left at the end"
+    return f"Without control the city breaks at demand times {load.broken:g}: {more}."
+
+
+def _at(level: Level) -> str:
+    return "at today's demand" if level.demand == 1.0 else f"at demand times {level.demand:g}"
+
+
+def _title(level: Level) -> str:
+    return "Today's demand" if level.demand == 1.0 else f"Demand times {level.demand:g}"
+
+
+def _chance(share: float) -> str:
+    return ">99 %" if share > 0.99 else f"{100.0 * share:.0f} %"
+
+
+def row(one: Outcome) -> dict[str, str]:
+    """Return a strategy as a row of text."""
+    means = one.means
+    verdict = one.verdict
+    said = ""
+    change = ""
+    if verdict is not None:
+        said = verdict.answer.value
+        if verdict.answer is not Answer.UNKNOWN:
+            said += f" ({_chance(verdict.chance)})"
+        change = verdict.change
+    return {
+        "strategy": one.label,
+        "verdict": said,
+        "time spent": change,
+        "min": f"{means['mean_trip_time_s'] / 60.0:.1f}",
+        "served": f"{means['completed_veh']:,.0f}",
+        "left": f"{one.left:,.0f}",
+        "teleports": f"{means['teleports']:.0f}",
+    }
+
+
+def text(study: Study) -> str:
+    """Return the study for the terminal."""
+    lines = []
+    for level in study.levels:
+        lines.append(f"{_title(level)}; min: minutes per trip")
+        lines.append(text_table([row(one) for one in level.outcomes]))
+        for line in details(level):
+            lines += wrapped(line)
+        lines.append("")
+    for line in (answer(study), *trust(study)):
+        lines += wrapped(line)
+    return "\n".join([*lines, f"Page: {study.page}", next_line(study)])
+
+
+def write(study: Study) -> Path:
+    """Write the page of a study; return its path."""
+    best = study.recommended
+    names = [REFERENCE]
+    demand = study.levels[0].demand
+    if best is not None:
+        level, one = best
+        names.append(one.strategy)
+        demand = level.demand
+    finished = results.read(study.runs)
+    shown = html.map_of(finished, demand=demand, names=names)
+    environment = Environment(
+        loader=PackageLoader("cosim.studying", "."),
+        autoescape=True,
+        trim_blocks=True,
+        undefined=StrictUndefined,
+    )
+    text = environment.get_template("study.html.j2").render(
+        name=study.scenario.name,
+        answer=answer(study),
+        next=next_line(study),
+        levels=[_shown(level) for level in study.levels],
+        trust=trust(study),
+        map=shown,
+        map_demand=demand,
+        map_names=" and ".join(LABELS[name] for name in names),
+        manifest=html.made_by(finished),
+        table=TABLE,
+        style=html.style() + (Path(__file__).parent / "study.css").read_text(encoding="utf-8"),
+    )
+    files.write_text(study.page, text)
+    return study.page
+
+
+def _shown(level: Level) -> dict[str, object]:
+    """Return what the page shows of a demand level."""
+    return {
+        "title": _title(level),
+        "rows": [_page_row(one) for one in level.outcomes],
+        "notes": details(level),
+    }
+
+
+def _page_row(one: Outcome) -> dict[str, object]:
+    """Return a row of the page: texts, and the change as a bar."""
+    means = one.means
+    cells = row(one)
+    hours = means[statistics.TTS] / 3600.0
+    cells["time"] = f"{hours:,.0f}" if hours >= 100.0 else f"{hours:.1f}"
+    delay = means.get("public_transport_delay_s", math.nan)
+    cells["bus"] = "–" if math.isnan(delay) else f"{delay:,.0f}"
+    cells["co2"] = f"{means['co2_kg'] / 1000.0:,.2f}"
+    cells["seeds"] = ""
+    cells["answer"] = ""
+    cells["chance"] = ""
+    tone = ""
+    bar: Mapping[str, float] = {}
+    if one.verdict is not None:
+        cells["seeds"] = str(one.verdict.seeds)
+        cells["answer"] = one.verdict.answer.value
+        if one.verdict.answer is not Answer.UNKNOWN:
+            cells["chance"] = _chance(one.verdict.chance)
+        if one.serves:
+            tone = one.verdict.answer.name.lower()
+        bar = _bar(one.verdict)
+    return {**cells, "tone": tone, "bar": bar}
+
+
+def _bar(verdict: Verdict) -> dict[str, float]:
+    """Return where the change and its interval lie on the bar.
+
+    They are left ends and widths, in percent of its width.
+    """
+    half = 0.0 if math.isnan(verdict.half) else verdict.half
+    mean = _place(verdict.percent)
+    low = _place(verdict.percent - half)
+    return {
+        "start": min(mean, 50.0),
+        "width": abs(mean - 50.0),
+        "low": low,
+        "spread": max(_place(verdict.percent + half) - low, 1.0),
+    }
+
+
+def _place(percent: float) -> float:
+    """Return where a change lies on the bar, in percent of its width."""
+    clipped = min(max(percent, -HALF_RANGE), HALF_RANGE)
+    return round(50.0 + 50.0 * clipped / HALF_RANGE, 1)
