@@ -31,17 +31,18 @@ from pydantic import BaseModel
 ROOT = Path(__file__).parents[1]
 PICTURE = Path(__file__).with_name("house.svg")
 # 175,000 was the aim, 205,000 with all that is to come. A step a line, options that are objects,
-# the guard and what cities do wrong took 25,000 more, the plant of streets 14,000: names and steps
-# were not cut to come under it.
-TOKENS = 220_000
-TEST_TOKENS = 165_000
+# the guard and what cities do wrong took 25,000 more, the plant of streets 14,000, studies of a
+# city 7,000, cuts of published networks, single changes in training and rows of finished runs 3,000
+# together: names and steps were not cut to come under it.
+TOKENS = 235_000
+TEST_TOKENS = 175_000
 TOKENS_PER_LINE = 9.5
 DECISIONS_IN_EXPRESSIONS = 0.65
 TUPLES_PER_1000_LINES = 4
-MODULES = 160
+MODULES = 172
 COMMANDS = 20
-PARAMETERS = 130
-SETTINGS = 140  # errors of a model, numbers of tuned rules and limits of time are declared, too
+PARAMETERS = 140
+SETTINGS = 148  # errors of a model, numbers of tuned rules and limits of time are declared, too
 WORDS_OF_A_README = 900
 DOCSTRING_LINE = 72
 ODD = re.compile(r"(Of|What|Whether|Who|Where|As|The same)\b")

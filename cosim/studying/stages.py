@@ -113,7 +113,7 @@ class Runner:
         return float(spent.sum() / max(rows["trips"].sum(), 1))
 
     def done(self, names: Sequence[str], levels: Sequence[float], seeds: int) -> pd.DataFrame:
-        """Do the runs that are not finished; return a row for each that did not fail.
+        """Do the unfinished runs; return a row for each that did not fail.
 
         Raises: InputError, and RunFailed if a run without control failed
         """

@@ -191,9 +191,9 @@ def run_many(
 
 
 def finished_table(out: Path) -> "pd.DataFrame":
-    """Return the finished runs in a folder as a table that was read from runs.csv.
+    """Return the finished runs in a folder as a table.
 
-    Only the order is that of runs.csv: a row is that of ROWS if size and time of its file are as
+    It is as if read from runs.csv, but only the order is from there: a row is that of ROWS if size and time of its file are as
     they were, else it is made of the file.
     """
     import pandas as pd  # takes half a second
