@@ -189,14 +189,6 @@ def test_who_waits_behind_a_piece_too_short_to_be_seen_on_is_seen():
     assert shown.count("Gr") >= 2
 
 
-def test_who_waits_on_the_junction_before_a_short_piece_is_seen():
-    """A vehicle that waits at the end of a, 0.2 m long, stands on the junction behind."""
-    turns = {("x", "a"): (":j_0_0",), ("x", "c"): ("elsewhere",)}
-    town = replace(TOWN, length={**TOWN.length, "a": 0.2}, turn_lanes=turns)
-    shown = [state for _, state in shown_by(CROSSING, {":": 1.0, "c": 9.0}, 120, town=town)]
-    assert shown.count("Gr") >= 2
-
-
 def test_saturation_flows_by_hand():
     """A lane each; of a lane that two movements share, a share; of a permissive green, less;
     nothing of a lane that this stage serves in part and another one wholly: its queue stands behind

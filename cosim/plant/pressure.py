@@ -2,9 +2,8 @@
 
 `Roads.weights` turns vehicles by lane into weights of movements, `Roads.gain` turns weights into
 pressures of stages (cosim.plant.max_pressure). Turning shares divide the vehicles on shared lanes
-and upstream of the turn lanes. Vehicles on the junction before a short street count as those on it:
-one that waits at its end stands there. A shared lane counts only for stages that serve all its
-movements. If no stage does, it counts with the probability that its first vehicle is served.
+and upstream of the turn lanes. A shared lane counts only for stages that serve all its movements.
+If no stage does, it counts with the probability that its first vehicle is served.
 """
 
 from collections import defaultdict
@@ -46,9 +45,7 @@ class Roads:
         cars = [lane for edge in city.edges for lane in city.lane_ids[edge]]
         links = [link for signal in signals for link in signal.links]
         others = [link for signal in signals for link in signal.others]
-        before = [lane for edge in city.edges for lane in self._before_short(edge)]
-        before_signals = [lane_id(link) for link in (*links, *others)]
-        self.lanes = list(dict.fromkeys([*cars, *before_signals, *before]))
+        self.lanes = list(dict.fromkeys([*cars, *map(lane_id, links), *map(lane_id, others)]))
         self.lane_number = {lane: n for n, lane in enumerate(self.lanes)}
         self._cars = frozenset(cars)
         self._links: dict[str, list[Link]] = {}  # edge -> its links at signals, for cars
@@ -188,24 +185,11 @@ class Roads:
                 queue[self.lane_number[lane]] = share
             length += self._city.length[before]
             first = before
-        for lane in self._before_short(edge):
-            queue[self.lane_number[lane]] = share
         if arriving:
             for before, part in self._arriving(first, length).items():
                 for lane in self._city.lane_ids[before]:
                     queue[self.lane_number[lane]] = share * part
         return queue
-
-    def _before_short(self, edge: str) -> list[str]:
-        """Return the lanes on the junction before an edge; [] unless it is short.
-
-        A vehicle that waits at the end of a short edge stands there.
-        """
-        lanes: list[str] = []
-        if self._city.length[edge] < SHORT_ROAD_M:
-            for before in self._city.before[edge]:
-                lanes += self._city.turn_lanes.get((before, edge), ())
-        return lanes
 
     def _arriving(self, edge: str, length: float) -> dict[str, float]:
         """Return edge before the road -> share of its vehicles that take `edge`.
