@@ -125,7 +125,7 @@ def longest_stretch(
 ) -> range:
     """Return the numbers of the longest stretch of edges that links join.
 
-    It is the first of equals.
+    All its edges are known. It is the first of equals.
     """
     best = range(0)
     begin = 0
