@@ -86,7 +86,7 @@ def is_newer(path: Path, than: Path) -> bool:
 
 
 def write_if_changed(path: Path, text: str) -> None:
-    """Write `text` to `path` unless it is there already, so that its time is that of a change."""
+    """Write `text` to `path` unless the file has it already."""
     if not path.is_file() or path.read_text(encoding="utf-8", errors="replace") != text:
         write_text(path, text)
 

@@ -191,10 +191,10 @@ def run_many(
 
 
 def finished_table(out: Path) -> "pd.DataFrame":
-    """Return the finished runs in a folder as a table that was read from runs.csv.
+    """Return the finished runs in a folder, as if read from runs.csv.
 
-    Only the order is that of runs.csv: a row is that of ROWS if size and time of its file are as
-    they were, else it is made of the file.
+    Only their order is that of runs.csv. A row is that of ROWS if size and time of its file are as
+    they were; else it is made of the file.
     """
     import pandas as pd  # takes half a second
 
