@@ -414,8 +414,8 @@ class Kept(NamedTuple):
 
 def _write_rows(out: Path, kept: Mapping[str, Kept]) -> None:
     """Write the rows of finished runs for the next call."""
-    text = json.dumps({"made_by": _made_by(), "runs": kept}, default=lambda number: number.item())
-    write_text(out / ROWS, text)
+    content = {"made_by": _made_by(), "runs": kept}
+    write_text(out / ROWS, json.dumps(content, default=lambda numbers: numbers.tolist()))
 
 
 def _known_rows(out: Path) -> dict[str, Kept]:
