@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from jaxtyping import TypeCheckError
 
-from nmfd.model.counting import held_up
+from nmfd.model.mfd import held_up
 from nmfd.types import State
 
 pytestmark = pytest.mark.skipif(

@@ -89,6 +89,18 @@ HALF = tiny.Acting(
 )
 
 
+def test_figures_are_drawn_again_if_a_run_is_new(tmp_path):
+    scenario = tiny.write(tmp_path)
+
+    def drawn(*controllers):
+        nmfd.benchmark(scenario, controllers, steps=2, out=tmp_path / "out")
+        return (tmp_path / "out" / "region_accumulation.png").stat().st_mtime_ns
+
+    first = drawn("no-control")
+    assert drawn("no-control") == first
+    assert drawn("no-control", "greedy") > first
+
+
 def test_a_controller_and_a_plant_as_objects(tmp_path):
     scenario = nmfd.load_scenario(tiny.write(tmp_path))
     inner = nmfd.NmfdPlant(scenario)

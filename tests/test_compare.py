@@ -18,8 +18,8 @@ from cosim.evaluation.model_validation import observed, outflow_samples, predict
 from cosim.plant.strategy import parse
 from nmfd.api import load_scenario
 from nmfd.model import dynamics, mfd
-from nmfd.model.counting import held_up
 from nmfd.model.identification import observed_split_ratios
+from nmfd.model.mfd import held_up
 from nmfd.model.regional_model import load_network, network_toml
 from nmfd.studies.fit_quality import fit_table, nearly_empty, predictions, region_fits, with_guesses
 

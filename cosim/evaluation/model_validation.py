@@ -7,18 +7,16 @@ import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
-import torch
 
 from cosim.evaluation.results import Finished
 from cosim.evaluation.simulate import regional_outflow
 from cosim.plant.strategy import of_finished
 from cosim.sumo.arrays import Points
-from nmfd.model.counting import held_up
-from nmfd.model.dynamics import advance, parameters
-from nmfd.model.identification import Observed
+from nmfd.model.mfd import held_up
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs import files
@@ -26,6 +24,9 @@ from nmfd.runs.tables import text_table
 from nmfd.studies.benchmark import draw_accumulations
 from nmfd.studies.fit_quality import SITUATIONS, SPILLBACK, predictions
 from nmfd.types import Result
+
+if TYPE_CHECKING:
+    from nmfd.model.identification import Observed
 
 FEWEST_VEHICLES = 5.0  # in a region during an interval that counts as a sample
 CAPTION = (
@@ -36,11 +37,13 @@ CAPTION = (
 )
 
 
-def observed(result: Result) -> Observed:
+def observed(result: Result) -> "Observed":
     """Return the data of a run for identification.
 
     Its demand is the departures.
     """
+    from nmfd.model.identification import Observed  # torch takes two seconds
+
     crossings = net_crossings(result)
     exits = crossings.sum(axis=2)
     own = np.arange(exits.shape[1])
@@ -84,6 +87,10 @@ def predict(scenario: Scenario, result: Result) -> Result:
 
     It gets the recorded departures and controls.
     """
+    import torch
+
+    from nmfd.model.dynamics import advance, parameters
+
     known = parameters(scenario.network)
     states = [torch.from_numpy(result["accumulation"][0])]
     given = (result["departures"] / scenario.step, result["perimeter"], expected_splits(result))

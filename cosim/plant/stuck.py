@@ -130,14 +130,7 @@ class Junctions:
         return self._session.lane(lane)[0]
 
     def _lane_behind(self, vehicle: str) -> str | None:
-<<<<<<< HEAD
-        """Return the lane of a vehicle's next street.
-
-        It is None if the vehicle's own lane leads elsewhere.
-        """
-=======
         """Return the lane of the next street; None if its own leads elsewhere."""
->>>>>>> dublin
         session = self._session
         lane, _ = session.place(vehicle)
         ways = session.next_lanes(lane)

@@ -86,7 +86,7 @@ def read_xml(path: Path, depth: int = 0) -> ElementTree.Element:
 
 
 def xml_text(element: ElementTree.Element, own: Mapping[str, str] = {}) -> str:
-    """Return an element as ElementTree.tostring writes it, but sooner.
+    """Return an element as ElementTree.tostring does, in less time.
 
     own: attributes instead of those of the element
     """

@@ -22,12 +22,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Real
 
 from nmfd.arrays import Adjacency, PerPair, PerRegion
 from nmfd.metrics import largest_accumulation
 from nmfd.model.identification import HORIZON, Observed, prediction_errors
-from nmfd.model.mfd import JAM_DENSITY, RoundedLinear, guess_beyond
+from nmfd.model.mfd import JAM_DENSITY, RoundedLinear, guess_beyond, held_up
 from nmfd.model.regional_model import LEAST_ROOM, RegionalModel, passing_share
 
 ROUNDS = 6  # of MFD, rates and capacities after each other
@@ -42,10 +41,7 @@ FALLS = (0.95, 0.5, 0.1, 0.01)  # of the largest outflow: points of the branch o
 LIMITS = np.geomspace(1.0, 0.02, 60)  # of the capacity of a boundary, of which one is chosen
 LOCKED = 0.5  # of the largest outflow: with less at the end of its data, a region has locked
 STORAGES = (1.0, 0.8, 0.7, 0.6)  # of the largest accumulation of a region that locked
-COLLAPSED_SHARE = 0.7  # of the largest outflow so far, below which a denser region is collapsed
 TELLING = 0.98  # of the squared error: a limit that lowers it to less is believed
-
-OverTime = Real[np.ndarray, "T R"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -308,27 +304,6 @@ def _pooled(n: np.ndarray, exits: np.ndarray, ready: np.ndarray) -> tuple[np.nda
     rates = np.bincount(bins, exits)[used] / weight
     falling = isotonic_regression(rates, weights=weight, increasing=False).x
     return middle, middle * falling
-
-
-def held_up(
-    accumulation: OverTime, outflow: OverTime, adjacency: Adjacency
-) -> Bool[np.ndarray, "T R"]:
-    """Mark intervals in which a neighbour holds up a region's outflow.
-
-    The neighbour has collapsed, and did so before the region. A collapsed region holds more
-    vehicles than when its outflow was largest so far, and lets out less than COLLAPSED_SHARE of
-    that. Its queues spill back and lower the outflow of the region behind.
-
-    accumulation, outflow: (veh), (veh/s), both (T, R)
-    """
-    largest = np.maximum.accumulate(outflow)
-    interval = np.arange(len(outflow))[:, None]
-    best = np.maximum.accumulate(np.where(outflow == largest, interval, 0))
-    fuller = accumulation > np.take_along_axis(accumulation, best, axis=0)
-    collapsed = fuller & (outflow < COLLAPSED_SHARE * largest)
-    onset = np.where(collapsed.any(axis=0), collapsed.argmax(axis=0), len(outflow))
-    earlier = adjacency & (onset[None, :] < onset[:, None])
-    return (collapsed[:, None, :] & earlier[None]).any(axis=2)
 
 
 def _with_rates(

@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Real
+from jaxtyping import Bool, Real
 
+from nmfd.arrays import Adjacency
 from nmfd.errors import InputError
 
 Samples = Real[np.ndarray, " N"]
@@ -20,6 +21,8 @@ ALPHA = 0.98405
 BETA = -1.97190
 KINK_ROUNDING = 0.005  # of the jam accumulation: width of rounded kinks
 JAM_DENSITY = 80.0  # veh per lane-km: 60 % of the lanes full of standing vehicles
+COLLAPSED_SHARE = 0.7  # of the largest outflow so far, below which a denser region is collapsed
+OverTime = Real[np.ndarray, "T R"]
 
 
 def of_numbers(kind: "type[Mfd]", **numbers: Any) -> Any:
@@ -387,3 +390,24 @@ def _fit_cubic(x: np.ndarray, g: np.ndarray, jam: float, max_rate: float) -> Cub
     )
     a, b, c = map(float, result.x * scale)
     return Cubic(a=a / jam**3, b=b / jam**2, c=c / jam, jam=jam)
+
+
+def held_up(
+    accumulation: OverTime, outflow: OverTime, adjacency: Adjacency
+) -> Bool[np.ndarray, "T R"]:
+    """Mark intervals in which a neighbour holds up a region's outflow.
+
+    The neighbour has collapsed, and did so before the region. A collapsed region holds more
+    vehicles than when its outflow was largest so far, and lets out less than COLLAPSED_SHARE of
+    that. Its queues spill back and lower the outflow of the region behind.
+
+    accumulation, outflow: (veh), (veh/s), both (T, R)
+    """
+    largest = np.maximum.accumulate(outflow)
+    interval = np.arange(len(outflow))[:, None]
+    best = np.maximum.accumulate(np.where(outflow == largest, interval, 0))
+    fuller = accumulation > np.take_along_axis(accumulation, best, axis=0)
+    collapsed = fuller & (outflow < COLLAPSED_SHARE * largest)
+    onset = np.where(collapsed.any(axis=0), collapsed.argmax(axis=0), len(outflow))
+    earlier = adjacency & (onset[None, :] < onset[:, None])
+    return (collapsed[:, None, :] & earlier[None]).any(axis=2)

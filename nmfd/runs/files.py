@@ -86,10 +86,7 @@ def is_newer(path: Path, than: Path) -> bool:
 
 
 def write_if_changed(path: Path, text: str) -> None:
-    """Write `text` to `path` unless it is there already.
-
-    So the time of the file is that of its last change.
-    """
+    """Write `text` to `path` unless the file has it already."""
     if not path.is_file() or path.read_text(encoding="utf-8", errors="replace") != text:
         write_text(path, text)
 

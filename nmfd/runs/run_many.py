@@ -191,10 +191,10 @@ def run_many(
 
 
 def finished_table(out: Path) -> "pd.DataFrame":
-    """Return the finished runs in a folder as a table.
+    """Return the finished runs in a folder, as if read from runs.csv.
 
-    It is as if read from runs.csv, but only the order is from there: a row is that of ROWS if size and time of its file are as
-    they were, else it is made of the file.
+    Only their order is that of runs.csv. A row is that of ROWS if size and time of its file are as
+    they were; else it is made of the file.
     """
     import pandas as pd  # takes half a second
 
@@ -414,8 +414,8 @@ class Kept(NamedTuple):
 
 def _write_rows(out: Path, kept: Mapping[str, Kept]) -> None:
     """Write the rows of finished runs for the next call."""
-    text = json.dumps({"made_by": _made_by(), "runs": kept}, default=lambda number: number.item())
-    write_text(out / ROWS, text)
+    content = {"made_by": _made_by(), "runs": kept}
+    write_text(out / ROWS, json.dumps(content, default=lambda numbers: numbers.tolist()))
 
 
 def _known_rows(out: Path) -> dict[str, Kept]:

@@ -3,17 +3,20 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
 from nmfd.arrays import PerRegion, Points, StatesOverTime
 from nmfd.metrics import largest_accumulation
-from nmfd.model import identification, mfd
-from nmfd.model.identification import Observed
+from nmfd.model import mfd
 from nmfd.model.regional_model import Errors, HeldOut, RegionalModel
 from nmfd.runs import files
 from nmfd.runs.tables import text_table, wrapped
+
+if TYPE_CHECKING:
+    from nmfd.model.identification import Observed
 
 # By region: label -> samples (n, 2) of accumulation [veh] and outflow [veh/s].
 Samples = Sequence[Mapping[str, Points]]
@@ -262,7 +265,7 @@ def fit_table(
 
 def predictions(
     network: RegionalModel,
-    runs: Sequence[Observed],
+    runs: "Sequence[Observed]",
     scheme: dict,
     critical: PerRegion | None = None,
 ) -> pd.DataFrame:
@@ -284,6 +287,8 @@ def predictions(
         flowing_states, congested_states: their number
         flowing_total_share: predicted over observed vehicles in the flowing states (-)
     """
+    from nmfd.model import identification  # torch takes two seconds
+
     if critical is None:
         critical = network.known_critical
     longest = max(len(run.demand) for run in runs)
