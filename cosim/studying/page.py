@@ -285,7 +285,7 @@ def write(study: Study) -> Path:
         levels=[_shown(level) for level in study.levels],
         trust=trust(study),
         map=shown,
-        map_demand=demand,
+        map_demand=f"{demand:g}",
         map_names=" and ".join(LABELS[name] for name in names),
         manifest=html.made_by(finished),
         table=TABLE,
