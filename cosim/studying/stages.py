@@ -217,7 +217,7 @@ def gates(runner: Runner, load: Loading, *, own: bool) -> Gates:
         scenario = load_scenario(scenario.folder or Path())
     verdict = identify.run_verdict(scenario, scenario.network, runs)
     if not verdict.protect:
-        return Gates(scenario, verdict.sentences[0].partition("? ")[2])
+        return Gates(scenario, verdict.sentences[0].partition(": ")[2])
     if own:
         identify.write_protected(scenario, verdict.protect)
         scenario = load_scenario(scenario.folder or Path())
