@@ -113,7 +113,9 @@ class Runner:
         return float(spent.sum() / max(rows["trips"].sum(), 1))
 
     def done(self, names: Sequence[str], levels: Sequence[float], seeds: int) -> pd.DataFrame:
-        """Do the runs that are not finished; return a row for each that did not fail.
+        """Do the runs that are not finished; return a row for each.
+
+        A failed run has no row.
 
         Raises: InputError, and RunFailed if a run without control failed
         """
