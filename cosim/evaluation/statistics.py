@@ -18,7 +18,7 @@ from cosim.sumo.net import City
 from nmfd.arrays import PerRegion
 from nmfd.metrics import COUNTED, decision_ms, percent_change
 from nmfd.runs import config
-from nmfd.runs.tables import WIDTH, markdown_table, text_table, wrapped
+from nmfd.runs.tables import NARROW, markdown_table, text_table, wrapped
 from nmfd.studies import benchmark
 from nmfd.studies.benchmark import REFERENCE, interval
 from nmfd.types import Result
@@ -293,7 +293,7 @@ def brief(table: pd.DataFrame) -> pd.DataFrame:
     whole["controller"] = whole["controller"].map(_in_lines)
     first = list(outcomes)[:4]
     columns = [*first, *BRIEF]
-    while len(columns) > len(first) and text_width(whole[columns]) > WIDTH:
+    while len(columns) > len(first) and text_width(whole[columns]) > NARROW:
         columns.pop()
     return whole[columns]
 
@@ -322,13 +322,13 @@ def text(rows: pd.DataFrame, *, explain: bool = False) -> str:
         lines += [f"Demand times {level:g}", text_table(part.to_dict("records")), ""]
         for note in (floor(table), *warnings(table)):
             if note:
-                lines += [*wrapped(note), ""]
+                lines += [*wrapped(note, NARROW), ""]
         for heading in part:
             headings[heading.partition(" [")[0]] = None
     if explain:
         for heading in headings:
             if heading in COLUMNS:
-                lines += wrapped(f"{heading}: {COLUMNS[heading]}")
+                lines += wrapped(f"{heading}: {COLUMNS[heading]}", NARROW)
     return "\n".join(lines).rstrip()
 
 

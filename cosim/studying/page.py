@@ -16,7 +16,7 @@ from cosim.sumo.net import network_folder
 from nmfd.model.scenario import Scenario
 from nmfd.runs import files
 from nmfd.runs.run_many import TABLE
-from nmfd.runs.tables import text_table, wrapped
+from nmfd.runs.tables import NARROW, text_table, wrapped
 from nmfd.studies.benchmark import REFERENCE
 
 PAGE = "study.html"
@@ -254,10 +254,10 @@ def text(study: Study) -> str:
         lines.append(f"{_title(level)}; min: minutes per trip")
         lines.append(text_table([row(one) for one in level.outcomes]))
         for line in details(level):
-            lines += wrapped(line)
+            lines += wrapped(line, NARROW)
         lines.append("")
     for line in (answer(study), *trust(study)):
-        lines += wrapped(line)
+        lines += wrapped(line, NARROW)
     return "\n".join([*lines, f"Page: {study.page}", next_line(study)])
 
 
@@ -285,7 +285,7 @@ def write(study: Study) -> Path:
         levels=[_shown(level) for level in study.levels],
         trust=trust(study),
         map=shown,
-        map_demand=demand,
+        map_demand=f"{demand:g}",
         map_names=" and ".join(LABELS[name] for name in names),
         manifest=html.made_by(finished),
         table=TABLE,

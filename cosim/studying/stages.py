@@ -113,7 +113,9 @@ class Runner:
         return float(spent.sum() / max(rows["trips"].sum(), 1))
 
     def done(self, names: Sequence[str], levels: Sequence[float], seeds: int) -> pd.DataFrame:
-        """Do the unfinished runs; return a row for each that did not fail.
+        """Do the runs that are not finished; return a row for each.
+
+        A failed run has no row.
 
         Raises: InputError, and RunFailed if a run without control failed
         """
@@ -217,7 +219,7 @@ def gates(runner: Runner, load: Loading, *, own: bool) -> Gates:
         scenario = load_scenario(scenario.folder or Path())
     verdict = identify.run_verdict(scenario, scenario.network, runs)
     if not verdict.protect:
-        return Gates(scenario, verdict.sentences[0].partition("? ")[2])
+        return Gates(scenario, verdict.sentences[0].partition(": ")[2])
     if own:
         identify.write_protected(scenario, verdict.protect)
         scenario = load_scenario(scenario.folder or Path())

@@ -7,7 +7,8 @@ from functools import partial
 
 from tabulate import tabulate
 
-WIDTH = 100  # characters of a line below a table, and of a table that can be narrower
+WIDTH = 120  # characters of a line below a table
+NARROW = 100  # of a table and all lines around it, where a table can be made so narrow
 NUMBER = re.compile(r"[-+]?\d.*|-|nan|")  # also with a unit, an interval or a second number
 
 
@@ -47,12 +48,12 @@ def markdown_table(headings: Sequence[str], lines: Iterable[Iterable[object]]) -
     return "\n".join(rows)
 
 
-def wrapped(caption: str) -> list[str]:
-    """Return a caption in lines of at most WIDTH characters.
+def wrapped(caption: str, width: int = WIDTH) -> list[str]:
+    """Return a caption in lines of at most so many characters.
 
     Continued lines keep their indentation.
     """
-    wrap = partial(textwrap.wrap, width=WIDTH, break_long_words=False, break_on_hyphens=False)
+    wrap = partial(textwrap.wrap, width=width, break_long_words=False, break_on_hyphens=False)
     parts = []
     for line in caption.splitlines():
         indent = " " * (len(line) - len(line.lstrip()))
