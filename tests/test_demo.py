@@ -21,7 +21,7 @@ def made(monkeypatch):
     monkeypatch.setattr(api, "DEMO", made_up.SCENARIO)
     made_up.instead_of_sumo(monkeypatch, partial(made_up.result, city=city))
     monkeypatch.setattr(html, "_pictures", lambda *_: [])
-    monkeypatch.setattr(html, "_map", lambda *_: ("", "", ""))
+    monkeypatch.setattr(html, "map_of", lambda *_, **__: html.Map(0, "", []))
 
 
 def test_report_and_page(made, tmp_path):

@@ -396,8 +396,8 @@ def test_parts_without_a_connection_and_small_regions_are_told(tmp_path):
 
 
 def test_own_regions_from_a_spreadsheet_and_in_pieces(net, city, tmp_path):
-    """A mark at the beginning and empty lines do not matter; streets that cannot stay where they
-    were put are told."""
+    """A mark at the beginning and empty lines do not matter; a region in pieces stays, and is
+    told."""
     config, edges = city(), read_streets(net).edges
     rows = [f"{edge},{int(edge[0] in 'CD')}" for edge in edges]
     csv = tmp_path / "own.csv"
@@ -407,7 +407,9 @@ def test_own_regions_from_a_spreadsheet_and_in_pieces(net, city, tmp_path):
     assert scenario.network.regions == 2
     apart = {"A0A1", "A1A2", "D2D3"}
     csv.write_text("\n".join(["edge,region", *(f"{edge},{int(edge in apart)}" for edge in edges)]))
-    assert "1 streets are in other regions than in" in imported(config, regions=csv)[0]
+    text, scenario = imported(config, regions=csv)
+    assert re.search("region 1 .* is in 2 pieces, as in your own table", text), text
+    assert "are in other regions" not in text
 
 
 def test_sumos_own_words_in_one_line(city, capfd):
