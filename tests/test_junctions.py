@@ -11,7 +11,7 @@ LENGTH, EDGES = 5.0, (":x_1", ":x_2", ":x_10", ":y_1", "a", "b", "short")
 CITY = SimpleNamespace(
     region_of=dict.fromkeys(EDGES, 0),
     length={"a": 50.0, "b": 50.0, "short": 0.2},
-    turn_lanes={("short", "a"): (":x_3_0",), ("a", "b"): (":y_1_0",)},
+    over={("short", "a"): (":x_3",), ("a", "b"): (":y_1",)},
 )
 
 

@@ -9,7 +9,7 @@ import tiny_city
 from commands import cosim, error_line, good
 
 from cosim.studying import page, stages
-from cosim.studying.stages import EVERYWHERE, GATES, LABELS, Level, Outcome
+from cosim.studying.stages import AT_CRITICAL, EVERYWHERE, LABELS, Level, Outcome
 from cosim.studying.verdict import judge
 from cosim.sumo.net import city_of
 from nmfd.api import load_scenario
@@ -144,7 +144,7 @@ def test_from_a_sumo_configuration_to_a_page(tmp_path, monkeypatch):
     out = tmp_path / "out"
     source = tiny_city.city(tmp_path)
     text = good(cosim("study", source, "--most-seeds", 3, "--workers", 2, "--out", out))
-    labels = ", ".join(GATES.values())
+    labels = ", ".join(AT_CRITICAL.values())
     assert f"{labels}: not judged; every region was nearly empty in all runs without" in text
     assert "The critical accumulations of the regions were not measured." in text
     assert (out / "study.html").is_file()

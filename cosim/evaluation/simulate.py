@@ -87,6 +87,7 @@ def simulate(
             gui=gui,
         )
         stack.callback(plant.close)
+        # Without a command, drivers do what the controller's model takes them to do.
         believed = replace(scenario, network=planning.network)
         result = closed_loop.run(plant, controller, believed, seed=job.seed, progress=progress)
         used = scenario.settings | {"sumo": chosen.model_dump(mode="json", exclude_defaults=True)}

@@ -192,6 +192,11 @@ def floor(table: pd.DataFrame) -> str:
     return f"Floor: on the ways of {name}, without any delay, {free[least]:.4g} veh s."
 
 
+def notes(table: pd.DataFrame) -> list[str]:
+    """Return the sentences below a table: its floor, and its warnings."""
+    return [note for note in (floor(table), *warnings(table)) if note]
+
+
 def _listed(table: pd.DataFrame, values: pd.Series) -> str:
     """Return controllers with a number each."""
     pairs = zip(table["controller"], values, strict=True)
@@ -320,9 +325,8 @@ def text(rows: pd.DataFrame, *, explain: bool = False) -> str:
     for level, table in statistics(rows).groupby("demand", sort=True):
         part = brief(table)
         lines += [f"Demand times {level:g}", text_table(part.to_dict("records")), ""]
-        for note in (floor(table), *warnings(table)):
-            if note:
-                lines += [*wrapped(note, NARROW), ""]
+        for note in notes(table):
+            lines += [*wrapped(note, NARROW), ""]
         for heading in part:
             headings[heading.partition(" [")[0]] = None
     if explain:
@@ -339,7 +343,7 @@ def markdown(rows: pd.DataFrame) -> str:
         parts.append(f"## Demand times {level:g}")
         for part in shown(table):
             parts.append(markdown_table(list(part), part.to_numpy().tolist()))
-        parts += [note for note in (floor(table), *warnings(table)) if note]
+        parts += notes(table)
     return "\n\n".join([*parts, CAPTION]) + "\n"
 
 

@@ -87,9 +87,9 @@ class Junctions:
         self._inside: dict[str, list[str]] = defaultdict(list)  # junction -> its internal edges
         for edge in sorted(city.region_of):
             if edge.startswith(":"):
-                self._inside[edge[1:].rpartition("_")[0]].append(edge)
-        for (edge, _), lanes in sorted(city.turn_lanes.items()):
-            junction = lanes[0][1:].rsplit("_", 2)[0]
+                self._inside[_junction(edge)].append(edge)
+        for (edge, _), way in sorted(city.over.items()):
+            junction = _junction(way[0])
             if city.length[edge] < SHORT_STREET_M and edge not in self._inside[junction]:
                 self._inside[junction].append(edge)
 
@@ -142,3 +142,8 @@ class Junctions:
             if onward.rpartition("_")[0] in following:
                 return onward
         return None
+
+
+def _junction(edge: str) -> str:
+    """Return the junction of an internal edge, such as "x" of ":x_3"."""
+    return edge[1:].rpartition("_")[0]

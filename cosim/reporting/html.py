@@ -74,11 +74,9 @@ def write_page(path: Path, runs: Sequence[Finished], *, seed: int | None = None)
     Raises: InputError if there is no run with this seed
     """
     shown = map_of(runs[0], seed=seed)
-    loader = PackageLoader("cosim.reporting", ".")
-    environment = Environment(
-        loader=loader, autoescape=True, trim_blocks=True, undefined=StrictUndefined
-    )
-    page = environment.get_template("report.html.j2").render(
+    page = rendered(
+        "cosim.reporting",
+        "report.html.j2",
         name=", ".join(dict.fromkeys(run.scenario.name for run in runs)),
         runs=[_run(run) for run in runs],
         seed=shown.seed,
@@ -89,6 +87,17 @@ def write_page(path: Path, runs: Sequence[Finished], *, seed: int | None = None)
     )
     files.write_text(path, page)
     return path
+
+
+def rendered(package: str, template: str, **values: object) -> str:
+    """Return a page from a template in the folder of a package."""
+    environment = Environment(
+        loader=PackageLoader(package, "."),
+        autoescape=True,
+        trim_blocks=True,
+        undefined=StrictUndefined,
+    )
+    return environment.get_template(template).render(**values)
 
 
 def style() -> str:

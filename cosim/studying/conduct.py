@@ -7,7 +7,7 @@ from pathlib import Path
 
 from cosim.studying import page, stages
 from cosim.studying.page import Study
-from cosim.studying.stages import EVERYWHERE, GATES, Level, Runner
+from cosim.studying.stages import AT_CRITICAL, EVERYWHERE, Level, Runner
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.runs.files import file_name, write_text
@@ -75,8 +75,8 @@ def _level(
     skipped = dict(impossible)
     reason = no_gates or stages.far_from_critical(runner, level)
     if reason:
-        skipped |= dict.fromkeys(GATES, reason)
-    names = [name for name in (*EVERYWHERE, *GATES) if name not in skipped]
+        skipped |= dict.fromkeys(AT_CRITICAL, reason)
+    names = [name for name in (*EVERYWHERE, *AT_CRITICAL) if name not in skipped]
     return stages.level_of(runner, level, names, skipped, most_seeds)
 
 

@@ -5,8 +5,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
-
 from cosim.evaluation import results, statistics
 from cosim.importing.importer import COMPARISONS, reported
 from cosim.reporting import html
@@ -183,6 +181,7 @@ def trust(study: Study) -> list[str]:
         lines.append("The critical accumulations of the regions were not measured.")
     elif unseen:
         lines.append(f"Never seen beyond their critical accumulation: {', '.join(unseen)}.")
+    finished = results.read(study.runs)
     for level in study.levels:
         teleports = []
         for one in level.outcomes:
@@ -190,7 +189,7 @@ def trust(study: Study) -> list[str]:
                 teleports.append(f"{one.label} {one.means['teleports']:.1f}")
         said = ", ".join(teleports) if teleports else "none"
         lines.append(f"Teleports a run {_at(level)}: {said}.")
-        rows = results.read(study.runs).level(level.demand).rows
+        rows = finished.level(level.demand).rows
         table = statistics.statistics(statistics.on_common_seeds(rows))
         lines += [f"{_title(level)}: {text}" for text in statistics.warnings(table)]
     return lines
@@ -272,13 +271,9 @@ def write(study: Study) -> Path:
         demand = level.demand
     finished = results.read(study.runs)
     shown = html.map_of(finished, demand=demand, names=names)
-    environment = Environment(
-        loader=PackageLoader("cosim.studying", "."),
-        autoescape=True,
-        trim_blocks=True,
-        undefined=StrictUndefined,
-    )
-    text = environment.get_template("study.html.j2").render(
+    text = html.rendered(
+        "cosim.studying",
+        "study.html.j2",
         name=study.scenario.name,
         answer=answer(study),
         next=next_line(study),

@@ -24,7 +24,7 @@ from nmfd.model.identification import ITERATIONS
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs.files import file_name
-from nmfd.runs.run_many import TABLE, Run, raise_failures, run_many
+from nmfd.runs.run_many import TABLE, Run, finished_table, raise_failures, run_many
 from nmfd.studies import fit_quality
 from nmfd.studies.benchmark import REFERENCE
 from nmfd.types import Result
@@ -43,8 +43,8 @@ EVERYWHERE = {
     "route-guidance+guidance-period-60": "guidance",
     "route-guidance+max-pressure+guidance-period-60": "guidance over max-pressure",
 }
-GATES = {"pi-gating": "PI gates", "metering": "metering"}
-LABELS = {REFERENCE: "no control"} | EVERYWHERE | GATES
+AT_CRITICAL = {"pi-gating": "PI gates", "metering": "metering"}
+LABELS = {REFERENCE: "no control"} | EVERYWHERE | AT_CRITICAL
 FAILED = f"a run failed, for the reason in {TABLE}"
 MODEL_COMMENT = "Written by cosim study from runs of {} without control, demand times {}."
 
@@ -103,10 +103,7 @@ class Runner:
 
     def _seconds_per_trip(self) -> float:
         """Return the wall time per trip of finished runs."""
-        file = self.out / TABLE
-        rows = pd.DataFrame()
-        if file.is_file():
-            rows = results.finished_rows(pd.read_csv(file))
+        rows = results.finished_rows(finished_table(self.out))
         if rows.empty:
             return SECONDS_PER_TRIP
         spent = rows["wall_time_s"] + rows["setup_time_s"]
@@ -134,7 +131,7 @@ class Runner:
     def impossible(self) -> dict[str, str]:
         """Return the strategies that cannot run in this city, with the reason."""
         reasons = {}
-        for name in (*EVERYWHERE, *GATES):
+        for name in (*EVERYWHERE, *AT_CRITICAL):
             try:
                 self.planned([name], LEVELS[:1], 1)
             except InputError as error:

@@ -3,8 +3,7 @@
 import csv
 import math
 import xml.etree.ElementTree as ElementTree
-from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -76,7 +75,6 @@ class City:
     signals: edge -> signal at its end
     over: (from_edge, to_edge) -> internal edges of this turn, in order
     inside: internal edge of a turn -> length (m)
-    turn_lanes: (from_edge, to_edge) -> lanes on the junction of this turn
     """
 
     net_file: Path
@@ -93,7 +91,6 @@ class City:
     signals: Mapping[str, str]
     over: Mapping[tuple[str, str], tuple[str, ...]] = field(default_factory=dict)
     inside: Mapping[str, float] = field(default_factory=dict)
-    turn_lanes: Mapping[tuple[str, str], Sequence[str]] = field(default_factory=dict)
 
     @cached_property
     def number(self) -> dict[str, int]:
@@ -282,15 +279,7 @@ def _derived(
     for link in links:
         time = net.internal[_stem(link.via)].time if link.via else 0.0
         turn_time[link.source, link.target] = time
-    over: dict[tuple[str, str], tuple[str, ...]] = {}
-    turn_lanes = defaultdict[tuple[str, str], list[str]](list)
-    onward = _onward_on_junctions(net.connections)
-    for link in links:
-        turn = link.source, link.target
-        way = _way_over_junction(link, onward)
-        if way:
-            over[turn] = tuple(map(_stem, way))
-            turn_lanes[turn] += way
+    over = _turns_over_junctions(links, net.connections)
     inside = {}
     for edge in sorted(set().union(*over.values())):
         length = net.internal[edge].length
@@ -312,7 +301,6 @@ def _derived(
         signals={link.source: link.signal for link in links if link.signal},
         over=over,
         inside=inside,
-        turn_lanes=turn_lanes,
     )
 
 
@@ -516,26 +504,27 @@ def _internal_regions(net: _Net, region_of: Mapping[str, int]) -> dict[str, int]
     return {edge: regions.get(edge, of_junction.get(_stem(edge), 0)) for edge in net.internal}
 
 
-def _onward_on_junctions(connections: Iterable[Connection]) -> dict[str, str | None]:
-    """Return lane on a junction -> the next one there, None at the last."""
+def _turns_over_junctions(
+    links: Sequence[Connection], connections: Sequence[Connection]
+) -> dict[tuple[str, str], tuple[str, ...]]:
+    """Return (from_edge, to_edge) -> internal edges in between.
+
+    There are two if the turn waits in the middle of the junction.
+    """
     onward = {}
     for connection in connections:
         if connection.source.startswith(":"):
             onward[f"{connection.source}_{connection.lane}"] = connection.via
-    return onward
-
-
-def _way_over_junction(link: Connection, onward: Mapping[str, str | None]) -> list[str]:
-    """Return the lanes on the junction of a connection.
-
-    There are two if the turn waits in the middle of the junction.
-    """
-    way = []
-    lane = link.via
-    while lane:
-        way.append(lane)
-        lane = onward.get(lane)
-    return way
+    over: dict[tuple[str, str], tuple[str, ...]] = {}
+    for link in links:
+        way = []
+        via = link.via
+        while via:
+            way.append(_stem(via))
+            via = onward.get(via)
+        if way:
+            over[link.source, link.target] = tuple(way)
+    return over
 
 
 def _gateways(links: Sequence[Connection], region_of: Mapping[str, int]) -> tuple[Gateway, ...]:

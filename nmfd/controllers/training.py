@@ -202,7 +202,7 @@ def train(
     else:
         run.prepare()
     while True:
-        _descend(run, setup.steps, progress)
+        run.descend(progress)
         if run.best == run.bar:
             problem = f"no policy gained {WORTH:.0%} on the model: its gates stay open"
             print(f"nmfd: {problem}", file=sys.stderr)
@@ -220,21 +220,6 @@ def train(
             "lower the learning rate"
         )
     return keeper.finish()
-
-
-def _descend(
-    run: "TrainingRun", steps: int, progress: Callable[[int, int, str], None] | None
-) -> None:
-    """Take the steps of one descent that are left."""
-    while run.done < steps:
-        run.step()
-        if run.done % VALIDATION_PERIOD == 0 or run.done == steps:
-            run.validate()
-            run.save()
-        if progress:
-            unit = "" if run.own else " veh s"
-            best = f"best {run.best:.4g}{unit}" if math.isfinite(run.best) else "no validation yet"
-            progress(run.done, steps, best)
 
 
 class Change(NamedTuple):
@@ -333,18 +318,13 @@ class TrainingRun:
             weight_decay=self._recipe.weight_decay,
         )
 
-    @property
-    def own(self) -> bool:
-        """True if the cost is the user's own."""
-        return bool(self._task.own)
-
     def prepare(self) -> None:
         """Begin as the settings say: like a gate, or like no control.
 
         A compact policy begins with the best of its single changes, not in a corner where descent
         finds nothing.
         """
-        if isinstance(self._policy, CompactPolicy) and not self.own:
+        if isinstance(self._policy, CompactPolicy) and not self._task.own:
             self.validate()
             change = self.better_change()
             while change is not None:
@@ -361,6 +341,24 @@ class TrainingRun:
             self.best *= 1.0 - WORTH
             self.bar = self.best
             self._policy.load_state_dict(first)
+
+    def descend(self, progress: Callable[[int, int, str], None] | None) -> None:
+        """Take the steps of a descent that are left."""
+        steps = self._setup.steps
+        while self.done < steps:
+            self.step()
+            if self.done % VALIDATION_PERIOD == 0 or self.done == steps:
+                self.validate()
+                self._keeper.save(self.state())
+            if progress:
+                progress(self.done, steps, self._best_text())
+
+    def _best_text(self) -> str:
+        """Return the best validation so far as text."""
+        if not math.isfinite(self.best):
+            return "no validation yet"
+        unit = "" if self._task.own else " veh s"
+        return f"best {self.best:.4g}{unit}"
 
     def step(self) -> None:
         """Take one step of Adam."""
@@ -471,7 +469,7 @@ class TrainingRun:
         There is none for a cost or a module of the user's own, whose outputs are unknown.
         """
         policy = self._policy
-        if self.own or not isinstance(policy, Policy) or not self._best_weights:
+        if self._task.own or not isinstance(policy, Policy) or not self._best_weights:
             return None
         best = copy.deepcopy(policy)
         best.load_state_dict(self._best_weights)
@@ -501,10 +499,6 @@ class TrainingRun:
         self._optimizer = self._new_optimizer()
         self.done = 0
         return True
-
-    def save(self) -> None:
-        """Save the state of the training."""
-        self._keeper.save(self.state())
 
     def state(self) -> State:
         """Return all that `restore` needs."""

@@ -86,6 +86,16 @@ def rate(p: Parameters, accumulation: PerRegion) -> PerRegion:
     return p.mfd.rate(accumulation, torch)
 
 
+def desired_outflow(p: Parameters, x: PerPair, splits: PerTurn) -> PerPair:
+    """Return the outflow without boundaries (veh/s, (..., R, R))."""
+    leaving = rate(p, x.sum(-1)).unsqueeze(-1) * x
+    if p.exit_rates is not None:
+        leaving = leaving * p.exit_rates
+    if p.detours is not None:
+        leaving = leaving / (1.0 + (splits * p.detours).sum(-2))
+    return leaving
+
+
 def flows(
     p: Parameters, x: PerPair, perimeter: PerPair, splits: PerTurn
 ) -> tuple[PerRegion, PerTurn]:
@@ -96,11 +106,7 @@ def flows(
     capacities, `passing` replaces u_ih.
     """
     accumulation = x.sum(-1)
-    leaving = rate(p, accumulation).unsqueeze(-1) * x
-    if p.exit_rates is not None:
-        leaving = leaving * p.exit_rates
-    if p.detours is not None:
-        leaving = leaving / (1.0 + (splits * p.detours).sum(-2))
+    leaving = desired_outflow(p, x, splits)
     completions = torch.diagonal(leaving, dim1=-2, dim2=-1)
     onward = (leaving * p.off_diagonal).unsqueeze(-2)
     if p.capacity is None:

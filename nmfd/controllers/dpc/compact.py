@@ -37,6 +37,7 @@ The regional model answers prices by a logit (nmfd.model.answer). The policy is 
 network.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -144,10 +145,18 @@ class CompactPolicy(Policy):
 
 
 def rule(
-    planning: PlanningModel, numbers: Numbers, *, guidance: bool, metering: bool
+    kind: type[CompactPolicy],
+    planning: PlanningModel,
+    numbers: Sequence[float],
+    *,
+    guidance: bool,
+    metering: bool,
 ) -> DpcController:
-    """Return the controller of these numbers for the protected regions."""
+    """Return the controller of a policy with these numbers.
+
+    kind: of the policy, for the protected regions
+    """
     architecture = Architecture(guidance=guidance, compact=planning.protected, metering=metering)
-    policy = CompactPolicy(planning.network, architecture)
+    policy = kind(planning.network, architecture)
     policy.numbers.data.copy_(torch.tensor(numbers, dtype=DTYPE))
     return DpcController(policy)

@@ -1,6 +1,6 @@
 """Constant control: a sign that never changes, and measures nothing.
 
-It is the floor under every policy: one that does not beat the best constant only needs it.
+Every policy must beat the best one: else the sign is enough.
 """
 
 import torch
@@ -8,8 +8,7 @@ from torch import nn
 
 from nmfd.controllers.dpc.compact import CompactPolicy
 from nmfd.controllers.dpc.numbers import Levels
-from nmfd.controllers.dpc.policy import DTYPE, FILL_TIME_S, Architecture, DpcController, Memory
-from nmfd.model.planning import PlanningModel
+from nmfd.controllers.dpc.policy import DTYPE, FILL_TIME_S, Memory
 from nmfd.model.regional_model import RegionalModel
 from nmfd.tensors import PerPair, PerRegion
 
@@ -50,13 +49,3 @@ class ConstantPolicy(CompactPolicy):
 
     def _levels(self) -> Levels:
         return Levels(*self.numbers)
-
-
-def constant(
-    planning: PlanningModel, levels: Levels, *, guidance: bool, metering: bool
-) -> DpcController:
-    """Return the controller of these levels for the protected regions."""
-    architecture = Architecture(guidance=guidance, compact=planning.protected, metering=metering)
-    policy = ConstantPolicy(planning.network, architecture)
-    policy.numbers.data.copy_(torch.tensor(levels, dtype=DTYPE))
-    return DpcController(policy)

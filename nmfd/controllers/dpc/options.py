@@ -249,10 +249,15 @@ class GatingRule(Options):
         return None
 
     def make(self, planning: PlanningModel) -> "DpcController":
-        from nmfd.controllers.dpc.compact import rule
+        from nmfd.controllers.dpc.compact import CompactPolicy, rule
 
-        numbers = Numbers(*self.numbers)
-        controller = rule(planning, numbers, guidance=self.guidance, metering=self.metering)
+        controller = rule(
+            CompactPolicy,
+            planning,
+            Numbers(*self.numbers),
+            guidance=self.guidance,
+            metering=self.metering,
+        )
         controller.name = self.name
         return controller
 
@@ -287,9 +292,15 @@ class ConstantControl(Options):
         return None
 
     def make(self, planning: PlanningModel) -> "DpcController":
-        from nmfd.controllers.dpc.constant import constant
+        from nmfd.controllers.dpc.compact import rule
+        from nmfd.controllers.dpc.constant import ConstantPolicy
 
-        levels = Levels(*self.numbers)
-        controller = constant(planning, levels, guidance=self.guidance, metering=self.metering)
+        controller = rule(
+            ConstantPolicy,
+            planning,
+            Levels(*self.numbers),
+            guidance=self.guidance,
+            metering=self.metering,
+        )
         controller.name = self.name
         return controller

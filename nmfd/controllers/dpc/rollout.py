@@ -292,12 +292,7 @@ class Rollout:
 
     def _diverted(self, x: PerPair, splits: PerTurn) -> PerPair:
         """Return the flow off the nominal splits (veh/s, (..., R, R))."""
-        p = self.parameters
-        leaving = dynamics.rate(p, x.sum(-1)).unsqueeze(-1) * x
-        if p.exit_rates is not None:
-            leaving = leaving * p.exit_rates
-        if p.detours is not None:
-            leaving = leaving / (1.0 + (splits * p.detours).sum(-2))
+        leaving = dynamics.desired_outflow(self.parameters, x, splits)
         return 0.5 * (splits - self.nominal_splits).abs().sum(-2) * leaving
 
 

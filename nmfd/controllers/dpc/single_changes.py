@@ -117,5 +117,5 @@ def _with_perimeter(policy: Policy, perimeter: Callable[[PerPair, PerPair], PerP
 def _with_method(policy: Policy, name: str, method: Callable) -> Policy:
     """Return a copy with the same weights and another method."""
     changed = copy.copy(policy)
-    object.__setattr__(changed, name, method)
+    setattr(changed, name, method)
     return changed
