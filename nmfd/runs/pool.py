@@ -107,11 +107,11 @@ def in_processes(
                 number = live.pop(future)
                 yield number, _outcome(future, limits[number])
     finally:  # after Ctrl-C there are some
-        for future in live:
-            future.cancel()
         for process in multiprocessing.active_children():
             if live and process.name == NAME:
                 process.kill()
+        for future in live:
+            future.cancel()
 
 
 def in_subprocess(job: Job, folder: str) -> Any:
@@ -225,7 +225,10 @@ def work(job: bytes, folder: str, environment: Mapping[str, str]) -> Any:
     os.environ.clear()
     os.environ.update(environment)
     os.chdir(folder)
-    return attempt(lambda: cloudpickle.loads(job)())
+    outcome = attempt(lambda: cloudpickle.loads(job)())
+    if hasattr(signal, "SIGPIPE"):  # after Ctrl-C nobody reads the outcome: no error message then
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    return outcome
 
 
 def _end_with_parent() -> None:
