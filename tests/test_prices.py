@@ -72,8 +72,8 @@ def test_the_lower_bound_without_metering_is_not_that_of_a_policy_that_meters():
 
 
 def test_mpc_of_grid7_has_the_outputs_of_the_policy():
-    """The script decides within its bounds, prices the filling centre most, and lets fewest trips
-    begin there."""
+    """The script prices the filling centre most, and meters by the room that every region has
+    left."""
     scenario = load_scenario("grid7_peak", {"demand_factor": 2.0})
     strategy = parse(
         f"{scenario.folder}/price_mpc.py:PriceMpc+max-pressure+guidance-period-60+metering"
@@ -84,7 +84,8 @@ def test_mpc_of_grid7_has_the_outputs_of_the_policy():
     )
     assert controls.prices.argmax() == 3
     assert controls.prices[3] > 0.5
-    assert controls.metering[3] < 3.0 < controls.metering[2]
+    critical = strategy.own_planning(scenario).network.critical
+    np.testing.assert_allclose(controls.metering, (1.2 * critical - x.sum(1)) / 60.0, rtol=1e-4)
 
 
 def test_a_price_everywhere_diverts_nobody_from_ways_that_take_the_same_time():
@@ -118,3 +119,14 @@ def test_expected_splits_are_written_as_commanded_only_where_they_are_obeyed():
     np.testing.assert_array_equal(answered["splits"][0], nominal)
     np.testing.assert_array_equal(expected_splits(answered), answered["expected_splits"])
     np.testing.assert_array_equal(expected_splits(obeyed), obeyed["splits"])
+
+
+def test_a_price_that_is_the_same_everywhere_changes_no_way():
+    network = parse("dpc-pcrg+max-pressure").own_planning(load_scenario("grid7_peak")).network
+    answer = Answer(network)
+    x = 20.0 * torch.ones(network.regions, network.regions)
+    centre = torch.zeros(network.regions)
+    centre[3] = 5.0
+    assert torch.allclose(answer(x, torch.full_like(centre, 19.0)), answer.own, atol=1e-6)
+    assert torch.allclose(answer(x, 2.0 * centre + 1.0), answer(x, centre), atol=1e-6)
+    assert not torch.allclose(answer(x, centre), answer.own, atol=0.05)

@@ -8,6 +8,8 @@ the nominal theta0, with the dispersion s (RegionalModel):
     e_hj = c_h t_hj + sum_g theta0_hgj e_gj        for h != j, otherwise 0
 
 t_hj is the mean time to leave h on the way to j, so that e_hj is what the prices add from h on.
+A price that is the same everywhere changes no way of drivers who compare times. So c_i is the price
+relative to the least one: (1 + price_i) / (1 + least price) - 1.
 Where the time in a region depends on the next one (RegionalModel.detours), so does its price:
 
     theta_ihj ~ theta0_ihj exp(-(e_hj + c_i t_ij detour_ihj) / s)
@@ -50,7 +52,9 @@ class Answer(nn.Module):
         leaving = rate.unsqueeze(-1)
         if p.exit_rates is not None:
             leaving = leaving * p.exit_rates
-        here = prices.unsqueeze(-1) / leaving * p.off_diagonal
+        least_price = prices.amin(-1, keepdim=True)
+        relative = (1.0 + prices) / (1.0 + least_price) - 1.0
+        here = relative.unsqueeze(-1) / leaving * p.off_diagonal
         longer = None
         if p.detours is not None:
             longer = here.unsqueeze(-2) * p.detours

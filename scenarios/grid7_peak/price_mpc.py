@@ -7,9 +7,8 @@ same regional model.
 
 Every interval it lowers the mean total time spent of MODELS rollouts over HORIZON intervals, each
 with a regional model of its own, by ITERATIONS of Adam on u and prices held over the horizon, from
-those of the last interval. Spread of the models and metering level are those that the policy was
-trained with (scenario.toml). The costs are the best of six pairs in SUMO at twice the demand on
-seed 1100 (reference/README.md).
+those of the last interval. The costs are the best of six pairs in SUMO at twice the demand on seed
+1100 (reference/README.md), with the fitted model of then.
 """
 
 import time
@@ -18,7 +17,6 @@ import numpy as np
 import torch
 from torch import nn
 
-from nmfd.controllers.dpc.numbers import Numbers
 from nmfd.controllers.dpc.policy import FILL_TIME_S
 from nmfd.controllers.dpc.rollout import Rollout
 from nmfd.model.answer import Answer
@@ -28,6 +26,8 @@ from nmfd.types import Controls, Observation
 HORIZON, MODELS, ITERATIONS = 20, 4, 10
 PRICE_RATE, GATE_RATE = 0.3, 0.1  # steps of Adam
 START, HIGHEST = 0.2, 10.0  # prices
+SPREAD, SCALE = 0.3, 0.85  # of the drawn models, options mfd_spread and mfd_scale of DPC
+METERING = 1.2  # critical accumulations
 COSTS = {"detour_cost": 100.0, "holding_cost": 600.0}  # s, options of DPC, too
 
 
@@ -63,14 +63,11 @@ class PriceMpc:
 
     def __init__(self, planning: PlanningModel):
         self.planning = planning
-        self.setup = planning.controller_options[
-            "dpc-pcrg+max-pressure+guidance-period-60+metering"
-        ]
         self.rollout = Rollout(planning, **COSTS)
         self.reset()
 
     def reset(self, seed: int = 0):
-        self.policy = Held(self.planning, Numbers(*self.setup["numbers"]).metering)
+        self.policy = Held(self.planning, METERING)
 
     def act(self, observation: Observation) -> Controls:
         begin, k, policy = time.perf_counter(), observation.step, self.policy
@@ -86,9 +83,7 @@ class PriceMpc:
         random, best, kept = torch.Generator(), np.inf, policy.state_dict()
         for n in range(ITERATIONS + 1):
             random.manual_seed(k)  # the same models in every iteration
-            self.rollout.draw_model(
-                MODELS, self.setup["mfd_spread"], random, self.setup["mfd_scale"]
-            )
+            self.rollout.draw_model(MODELS, SPREAD, random, SCALE)
             spent = self.rollout.total_time_spent(policy, *batch, random).mean()
             if spent.item() < best:
                 best, kept = (
