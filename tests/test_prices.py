@@ -85,7 +85,7 @@ def test_mpc_of_grid7_has_the_outputs_of_the_policy():
     assert controls.prices.argmax() == 3
     assert controls.prices[3] > 0.5
     critical = strategy.own_planning(scenario).network.critical
-    np.testing.assert_allclose(controls.metering, (1.2 * critical - x.sum(1)) / 60.0, rtol=1e-4)
+    np.testing.assert_allclose(controls.metering, (1.2 * critical - x.sum(1)) / 90.0, rtol=1e-4)
 
 
 def test_a_price_everywhere_diverts_nobody_from_ways_that_take_the_same_time():
