@@ -119,18 +119,12 @@ class PiGating(SetPoint):
 def filled(planning: PlanningModel, region: int) -> float:
     """Return the vehicles that open gates let into a region in an interval.
 
-    They are the largest flow into the region times the control interval (veh). Queues behind gates
-    discharge at the capacities of the boundaries, at u = 1, however little their regions discharge
-    on average. Where no capacities are known, the neighbours send what the maximum of their MFDs
-    discharges towards the region, by the forecast on nominal routes. Of either, the share counts
-    that passes signals under control.
+    They are the largest flow into the region times the control interval (veh). The neighbours send
+    what the maximum of their MFDs discharges towards the region, by the forecast on nominal routes.
+    All boundaries together pass at most their capacities at u = 1. Of both, the share counts that
+    passes signals under control.
     """
     network = planning.network
-    obeying = network.adjacency[:, region].astype(float)
-    if network.controllable is not None:
-        obeying = network.controllable[:, region]
-    if network.open_capacity is not None:
-        return float(obeying @ network.open_capacity[:, region]) * planning.step
     passing = _passing(planning)
     duration = passing  # share of time in a region, by destination
     if network.exit_rates is not None:
@@ -139,7 +133,13 @@ def filled(planning: PlanningModel, region: int) -> float:
     bound = (network.nominal_splits[:, region] * passing).sum(axis=1)
     largest = np.array([mfd.capacity for mfd in network.mfds])
     sent = largest * bound / np.where(in_total > 0.0, in_total, 1.0)
-    return float(obeying @ sent) * planning.step
+    obeying = network.adjacency[:, region].astype(float)
+    if network.controllable is not None:
+        obeying = network.controllable[:, region]
+    flow = float(obeying @ sent)
+    if network.open_capacity is not None:
+        flow = min(flow, float(obeying @ network.open_capacity[:, region]))
+    return flow * planning.step
 
 
 def _passing(planning: PlanningModel) -> PerPair:
