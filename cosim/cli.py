@@ -42,7 +42,7 @@ CONTROLLER = click.option(
     metavar="NAME[+...]",
     help="Controller from `nmfd show` or FILE:Class, and options of the city, joined by +: "
     "actuated or max-pressure (signals), rerouting-N and compliance-N (percent of drivers), "
-    "guided, guidance-period-N (s), metering, estimate.",
+    "guided, guidance-period-N (s), planned, metering, estimate.",
 )
 AGAINST = click.option(
     "--against", metavar="NAME[+...]", help="Second controller, run on the same trips."

@@ -1,4 +1,4 @@
-"""Planning of routes by iterated marginal costs, one SUMO run per iteration.
+"""Planning of routes by iterated marginal costs, a SUMO run per iteration.
 
 The first plan has the routes in which guidance every minute ends. Then, in every iteration, SUMO
 runs with the plan, and a share of the drivers, those who gain most by it, change to the route of
@@ -173,7 +173,7 @@ def plan_routes(
 
 
 def _due(scenario: Scenario, chosen: Settings, city: City, seed: int) -> dict[str, float]:
-    """Return vehicle -> planned departure (s) of those that may get other routes."""
+    """Return when each vehicle is due (s) that may get another route."""
     originals = own_vehicles(scenario, chosen, city)
     shared = recorded.read_routes(own_files(scenario, chosen.additional))
     due = {}

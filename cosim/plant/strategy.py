@@ -106,7 +106,10 @@ class Strategy(regional.Strategy):
         return changed
 
     def fingerprint(self, scenario: Scenario, policy: Path | None = None) -> dict[str, Any]:
-        """Return what its runs depend on besides city and demand. Raise InputError."""
+        """Return what its runs depend on besides city and demand.
+
+        Raises: InputError
+        """
         found = super().fingerprint(scenario, policy)
         plans = own_files(scenario, self.city.planned)
         if plans:

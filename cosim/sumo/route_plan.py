@@ -1,4 +1,4 @@
-"""Planned routes of drivers, by first edge, last edge and quarter of an hour.
+"""Planned routes of drivers, by first and last edge and quarter of an hour.
 
 A plan is a table of begin of the quarter [s], number of drivers, and route (edges with a space
 between them). The vehicles of a run need not be those that the plan was made for: they take the
@@ -162,9 +162,9 @@ def planned_trips(
         if place in routes and follows[place]:
             element = _on_route(element, routes[place])
         elements.append(element)
-    depart: PerTrip = np.array([row[0] for row in drawn])
+    departures: PerTrip = np.array([row[0] for row in drawn])
     return PlannedTrips(
-        originals=RecordedTrips(depart=depart, elements=tuple(elements), types=originals.types),
+        originals=RecordedTrips(depart=departures, elements=tuple(elements), types=originals.types),
         drawn=[(row[0], place, row[2]) for place, row in enumerate(drawn)],
         planned=frozenset(drawn[place][2] for place in routes),
     )
