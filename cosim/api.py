@@ -20,7 +20,7 @@ from cosim.evaluation.signal_proof import sheets
 from cosim.evaluation.simulate import Simulation, simulate
 from cosim.importing import get as cities
 from cosim.plant import strategy as strategies_of
-from cosim.plant.settings import Settings
+from cosim.plant.settings import PLAN, Settings
 from cosim.plant.strategy import Strategy, parse
 from cosim.sumo.trips import PLANNING_SEEDS
 from nmfd.api import (
@@ -36,6 +36,7 @@ from nmfd.controllers.strategy import BuiltIn, ControllerLike, parse_many
 from nmfd.errors import RunFailed
 from nmfd.metrics import summary
 from nmfd.model.scenario import Scenario
+from nmfd.runs import shipped
 from nmfd.runs.files import default_folder, file_name, write_table
 from nmfd.runs.frame import Table
 from nmfd.runs.progress import Progress, watched
@@ -420,6 +421,55 @@ def tune(
     best = strategy.options(tuning.best_of(order, table))
     text = (order.out / "tune.toml").read_text(encoding="utf-8")
     return Tuned(table=Table(table), best=best, text=text, folder=order.out)
+
+
+def plan(
+    scenario: ScenarioLike,
+    controller: ControllerLike,
+    *,
+    city: Settings | str | None = None,
+    seed: int = TUNING_SEED,
+    demand: float = 1.0,
+    iterations: int = 9,
+    plan_file: Path | str | None = None,
+    out: Path | str | None = None,
+    time_limit: float | None = None,
+    overwrite: bool = False,
+    progress: Progress = None,
+) -> Table:
+    """Plan the routes of drivers by iterated marginal costs, as `cosim plan`.
+
+    controller: signals and whatever else acts besides, such as "max-pressure"
+    iterations: SUMO runs with a plan, after one with guidance every minute
+    plan_file: SCENARIO/plan.csv.gz if None; it is `table.attrs["plan"]`
+    out: run folder, runs/SCENARIO-plan if None; it is `table.attrs["folder"]`
+    others: as in `run` and `evaluate`
+
+    The table has a row per iteration (cosim.evaluation.plan_routes). The same call continues after
+    an interruption. Raises: InputError, and RunFailed if a run failed
+    """
+    from cosim.evaluation import plan_routes
+
+    one = loaded(scenario)
+    loaded(one, demand=demand)  # checks the factor
+    if plan_file is None:
+        folder = one.folder or Path()
+        plan_file = shipped.beside(folder, PLAN, "--plan-file FILE", scenario=True)
+    out = Path("runs", f"{file_name(one.name)}-plan") if out is None else Path(out)
+    order = plan_routes.Planning(
+        scenario=one,
+        strategy=parse(controller, city),
+        out=out,
+        demand=demand,
+        seed=seed,
+        iterations=iterations,
+    )
+    table = plan_routes.plan_routes(
+        order, Path(plan_file), time_limit=time_limit, overwrite=overwrite, progress=progress
+    )
+    table.attrs["plan"] = str(plan_file)
+    table.attrs["folder"] = str(out)
+    return table
 
 
 def study(

@@ -42,7 +42,7 @@ CONTROLLER = click.option(
     metavar="NAME[+...]",
     help="Controller from `nmfd show` or FILE:Class, and options of the city, joined by +: "
     "actuated or max-pressure (signals), rerouting-N and compliance-N (percent of drivers), "
-    "guided, guidance-period-N (s), metering, estimate.",
+    "guided, guidance-period-N (s), planned, metering, estimate.",
 )
 AGAINST = click.option(
     "--against", metavar="NAME[+...]", help="Second controller, run on the same trips."
@@ -79,7 +79,7 @@ def span(text: str) -> tuple[float, float]:
     cls=Commands,
     context_settings={"show_default": True},
     sections={
-        "Runs": ("demo", "run", "watch", "evaluate", "compare", "report", "tune"),
+        "Runs": ("demo", "run", "watch", "evaluate", "compare", "report", "tune", "plan"),
         "A city of your own": ("study", "get", "import", "identify", "links"),
     },
     elsewhere={"list": "nmfd show"} | {name: f"nmfd {name}" for name in nmfd.cli.main.commands},
@@ -358,6 +358,36 @@ def tune(scenario: Path, settings: dict, controller: str, **how: Any) -> None:
         f"{found.text}Written to {found.folder}: see tune.csv; to use the options, copy tune.toml "
         "into the scenario.toml"
     )
+
+
+@main.command()
+@SCENARIO
+@CONTROLLER
+@click.option("--iterations", type=COUNT, default=9, help="Runs after the one with guidance.")
+@click.option("--seed", type=SEED, default=1000, help="Seed of trips and drivers.")
+@ONE_DEMAND
+@click.option(
+    "--plan-file", type=FILE, metavar="FILE", help="The plan. [default: SCENARIO/plan.csv.gz]"
+)
+@TIME_LIMIT
+@OVERWRITE
+@out_option("runs/SCENARIO-plan")
+def plan(scenario: Path, settings: dict, controller: str, **options: Any) -> None:
+    """Plan routes of drivers by iterated marginal costs.
+
+    Begins with the routes in which guidance every minute ends. In every iteration some drivers
+    change to the route that adds least time for all. The plan tells how many drivers take which
+    route, by first and last edge and quarter of an hour; the word `planned` follows it, on other
+    seeds, too. The same command continues.
+
+    \b
+    Examples:
+      cosim plan mycity --controller max-pressure
+      cosim evaluate mycity --controllers max-pressure,planned+max-pressure
+    """
+    rows = cosim.api.plan(nmfd.load_scenario(scenario, settings), controller, **options)
+    click.echo(rows.to_string(index=False))
+    click.echo(f"Written to {rows.attrs['plan']}: drivers follow it with the word planned")
 
 
 @main.command()

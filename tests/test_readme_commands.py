@@ -26,6 +26,7 @@ NOT_RUN = {  # what takes long or needs more, and where it is tested
     "cosim watch": "test_view.py",
     "cosim study": "test_study.py",
     "cosim tune": "test_tuning.py",
+    "cosim plan": "test_route_plan.py",
     "nmfd bound": "test_bound.py",
     "nmfd robustness": "test_robustness.py",
     "cosim get": "test_get.py",

@@ -14,6 +14,7 @@ where boundaries are ragged). Its next region is the one it enters on its last e
 
 import math
 from collections import defaultdict
+from collections.abc import Container
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -129,6 +130,7 @@ class Guide:
         *,
         compliance: float,
         random: np.random.Generator,
+        planned: Container[str] = frozenset(),
         most_detour: float = MOST_DETOUR_S,
         ways_return: bool = False,
         period: float = 0.0,
@@ -137,6 +139,7 @@ class Guide:
     ):
         """own: split ratios without guidance (-, (R, R, R))
         compliance: probability that a driver follows in a region (-)
+        planned: vehicles that are not guided, because a plan has routes for them
         most_detour: see MOST_DETOUR_S (s)
         ways_return: routes may leave a region and come back
         period: after which a driver is guided again in the same region (s); 0: never
@@ -149,6 +152,7 @@ class Guide:
         self._region = city.edge_region.tolist()
         self._compliance = compliance
         self._random = random
+        self._planned = planned
         self._most_detour = most_detour
         self._period = _steps(period, session)
         self._retry = _steps(RETRY_S, session)
@@ -194,7 +198,8 @@ class Guide:
         self._visits.begin_step()
         for event in events:
             self._visits.end(event.vehicle)
-            if event.free and self._random.random() < self._compliance:
+            guidable = event.free and event.vehicle not in self._planned
+            if guidable and self._random.random() < self._compliance:
                 visit = _Visit(event, int(self._random.integers(DRIVER_CLASSES)))
                 # The routes of some, such as taxis, end on roads closed to cars.
                 if event.edge in self._city.number:

@@ -11,7 +11,8 @@ from cosim.plant.settings import ACTUATED, ESTIMATE, WEBSTER, Settings, own_file
 from cosim.sumo import outputs
 from cosim.sumo import recorded_trips as recorded
 from cosim.sumo.net import City
-from cosim.sumo.recorded_trips import HeldTrips, RecordedTrips, as_recorded
+from cosim.sumo.recorded_trips import DrawnTrip, HeldTrips, RecordedTrips, as_recorded
+from cosim.sumo.route_plan import PlannedTrips, planned_trips, read_plan
 from cosim.sumo.session import Session
 from cosim.sumo.signals import Signal
 from cosim.sumo.trips import PLANNING_SEEDS, make_trips, turning_flows
@@ -39,12 +40,30 @@ def own_vehicles(scenario: Scenario, settings: Settings, city: City) -> Recorded
     return originals
 
 
+def drawn_vehicles(
+    scenario: Scenario, settings: Settings, originals: RecordedTrips, seed: int
+) -> list[DrawnTrip]:
+    """Return departure, number and id of the vehicles of one run.
+
+    originals: recorded trips, or trips made from the demand by `seed`
+    """
+    factor = 1.0
+    begin = 0.0
+    jitter = 0.0
+    if settings.routes:
+        factor = scenario.demand_factor
+        begin = settings.begin
+        jitter = recorded.JITTER_S if seed else 0.0
+    return recorded.draw(originals, seed=seed, factor=factor, jitter=jitter, begin=begin)
+
+
 class Launch:
     """Start of SUMO for one run after the other.
 
     Files are in a temporary folder, which `close` removes.
 
     vehicles: ids of those of the last run; held: its trips under metering
+    planned: ids of its vehicles for which a plan has routes
     trip_file: SUMO's tripinfo output; emission_file: emissions by edge at the end of the run
     """
 
@@ -75,6 +94,7 @@ class Launch:
         self._folder = self._temporary.enter_context(temporary_folder())
         self.vehicles: list[str] = []
         self.held: HeldTrips | None = None
+        self.planned: frozenset[str] = frozenset()
         self.trip_file = trip_file or self._folder / "tripinfo.xml"
         self.emission_file = self._folder / "emissions.xml"
 
@@ -159,14 +179,12 @@ class Launch:
         scenario = self._scenario
         settings = self._settings
         originals = self._vehicles_of(seed)
-        factor = 1.0
-        begin = 0.0
-        jitter = 0.0
-        if settings.routes:
-            factor = scenario.demand_factor
-            begin = settings.begin
-            jitter = recorded.JITTER_S if seed else 0.0
-        drawn = recorded.draw(originals, seed=seed, factor=factor, jitter=jitter, begin=begin)
+        drawn = drawn_vehicles(scenario, settings, originals, seed)
+        if settings.planned:
+            trips = self._planned(originals, drawn, seed)
+            originals = trips.originals
+            drawn = trips.drawn
+            self.planned = trips.planned
         if settings.metering > 0.0:
             self.held = recorded.write_held_trips(
                 originals, drawn, path, self._shared_routes, self._city.region_of
@@ -180,6 +198,26 @@ class Launch:
         else:
             recorded.write_recorded_trips(originals, drawn, path)
         return [name for _, _, name in drawn]
+
+    def _planned(
+        self, originals: RecordedTrips, drawn: Sequence[DrawnTrip], seed: int
+    ) -> PlannedTrips:
+        """Return the vehicles of one run with planned routes. Raises InputError."""
+        settings = self._settings
+        where = f"{self._scenario.where}: sumo.planned"
+        plan = read_plan(own_files(self._scenario, settings.planned), self._city)
+        trips = planned_trips(
+            plan,
+            originals,
+            drawn,
+            self._shared_routes,
+            seed=seed,
+            compliance=settings.compliance,
+        )
+        if not trips.planned:
+            problem = "no trip begins and ends on the same edges as a route of the plan"
+            raise InputError(f"{where}: {problem}; make the plan with cosim plan, or omit it")
+        return trips
 
     def _vehicles_of(self, seed: int) -> RecordedTrips:
         """Return the recorded trips, or trips made from the demand by `seed`."""

@@ -142,6 +142,7 @@ class SumoPlant:
             city,
             self._planning.network.nominal_splits,
             compliance=settings.compliance,
+            planned=self._launch.planned,
             ways_return=settings.ways_return,
             period=settings.guidance_period,
             lanes=not settings.mesoscopic,

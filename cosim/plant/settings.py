@@ -54,7 +54,8 @@ def _known(name: str) -> str:
 
 EXACT = "exact"
 ESTIMATE = "estimate"
-FILES = ("routes", "background", "additional")
+PLAN = "plan.csv.gz"  # of routes, in the folder of a scenario
+FILES = ("routes", "background", "additional", "planned")
 # Options of SUMO that every run sets itself -> what to give instead.
 SET_BY_RUNS = {
     "additional-files": "give sumo.additional",
@@ -123,6 +124,11 @@ class Settings(config.Settings):
     guidance_period: Seconds = setting(
         "time after which a driver is guided again in the same region; 0: never", 0.0
     )
+    planned: Texts = setting(
+        "plans of routes (`cosim plan`), added up, that drivers take from their departure on; "
+        "compliance holds for them, too, and guidance only for drivers without a plan",
+        (),
+    )
     ways_return: bool = setting(
         "guided drivers may leave a region and come back where that is fastest", False
     )
@@ -169,16 +175,37 @@ def settings(scenario: "Scenario") -> Settings:
         remedy = "remove it, or use the regional model (nmfd)"
         raise config.error(path, "initial", f"a city in SUMO begins empty; {remedy}")
     result = config.checked(Settings, scenario.sumo, path, "sumo.")
-    for key in FILES:
-        for file in own_files(scenario, getattr(result, key)):
-            if not file.is_file():
-                problem = f"no such file: {file}; give the path of an existing one"
-                raise config.error(path, f"sumo.{key}", problem)
+    check_files(scenario, result)
     steps = scenario.step / result.step_length
     if steps < 1.0 or abs(steps - round(steps)) > 1e-9:
         expected = f"a divisor of the control interval {scenario.step:g} s"
         raise config.error(path, "sumo.step_length", config.got(expected, result.step_length))
     return result
+
+
+def check_files(scenario: "Scenario", settings: Settings) -> None:
+    """Check that the files of the city exist. Raise InputError."""
+    if settings.planned:
+        check_plannable(scenario, settings)
+    for key in FILES:
+        for file in own_files(scenario, getattr(settings, key)):
+            if not file.is_file():
+                remedy = "give the path of an existing one"
+                if key == "planned":
+                    remedy += ", or make it with cosim plan"
+                problem = f"no such file: {file}; {remedy}"
+                raise config.error(scenario.where, f"sumo.{key}", problem)
+
+
+def check_plannable(scenario: "Scenario", settings: Settings) -> None:
+    """Check that the city has its own vehicles, whose routes a plan may know.
+
+    Raises: InputError
+    """
+    if not settings.routes:
+        problem = "every seed draws other trips from the demand, which no plan knows"
+        remedy = "plan routes in a city that is imported with its vehicles"
+        raise config.error(scenario.where, "sumo.planned", f"{problem}; {remedy}")
 
 
 def own_files(scenario: "Scenario", names: Texts) -> list[Path]:

@@ -11,14 +11,24 @@ SIGNAL_CONTROLS.
 """
 
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
-from cosim.plant.settings import FIXED, SIGNAL_CONTROLS, Settings, settings
+from cosim.plant.settings import (
+    FIXED,
+    PLAN,
+    SIGNAL_CONTROLS,
+    Settings,
+    check_files,
+    own_files,
+    settings,
+)
 from nmfd.controllers import strategy as regional
 from nmfd.controllers.strategy import ALONE, CONTROLLERS, ControllerLike, Given, split
 from nmfd.errors import InputError, did_you_mean
 from nmfd.model.planning import GUIDED
 from nmfd.model.scenario import Scenario
+from nmfd.runs.files import file_hash
 
 
 class Word(NamedTuple):
@@ -54,6 +64,7 @@ WORDS: dict[str, Word] = {
         "trips wait outside while their region is full, or as the controller commands",
     ),
     GUIDED: Word("guided", True, "drivers are guided by travel times"),
+    "planned": Word("planned", (PLAN,), f"drivers take the routes of the scenario's {PLAN}"),
 }
 NUMBERS: dict[str, Number] = {
     "rerouting": Number(
@@ -90,7 +101,20 @@ class Strategy(regional.Strategy):
 
     def settings(self, scenario: Scenario) -> Settings:
         """Return the settings of the city under this strategy. Raise InputError."""
-        return settings(scenario).changed(**self.changes)
+        changed = settings(scenario).changed(**self.changes)
+        check_files(scenario, changed)
+        return changed
+
+    def fingerprint(self, scenario: Scenario, policy: Path | None = None) -> dict[str, Any]:
+        """Return what its runs depend on besides city and demand.
+
+        Raises: InputError
+        """
+        found = super().fingerprint(scenario, policy)
+        plans = own_files(scenario, self.city.planned)
+        if plans:
+            found["planned"] = [file_hash(file) for file in plans]
+        return found
 
 
 def parse(controller: ControllerLike, city: Settings | str | None = None) -> Strategy:
