@@ -37,17 +37,15 @@ from nmfd.model.scenario import Scenario
 from nmfd.runs import config, files, shipped
 from nmfd.runs.progress import watched
 from nmfd.runs.run_many import locked, raise_failures, run_many
-from nmfd.runs.tables import wrapped
+from nmfd.runs.tables import NARROW, wrapped
 from nmfd.studies import fit_quality, plots
 from nmfd.types import Result
 
 PATHS = ("net", "regions")  # keys of [sumo] in network.toml
 UNGUIDED_STAGES = ("no-control", "probing-pc")
 GUIDED_STAGES = ("route-guidance", "probing-pcrg")
-# Factors on the demand: the first ones, and from the last one up until the city breaks.
-FIRST_LEVELS = (0.6, 0.8, 1.0)
-LEVEL_STEP = 0.15
-HIGHEST_LEVEL = 2.0
+# Factors on the demand of a city that is loaded until it breaks: all up to 1, then one more each.
+LEVELS = (0.6, 0.8, 1.0, 1.15, 1.3, 1.45, 1.6, 1.75, 1.9, 2.0)
 LEAST_FLOW = 1e-3  # veh/s, of a boundary whose signals are never green
 SATURATION = 0.5  # vehicles a second and lane that pass a green signal
 COUNTED, FITTED = "counted", "fitted"
@@ -98,15 +96,12 @@ class Task:
 
     def until_broken(self) -> tuple["Task", list[Result]]:
         """Return the task with levels up to where the city breaks; their runs."""
-        task = replace(self, levels=FIRST_LEVELS)
-        while True:
+        for number in range(LEVELS.index(1.0), len(LEVELS)):
+            task = replace(self, levels=LEVELS[: number + 1])
             runs = task.loading_runs(0)
-            highest = task.levels[-1]
-            broken = breaking_level(task.levels, task.mean_arrivals(runs))
-            if broken is not None or highest >= HIGHEST_LEVEL:
-                return task, runs
-            further = round(min(highest + LEVEL_STEP, HIGHEST_LEVEL), 2)
-            task = replace(task, levels=(*task.levels, further))
+            if breaking_level(task.levels, task.mean_arrivals(runs)) is not None:
+                break
+        return task, runs
 
     def mean_arrivals(self, runs: Sequence[Result]) -> list[float]:
         """Return the completed trips at each level, mean over the seeds."""
@@ -266,6 +261,26 @@ class Identified:
         ]
         return "\n".join(lines)
 
+    def text(self) -> str:
+        """Return the model for the terminal; fit.txt says more."""
+        errors = fit_quality.held_out(self.held_out)
+        drivers = "guided drivers" if self.task.guided else "drivers on their own routes"
+        doubts = fit_quality.doubt_lines(self.model, self.fits)
+        if errors.problem:
+            doubts.append(f"WARNING: {errors.problem}")
+        caption = (
+            "Critical accumulation [veh], largest outflow [veh/s], fit of the MFD, and error [veh] "
+            f"{errors.ahead:g} s ahead in runs that the model has not seen; in brackets that of "
+            '"as now", the prediction that nothing changes.'
+        )
+        parts = [
+            section(f"MODEL OF {drivers.upper()}", [f"{self.method} in {len(self.runs)} runs"]),
+            *wrapped(caption, NARROW),
+            fit_quality.short_table(self.model, self.fits, self.held_out),
+            section("DOUBTS", doubts or ["none"]),
+        ]
+        return "\n".join(parts)
+
     def write(self, out: Path, target: Path) -> None:
         """Write the model, and what its fit is based on.
 
@@ -298,6 +313,11 @@ class Identified:
             f"# rates and MFDs are {self.method}; loading runs: demand times {times}, "
             f"seeds {min(seeds)} to {max(seeds)}."
         )
+
+
+def section(heading: str, sentences: Sequence[str]) -> str:
+    """Return sentences under a heading, for the terminal."""
+    return "\n".join(["", heading, *wrapped("\n".join(sentences), NARROW)])
 
 
 def write_model(model: RegionalModel, own: Path, target: Path, comment: str) -> None:
@@ -393,18 +413,18 @@ def identify(
             proposed = _proposal(loaded, regions, written=written)
             if written and proposed:
                 protected = regions
+            model = os.path.normpath(target / "network.toml")
             report += [
-                found.fit_text(),
-                *wrapped("\n".join([*found.verdict.sentences, *proposed])),
-                f"Written to {os.path.normpath(target / 'network.toml')}; "
-                f"samples and figures to {folder}",
+                found.text(),
+                section("VERDICT", [*found.verdict.sentences, *proposed]),
+                section("FILES", [f"Written to {model}; fit.txt, samples and figures to {folder}"]),
             ]
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"finished runs are in {main}; the same command goes on") from None
     # Last, so that the same command finds the same scenario after an interruption.
     if protected != first.protected:
         write_protected(first, protected)
-    report.append(f"Next: cosim run {scenario} --controller pi-gating --against no-control")
+    report.append(f"\nNext: cosim run {scenario} --controller pi-gating --against no-control")
     return "\n".join(report)
 
 
@@ -588,7 +608,9 @@ def as_it_was(
 
 
 def breaking_level(levels: Sequence[float], arrivals: Sequence[float]) -> float | None:
-    """Return the lowest demand with fewer completed trips than the one before.
+    """Return the demand at which a city breaks, None if it does not.
+
+    It is the lowest one with fewer completed trips than the one before.
 
     levels: factors on the demand, rising
     arrivals: completed trips at each

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -24,7 +24,7 @@ States = Sequence[StatesOverTime]  # accumulations of each run
 SPILLBACK = "held up by a neighbour"  # label of samples that the region's own MFD does not explain
 SAMPLES = 10  # of a region: with fewer it keeps its MFD
 HYSTERESIS_BINS = 12  # of accumulation
-FEWEST_IN_BIN = 3  # samples of either branch
+FEWEST_IN_BIN = 3  # samples of either branch, of several runs
 EXPLAINED = 0.3  # R2 below which the curve explains hardly more than the mean outflow
 FALL = 0.05  # share of the largest outflow: a smaller fall up to the jam is no falling branch
 AHEAD_S = 900.0  # of the longer prediction
@@ -80,7 +80,7 @@ def with_guesses(
     above = {}
     mfds = list(model.mfds)
     for n, curve in enumerate(model.mfds):
-        if n not in empty and _falls(curve, most[n]):
+        if n not in empty and falls(curve, most[n]):
             continue
         above[n] = float(most[n])
         if n in empty:
@@ -96,7 +96,7 @@ def with_guesses(
     return replace(model, mfds=tuple(mfds), storage=storage, critical_above=above)
 
 
-def _falls(curve: mfd.Mfd, most: float) -> bool:
+def falls(curve: mfd.Mfd, most: float) -> bool:
     """Return True if the outflow has fallen at `most` [veh]."""
     if most <= curve.critical:
         return False
@@ -200,11 +200,15 @@ def nearly_empty(samples: Samples) -> list[int]:
     return [region for region, cloud in enumerate(samples) if len(own_points(cloud)) < SAMPLES]
 
 
-def hysteresis(cloud: Mapping[str, Points]) -> float:
+def hysteresis(cloud: Mapping[str, Points], fewest: int = FEWEST_IN_BIN) -> float:
     """Return the excess of outflow while loading over unloading [-].
 
     It is a share of the outflow: the mean over bins of accumulation with samples of both, weighted
-    by outflow; NaN without such bins.
+    by outflow; NaN without such bins. Above 0 the loop is clockwise (Gayah and Daganzo,
+    Transportation Research B 45, 2011; Saberi and Mahmassani, Transportation Research Record 2315,
+    2012).
+
+    fewest: samples of either branch in a bin
     """
     nothing = np.empty((0, 2))
     loading = cloud.get("loading", nothing)
@@ -216,7 +220,7 @@ def hysteresis(cloud: Mapping[str, Points]) -> float:
     for n in range(HYSTERESIS_BINS):
         up = loading[loading_bin == n, 1]
         down = unloading[unloading_bin == n, 1]
-        if min(len(up), len(down)) >= FEWEST_IN_BIN:
+        if min(len(up), len(down)) >= fewest:
             pairs.append((up.mean(), down.mean()))
     if not pairs:
         return float("nan")
@@ -236,12 +240,9 @@ def fit_table(
     """Return the fits as text, followed by the meanings of the doubts."""
     rows = []
     for fit in fits.itertuples(index=False):
-        critical = f"{fit.critical_veh:.0f}"
-        if np.isnan(fit.critical_veh):
-            critical = f"above {fit.critical_above_veh:.0f}"
         row = {
             "region": f"{fit.region} {fit.name}",
-            "critical [veh]": critical,
+            "critical [veh]": _critical(fit),
             "jam [veh]": f"{fit.jam_veh:.0f}",
         }
         if network.storage is not None:
@@ -251,7 +252,7 @@ def fit_table(
             "samples": fit.samples,
             "R2": f"{fit.r2:.2f}",
             "spread": f"{100 * fit.spread:.0f} %",
-            "hysteresis": "-" if np.isnan(fit.hysteresis) else f"{100 * fit.hysteresis:.0f} %",
+            "hysteresis": _percent(fit.hysteresis),
             "most / critical": "-" if np.isnan(fit.most_share) else f"{fit.most_share:.2f}",
             "WARNINGS": "; ".join(fit.doubts) or "none",
         }
@@ -261,6 +262,49 @@ def fit_table(
         if any(doubt.startswith(kind) for doubts in fits["doubts"] for doubt in doubts):
             lines.append(f"WARNING, {kind}: {meaning}")
     return "\n".join([text_table(rows), *wrapped("\n".join(lines))])
+
+
+def short_table(network: RegionalModel, fits: pd.DataFrame, errors: pd.DataFrame) -> str:
+    """Return fits and errors of predictions by region as one narrow table.
+
+    errors: `predictions` in runs that the model has not seen
+    """
+    rows = []
+    of_fit = fits.itertuples(index=False)
+    for title, fit, (_, error) in zip(network.titles, of_fit, errors.iterrows(), strict=True):
+        row = {
+            "region": title,
+            "critical": _critical(fit),
+            "outflow": f"{fit.max_outflow_veh_s:.3f}",
+            "R2": f"{fit.r2:.2f}",
+            "hysteresis": _percent(fit.hysteresis),
+        }
+        for name in SITUATIONS:
+            model = _vehicles(error[f"{name}_rmse_veh"])
+            row[name] = f"{model} ({_vehicles(error[f'{name}_persistence_rmse_veh'])})"
+        rows.append(row)
+    return text_table(rows)
+
+
+def doubt_lines(network: RegionalModel, fits: pd.DataFrame) -> list[str]:
+    """Return a line for every region with doubts."""
+    lines = []
+    for title, doubts in zip(network.titles, fits["doubts"], strict=True):
+        if doubts:
+            lines.append(f"{title}: {'; '.join(doubts)}")
+    return lines
+
+
+def _critical(fit: Any) -> str:
+    """Return the critical accumulation [veh] of a row of `region_fits`."""
+    if np.isnan(fit.critical_veh):
+        return f"above {fit.critical_above_veh:.0f}"
+    return f"{fit.critical_veh:.0f}"
+
+
+def _percent(share: float) -> str:
+    """Return a share as text, "-" for NaN."""
+    return "-" if np.isnan(share) else f"{100 * share:.0f} %"
 
 
 def predictions(
