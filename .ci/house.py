@@ -33,17 +33,18 @@ PICTURE = Path(__file__).with_name("house.svg")
 # 175,000 was the aim, 205,000 with all that is to come. A step a line, options that are objects,
 # the guard and what cities do wrong took 25,000 more, the plant of streets 14,000, studies of a
 # city 7,000, cuts of published networks, single changes in training and rows of finished runs 3,000
-# together: names and steps were not cut to come under it.
-TOKENS = 235_000
+# together, plans of routes, MFDs of edgeData and trips from counts 6,000: names and steps were not
+# cut to come under it.
+TOKENS = 242_000
 TEST_TOKENS = 175_000
 TOKENS_PER_LINE = 9.5
 DECISIONS_IN_EXPRESSIONS = 0.65
 TUPLES_PER_1000_LINES = 4
-MODULES = 180
+MODULES = 176
 COMMANDS = 21  # plans of routes, and MFDs without control
-PARAMETERS = 140
+PARAMETERS = 155
 SETTINGS = 148  # errors of a model, numbers of tuned rules and limits of time are declared, too
-WORDS_OF_A_README = 940  # a glossary and a list of changes grow
+WORDS_OF_A_README = 960  # a glossary and a list of changes grow
 DOCSTRING_LINE = 72
 ODD = re.compile(r"(Of|What|Whether|Who|Where|As|The same)\b")
 TOKEN_TYPES = (tokenize.NAME, tokenize.OP, tokenize.NUMBER, tokenize.STRING)

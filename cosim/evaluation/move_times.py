@@ -1,4 +1,4 @@
-"""Travel times of moves between edges, as driven, and routes of least cost.
+"""Travel times of moves between edges, and routes of least cost.
 
 A move leads from one edge to the next. Its time is that on the first edge, so that the queue for
 one turn does not count for another. A route's cost is the time that it adds for all drivers: on

@@ -1,4 +1,4 @@
-"""MFDs of regions from SUMO's edgeData, without control and import: `cosim mfd`.
+"""MFDs of regions from SUMO's edgeData, without control: `cosim mfd`.
 
 With the edges of a region and an interval of T seconds (Edie, 1963),
 

@@ -1,4 +1,4 @@
-"""Planned routes of drivers, by first and last edge and quarter of an hour.
+"""Planned routes, by first and last edge and quarter of an hour.
 
 A plan is a table of begin of the quarter [s], number of drivers, and route (edges with a space
 between them). The vehicles of a run need not be those that the plan was made for: they take the
