@@ -22,6 +22,7 @@ PLACEHOLDERS = (
     "scenarios/mycity",
     "mycity",
     "city.",
+    "edges.xml",
     "mine",
     "scenarios/mine",
     "networks/mine",

@@ -322,7 +322,7 @@ def test_signal_plans_know_the_city_s_own_vehicles(imported):
             lambda folder: (folder / "city.sumocfg").write_text(
                 '<configuration><net-file value="city.net.xml"/></configuration>'
             ),
-            "or add --routes FILE or --demand",
+            "or add --routes FILE, --counts FILE or --demand",
         ),
     ],
 )

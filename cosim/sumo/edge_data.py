@@ -72,8 +72,8 @@ def read_edge_data(path: Path, needed: str = "sampledSeconds") -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-    """Return an <edge>, with 0 for missing attributes. Raises ValueError."""
-    """Return an <edge>; attributes that are not there are 0. Raises ValueError."""
+def _row(edge: ElementTree.Element, begin: float, end: float) -> EdgeRow:
+    """Return an <edge>, with 0 for missing numbers. Raises ValueError."""
     time = float(edge.get("sampledSeconds", 0.0))
     distance = 0.0
     if time > 0.0:
