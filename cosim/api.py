@@ -44,6 +44,7 @@ from nmfd.studies.benchmark import REFERENCE, draw_accumulations
 from nmfd.types import Result
 
 if TYPE_CHECKING:
+    from cosim.importing.edge_mfds import EdgeMfds
     from cosim.studying.page import Study
     from nmfd.controllers.base import Options
 
@@ -462,6 +463,32 @@ def get(name: str | None, out: Path | str | None = None) -> str:
     if name is None:
         return cities.listed()
     return cities.get(name, Path("cities", name) if out is None else Path(out))
+
+
+def mfd(
+    net: Path | str,
+    edge_data: Path | str | Sequence[Path | str],
+    *,
+    regions: int | Path | str = "auto",
+    out: Path | str | None = None,
+) -> "EdgeMfds":
+    """Fit MFDs of regions to SUMO's edgeData, and write them.
+
+    net: network of SUMO
+    edge_data: what SUMO wrote, one file for each run
+    regions: their number, "auto", or a table edge,region
+    out: folder of regions, samples, fits and picture, runs/NAME-mfd if None
+
+    Raises: InputError
+    """
+    from cosim.importing.edge_mfds import edge_mfds
+
+    net = Path(net)
+    given = [edge_data] if isinstance(edge_data, str | Path) else edge_data
+    folder = Path("runs", f"{file_name(net.name.partition('.')[0])}-mfd")
+    if out is not None:
+        folder = Path(out)
+    return edge_mfds(net, [Path(file) for file in given], str(regions), folder)
 
 
 def links(

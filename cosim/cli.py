@@ -65,6 +65,18 @@ ROUTES = click.option(
     metavar="FILE",
     help="File of vehicles or flows. May be repeated.",
 )
+COUNTS = click.option(
+    "--counts",
+    type=FILE,
+    metavar="FILE",
+    help="edgeData of SUMO, of whose counts (entered) trips are made, for a city without demand.",
+)
+REGIONS = click.option(
+    "--regions",
+    default="auto",
+    metavar="N|auto|CSV",
+    help="Number of regions to find, auto, or a table edge,region.",
+)
 EXPLAIN = click.option("--explain", is_flag=True, help="Print what the columns mean.")
 
 
@@ -80,7 +92,7 @@ def span(text: str) -> tuple[float, float]:
     context_settings={"show_default": True},
     sections={
         "Runs": ("demo", "run", "watch", "evaluate", "compare", "report", "tune"),
-        "A city of your own": ("study", "get", "import", "identify", "links"),
+        "A city of your own": ("study", "get", "import", "identify", "mfd", "links"),
     },
     elsewhere={"list": "nmfd show"} | {name: f"nmfd {name}" for name in nmfd.cli.main.commands},
 )
@@ -428,12 +440,7 @@ def import_(source: Path | None, bbox: str | None, **options: Any) -> None:
 
 @main.command()
 @click.argument("source", type=click.Path(path_type=Path), metavar="SUMOCFG|NET|SCENARIO")
-@click.option(
-    "--regions",
-    default="auto",
-    metavar="N|auto|CSV",
-    help="Number of regions of an import, auto, or a table edge,region.",
-)
+@REGIONS
 @ROUTES
 @click.option(
     "--most-seeds",
@@ -498,6 +505,28 @@ def identify(scenario: Path, **options: Any) -> None:
       cosim identify grid7_peak --with guided+max-pressure --network networks/grid7_max_pressure
     """
     click.echo(cosim.identify(scenario, **options))
+
+
+@main.command()
+@click.argument("net", type=FILE)
+@click.argument("edge_data", type=FILE, nargs=-1, required=True, metavar="EDGEDATA...")
+@REGIONS
+@EXPLAIN
+@out_option("runs/NAME-mfd", "Folder of regions, samples, fits and picture.")
+def mfd(net: Path, edge_data: tuple[Path, ...], explain: bool, **options: Any) -> None:
+    """Fit MFDs to SUMO's own edgeData, without any control.
+
+    EDGEDATA is what <edgeData id="all" freq="300" file="edges.xml"/> in an additional file makes
+    SUMO write, one file for each run. Prints critical accumulation, production, speed and
+    hysteresis by region. For tables of detectors: nmfd identify.
+
+    \b
+    Example:
+      cosim mfd city.net.xml edges.xml --regions 3
+    """
+    found = cosim.api.mfd(net, edge_data, **options)
+    click.echo(found.text(explain=explain))
+    click.echo(f"Written to {found.out}: see mfd.png and samples.csv")
 
 
 @main.command()

@@ -29,6 +29,7 @@ NOT_RUN = {  # what takes long or needs more, and where it is tested
     "nmfd bound": "test_bound.py",
     "nmfd robustness": "test_robustness.py",
     "cosim get": "test_get.py",
+    "cosim mfd": "test_edge_mfds.py",
     "cosim demo": "test_demo.py",
     "nmfd identify": "test_measured.py",
 }

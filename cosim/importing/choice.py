@@ -1,4 +1,7 @@
-"""Number of regions: the partition whose gates can hold most vehicles."""
+"""Regions as the user wants them: a number, a table, or AUTO.
+
+With AUTO it is the partition whose gates can hold most vehicles.
+"""
 
 from collections.abc import Collection, Mapping
 from typing import NamedTuple
@@ -6,21 +9,61 @@ from typing import NamedTuple
 import numpy as np
 
 from cosim.importing.baseline import Baseline
-from cosim.importing.partition import partition
+from cosim.importing.partition import finish, partition
 from cosim.importing.quality import SMALLEST_LANE_KM
 from cosim.importing.streets import Streets
 from cosim.sumo.arrays import EdgeNumbers
+from nmfd.errors import InputError
 
+AUTO = "auto"
 FEWEST_REGIONS = 2
 MOST_REGIONS = 6
 CHOSEN = "regions chosen: "  # how the reason begins
 
 
 class Choice(NamedTuple):
-    """A partition, and the reason for its number of regions in one sentence."""
+    """A partition, and the reason for its number of regions in one sentence.
+
+    The reason is "" if the user said which regions.
+    """
 
     labels: EdgeNumbers
-    reason: str
+    reason: str = ""
+
+
+def number_of(regions: str, fewest: int = FEWEST_REGIONS) -> int | None:
+    """Return the number of regions to find, None for a file or AUTO.
+
+    Raises: InputError
+    """
+    if not regions.isdecimal():
+        return None
+    if int(regions) < fewest:
+        raise InputError(
+            f"--regions: expected {fewest} or more regions, or a file, got {regions} instead"
+        )
+    return int(regions)
+
+
+def labelled(
+    streets: Streets,
+    baseline: Baseline,
+    moves: Mapping[tuple[int, int], int],
+    wanted: int | EdgeNumbers | None,
+    *,
+    uncontrollable: Collection[str] = (),
+) -> Choice:
+    """Return the wanted regions.
+
+    wanted: their number, those of the user's own table (E,), or None for AUTO
+    moves, uncontrollable: as in `holdable`
+    Raises: InputError if the network has too few streets
+    """
+    if wanted is None:
+        return choose(streets, baseline, moves, uncontrollable=uncontrollable)
+    if isinstance(wanted, int):
+        return Choice(partition(streets, baseline, wanted, uncontrollable=uncontrollable))
+    return Choice(finish(streets, wanted, own=True))
 
 
 def densest_region(streets: Streets, baseline: Baseline, labels: EdgeNumbers) -> int:

@@ -18,12 +18,12 @@ from cosim.importing import maps, model, quality, report
 from cosim.importing.assignment import ITERATIONS, Assigned, assign
 from cosim.importing.baseline import Baseline, averaged_runs
 from cosim.importing.case import Progress, SumoInput, seconds, sumo_input
-from cosim.importing.choice import CHOSEN, choose, densest_region
+from cosim.importing.choice import AUTO, CHOSEN, densest_region, labelled, number_of
 from cosim.importing.comparison import Comparison, compare, plain_trips
 from cosim.importing.demand import Traffic, read_traffic, wrapped
 from cosim.importing.generated import morning_peak
 from cosim.importing.osm import Box, parse_box
-from cosim.importing.partition import finish, own_regions, partition
+from cosim.importing.partition import own_regions
 from cosim.importing.streets import Streets, read_streets
 from cosim.sumo.arrays import EdgeNumbers
 from cosim.sumo.net import load_city
@@ -40,7 +40,6 @@ from nmfd.studies import plots
 # For cars: beyond, the run without control is mesoscopic, so that it takes a minute.
 LARGE_CITY_EDGES = 5000
 NET = "city.net.xml.gz"
-AUTO = "auto"  # number of regions: cosim.importing.choice
 REGIONS = "regions.csv"
 FILES = {
     "routes": "vehicles.rou.xml.gz",
@@ -150,7 +149,7 @@ def import_city(
         out=out,
         scenario=scenario or out.parent.parent / "scenarios" / out.name,
         regions=Path(str(regions)),
-        count=_count(str(regions)),
+        count=number_of(str(regions)),
         routes=tuple(routes),
         demand=demand,
         level=level,
@@ -180,18 +179,6 @@ def import_city(
         _move(scenario_folder, request.scenario)
     written = f"Written to {out} (see map.png, quality.csv, gateways.csv) and {request.scenario}"
     return "\n".join([*lines, f"{written}; next: cosim identify {out}"])
-
-
-def _count(regions: str) -> int | None:
-    """Return the number of regions to find, None for a file.
-
-    Raises: InputError
-    """
-    if not regions.isdecimal():
-        return None
-    if int(regions) < 2:
-        raise InputError(f"--regions: expected 2 or more regions, or a file, got {regions} instead")
-    return int(regions)
 
 
 def _check_new(folder: Path) -> None:
@@ -269,16 +256,9 @@ def _imported(request: Request, case: SumoInput, folder: Path, progress: Progres
     switched = sorted(timetabled(case.net, case.additional))
     everywhere = without_effect(case.options, mesoscopic)
     left = quality.left_alone(streets, switched, everywhere)
-    chosen = ""
-    if given is not None:
-        labels = finish(streets, given, own=True)
-    elif request.count is not None:
-        labels = partition(streets, baseline, request.count, uncontrollable=left)
-    else:
-        choice = choose(streets, baseline, traffic.moves, uncontrollable=left)
-        labels = choice.labels
-        chosen = choice.reason
-    if labels.max() < 1:
+    wanted = request.count if given is None else given
+    choice = labelled(streets, baseline, traffic.moves, wanted, uncontrollable=left)
+    if choice.labels.max() < 1:
         raise InputError(
             f"{streets.path}: no two regions can be made that can be reached from each other"
         )
@@ -289,9 +269,9 @@ def _imported(request: Request, case: SumoInput, folder: Path, progress: Progres
         traffic=traffic,
         clock=clock,
         baseline=baseline,
-        labels=labels,
+        labels=choice.labels,
         given=given,
-        chosen=chosen,
+        chosen=choice.reason,
         left=left,
         switched=tuple(switched),
         factor=factor,

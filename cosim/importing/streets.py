@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Float, Int
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
@@ -147,6 +148,17 @@ def read_streets(net: Path, additional: Iterable[Path] = ()) -> Streets:
     return _from_rows(
         net, rows, links, roundabouts, logics, left_hand=root.get("lefthand") == "true"
     )
+
+
+def numbers_of(edges: pd.Series, streets: Streets, path: Path) -> pd.Series:
+    """Return the numbers of edges that a file names. Raises InputError."""
+    numbers = edges.map(streets.number)
+    unknown = edges[numbers.isna()]
+    if len(unknown):
+        raise InputError(
+            f"{path}: edge {unknown.iloc[0]} is not in {streets.path}; give the network it is of"
+        )
+    return numbers.astype(int)
 
 
 def _from_rows(

@@ -24,7 +24,7 @@ States = Sequence[StatesOverTime]  # accumulations of each run
 SPILLBACK = "held up by a neighbour"  # label of samples that the region's own MFD does not explain
 SAMPLES = 10  # of a region: with fewer it keeps its MFD
 HYSTERESIS_BINS = 12  # of accumulation
-FEWEST_IN_BIN = 3  # samples of either branch
+FEWEST_IN_BIN = 3  # samples of either branch, of several runs
 EXPLAINED = 0.3  # R2 below which the curve explains hardly more than the mean outflow
 FALL = 0.05  # share of the largest outflow: a smaller fall up to the jam is no falling branch
 AHEAD_S = 900.0  # of the longer prediction
@@ -80,7 +80,7 @@ def with_guesses(
     above = {}
     mfds = list(model.mfds)
     for n, curve in enumerate(model.mfds):
-        if n not in empty and _falls(curve, most[n]):
+        if n not in empty and falls(curve, most[n]):
             continue
         above[n] = float(most[n])
         if n in empty:
@@ -96,7 +96,7 @@ def with_guesses(
     return replace(model, mfds=tuple(mfds), storage=storage, critical_above=above)
 
 
-def _falls(curve: mfd.Mfd, most: float) -> bool:
+def falls(curve: mfd.Mfd, most: float) -> bool:
     """Return True if the outflow has fallen at `most` [veh]."""
     if most <= curve.critical:
         return False
@@ -200,11 +200,15 @@ def nearly_empty(samples: Samples) -> list[int]:
     return [region for region, cloud in enumerate(samples) if len(own_points(cloud)) < SAMPLES]
 
 
-def hysteresis(cloud: Mapping[str, Points]) -> float:
+def hysteresis(cloud: Mapping[str, Points], fewest: int = FEWEST_IN_BIN) -> float:
     """Return the excess of outflow while loading over unloading [-].
 
     It is a share of the outflow: the mean over bins of accumulation with samples of both, weighted
-    by outflow; NaN without such bins.
+    by outflow; NaN without such bins. Above 0 the loop is clockwise (Gayah and Daganzo,
+    Transportation Research B 45, 2011; Saberi and Mahmassani, Transportation Research Record 2315,
+    2012).
+
+    fewest: samples of either branch in a bin
     """
     nothing = np.empty((0, 2))
     loading = cloud.get("loading", nothing)
@@ -216,7 +220,7 @@ def hysteresis(cloud: Mapping[str, Points]) -> float:
     for n in range(HYSTERESIS_BINS):
         up = loading[loading_bin == n, 1]
         down = unloading[unloading_bin == n, 1]
-        if min(len(up), len(down)) >= FEWEST_IN_BIN:
+        if min(len(up), len(down)) >= fewest:
             pairs.append((up.mean(), down.mean()))
     if not pairs:
         return float("nan")

@@ -125,7 +125,7 @@ class Identified:
         text = network_toml(self.network, {}, comment)
         config.checked(NetworkTable, tomllib.loads(text), out / "network.toml")
         out.mkdir(parents=True, exist_ok=True)
-        samples = _samples(self.intervals, self.network.region_names)
+        samples = samples_of(self.intervals, self.network.region_names)
         plots.draw_mfds(out / "mfd.png", self.network, samples)
         files.write_table(out / "samples.csv", self.intervals, float_format="%.6g")
         fit_quality.write_fits(out / "fit.csv", self.fits)
@@ -373,7 +373,7 @@ def fit(data: Measured, *, name: str, adjacency: Path | None = None) -> Identifi
     Raises: InputError for a region with too few intervals, or that cannot be reached
     """
     names = tuple(data.regions.index)
-    samples = _samples(data.intervals, names)
+    samples = samples_of(data.intervals, names)
     for region in fit_quality.nearly_empty(samples):
         left = "".join(f"; {line}" for line in data.left)
         raise InputError(
@@ -406,14 +406,20 @@ def fit(data: Measured, *, name: str, adjacency: Path | None = None) -> Identifi
     return Identified(network=network, fits=fits, intervals=data.intervals, text=text)
 
 
-def _samples(intervals: pd.DataFrame, regions: Sequence[str]) -> list[dict[str, Points]]:
-    """Return fit_quality.Samples with labels "loading" and "unloading"."""
+def samples_of(
+    intervals: pd.DataFrame, regions: Sequence[str], flow: str = "outflow_veh_s"
+) -> list[dict[str, Points]]:
+    """Return fit_quality.Samples with labels "loading" and "unloading".
+
+    intervals: rows with region, day, accumulation_veh and `flow`, by region, day and time
+    flow: column of the second coordinate
+    """
     samples = []
     for region in regions:
         part = intervals[intervals["region"] == region]
         rising = part.groupby("day")["accumulation_veh"].diff().fillna(0.0) >= 0
         occupied = part["accumulation_veh"] > 0
-        points = part[["accumulation_veh", "outflow_veh_s"]].to_numpy(dtype=float)
+        points = part[["accumulation_veh", flow]].to_numpy(dtype=float)
         cloud = {"loading": points[occupied & rising], "unloading": points[occupied & ~rising]}
         samples.append(cloud)
     return samples

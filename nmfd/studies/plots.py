@@ -47,6 +47,7 @@ LINE_STYLES = ("-", "--", ":", "-.")
 MARKERS = "o^sDvPX"
 CRITICAL = "critical accumulation of the model"
 UNSEEN = "beyond all samples: a guess"
+OUTFLOW = "outflow [veh/s]"
 LAST = CRITICAL, UNSEEN  # labels at the end of legends
 LONGEST_IN_MINUTES = 4 * 3600  # s; the axis of a longer time is in hours
 
@@ -204,13 +205,19 @@ def with_intervals(ax: Axes, values: Mapping[str, Mapping[float, tuple[float, fl
 
 
 def mfd(
-    ax: Axes, mfd: Mfd, samples: Mapping[str, np.ndarray] | None = None, *, seen: bool = True
+    ax: Axes,
+    mfd: Mfd,
+    samples: Mapping[str, np.ndarray] | None = None,
+    *,
+    seen: bool = True,
+    flow: str = OUTFLOW,
 ) -> Axes:
     """Draw outflow against accumulation, and hatch what lies beyond samples.
 
     samples: label -> accumulation [veh] and outflow [veh/s] (n, 2), such as {"loading": ...,
         "unloading": ...}
     seen: False if the critical accumulation is a guess, which is not shown
+    flow: label of the vertical axis
     """
     clouds = {label: np.asarray(cloud) for label, cloud in (samples or {}).items() if len(cloud)}
     right = 1.15 * mfd.jam
@@ -235,7 +242,7 @@ def mfd(
         ax.annotate(text, peak, fontsize="small", **above)
     highest = max([mfd.capacity, *(cloud[:, 1].max() for cloud in clouds.values())])
     ax.set(xlim=(0.0, right), xlabel="accumulation [veh]")
-    ax.set(ylim=(0.0, 1.12 * highest), ylabel="outflow [veh/s]")
+    ax.set(ylim=(0.0, 1.12 * highest), ylabel=flow)
     ax.xaxis.set_major_locator(MaxNLocator(5))
     _thousands(ax.xaxis)
     _open(ax)
@@ -243,11 +250,16 @@ def mfd(
 
 
 def draw_mfds(
-    path: Path, network: RegionalModel, samples: Sequence[Mapping[str, np.ndarray]] | None = None
+    path: Path,
+    network: RegionalModel,
+    samples: Sequence[Mapping[str, np.ndarray]] | None = None,
+    flow: str = OUTFLOW,
 ) -> Path:
     """Draw the MFD of each region over its outflow samples, as one file.
 
     Equal MFDs without samples are drawn once.
+
+    flow: label of the vertical axes
     """
     if samples or len(set(network.mfds)) > 1:
         titles = list(network.titles)
@@ -258,7 +270,7 @@ def draw_mfds(
     drawing, axes = panels(len(titles))
     for region, (ax, title) in enumerate(zip(axes, titles, strict=True)):
         seen = region not in network.critical_above
-        mfd(ax, network.mfds[region], samples[region] if samples else None, seen=seen)
+        mfd(ax, network.mfds[region], samples[region] if samples else None, seen=seen, flow=flow)
         ax.set_title(title, fontsize="medium")
     legend_below(drawing, axes)
     return save(drawing, path)

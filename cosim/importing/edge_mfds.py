@@ -1,0 +1,239 @@
+"""MFDs of regions from SUMO's edgeData, without control: `cosim mfd`.
+
+With the edges of a region and an interval of T seconds (Edie, 1963),
+
+    accumulation   n = sum of sampledSeconds / T               [veh]
+    production     P = sum of sampledSeconds times speed / T   [veh km/h]
+
+P / n is the mean speed, and P over the lane-kilometres the mean flow per lane. The outflow of a
+region is not there, as edgeData has no turns; it is about P over the mean trip length within it.
+
+`nmfd identify` does the same for tables of detectors.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from cosim.importing.baseline import INTERVAL_S, Baseline, Way
+from cosim.importing.choice import AUTO, labelled, number_of
+from cosim.importing.partition import digraph, names, own_regions, positions
+from cosim.importing.streets import Streets, numbers_of, read_streets
+from cosim.sumo.arrays import EdgeNumbers, PerEdge
+from cosim.sumo.edge_data import read_edge_data
+from nmfd.arrays import PerRegion
+from nmfd.errors import InputError
+from nmfd.model import mfd
+from nmfd.model.regional_model import RegionalModel
+from nmfd.runs import files
+from nmfd.runs.tables import NARROW, text_table, wrapped
+from nmfd.studies import fit_quality, plots
+from nmfd.studies.measured import U_MAX, U_MIN, samples_of
+
+PRODUCTION = "production_veh_km_h"
+CAPTION = """\
+critical: accumulation at the largest production, its density in veh per lane-km; "above": not seen
+production: the largest of the fitted curve [veh km/h]; speed: there [km/h]
+hysteresis: excess of production while loading over unloading at the same accumulation
+R2: share of the variance that the curve explains"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EdgeMfds:
+    """MFDs of the regions of a network.
+
+    regions: edge and region of every edge
+    chosen: why there are so many regions, "" if the user said how many
+    samples: a row per region, file (day) and interval, with accumulation_veh, production_veh_km_h,
+        density_veh_km and flow_veh_h (both per lane), speed_km_h and arrived_veh (trips that ended
+        there)
+    network: its MFDs give the production [veh km/h]
+    fits: a row per region: fit_quality.region_fits, and lane_km
+    out: folder of files
+    """
+
+    regions: pd.DataFrame
+    chosen: str
+    samples: pd.DataFrame
+    network: RegionalModel
+    fits: pd.DataFrame
+    out: Path
+
+    def text(self, *, explain: bool = False) -> str:
+        """Return the table of the terminal; explain: with what its columns mean."""
+        lines = [text_table([_row(fit) for _, fit in self.fits.iterrows()])]
+        if explain:
+            lines += wrapped(CAPTION, NARROW)
+        for fit in self.fits.itertuples():
+            for doubt in fit.doubts:
+                lines += wrapped(f"WARNING, region {fit.region} {fit.name}: {doubt}", NARROW)
+        return "\n".join([*wrapped(self.chosen, NARROW), *lines])
+
+    def write(self) -> None:
+        """Write regions, samples, fits and a picture of the MFDs."""
+        out = self.out
+        out.mkdir(parents=True, exist_ok=True)
+        files.write_table(out / "regions.csv", self.regions)
+        files.write_table(out / "samples.csv", self.samples, float_format="%.6g")
+        fit_quality.write_fits(out / "fit.csv", self.fits)
+        clouds = samples_of(self.samples, self.network.region_names, PRODUCTION)
+        plots.draw_mfds(out / "mfd.png", self.network, clouds, "production [veh km/h]")
+
+
+def edge_mfds(net: Path, edge_data: Sequence[Path], regions: str, out: Path) -> EdgeMfds:
+    """Fit the MFDs of a network, and write them.
+
+    edge_data: SUMO's outputs, one for every run
+    regions: their number, AUTO, or a table edge,region
+    out: folder of files
+    Raises: InputError
+    """
+    wanted: int | EdgeNumbers | None = number_of(regions, fewest=1)
+    streets = read_streets(net)
+    if wanted is None and regions != AUTO:
+        wanted = own_regions(streets, Path(regions))
+    days = []
+    for day, path in enumerate(edge_data):
+        rows = read_edge_data(path)
+        numbers = numbers_of(rows["edge"], streets, path)
+        days.append(rows.assign(day=day, number=numbers))
+    rows = pd.concat(days, ignore_index=True)
+    baseline = _baseline(streets, rows, len(days))
+    choice = labelled(streets, baseline, baseline.moves(), wanted)
+    region_names = names(streets, choice.labels)
+    lane_km = np.bincount(choice.labels, streets.lane_metres) / 1000.0
+    samples = _samples(rows, choice.labels, region_names, lane_km)
+    network = _network(streets, choice.labels, region_names, samples)
+    clouds = samples_of(samples, region_names, PRODUCTION)
+    fits = fit_quality.region_fits(network, clouds, lane_km=lane_km)
+    # One run has few samples, so that one of either branch is enough.
+    fits["hysteresis"] = [fit_quality.hysteresis(cloud, fewest=1) for cloud in clouds]
+    found = EdgeMfds(
+        regions=pd.DataFrame({"edge": streets.edges, "region": choice.labels}),
+        chosen=choice.reason,
+        samples=samples,
+        network=network,
+        fits=fits.assign(lane_km=lane_km),
+        out=out,
+    )
+    found.write()
+    return found
+
+
+def _baseline(streets: Streets, rows: pd.DataFrame, days: int) -> Baseline:
+    """Return presence and turns, by which regions are found.
+
+    rows: EdgeRow, day and number
+    """
+    longest = (rows["end"] - rows["begin"]).max()
+    window = longest * np.ceil(INTERVAL_S / longest)
+    place = ((rows["begin"] - rows["begin"].min()) / window).astype(int)
+    presence = np.zeros((place.max() + 1, len(streets.edges)))
+    time = rows["time"] * INTERVAL_S / window / days
+    np.add.at(presence, (place, rows["number"]), time)
+    edges = rows.groupby("number")[["left", "entered"]].sum()
+    counts = edges.reindex(range(len(streets.edges)), fill_value=0.0)
+    ways = _turns(streets, counts["left"].to_numpy(), counts["entered"].to_numpy())
+    return Baseline(presence=presence, ways=ways, teleports=0, waiting=0, running=0)
+
+
+def _turns(streets: Streets, left: PerEdge, entered: PerEdge) -> Mapping[Way, int]:
+    """Return the vehicles from edge to edge, about.
+
+    Those that leave an edge are divided as the next edges are entered.
+    """
+    source, target = streets.links.T
+    onward = np.bincount(source, entered[target], len(left))
+    flow = left[source] * entered[target] / np.maximum(onward[source], 1.0)
+    turns = zip(source.tolist(), target.tolist(), flow.round().astype(int).tolist(), strict=True)
+    return {((edge, following), following): vehicles for edge, following, vehicles in turns}
+
+
+def _samples(
+    rows: pd.DataFrame, labels: EdgeNumbers, region_names: Sequence[str], lane_km: PerRegion
+) -> pd.DataFrame:
+    """Return EdgeMfds.samples. rows: EdgeRow, day and number"""
+    region = labels[rows["number"]]
+    keys = ["region", "day", "begin"]
+    sums = rows.assign(region=region).groupby(keys)
+    table = sums[["time", "distance", "arrived"]].sum().join(sums["end"].first()).reset_index()
+    length = table["end"] - table["begin"]
+    lanes = lane_km[table["region"]]
+    accumulation = table["time"] / length
+    production = 3.6 * table["distance"] / length
+    return pd.DataFrame(
+        {
+            "region": np.array(region_names)[table["region"]],
+            "day": table["day"],
+            "begin_s": table["begin"],
+            "end_s": table["end"],
+            "accumulation_veh": accumulation,
+            PRODUCTION: production,
+            "density_veh_km": accumulation / lanes,
+            "flow_veh_h": production / lanes,
+            "speed_km_h": production / accumulation.where(accumulation > 0),
+            "arrived_veh": table["arrived"],
+        }
+    )
+
+
+def _network(
+    streets: Streets, labels: EdgeNumbers, region_names: tuple[str, ...], samples: pd.DataFrame
+) -> RegionalModel:
+    """Return the regional model whose MFDs fit the samples best.
+
+    Raises: InputError for a region with too few of them
+    """
+    curves = []
+    above = {}
+    for region, cloud in enumerate(samples_of(samples, region_names, PRODUCTION)):
+        points = fit_quality.own_points(cloud)
+        if len(points) < fit_quality.SAMPLES:
+            raise InputError(
+                f"region {region} {region_names[region]}: has vehicles in {len(points)} intervals; "
+                f"an MFD needs {fit_quality.SAMPLES} or more: give a smaller freq of edgeData, a "
+                "longer run, or fewer regions"
+            )
+        curve = mfd.fit(*points.T)
+        most = points[:, 0].max()
+        if not fit_quality.falls(curve, most):
+            above[region] = float(most)
+        curves.append(curve)
+    return RegionalModel(
+        name=streets.path.name,
+        region_names=region_names,
+        positions=positions(streets, labels),
+        adjacency=digraph(streets, labels) > 0,
+        mfds=tuple(curves),
+        u_min=U_MIN,
+        u_max=U_MAX,
+        critical_above=above,
+    )
+
+
+def _row(fit: pd.Series) -> dict[str, object]:
+    """Return a row of the table. fit: of EdgeMfds.fits"""
+    critical = f"{fit['critical_veh']:,.0f}"
+    density = f"{fit['critical_veh'] / fit['lane_km']:.1f}"
+    speed = f"{fit['max_outflow_veh_s'] / fit['critical_veh']:.1f}"
+    if np.isnan(fit["critical_veh"]):
+        critical = f"above {fit['critical_above_veh']:,.0f}"
+        density = "-"
+        speed = "-"
+    loop = "-"
+    if not np.isnan(fit["hysteresis"]):
+        loop = f"{fit['hysteresis']:+.0%}"
+    return {
+        "region": f"{fit['region']} {fit['name']}",
+        "lane-km": f"{fit['lane_km']:.1f}",
+        "samples": fit["samples"],
+        "critical [veh]": critical,
+        "veh/lane-km": density,
+        "production": f"{fit['max_outflow_veh_s']:,.0f}",
+        "speed": speed,
+        "hysteresis": loop,
+        "R2": f"{fit['r2']:.2f}",
+    }

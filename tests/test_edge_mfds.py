@@ -1,0 +1,153 @@
+"""cosim mfd: MFDs from SUMO's edgeData."""
+
+import numpy as np
+import pandas as pd
+import pytest
+import tiny_city
+from commands import cosim, error_line, good
+
+import cosim.api as api
+from cosim.evaluation.model_validation import outflow_samples
+from cosim.evaluation.simulate import regional_outflow
+from cosim.importing.edge_mfds import edge_mfds
+from cosim.importing.streets import read_streets
+from cosim.sumo.net import city_files
+from nmfd.api import load_scenario
+from nmfd.errors import InputError
+from nmfd.model import mfd
+from nmfd.studies import fit_quality
+
+FULL = 30.0  # veh on an edge at which nothing moves
+FREE = 10.0  # m/s
+SLOWER = 0.8  # while unloading
+
+
+def meandata(edges, loads, freq=300.0):
+    """edgeData with equally many vehicles on all edges, which drive slower while they get fewer;
+    a vehicle on a junction does not count."""
+    lines = ["<meandata>"]
+    for k, (before, load) in enumerate(zip([0.0, *loads], loads, strict=False)):
+        speed = FREE * (1.0 - load / FULL)
+        if load < before:
+            speed *= SLOWER
+        lines.append(f'<interval begin="{k * freq}" end="{(k + 1) * freq}">')
+        lines.append('<edge id=":A0_0" sampledSeconds="900" speed="1"/>')
+        for edge in edges:
+            about = f'sampledSeconds="{load * freq}" speed="{speed}" arrived="1"'
+            lines.append(f'<edge id="{edge}" {about}/>')
+        lines.append("</interval>")
+    return "\n".join([*lines, "</meandata>"])
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A network, edgeData up to 24 vehicles on each edge and down again, and a table of regions."""
+    folder = tmp_path_factory.mktemp("made")
+    net = tiny_city.network(folder)
+    edges = read_streets(net).edges
+    loads = [*range(1, 25), *range(23, 0, -1)]
+    (folder / "edges.xml").write_text(meandata(edges, loads))
+    west = [int("A" not in edge and "B" not in edge) for edge in edges]
+    pd.DataFrame({"edge": edges, "region": west}).to_csv(folder / "own.csv", index=False)
+    return folder
+
+
+def test_the_curve_that_made_the_data_comes_back(made, tmp_path):
+    files = made / "city.net.xml", made / "edges.xml"
+    found = edge_mfds(files[0], [files[1]], str(made / "own.csv"), tmp_path)
+    edges = np.bincount(found.regions["region"])
+    samples = pd.read_csv(tmp_path / "samples.csv")
+    first = samples[samples["region"] == found.network.region_names[0]]
+    assert first["accumulation_veh"].tolist()[:2] == [edges[0], 2.0 * edges[0]]
+    production = 3.6 * 2.0 * edges[0] * FREE * (1.0 - 2.0 / FULL)
+    assert first["production_veh_km_h"][1] == pytest.approx(production, rel=1e-4)
+    assert (first["arrived_veh"] == edges[0]).all()
+    assert found.fits["critical_veh"].to_numpy() / edges == pytest.approx(15.0, rel=0.1)
+    loop = (1.0 - SLOWER) / (0.5 + 0.5 * SLOWER)
+    assert found.fits["hysteresis"].to_numpy() == pytest.approx(loop, rel=0.05)
+    assert (tmp_path / "mfd.png").is_file()
+
+
+def test_the_command(made, tmp_path):
+    """Two runs and one region, found without a table; the table of the terminal is narrow."""
+    edges = made / "edges.xml"
+    options = "--regions", "1", "--explain", "--out", tmp_path
+    text = good(cosim("mfd", made / "city.net.xml", edges, edges, *options))
+    assert max(map(len, text.splitlines())) <= 100
+    line = text.splitlines()[1].split()
+    assert line[:2] == ["0", "centre"]
+    assert line[3] == "94"  # samples of two runs of 47 intervals
+
+
+@pytest.mark.parametrize("regions", ["2", "auto"])
+def test_regions_are_found(made, tmp_path, regions):
+    found = edge_mfds(made / "city.net.xml", [made / "edges.xml"], regions, tmp_path)
+    assert sorted(set(pd.read_csv(tmp_path / "regions.csv")["region"])) == [0, 1]
+    assert bool(found.chosen) == (regions == "auto")
+
+
+EDGE = '<edge id="A0A1" sampledSeconds="{}" {}/>'
+ONE = '<interval begin="0" end="{}">{}</interval>'
+
+
+@pytest.mark.parametrize(
+    "content, expected",
+    [
+        ("day,interval\n", "is not SUMO's edgeData"),
+        ("<net/>", "expected <meandata>, got a file of <net>"),
+        ("<meandata></meandata>", "has no edges; put <edgeData"),
+        (ONE.format(60, EDGE.format(9, "")), "edge A0A1: speed: missing"),
+        (ONE.format(60, '<edge id="A0A1"/>'), "edge A0A1: sampledSeconds: missing"),
+        (2 * ONE.format(60, EDGE.format(0, "")), "of 0 s to 60 s begins before 60 s"),
+        (ONE.format(60, '<edge id="none" sampledSeconds="0"/>'), "edge none is not in"),
+        (ONE.format(60, EDGE.format(9, 'speed="1"')), "has vehicles in 1 intervals; an MFD needs"),
+    ],
+)
+def test_one_clear_line(made, tmp_path, content, expected):
+    if content.startswith("<interval"):
+        content = f"<meandata>{content}</meandata>"
+    (tmp_path / "edges.xml").write_text(content)
+    options = "--regions", "1", "--out", tmp_path / "out"
+    line = error_line(cosim("mfd", made / "city.net.xml", tmp_path / "edges.xml", *options))
+    assert expected in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_missing_files_and_odd_numbers(made, tmp_path):
+    net = made / "city.net.xml"
+    with pytest.raises(InputError, match="none.xml: no such file"):
+        edge_mfds(net, [tmp_path / "none.xml"], "1", tmp_path)
+    with pytest.raises(InputError, match="--regions: expected 1 or more regions"):
+        edge_mfds(net, [made / "edges.xml"], "0", tmp_path)
+
+
+@pytest.mark.slow
+def test_the_accumulations_are_those_of_the_run(tmp_path):
+    """Vehicles on junctions are in neither of the two means. SUMO counts a vehicle on an edge until
+    its rear has left, so that a locked region holds up to a tenth more. `identify` fits its MFD to
+    outflows, and to accumulations with the vehicles on junctions: in the centre the critical ones
+    differ by less than 15 %, and production over the mean trip length is the outflow."""
+    measure = tmp_path / "edges.add.xml"
+    output = tmp_path / "edges.xml"
+    measure.write_text(f'<additional><edgeData id="a" freq="90" file="{output}"/></additional>')
+    scenario = load_scenario("demo", {"sumo.additional": [str(measure)], "steps": 12})
+    run = api.run(scenario, "no-control", seed=1000, progress=False)
+    net, regions = city_files(scenario.network)
+    found = api.mfd(net, output, regions=regions, out=tmp_path / "out")
+    columns = ["accumulation_veh", "production_veh_km_h"]
+    tables = found.samples.pivot(index="begin_s", columns="region", values=columns)
+    names = list(found.network.region_names)
+    vehicles = tables["accumulation_veh"][names].to_numpy()
+    production = tables["production_veh_km_h"][names].to_numpy() / 3.6
+    assert vehicles == pytest.approx(run["mean_accumulation"], rel=0.12, abs=3.0)
+    assert production == pytest.approx(run["production"], rel=0.15, abs=20.0)
+    outflow = regional_outflow(run, run.step)
+    trip_length = production.sum(axis=0) / outflow.sum(axis=0)
+    centre = 4
+    assert production[:, centre] / trip_length[centre] == pytest.approx(
+        outflow[:, centre], rel=0.2, abs=0.3
+    )
+    cloud = outflow_samples(scenario.network, [run])[centre]
+    identified = mfd.fit(*fit_quality.own_points(cloud).T)
+    critical = found.fits["critical_veh"][centre]
+    assert critical == pytest.approx(identified.critical, rel=0.15)
