@@ -428,6 +428,7 @@ def study(
     *,
     regions: int | Path | str = "auto",
     routes: Sequence[Path | str] = (),
+    counts: Path | str | None = None,
     most_seeds: int = 10,
     out: Path | str | None = None,
     workers: int = 1,
@@ -437,6 +438,7 @@ def study(
     source: sumocfg, net.xml or file of OpenStreetMap; or a scenario, by name or folder
     regions: number of regions of an import, "auto", or a table edge,region
     routes: files with vehicles beside those of the source
+    counts: edgeData of SUMO, of which trips are made for a source without demand
     most_seeds: seeds of a strategy whose verdict is open; all have three
     out: folder of import, runs and page, runs/NAME-study if None
     workers: runs at a time
@@ -449,6 +451,7 @@ def study(
         Path(source),
         regions=str(regions),
         routes=[Path(file) for file in routes],
+        counts=None if counts is None else Path(counts),
         most_seeds=most_seeds,
         out=None if out is None else Path(out),
         workers=workers,

@@ -401,6 +401,7 @@ def get(name: str | None) -> None:
     help="Number of regions to find, auto, or a table edge,region.",
 )
 @ROUTES
+@COUNTS
 @click.option(
     "--demand",
     type=click.Choice(["peak"]),
@@ -442,6 +443,7 @@ def import_(source: Path | None, bbox: str | None, **options: Any) -> None:
 @click.argument("source", type=click.Path(path_type=Path), metavar="SUMOCFG|NET|SCENARIO")
 @REGIONS
 @ROUTES
+@COUNTS
 @click.option(
     "--most-seeds",
     type=click.IntRange(min=3),

@@ -77,7 +77,7 @@ def test_from_a_scenario_to_a_page(ran, tmp_path):
 def test_a_folder_holds_one_study(tmp_path):
     (tmp_path / "study.json").write_text(json.dumps({"source": "city.sumocfg"}))
     line = error_line(cosim("study", "demo", "--out", tmp_path))
-    assert "holds another study (source, regions, routes changed)" in line
+    assert "holds another study (source, regions changed)" in line
 
 
 def outcome(strategy, *changes, more_left=0.0):

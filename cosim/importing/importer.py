@@ -20,6 +20,7 @@ from cosim.importing.baseline import Baseline, averaged_runs
 from cosim.importing.case import Progress, SumoInput, seconds, sumo_input
 from cosim.importing.choice import AUTO, CHOSEN, densest_region, labelled, number_of
 from cosim.importing.comparison import Comparison, compare, plain_trips
+from cosim.importing.counts import Counted, sampled
 from cosim.importing.demand import Traffic, read_traffic, wrapped
 from cosim.importing.generated import morning_peak
 from cosim.importing.osm import Box, parse_box
@@ -69,6 +70,7 @@ class Request:
     regions: Path
     count: int | None
     routes: tuple[Path, ...]
+    counts: Path | None
     demand: str | None
     level: float
     mesoscopic: bool
@@ -90,6 +92,7 @@ class City:
     switched: of these, signals whose programme a timetable changes
     factor: of the demand [-]; mesoscopic: the scenario's model
     files: keys of [sumo] -> names of files beside the scenario
+    counted: trips made of counts, None without counts
     assigned: routes of a generated peak; same: comparison with plain SUMO, or why there is none
     """
 
@@ -107,6 +110,7 @@ class City:
     factor: float
     mesoscopic: bool
     files: Mapping[str, Sequence[str]]
+    counted: Counted | None
     assigned: Assigned | None
     same: Comparison | str
 
@@ -118,6 +122,7 @@ def import_city(
     *,
     regions: int | Path | str,
     routes: Sequence[Path] = (),
+    counts: Path | None = None,
     demand: str | None = None,
     level: float = 1.0,
     mesoscopic: bool = False,
@@ -135,6 +140,7 @@ def import_city(
     scenario: new folder of the scenario; scenarios/NAME beside the folder of networks if None
     regions: number of regions to find, "auto", or the user's own table edge,region
     routes: files with vehicles beside those of the sumocfg
+    counts: edgeData with vehicles that `entered` streets, of which trips are made instead
     demand: "peak" generates a morning peak instead
     level: multiplies the vehicles or the peak [-]
     mesoscopic: the scenario uses SUMO's queue model
@@ -151,6 +157,7 @@ def import_city(
         regions=Path(str(regions)),
         count=number_of(str(regions)),
         routes=tuple(routes),
+        counts=counts,
         demand=demand,
         level=level,
         mesoscopic=mesoscopic,
@@ -172,7 +179,7 @@ def import_city(
         network_folder.mkdir()
         scenario_folder = scratch / "scenario"
         scenario_folder.mkdir()
-        city = _imported(request, case, scenario_folder, progress)
+        city = _imported(request, case, scratch, scenario_folder, progress)
         progress("writing")
         lines = _write(city, network_folder, scenario_folder)
         _move(network_folder, request.out)
@@ -220,15 +227,23 @@ def _as_requested(case: SumoInput, request: Request) -> SumoInput:
     return replace(case, begin=begin, end=end, routes=(*case.routes, *request.routes))
 
 
-def _imported(request: Request, case: SumoInput, folder: Path, progress: Progress) -> City:
+def _imported(
+    request: Request, case: SumoInput, scratch: Path, folder: Path, progress: Progress
+) -> City:
     """Return the city, after the runs without control.
 
+    scratch: folder for files that are needed only now
     folder: its vehicles are written there
     """
     streets = read_streets(case.net, case.additional)
     given = None
     if request.count is None and str(request.regions) != AUTO:
         given = own_regions(streets, request.regions)
+    counted = None
+    if request.counts is not None:
+        _check_only_counts(request, case)
+        counted = sampled(request.counts, streets, scratch, request.seed, progress)
+        case = replace(case, routes=(counted.routes,))
     traffic = read_traffic(case, streets, request.seed)
     mesoscopic = request.mesoscopic or case.mesoscopic
     simulated_meso = bool(mesoscopic or streets.drivable.sum() > LARGE_CITY_EDGES)
@@ -277,9 +292,19 @@ def _imported(request: Request, case: SumoInput, folder: Path, progress: Progres
         factor=factor,
         mesoscopic=mesoscopic,
         files=files,
+        counted=counted,
         assigned=assigned,
         same=same,
     )
+
+
+def _check_only_counts(request: Request, case: SumoInput) -> None:
+    """Raise InputError if there are vehicles beside those of counts."""
+    if case.routes or request.demand is not None:
+        raise InputError(
+            f"--counts: {case.source} has vehicles of its own; omit --routes and --demand, or give "
+            "the network alone"
+        )
 
 
 def _peak(
@@ -454,6 +479,8 @@ def _report(
     if city.same:
         lines.append(report.comparison(city.same, city.case, traffic, clock))
     lines += traffic.remarks
+    if city.counted is not None:
+        lines.append(city.counted.text(city.streets, city.baseline))
     if city.assigned is not None:
         lines += report.assignment(city.assigned)
     lines += report.not_taken_over(city.case, clock)

@@ -24,7 +24,7 @@ def no_vehicles(case: SumoInput, traffic: Traffic) -> str:
     remarks = "".join(f"; {remark}" for remark in traffic.remarks)
     return (
         f"{case.source}: names no vehicles for the streets of cars{_notes(traffic)}{remarks}; "
-        "give a sumocfg with route-files, or add --routes FILE or --demand peak"
+        "give a sumocfg with route-files, or add --routes FILE, --counts FILE or --demand peak"
     )
 
 

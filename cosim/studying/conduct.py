@@ -21,6 +21,7 @@ def conducted(
     *,
     regions: str,
     routes: Sequence[Path],
+    counts: Path | None,
     most_seeds: int,
     out: Path | None,
     workers: int,
@@ -33,10 +34,11 @@ def conducted(
         "source": str(source.absolute()) if own else str(source),
         "regions": regions,
         "routes": ",".join(str(path.absolute()) for path in routes),
+        "counts": "" if counts is None else str(counts.absolute()),
     }
     _check_folder(folder, about)
     if own:
-        scenario = stages.imported(source, folder, regions, routes)
+        scenario = stages.imported(source, folder, regions, routes, counts)
     else:
         scenario = load_scenario(source)
     runner = Runner(scenario=scenario, out=folder / "runs", workers=workers)
@@ -86,7 +88,7 @@ def _check_folder(folder: Path, about: Mapping[str, str]) -> None:
     if not file.is_file():
         return
     kept = json.loads(file.read_text(encoding="utf-8"))
-    changed = [key for key, value in about.items() if kept.get(key) != value]
+    changed = [key for key, value in about.items() if kept.get(key, "") != value]
     if changed:
         problem = f"holds another study ({', '.join(changed)} changed)"
         raise InputError(f"{folder}: {problem}; choose another folder with --out")

@@ -54,13 +54,16 @@ def say(text: str) -> None:
     print(text, file=sys.stderr)
 
 
-def imported(source: Path, out: Path, regions: str, routes: Sequence[Path]) -> Scenario:
+def imported(
+    source: Path, out: Path, regions: str, routes: Sequence[Path], counts: Path | None
+) -> Scenario:
     """Import a city into the folder of a study, unless that is done.
 
     source: as `cosim import` takes it
     out: folder of the study
     regions: number, "auto", or table edge,region
     routes: files with vehicles beside those of the source
+    counts: edgeData of which trips are made, or None
     Raises: InputError
     """
     name = file_name(source.name.partition(".")[0])
@@ -68,7 +71,7 @@ def imported(source: Path, out: Path, regions: str, routes: Sequence[Path]) -> S
     scenario = out / "scenarios" / name
     if not scenario.exists():
         say(f"Import of {source}")
-        import_city(source, network, scenario, regions=regions, routes=routes)
+        import_city(source, network, scenario, regions=regions, routes=routes, counts=counts)
     for beginnings in (COMPARISONS, CHOICES):
         line = reported(network, beginnings)
         if line:
