@@ -271,6 +271,7 @@ def test_the_page_answers_to_the_names_of_this_machine_only(site, host, status):
     page = site.loop.run_sync(lambda: answers("/"))
     assert page.code == status
     assert (b"Bokeh" in page.body) == (status == 200)
+    assert (b": no-control</h1>" in page.body) == (status == 200)
     assert site.loop.run_sync(lambda: answers("/static/js/bokeh.min.js")).code == status
     no_websocket = site.loop.run_sync(lambda: answers("/ws"))
     assert no_websocket.code == (400 if status == 200 else 404)

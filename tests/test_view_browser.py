@@ -135,10 +135,12 @@ def test_the_live_page(width, host, tmp_path):
         [*command, "--against", mine], stderr=subprocess.PIPE, text=True, cwd=tmp_path
     )
     try:
+        assert "SUMO loads grid7_peak" in process.stderr.readline()
         address = re.search(r"http://localhost:\d+/", process.stderr.readline())[0]
         address = address.replace("localhost", host)
         with opened(address, address, width) as page:
             assert mine in page.get_by_role("table").inner_text()
+            assert page.locator("h1").inner_text() == f"grid7_peak: no-control against {mine}"
 
             def minutes():
                 return float(re.search(r">([\d.]+) min<", page.evaluate(NUMBERS))[1])

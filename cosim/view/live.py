@@ -50,6 +50,24 @@ PACES = {  # wall time per simulated second [s]
     "slower": 0.1,
     "slowest": 0.5,
 }
+# The root of the page is empty until Bokeh has drawn it.
+TEMPLATE = """
+{% block inner_head %}
+{{ super() }}
+<style>
+h1 { font: 600 22px sans-serif; margin: 8px 6px; overflow-wrap: anywhere; }
+[data-root-id]:empty::before {
+  content: "Loading: the browser draws the map and curves. SUMO is under way meanwhile.";
+  font: 15px sans-serif;
+  margin-left: 6px;
+}
+</style>
+{% endblock %}
+{% block contents %}
+<h1>{{ title | e }}</h1>
+{{ super() }}
+{% endblock %}
+"""
 HOSTS = ("localhost", "127.0.0.1", "[::1]")  # names of this machine that a browser may ask for
 
 
@@ -240,6 +258,7 @@ class Viewer:
         pace.on_change("value", self._set_pace)
         self._page.regions.on_change("value", self._choose)
         document.title = f"{show.picture.name}: {' against '.join(self._page.names)}"
+        document.template = TEMPLATE
         document.add_root(self._page.layout([self._pause, pace, self._page.regions]))
         self.refresh()
         document.add_periodic_callback(self.refresh, REFRESH_MS)
@@ -349,6 +368,7 @@ def watch(jobs: Sequence[Simulation], *, port: int = 0, browse: bool = False) ->
     """
     logging.getLogger("bokeh").setLevel(logging.ERROR)
     show = Show(jobs)
+    print(f"cosim: SUMO loads {jobs[0].scenario.name}; the page follows", file=sys.stderr)
     try:
         while show.picture is None and not show.over:
             show.update()
