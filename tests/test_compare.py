@@ -278,7 +278,7 @@ def test_the_same_command_goes_on_after_ctrl_c_in_the_second_model(tmp_path, mon
     folder = tiny.write(tmp_path, network=tiny.row_network(3))
     before = (folder / "scenario.toml").read_text()
     verdict = SimpleNamespace(protect=(0, 2), sentences=("Yes.",))
-    found = SimpleNamespace(verdict=verdict, write=lambda out, target: None, fit_text=lambda: "")
+    found = SimpleNamespace(verdict=verdict, write=lambda out, target: None, text=lambda: "")
     tasks, stopped = [], [True]
 
     def identified(task):
@@ -295,6 +295,7 @@ def test_the_same_command_goes_on_after_ctrl_c_in_the_second_model(tmp_path, mon
     assert (folder / "scenario.toml").read_text() == before
     stopped.clear()
     said = identify.identify(folder, protect=True, out=out)
+    assert re.findall("(?m)^[A-Z]+$", said) == ["VERDICT", "FILES"] * 2
     assert said.count("protected = [0, 2] instead of [1]") == 1
     assert "was written there" in " ".join(said.split())
     assert [task.scenario.protected for task in tasks] == [(1,), (0, 2)] * 2

@@ -15,11 +15,13 @@ from nmfd.model.regional_model import Errors, HeldOut, load_network
 from nmfd.studies.fit_quality import (
     MEANINGS,
     ahead_table,
+    doubt_lines,
     fit_table,
     held_out,
     prediction_text,
     predictions,
     region_fits,
+    short_table,
     with_guesses,
     write_fits,
 )
@@ -143,6 +145,22 @@ def test_errors_are_told_apart_by_congestion(network):
     assert summary.flowing.model == pytest.approx(predicted)
     alone = held_out(predictions(network, runs, scheme, critical=np.full(3, 1e3)))
     assert alone.congested is None
+
+
+def test_the_short_table_has_fits_and_errors(network):
+    state = np.zeros((9, 3, 3))
+    state[:, 0, 0] = 10.0 * np.arange(9)
+    scheme = {"step": 225.0, "substeps": 8, "integrator": "euler"}
+    errors = predictions(network, [observed(network, state)], scheme)
+    network = replace(network, critical_above={2: 7.0})
+    fits = region_fits(network, [cloud([1.0], [1.0])] * 3)
+    lines = short_table(network, fits, errors).splitlines()
+    assert len(lines) == 4
+    assert max(map(len, lines)) <= 100
+    assert lines[1].endswith(")")
+    assert "(40.0)" in lines[1]
+    assert "above 7" in lines[3]
+    assert doubt_lines(network, fits)[1].endswith(": few samples (1)")
 
 
 def test_a_model_worse_than_as_now_is_said_to_know_nothing(network):

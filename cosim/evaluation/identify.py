@@ -37,7 +37,7 @@ from nmfd.model.scenario import Scenario
 from nmfd.runs import config, files, shipped
 from nmfd.runs.progress import watched
 from nmfd.runs.run_many import locked, raise_failures, run_many
-from nmfd.runs.tables import wrapped
+from nmfd.runs.tables import NARROW, wrapped
 from nmfd.studies import fit_quality, plots
 from nmfd.types import Result
 
@@ -266,6 +266,26 @@ class Identified:
         ]
         return "\n".join(lines)
 
+    def text(self) -> str:
+        """Return the model for the terminal; fit.txt says more."""
+        errors = fit_quality.held_out(self.held_out)
+        drivers = "guided drivers" if self.task.guided else "drivers on their own routes"
+        doubts = fit_quality.doubt_lines(self.model, self.fits)
+        if errors.problem:
+            doubts.append(f"WARNING: {errors.problem}")
+        caption = (
+            "Critical accumulation [veh], largest outflow [veh/s], fit of the MFD, and error [veh] "
+            f"{errors.ahead:g} s ahead in runs that the model has not seen; in brackets that of "
+            '"as now", the prediction that nothing changes.'
+        )
+        parts = [
+            section(f"MODEL OF {drivers.upper()}", [f"{self.method} in {len(self.runs)} runs"]),
+            *wrapped(caption, NARROW),
+            fit_quality.short_table(self.model, self.fits, self.held_out),
+            section("DOUBTS", doubts or ["none"]),
+        ]
+        return "\n".join(parts)
+
     def write(self, out: Path, target: Path) -> None:
         """Write the model, and what its fit is based on.
 
@@ -298,6 +318,11 @@ class Identified:
             f"# rates and MFDs are {self.method}; loading runs: demand times {times}, "
             f"seeds {min(seeds)} to {max(seeds)}."
         )
+
+
+def section(heading: str, sentences: Sequence[str]) -> str:
+    """Return sentences under a heading, for the terminal."""
+    return "\n".join(["", heading, *wrapped("\n".join(sentences), NARROW)])
 
 
 def write_model(model: RegionalModel, own: Path, target: Path, comment: str) -> None:
@@ -393,18 +418,18 @@ def identify(
             proposed = _proposal(loaded, regions, written=written)
             if written and proposed:
                 protected = regions
+            model = os.path.normpath(target / "network.toml")
             report += [
-                found.fit_text(),
-                *wrapped("\n".join([*found.verdict.sentences, *proposed])),
-                f"Written to {os.path.normpath(target / 'network.toml')}; "
-                f"samples and figures to {folder}",
+                found.text(),
+                section("VERDICT", [*found.verdict.sentences, *proposed]),
+                section("FILES", [f"Written to {model}; fit.txt, samples and figures to {folder}"]),
             ]
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"finished runs are in {main}; the same command goes on") from None
     # Last, so that the same command finds the same scenario after an interruption.
     if protected != first.protected:
         write_protected(first, protected)
-    report.append(f"Next: cosim run {scenario} --controller pi-gating --against no-control")
+    report.append(f"\nNext: cosim run {scenario} --controller pi-gating --against no-control")
     return "\n".join(report)
 
 

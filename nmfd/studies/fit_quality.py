@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -240,12 +240,9 @@ def fit_table(
     """Return the fits as text, followed by the meanings of the doubts."""
     rows = []
     for fit in fits.itertuples(index=False):
-        critical = f"{fit.critical_veh:.0f}"
-        if np.isnan(fit.critical_veh):
-            critical = f"above {fit.critical_above_veh:.0f}"
         row = {
             "region": f"{fit.region} {fit.name}",
-            "critical [veh]": critical,
+            "critical [veh]": _critical(fit),
             "jam [veh]": f"{fit.jam_veh:.0f}",
         }
         if network.storage is not None:
@@ -255,7 +252,7 @@ def fit_table(
             "samples": fit.samples,
             "R2": f"{fit.r2:.2f}",
             "spread": f"{100 * fit.spread:.0f} %",
-            "hysteresis": "-" if np.isnan(fit.hysteresis) else f"{100 * fit.hysteresis:.0f} %",
+            "hysteresis": _percent(fit.hysteresis),
             "most / critical": "-" if np.isnan(fit.most_share) else f"{fit.most_share:.2f}",
             "WARNINGS": "; ".join(fit.doubts) or "none",
         }
@@ -265,6 +262,49 @@ def fit_table(
         if any(doubt.startswith(kind) for doubts in fits["doubts"] for doubt in doubts):
             lines.append(f"WARNING, {kind}: {meaning}")
     return "\n".join([text_table(rows), *wrapped("\n".join(lines))])
+
+
+def short_table(network: RegionalModel, fits: pd.DataFrame, errors: pd.DataFrame) -> str:
+    """Return fits and errors of predictions by region as one narrow table.
+
+    errors: `predictions` in runs that the model has not seen
+    """
+    rows = []
+    of_fit = fits.itertuples(index=False)
+    for title, fit, (_, error) in zip(network.titles, of_fit, errors.iterrows(), strict=True):
+        row = {
+            "region": title,
+            "critical": _critical(fit),
+            "outflow": f"{fit.max_outflow_veh_s:.3f}",
+            "R2": f"{fit.r2:.2f}",
+            "hysteresis": _percent(fit.hysteresis),
+        }
+        for name in SITUATIONS:
+            model = _vehicles(error[f"{name}_rmse_veh"])
+            row[name] = f"{model} ({_vehicles(error[f'{name}_persistence_rmse_veh'])})"
+        rows.append(row)
+    return text_table(rows)
+
+
+def doubt_lines(network: RegionalModel, fits: pd.DataFrame) -> list[str]:
+    """Return a line for every region with doubts."""
+    lines = []
+    for title, doubts in zip(network.titles, fits["doubts"], strict=True):
+        if doubts:
+            lines.append(f"{title}: {'; '.join(doubts)}")
+    return lines
+
+
+def _critical(fit: Any) -> str:
+    """Return the critical accumulation [veh] of a row of `region_fits`."""
+    if np.isnan(fit.critical_veh):
+        return f"above {fit.critical_above_veh:.0f}"
+    return f"{fit.critical_veh:.0f}"
+
+
+def _percent(share: float) -> str:
+    """Return a share as text, "-" for NaN."""
+    return "-" if np.isnan(share) else f"{100 * share:.0f} %"
 
 
 def predictions(
