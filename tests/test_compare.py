@@ -308,7 +308,7 @@ def test_the_same_command_goes_on_after_ctrl_c_in_the_second_model(tmp_path, mon
     [
         ([60, 80, 100, 90], (0.6, 0.8, 1.0, 1.15), "breaks at 1.15 .*: 90 trips end, 100 at 1"),
         ([60, 50, 80, 100], (0.6, 0.8, 1.0), "breaks at 0.8 .*: 50 trips end, 60 at 0.6"),
-        (range(60, 200), (*np.arange(0.6, 1, 0.2), *np.arange(1, 2, 0.15), 2.0), "Up to 2 times"),
+        (range(60, 200), identify.LEVELS, "Up to 2 times"),
     ],
 )
 def test_a_city_is_loaded_until_it_breaks(monkeypatch, arrivals, levels, text):

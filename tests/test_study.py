@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 
 import made_up
+import pandas as pd
 import pytest
 import tiny_city
 from commands import cosim, error_line, good
@@ -67,7 +68,8 @@ def test_from_a_scenario_to_a_page(ran, tmp_path):
     assert "guidance: leaves 30 trips more unserved; not recommended" in text
     assert "metering: not judged; a run failed, for the reason in runs.csv" in text
     assert "Yes: max-pressure signals would save" in text
-    assert "breaks at demand times 1.3: 16.7% of its trips" in " ".join(text.split())
+    broken = "breaks at demand times 1.3, where fewer trips are completed than at the demand before"
+    assert f"{broken}: 16.7% of its trips" in " ".join(text.split())
     assert text.splitlines()[-1].startswith(f"Next: cosim watch demo --controller {PRESSURE} ")
     shown = (out / "study.html").read_text(encoding="utf-8")
     assert all(f"<td>{label}</td>" in shown for label in EVERYWHERE.values())
@@ -125,6 +127,31 @@ def test_the_next_line_follows_from_the_verdict():
     needed = undecided.levels[0].outcomes[0].verdict.needed
     assert f"--most-seeds {needed}" in page.next_line(undecided)
     assert page.answer(undecided).startswith("Cannot say yet: max-pressure signals")
+
+
+@pytest.mark.parametrize(
+    "completed, broken, under",
+    [
+        ([60, 80, 100, 90], 1.15, 1.0),
+        ([60, 50, 40], 0.8, 1.0),  # broken below its own demand, which is run all the same
+        ([60, 80, 100, 110, 120, 115], 1.45, 1.3),
+        (range(60, 70), None, 2.0),
+    ],
+)
+def test_a_study_loads_as_identify_does(completed, broken, under):
+    done = []
+
+    class Runner:
+        workers = 1
+
+        def done(self, names, levels, seeds):
+            done.extend(levels)
+            rows = {"demand": levels, "trips": 200, "removed_veh": 0}
+            return pd.DataFrame(rows | {"completed_veh": completed[len(done) - 1]})
+
+    load = stages.loading(Runner())
+    assert (load.broken, load.under) == (broken, under)
+    assert len(done) == len(completed) == len(load.left)
 
 
 def test_more_seeds_at_most_double():

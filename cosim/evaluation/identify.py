@@ -44,10 +44,8 @@ from nmfd.types import Result
 PATHS = ("net", "regions")  # keys of [sumo] in network.toml
 UNGUIDED_STAGES = ("no-control", "probing-pc")
 GUIDED_STAGES = ("route-guidance", "probing-pcrg")
-# Factors on the demand: the first ones, and from the last one up until the city breaks.
-FIRST_LEVELS = (0.6, 0.8, 1.0)
-LEVEL_STEP = 0.15
-HIGHEST_LEVEL = 2.0
+# Factors on the demand of a city that is loaded until it breaks: all up to 1, then one more each.
+LEVELS = (0.6, 0.8, 1.0, 1.15, 1.3, 1.45, 1.6, 1.75, 1.9, 2.0)
 LEAST_FLOW = 1e-3  # veh/s, of a boundary whose signals are never green
 SATURATION = 0.5  # vehicles a second and lane that pass a green signal
 COUNTED, FITTED = "counted", "fitted"
@@ -98,15 +96,12 @@ class Task:
 
     def until_broken(self) -> tuple["Task", list[Result]]:
         """Return the task with levels up to where the city breaks; their runs."""
-        task = replace(self, levels=FIRST_LEVELS)
-        while True:
+        for number in range(LEVELS.index(1.0), len(LEVELS)):
+            task = replace(self, levels=LEVELS[: number + 1])
             runs = task.loading_runs(0)
-            highest = task.levels[-1]
-            broken = breaking_level(task.levels, task.mean_arrivals(runs))
-            if broken is not None or highest >= HIGHEST_LEVEL:
-                return task, runs
-            further = round(min(highest + LEVEL_STEP, HIGHEST_LEVEL), 2)
-            task = replace(task, levels=(*task.levels, further))
+            if breaking_level(task.levels, task.mean_arrivals(runs)) is not None:
+                break
+        return task, runs
 
     def mean_arrivals(self, runs: Sequence[Result]) -> list[float]:
         """Return the completed trips at each level, mean over the seeds."""
@@ -613,7 +608,9 @@ def as_it_was(
 
 
 def breaking_level(levels: Sequence[float], arrivals: Sequence[float]) -> float | None:
-    """Return the lowest demand with fewer completed trips than the one before.
+    """Return the demand at which a city breaks, None if it does not.
+
+    It is the lowest one with fewer completed trips than the one before.
 
     levels: factors on the demand, rising
     arrivals: completed trips at each

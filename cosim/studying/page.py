@@ -204,12 +204,15 @@ def sameness(study: Study) -> str:
 
 
 def broken(load: Loading) -> str:
-    """Return up to which demand the city serves its trips without control."""
+    """Return the demand at which the city breaks without control."""
+    level = load.under if load.broken is None else load.broken
+    left = f"{load.left[level]:.1%} of its trips are left at the end"
     if load.broken is None:
-        return f"Without control the city serves all trips up to demand times {load.under:g}."
-    left = load.left[load.broken]
-    more = f"{left:.1%} of its trips are left at the end"
-    return f"Without control the city breaks at demand times {load.broken:g}: {more}."
+        return f"Without control the city does not break up to demand times {level:g}: {left}."
+    return (
+        f"Without control the city breaks at demand times {level:g}, where fewer trips are "
+        f"completed than at the demand before: {left}."
+    )
 
 
 def _at(level: Level) -> str:

@@ -11,6 +11,7 @@ import pandas as pd
 
 from cosim.evaluation import evaluate as evaluation
 from cosim.evaluation import identify, results, statistics
+from cosim.evaluation.identify import LEVELS, breaking_level
 from cosim.evaluation.model_validation import outflow_samples
 from cosim.evaluation.runs import SECONDS_PER_TRIP
 from cosim.importing.importer import CHOICES, COMPARISONS, import_city, reported
@@ -30,8 +31,6 @@ from nmfd.studies.benchmark import REFERENCE
 from nmfd.types import Result
 
 FIRST_SEED = 1000
-LEVELS = (1.0, 1.15, 1.3, 1.5, 1.75, 2.0)
-STANDING_SHARE = 0.01  # of the trips left at the end: the city has broken
 NEAR_CRITICAL = 0.8  # of the critical accumulation, below which gates stay open
 # More trips left than without control, as a share of all, that rule a strategy out.
 UNSERVED_SHARE = 0.001
@@ -146,7 +145,7 @@ class Loading(NamedTuple):
     """Runs without control at rising demand.
 
     left: demand level -> share of the trips that are left at the end
-    under: highest level at which the city does not break; its own demand if it breaks there
+    under: highest level at which the city does not break, at least its own demand
     broken: level at which it breaks, None if it does not
     """
 
@@ -158,12 +157,10 @@ class Loading(NamedTuple):
 def loading(runner: Runner) -> Loading:
     """Raise the demand without control until the city breaks.
 
-    It breaks if more than STANDING_SHARE of the trips are left at the end, or fewer arrive than at
-    the level before.
+    The levels, and what breaks is, are those of cosim.evaluation.identify.
     """
     left: dict[float, float] = {}
-    under = LEVELS[0]
-    arrived = 0.0
+    arrived: dict[float, float] = {}
     say(f"Loading without control, until the city breaks: demand times {_listed(LEVELS)}")
     for first in range(0, len(LEVELS), runner.workers):
         levels = LEVELS[first : first + runner.workers]
@@ -171,15 +168,17 @@ def loading(runner: Runner) -> Loading:
         for level in levels:
             row = rows.loc[level]
             left[level] = unfinished(row) / max(row["trips"], 1)
-            breaks = left[level] > STANDING_SHARE or row["completed_veh"] < arrived
-            counts = f"{row['completed_veh']:,.0f} of {row['trips']:,.0f} trips completed"
-            broken = ", the city breaks" if breaks else ""
-            say(f"demand times {level:g}: {counts}{broken}")
-            if breaks:
-                return Loading(left, under, level)
-            under = level
-            arrived = row["completed_veh"]
-    return Loading(left, under, None)
+            arrived[level] = row["completed_veh"]
+            say(
+                f"demand times {level:g}: {row['completed_veh']:,.0f} of {row['trips']:,.0f} trips "
+                "completed"
+            )
+            broken = breaking_level(list(arrived), list(arrived.values()))
+            if broken is not None and level >= 1.0:
+                say(f"The city breaks at demand times {broken:g}")
+                under = [one for one in arrived if 1.0 <= one < broken]
+                return Loading(left, max(under, default=1.0), broken)
+    return Loading(left, max(arrived), None)
 
 
 def unfinished(row: Mapping) -> float:
