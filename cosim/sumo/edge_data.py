@@ -63,9 +63,10 @@ def read_edge_data(path: Path, needed: str = "sampledSeconds") -> pd.DataFrame:
                 raise ValueError(f"interval of {begin:g} s to {end:g} s begins before {last:g} s")
             last = end
             for edge in element.iter("edge"):
+                if attribute(edge, "id").startswith(ON_JUNCTION):
+                    continue
                 attribute(edge, needed)
-                if not attribute(edge, "id").startswith(ON_JUNCTION):
-                    rows.append(_row(edge, begin, end))
+                rows.append(_row(edge, begin, end))
             element.clear()
     if not rows:
         raise InputError(f"{path}: has no edges; {REMEDY}")
@@ -73,7 +74,10 @@ def read_edge_data(path: Path, needed: str = "sampledSeconds") -> pd.DataFrame:
 
 
 def _row(edge: ElementTree.Element, begin: float, end: float) -> EdgeRow:
-    """Return an <edge>, with 0 for missing numbers. Raises ValueError."""
+    """Return an <edge>; attributes that are not there are 0.
+
+    Raises: ValueError for a time without a speed
+    """
     time = float(edge.get("sampledSeconds", 0.0))
     distance = 0.0
     if time > 0.0:
