@@ -8,7 +8,7 @@ from pathlib import Path
 from cosim.evaluation import results, statistics
 from cosim.importing.importer import COMPARISONS, reported
 from cosim.reporting import html
-from cosim.studying.stages import LABELS, Level, Loading, Outcome
+from cosim.studying.stages import LABELS, Level, Loading, Outcome, compared
 from cosim.studying.verdict import FEWEST_SEEDS, NOTHING_PERCENT, Answer, Verdict
 from cosim.sumo.net import network_folder
 from nmfd.model.scenario import Scenario
@@ -50,7 +50,24 @@ class Study:
 
     @property
     def recommended(self) -> tuple[Level, Outcome] | None:
-        """The best strategy that can be recommended, and its demand.
+        """The strategy to recommend, and its demand.
+
+        That is the simplest one that is not told apart from the best.
+        """
+        found = self.best
+        if found is None:
+            return None
+        level, best = found
+        simplest_first = list(LABELS)
+        alike = []
+        for one in level.outcomes:
+            if self._sound(one) and not told_apart(best, one):
+                alike.append(one)
+        return level, min(alike, key=lambda one: simplest_first.index(one.strategy))
+
+    @property
+    def best(self) -> tuple[Level, Outcome] | None:
+        """The strategy that saves most, and its demand.
 
         That is the lowest demand at which there is one. It gains there, and neither harms nor
         leaves more trips unserved at any demand.
@@ -83,6 +100,11 @@ class Study:
         return found
 
 
+def told_apart(best: Outcome, other: Outcome) -> bool:
+    """Return True if the common seeds show that the best one saves more."""
+    return compared(best.spent, other.spent).answer is Answer.GAINS
+
+
 def harmful(one: Outcome) -> bool:
     """Return True if harm is the verdict, or likelier than not."""
     if one.verdict is None:
@@ -96,21 +118,31 @@ def _percent(one: Outcome) -> float:
 
 def answer(study: Study) -> str:
     """Return the answer to the engineer's question in one sentence."""
-    best = study.recommended
-    if best is not None:
-        level, one = best
+    found = study.recommended
+    if found is not None:
+        level, one = found
         assert one.verdict is not None
         saved = one.verdict.change.removeprefix("-")
         chance = f"the odds are {_chance(one.verdict.odds.gains)} that it is more than"
         begins = "Yes" if level is study.levels[0] else "Not today, but with more traffic"
         return (
             f"{begins}: {one.label} would save {saved} of the time spent {_at(level)}; "
-            f"{chance} {NOTHING_PERCENT:g} %."
+            f"{chance} {NOTHING_PERCENT:g} %.{_not_told_apart(study, one)}"
         )
     if study.undecided:
         labels = dict.fromkeys(one.label for _, one in study.undecided)
         return f"Cannot say yet: {', '.join(labels)} may help or not; nothing else does."
     return "No: nothing that was tried saves time without leaving more trips unserved."
+
+
+def _not_told_apart(study: Study, simpler: Outcome) -> str:
+    """Return a sentence on the best strategy, "" if it is recommended."""
+    assert study.best is not None
+    _, best = study.best
+    if best is simpler or best.verdict is None:
+        return ""
+    saved = best.verdict.change.removeprefix("-")
+    return f" With {saved}, {best.label} is not told apart from that, which is simpler."
 
 
 def next_line(study: Study) -> str:
