@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -23,7 +22,7 @@ from cosim.importing.comparison import Comparison, compare, plain_trips
 from cosim.importing.demand import Traffic, read_traffic, wrapped
 from cosim.importing.generated import morning_peak
 from cosim.importing.osm import Box, parse_box
-from cosim.importing.partition import finish, own_regions, partition
+from cosim.importing.partition import finish, own_regions
 from cosim.importing.streets import Streets, read_streets
 from cosim.sumo.arrays import EdgeNumbers
 from cosim.sumo.net import load_city
@@ -48,7 +47,7 @@ FILES = {
     "additional": "city.add.xml.gz",
 }
 REPORT = "import.txt"
-# How its lines begin: on the comparison with plain SUMO, and on the number of regions.
+# How its lines begin: on the comparison with plain SUMO, and on the regions.
 COMPARISONS = ("same city", "not the same city", "not compared")
 CHOICES = (CHOSEN,)
 TYPES = ("vType", "vTypeDistribution")
@@ -86,7 +85,7 @@ class City:
 
     case: from its beginning on; labels: (E,) region of every edge
     given: regions of the user's own table (E,), -1 where it has none; None without a table
-    chosen: why there are so many regions, "" if the user said how many
+    chosen: why these regions, "" if they are the user's own
     left: signals that perimeter control does not use -> reason
     switched: of these, signals whose programme a timetable changes
     factor: of the demand [-]; mesoscopic: the scenario's model
@@ -117,7 +116,7 @@ def import_city(
     out: Path,
     scenario: Path | None = None,
     *,
-    regions: int | Path | str,
+    regions: int | Path | str = AUTO,
     routes: Sequence[Path] = (),
     demand: str | None = None,
     level: float = 1.0,
@@ -272,10 +271,10 @@ def _imported(request: Request, case: SumoInput, folder: Path, progress: Progres
     chosen = ""
     if given is not None:
         labels = finish(streets, given, own=True)
-    elif request.count is not None:
-        labels = partition(streets, baseline, request.count, uncontrollable=left)
     else:
-        choice = choose(streets, baseline, traffic.moves, uncontrollable=left)
+        choice = choose(
+            streets, baseline, traffic.routes, regions=request.count, uncontrollable=left
+        )
         labels = choice.labels
         chosen = choice.reason
     if labels.max() < 1:
@@ -349,14 +348,14 @@ def _peak(
             time_to_teleport=case.time_to_teleport,
             progress=progress,
         )
-    moves = Counter[tuple[int, int]]()
+    routes = Counter[tuple[int, ...]]()
     for vehicle in traffic.vehicles:
         route = vehicle.find("route")
         edges = assigned.routes.get(vehicle.get("id", ""))
         if route is not None and edges is not None:
             route.set("edges", " ".join(edges))
-            moves.update(pairwise(streets.number[edge] for edge in edges))
-    return replace(traffic, moves=moves), assigned
+            routes[tuple(streets.number[edge] for edge in edges)] += 1
+    return replace(traffic, routes=routes), assigned
 
 
 def _write_traffic(folder: Path, traffic: Traffic) -> dict[str, list[str]]:
