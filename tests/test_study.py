@@ -74,6 +74,7 @@ def test_from_a_scenario_to_a_page(ran, tmp_path):
     shown = (out / "study.html").read_text(encoding="utf-8")
     assert all(f"<td>{label}</td>" in shown for label in EVERYWHERE.values())
     assert "metering: not judged" in shown
+    assert shown.count('onclick="look(') == page.MOST_QUEUES
 
 
 def test_a_folder_holds_one_study(tmp_path):

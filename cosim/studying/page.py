@@ -1,16 +1,18 @@
 """Answer of a study: sentences, table of the terminal, HTML page."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
 
 from cosim.evaluation import results, statistics
 from cosim.importing.importer import COMPARISONS, reported
 from cosim.reporting import html
 from cosim.studying.stages import LABELS, Level, Loading, Outcome, compared
 from cosim.studying.verdict import FEWEST_SEEDS, NOTHING_PERCENT, Answer, Verdict
-from cosim.sumo.net import network_folder
+from cosim.sumo.net import edge_shapes, network_folder
 from nmfd.model.scenario import Scenario
 from nmfd.runs import files
 from nmfd.runs.run_many import TABLE
@@ -18,6 +20,7 @@ from nmfd.runs.tables import NARROW, text_table, wrapped
 from nmfd.studies.benchmark import REFERENCE
 
 PAGE = "study.html"
+MOST_QUEUES = 10
 HALF_RANGE = 50.0  # of the drawn changes (%); larger ones end there
 NO_COMPARISON = "Not compared with plain SUMO: the scenario was not imported by this study"
 
@@ -313,6 +316,8 @@ def write(study: Study) -> Path:
         trust=trust(study),
         map=shown,
         map_demand=f"{demand:g}",
+        queues=queues(finished, demand, names),
+        queue_names=[LABELS[name] for name in names],
         map_names=" and ".join(LABELS[name] for name in names),
         manifest=html.made_by(finished),
         table=TABLE,
@@ -320,6 +325,36 @@ def write(study: Study) -> Path:
     )
     files.write_text(study.page, text)
     return study.page
+
+
+def queues(finished: results.Finished, demand: float, names: Sequence[str]) -> list[dict]:
+    """Return the streets with the longest queues, by those of the first strategy.
+
+    A row has the street, its region, the signal at its end, where it ends (x, y) [m], and the
+    longest queue [veh] of every strategy, mean over their common seeds.
+    """
+    city = finished.map()
+    titles = finished.scenario.network.titles
+    runs = statistics.common_runs(finished.level(demand), names)
+    means = [np.mean([run["queue_max"] for run in of], axis=0) for of in runs if of]
+    if not means:
+        return []
+    shapes = edge_shapes(city)
+    rows = []
+    for edge in np.argsort(-means[0], kind="stable")[:MOST_QUEUES]:
+        name = city.edges[edge]
+        x, y = shapes[edge][-1]
+        rows.append(
+            {
+                "street": name,
+                "region": titles[city.edge_region[edge]],
+                "signal": city.signals.get(name, "–"),
+                "x": round(float(x)),
+                "y": round(float(y)),
+                "queues": [f"{mean[edge]:.0f}" for mean in means],
+            }
+        )
+    return rows
 
 
 def _shown(level: Level) -> dict[str, object]:
