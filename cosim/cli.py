@@ -426,8 +426,8 @@ def get(name: str | None) -> None:
 @click.option("--left-hand", is_flag=True, help="OpenStreetMap: traffic keeps left.")
 @click.option(
     "--regions",
-    required=True,
-    metavar="N|CSV",
+    default="auto",
+    metavar="N|auto|CSV",
     help="Number of regions to find, auto, or a table edge,region.",
 )
 @ROUTES

@@ -209,7 +209,7 @@ def test_mesoscopic_models_keep_the_ledger_and_differ(imported):
     scenario = load_scenario(imported[0] / "scenarios" / "tiny")
     crossings = []
     for model in (True, "ltm"):
-        with tiny_city.played(scenario, 4, 0.5, mesoscopic=model) as (_, _, record):
+        with tiny_city.played(scenario, 8, 0.5, mesoscopic=model) as (_, _, record):
             crossings.append(record.crossings)
     classic, ltm = crossings
     assert classic.sum() > 0

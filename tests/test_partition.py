@@ -2,6 +2,7 @@
 table."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -9,7 +10,8 @@ import tiny_city
 from tiny_city import pieces
 
 from cosim.importing.baseline import INTERVAL_S, Baseline
-from cosim.importing.choice import choose, densest_region, holdable
+from cosim.importing.boundaries import Turns, with_room
+from cosim.importing.choice import choose, densest_region
 from cosim.importing.partition import finish, make_blocks, own_regions, partition
 from cosim.importing.quality import doubts
 from cosim.importing.streets import read_streets
@@ -159,14 +161,47 @@ def test_the_chosen_partition_is_the_one_whose_gates_hold_most(tmp_path):
     streets = read_streets(tiny_city.network(tmp_path))
     density = np.where(streets.centre[:, 0] < 250.0, 0.08, 0.01)
     run = baseline(streets, density)
-    moves = {(int(a), int(b)): 1 for a, b in streets.links}
-    choice = choose(streets, run, moves)
-    two = partition(streets, run, 2)
-    held = holdable(streets, run, moves, choice.labels, ())
-    assert held > holdable(streets, run, moves, two, ()) > 0
-    assert np.bincount(choice.labels, streets.lane_metres).min() >= 3000.0
-    assert f"chosen: 3 regions: gates into the densest one meet {held} vehicles" in choice.reason
+    routes = {(int(a), int(b)): 1 for a, b in streets.links}
     signals = {signal for signal in streets.link_signals if signal}
-    assert holdable(streets, run, moves, choice.labels, signals) == 0
-    densest = choice.labels == densest_region(streets, run, choice.labels)
-    assert density[densest].mean() > density[~densest].mean()
+
+    def entered(labels, uncontrollable=()):
+        turns = Turns(streets, routes, with_room(streets, uncontrollable))
+        return turns.entered(labels == densest_region(streets, run, labels))
+
+    for regions in (None, 2):
+        choice = choose(streets, run, routes, regions=regions)
+        held, leaked = entered(choice.labels)
+        assert held - leaked > np.subtract(*entered(partition(streets, run, 2)))
+        assert f"of {len(routes)} vehicles {held} first enter the densest one" in choice.reason
+        assert np.bincount(choice.labels, streets.lane_metres).min() >= 3000.0
+        assert entered(choice.labels, signals).held == 0
+        densest = choice.labels == densest_region(streets, run, choice.labels)
+        assert density[densest].mean() > density[~densest].mean()
+        if regions:
+            assert set(choice.labels) == {0, 1}
+        assert all(pieces(streets, choice.labels == n) == 1 for n in set(choice.labels))
+
+
+def test_a_vehicle_counts_once_where_it_first_enters_from_elsewhere(streets):
+    """Along a row of streets, of which every other one is inside."""
+    row = [streets.number[f"{a}0{b}0"] for a, b in pairwise("ABCDEF")]
+    inside = np.isin(np.arange(len(streets.edges)), row[1::2])
+    links = [tuple(link) for link in streets.links]
+    held = np.array([link == (row[0], row[1]) for link in links])
+    routes = {tuple(row): 5, tuple(row[2:]): 3, tuple(row[1:]): 7, (row[0],): 1, (row[1],): 1}
+    assert Turns(streets, routes, held).entered(inside) == (5, 3)
+    assert Turns(streets, routes, ~held).entered(inside) == (3, 5)
+    assert Turns(streets, {}, held).entered(inside) == (0, 0)
+
+
+def test_a_gate_needs_room_before_it(streets):
+    signals = ("s",) * len(streets.links)
+    short = replace(streets, link_signals=signals, length=np.full(len(streets.edges), 40.0))
+    assert with_room(replace(streets, link_signals=signals), ()).all()
+    assert not with_room(streets, ()).any()
+    assert not with_room(replace(streets, link_signals=signals), ["s"]).any()
+    assert not with_room(short, ()).any()
+    # Before the last one, queues reach back to streets without a signal.
+    last = (None,) * (len(signals) - 1) + ("s",)
+    held = with_room(replace(short, link_signals=last), ())
+    assert np.flatnonzero(held).tolist() == [len(signals) - 1]

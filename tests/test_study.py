@@ -58,6 +58,8 @@ def test_from_a_scenario_to_a_page(ran, tmp_path):
     text = good(cosim("study", "demo", "--out", out))
     assert again in ran.done
     assert len(set(ran.done)) == len(ran.done)  # nothing twice
+    compared = {seed for name, _, seed in ran.done if name != "no-control"}
+    assert stages.LOADING_SEED not in compared
     table = text.partition("\n\n")[0].splitlines()
     assert max(map(len, table)) <= 100
     assert table[1].split()[:2] == ["strategy", "verdict"]
@@ -74,6 +76,7 @@ def test_from_a_scenario_to_a_page(ran, tmp_path):
     shown = (out / "study.html").read_text(encoding="utf-8")
     assert all(f"<td>{label}</td>" in shown for label in EVERYWHERE.values())
     assert "metering: not judged" in shown
+    assert shown.count('onclick="look(') == page.MOST_QUEUES
 
 
 def test_a_folder_holds_one_study(tmp_path):
@@ -83,7 +86,14 @@ def test_a_folder_holds_one_study(tmp_path):
 
 
 def outcome(strategy, *changes, more_left=0.0):
-    return Outcome(strategy=strategy, verdict=judge(changes), means={}, more_left=more_left)
+    """Without control the time spent is 100 with every seed."""
+    return Outcome(
+        strategy=strategy,
+        verdict=judge(changes),
+        means={},
+        more_left=more_left,
+        spent={seed: 100.0 + change for seed, change in enumerate(changes)},
+    )
 
 
 def studied(*levels):
@@ -110,12 +120,27 @@ GAIN = (-9.0, -10.0, -11.0)
         ([[outcome(PRESSURE, *GAIN)], [outcome(PRESSURE, 9.0, -8.0, 30.0)]], None),  # likely harm
         ([[outcome(PRESSURE, 0.0, 0.1, 0.0)], [outcome(PRESSURE, *GAIN)]], (1.3, PRESSURE)),
         ([[outcome(PRESSURE, *GAIN), outcome(GUIDED, -20.0, -21.0, -22.0)]], (1.0, GUIDED)),
+        ([[outcome(PRESSURE, *GAIN), outcome(GUIDED, -9.5, -10.5, -11.5)]], (1.0, PRESSURE)),
+        ([[outcome(PRESSURE, *GAIN), outcome(GUIDED, -12.0, -9.0, -13.0)]], (1.0, PRESSURE)),
+        (
+            [[outcome("pi-gating", *GAIN), outcome("metering", -12.0, -9.0, -11.0)]],
+            (1.0, "pi-gating"),
+        ),
         ([[outcome(PRESSURE, -30.0, 20.0, -30.0)]], None),
     ],
 )
 def test_nothing_is_recommended_that_harms_or_leaves_trips(levels, expected):
     best = studied(*levels).recommended
     assert (None if best is None else (best[0].demand, best[1].strategy)) == expected
+
+
+def test_the_answer_says_that_the_best_is_not_told_apart():
+    study = studied([outcome(PRESSURE, *GAIN), outcome(GUIDED, -12.0, -9.0, -13.0)])
+    said = page.answer(study)
+    assert said.startswith("Yes: max-pressure signals would save 10.0")
+    assert said.endswith(
+        " With 11.3 ± 5.2 %, guidance is not told apart from that, which is simpler."
+    )
 
 
 def test_the_next_line_follows_from_the_verdict():

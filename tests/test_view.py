@@ -20,6 +20,7 @@ from bokeh.resources import CDN
 from tornado.httpclient import AsyncHTTPClient
 
 from cosim.evaluation.simulate import Simulation, simulate
+from cosim.importing import maps
 from cosim.plant.strategy import parse
 from cosim.sumo.net import city_of
 from cosim.view import live, page, picture
@@ -99,6 +100,13 @@ def test_the_picture_of_a_city(scenario, drawn):
         assert abs(curve[curve[:, 1].argmax(), 0] - critical) < 0.1 * critical
 
 
+def test_a_region_in_the_midst_of_another_is_drawn_after_it():
+    square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    drawn = maps.largest_first([[square], [9.0 * square, 0.5 * square]])
+    assert [region for region, _ in drawn] == [1, 0, 1]
+    assert maps.pale(0) != maps.pale(1)
+
+
 def test_the_frame_at_a_time(whole):
     seen = live.Seen("x")
     assert seen.at(100.0) is None
@@ -121,6 +129,8 @@ def test_the_page_draws_every_street_and_escapes_names(drawn, whole):
     assert list(streets["edge"]) == list(drawn.edges)
     assert len(streets["xs"]) == len(drawn.edges)
     np.testing.assert_array_equal(streets["density"], whole[-1].density.astype(np.float32))
+    gates = one.maps[0].gates[0].source.data
+    assert gates["rim"] == [maps.colour(gate.target) for gate in drawn.boundaries]
     assert len(one.curves.lines[0].data["time"]) == STEPS + 1
     assert len(one.curves.lines[1].data["time"]) == 2
     content = file_html(document, CDN, title=EVIL)

@@ -1,15 +1,33 @@
-"""Regions as the user wants them: a number, a table, or AUTO.
+"""Regions at whose boundary gates hold most vehicles, and their number.
 
-With AUTO it is the partition whose gates can hold most vehicles.
+Searches start from partitions by density, and from these with a centre cut out round the densest
+place: the ring and centre of perimeter control.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from cosim.importing.baseline import Baseline
-from cosim.importing.partition import finish, partition
+from cosim.importing.boundaries import (
+    Clusters,
+    Entered,
+    Labels,
+    Limits,
+    Routes,
+    Turns,
+    with_room,
+)
+from cosim.importing.partition import (
+    SMALLEST_SHARE,
+    connect,
+    features,
+    finish,
+    make_blocks,
+    partition,
+    without_signals,
+)
 from cosim.importing.quality import SMALLEST_LANE_KM
 from cosim.importing.streets import Streets
 from cosim.sumo.arrays import EdgeNumbers
@@ -18,14 +36,15 @@ from nmfd.errors import InputError
 AUTO = "auto"
 FEWEST_REGIONS = 2
 MOST_REGIONS = 6
+CENTRES = (0.15, 0.25, 0.35, 0.5)  # share of the lanes in a centre that is cut out
+LARGEST_CLUSTER = 0.5  # of the smallest region
+EVEN = 0.4  # of the variance of density that the best partition by density explains, at least
+ENOUGH = 0.8  # of what gates hold at most: the fewest regions with so much are chosen
 CHOSEN = "regions chosen: "  # how the reason begins
 
 
 class Choice(NamedTuple):
-    """A partition, and the reason for its number of regions in one sentence.
-
-    The reason is "" if the user said which regions.
-    """
+    """A partition, and its reason in one sentence, "" without a search."""
 
     labels: EdgeNumbers
     reason: str = ""
@@ -48,7 +67,7 @@ def number_of(regions: str, fewest: int = FEWEST_REGIONS) -> int | None:
 def labelled(
     streets: Streets,
     baseline: Baseline,
-    moves: Mapping[tuple[int, int], int],
+    routes: Routes,
     wanted: int | EdgeNumbers | None,
     *,
     uncontrollable: Collection[str] = (),
@@ -56,14 +75,24 @@ def labelled(
     """Return the wanted regions.
 
     wanted: their number, those of the user's own table (E,), or None for AUTO
-    moves, uncontrollable: as in `holdable`
+    routes, uncontrollable: as in `choose`
     Raises: InputError if the network has too few streets
     """
-    if wanted is None:
-        return choose(streets, baseline, moves, uncontrollable=uncontrollable)
-    if isinstance(wanted, int):
-        return Choice(partition(streets, baseline, wanted, uncontrollable=uncontrollable))
+    if wanted is None or isinstance(wanted, int):
+        return choose(streets, baseline, routes, regions=wanted, uncontrollable=uncontrollable)
     return Choice(finish(streets, wanted, own=True))
+
+
+class _Found(NamedTuple):
+    """Regions (E,), and vehicles that enter the densest one."""
+
+    labels: EdgeNumbers
+    entered: Entered
+
+    @property
+    def net(self) -> int:
+        """Vehicles held less those leaking in."""
+        return self.entered.held - self.entered.leaked
 
 
 def densest_region(streets: Streets, baseline: Baseline, labels: EdgeNumbers) -> int:
@@ -73,55 +102,139 @@ def densest_region(streets: Streets, baseline: Baseline, labels: EdgeNumbers) ->
     return int(np.argmax(vehicles / np.bincount(labels, lanes)))
 
 
-def holdable(
-    streets: Streets,
-    baseline: Baseline,
-    moves: Mapping[tuple[int, int], int],
-    labels: EdgeNumbers,
-    uncontrollable: Collection[str],
-) -> int:
-    """Return the vehicles that gates into the densest region could hold.
-
-    moves: (edge, next edge) -> how often routes lead there
-    uncontrollable: signals that perimeter control cannot use
-    """
-    densest = densest_region(streets, baseline, labels)
-    held = 0
-    for (a, b), signal in zip(streets.links, streets.link_signals, strict=True):
-        enters = labels[a] != densest and labels[b] == densest
-        if enters and signal is not None and signal not in uncontrollable:
-            held += moves.get((int(a), int(b)), 0)
-    return held
-
-
 def choose(
     streets: Streets,
     baseline: Baseline,
-    moves: Mapping[tuple[int, int], int],
+    routes: Routes,
     *,
+    regions: int | None = None,
     uncontrollable: Collection[str] = (),
 ) -> Choice:
-    """Return the partition with 2 to 6 regions whose gates can hold most.
+    """Return the partition whose gates hold most vehicles; see `boundaries`.
 
     Vehicles are counted from the routes of all trips, as a run that locks drives only some. Every
-    region has at least SMALLEST_LANE_KM, if two such regions are possible.
+    region has at least SMALLEST_LANE_KM, if such regions are possible.
 
-    moves, uncontrollable: as in `holdable`
+    regions: their number, None for 2 to 6
+    uncontrollable: signals that perimeter control cannot use
     Raises: InputError if the network has too few streets
     """
     lane_km = streets.lane_metres[streets.drivable].sum() / 1000.0
     most = int(min(max(lane_km // SMALLEST_LANE_KM, FEWEST_REGIONS), MOST_REGIONS))
-    found = {}
-    for count in range(FEWEST_REGIONS, most + 1):
-        labels = partition(streets, baseline, count, uncontrollable=uncontrollable)
+    counts = range(FEWEST_REGIONS, most + 1)
+    if regions is not None:
+        counts = range(regions, regions + 1)
+    turns = Turns(streets, routes, with_room(streets, uncontrollable))
+    search = _Search(streets, baseline, uncontrollable)
+
+    def judged(labels: EdgeNumbers) -> _Found:
+        densest = densest_region(streets, baseline, labels)
+        return _Found(labels, turns.entered(labels == densest))
+
+    by_density = [search.by_density(count) for count in counts]
+    even = EVEN * max(map(search.explained, by_density))
+    plain = max(map(judged, by_density), key=lambda one: one.net)
+    best: dict[int, _Found] = {}  # number of regions -> the best with so many
+    for labels in (*by_density, *search.results(by_density, turns, even)):
+        number = int(labels.max()) + 1
         smallest = np.bincount(labels, streets.lane_metres).min() / 1000.0
-        if count == FEWEST_REGIONS or smallest >= SMALLEST_LANE_KM:
-            regions = int(labels.max()) + 1
-            held = holdable(streets, baseline, moves, labels, uncontrollable)
-            found[regions] = (held, labels)
-    best = max(found, key=lambda regions: (found[regions][0], -regions))
-    held, labels = found[best]
-    others = [f"{found[regions][0]:,} with {regions}" for regions in found if regions != best]
-    than = f", rather than {', '.join(others)}" if others else ""
-    reason = f"{CHOSEN}{best} regions: gates into the densest one meet {held:,} vehicles{than}"
-    return Choice(labels=labels, reason=reason)
+        if smallest < SMALLEST_LANE_KM or regions not in (None, number):
+            continue
+        one = judged(labels)
+        if number not in best or one.net > best[number].net:
+            best[number] = one
+    chosen = judged(by_density[0])
+    if best:
+        most = max(one.net for one in best.values())
+        enough = [number for number, one in best.items() if one.net >= ENOUGH * most]
+        chosen = best[min(enough, default=min(best))]
+    return Choice(labels=chosen.labels, reason=_reason(chosen, plain, sum(routes.values())))
+
+
+def _reason(chosen: _Found, plain: _Found, trips: int) -> str:
+    """Return why these regions are chosen; plain: the best by density alone."""
+    number = int(chosen.labels.max()) + 1
+    held, leaked = chosen.entered
+    return (
+        f"{CHOSEN}{number} regions: of {trips:,} vehicles {held:,} first enter the densest one "
+        f"past gates with room and {leaked:,} elsewhere; by density alone these were "
+        f"{plain.entered.held:,} and {plain.entered.leaked:,}"
+    )
+
+
+class _Search:
+    """Partitions by density, and searches from them."""
+
+    def __init__(self, streets: Streets, baseline: Baseline, uncontrollable: Collection[str]):
+        self._streets = streets
+        self._baseline = baseline
+        self._uncontrollable = uncontrollable
+        blocks = make_blocks(streets)
+        limit = LARGEST_CLUSTER * 1000.0 * SMALLEST_LANE_KM
+        controllable = with_room(streets, uncontrollable)
+        group = without_signals(streets, blocks, baseline.moves(), controllable, limit)
+        density = baseline.density(streets)
+        of = np.where(blocks.of >= 0, group[blocks.of], -1)
+        self._clusters = Clusters.made(streets, of, density)
+        inside = blocks.of >= 0
+        vehicles = np.bincount(
+            blocks.of[inside], (density * streets.lane_metres)[inside], len(blocks.weight)
+        )
+        smooth = features(blocks, vehicles / blocks.weight)[:, 0]
+        metres = np.bincount(group, blocks.weight)
+        away = np.hypot(*(blocks.position - blocks.position[np.argmax(smooth)]).T)
+        self._away = np.bincount(group, blocks.weight * away) / metres
+
+    def by_density(self, regions: int) -> EdgeNumbers:
+        """Return regions (E,) by density alone, a single one if that is asked for."""
+        if regions < FEWEST_REGIONS:
+            return np.zeros(len(self._streets.edges), dtype=int)
+        return partition(
+            self._streets, self._baseline, regions, uncontrollable=self._uncontrollable
+        )
+
+    def explained(self, labels: EdgeNumbers) -> float:
+        """Return the share of the variance of density between regions."""
+        return self._clusters.between(self._on_clusters(labels))
+
+    def results(
+        self, by_density: Sequence[EdgeNumbers], turns: Turns, even: float
+    ) -> Iterator[EdgeNumbers]:
+        """Yield regions (E,) found from those by density and from centres.
+
+        even: as in Limits
+        """
+        clusters = self._clusters
+        for plain in by_density:
+            regions = int(plain.max()) + 1
+            smallest = SMALLEST_SHARE * clusters.metres.sum() / regions
+            limits = Limits(smallest=max(1000.0 * SMALLEST_LANE_KM, smallest), even=even)
+            starts = [self._on_clusters(plain)]
+            around = self._on_clusters(self.by_density(regions - 1))
+            for share in CENTRES:
+                starts.append(self._with_centre(around, share))
+            for labels in starts:
+                better = clusters.improved(labels, turns, limits)
+                if clusters.between(better) >= even:
+                    yield finish(self._streets, clusters.on_edges(better))
+
+    def _with_centre(self, labels: Labels, share: float) -> Labels:
+        """Return regions (U,) with a new one round the densest place.
+
+        share: of all lanes
+        """
+        metres = self._clusters.metres
+        order = np.argsort(self._away)
+        centre = order[np.cumsum(metres[order]) <= share * metres.sum()]
+        cut = labels.copy()
+        cut[centre] = labels.max() + 1
+        edges = np.maximum(self._clusters.on_edges(cut), 0)
+        return self._on_clusters(connect(self._streets, edges))
+
+    def _on_clusters(self, labels: EdgeNumbers) -> Labels:
+        """Return the region (U,) of every cluster from that of edges."""
+        of = self._clusters.of
+        inside = of >= 0
+        found = np.zeros(len(self._clusters.metres), dtype=int)
+        found[of[inside]] = labels[inside]
+        return np.unique(found, return_inverse=True)[1]

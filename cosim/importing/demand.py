@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import pairwise
 from typing import NamedTuple
 from xml.etree.ElementTree import Element, SubElement
 
@@ -50,7 +49,7 @@ class Traffic:
 
     vehicles: the demand, N `vehicle` and `trip` elements by departure
     depart: (N,) [s]; origin, destination: (N,) edges, numbers of Streets
-    moves: (edge, next edge) -> how often the routes of all vehicles lead there
+    routes: edges -> number of vehicles of the demand
     background: public transport, persons, and vehicles without a fixed departure
     shared: types, routes, stops, programmes and other contents of the additional files
     notes: what was changed or left out -> count
@@ -65,7 +64,7 @@ class Traffic:
     depart: PerTrip
     origin: TripNumbers
     destination: TripNumbers
-    moves: Mapping[tuple[int, int], int] = field(default_factory=dict)
+    routes: Mapping[tuple[int, ...], int] = field(default_factory=dict)
     background: tuple[Element, ...] = ()
     shared: tuple[Element, ...] = ()
     notes: Mapping[str, int] = field(default_factory=dict)
@@ -134,7 +133,7 @@ class Reading:
         self._metres_kept = 0.0
         self._queued: dict[int, float] = {}  # step of the simulation -> last departure
         self._cars_at = Counter[float]()  # departure -> trips
-        self._moves = Counter[tuple[int, int]]()
+        self._routes = Counter[tuple[int, ...]]()
         self._notes = Counter[str]()
 
     def file(self, root: Element) -> None:
@@ -229,7 +228,7 @@ class Reading:
             self._notes[BUSES] += 1
             return
         self._cars_at[depart] += 1
-        self._moves.update(pairwise(edges))
+        self._routes[tuple(edges)] += 1
         first = edges[_index(element.get("departEdge", ""), 0)]
         last = edges[_index(element.get("arrivalEdge", ""), -1)]
         self._trips.append(_Trip(depart, first, last, element))
@@ -287,7 +286,7 @@ class Reading:
             depart=np.array([trip.depart for trip in trips], dtype=float),
             origin=np.array([trip.first for trip in trips], dtype=int),
             destination=np.array([trip.last for trip in trips], dtype=int),
-            moves=self._moves,
+            routes=self._routes,
             background=tuple(sorted(self._background, key=departure)),
             shared=tuple(self._shared),
             notes={note: count for note, count in self._notes.items() if count},

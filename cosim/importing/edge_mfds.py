@@ -19,8 +19,8 @@ import numpy as np
 import pandas as pd
 
 from cosim.importing.baseline import INTERVAL_S, Baseline, Way
-from cosim.importing.choice import AUTO, labelled, number_of
-from cosim.importing.partition import digraph, names, own_regions, positions
+from cosim.importing.choice import AUTO, Choice, labelled, number_of
+from cosim.importing.partition import digraph, names, own_regions, partition, positions
 from cosim.importing.streets import Streets, numbers_of, read_streets
 from cosim.sumo.arrays import EdgeNumbers, PerEdge
 from cosim.sumo.edge_data import read_edge_data
@@ -102,7 +102,11 @@ def edge_mfds(net: Path, edge_data: Sequence[Path], regions: str, out: Path) -> 
         days.append(rows.assign(day=day, number=numbers))
     rows = pd.concat(days, ignore_index=True)
     baseline = _baseline(streets, rows, len(days))
-    choice = labelled(streets, baseline, baseline.moves(), wanted)
+    if isinstance(wanted, int):
+        choice = Choice(partition(streets, baseline, wanted))
+    else:
+        pairs = {way: vehicles for (way, _), vehicles in baseline.ways.items()}
+        choice = labelled(streets, baseline, pairs, wanted)
     region_names = names(streets, choice.labels)
     lane_km = np.bincount(choice.labels, streets.lane_metres) / 1000.0
     samples = _samples(rows, choice.labels, region_names, lane_km)

@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -48,7 +47,7 @@ FILES = {
     "additional": "city.add.xml.gz",
 }
 REPORT = "import.txt"
-# How its lines begin: on the comparison with plain SUMO, and on the number of regions.
+# How its lines begin: on the comparison with plain SUMO, and on the regions.
 COMPARISONS = ("same city", "not the same city", "not compared")
 CHOICES = (CHOSEN,)
 TYPES = ("vType", "vTypeDistribution")
@@ -87,7 +86,7 @@ class City:
 
     case: from its beginning on; labels: (E,) region of every edge
     given: regions of the user's own table (E,), -1 where it has none; None without a table
-    chosen: why there are so many regions, "" if the user said how many
+    chosen: why these regions, "" if they are the user's own
     left: signals that perimeter control does not use -> reason
     switched: of these, signals whose programme a timetable changes
     factor: of the demand [-]; mesoscopic: the scenario's model
@@ -120,7 +119,7 @@ def import_city(
     out: Path,
     scenario: Path | None = None,
     *,
-    regions: int | Path | str,
+    regions: int | Path | str = AUTO,
     routes: Sequence[Path] = (),
     counts: Path | None = None,
     demand: str | None = None,
@@ -272,7 +271,7 @@ def _imported(
     everywhere = without_effect(case.options, mesoscopic)
     left = quality.left_alone(streets, switched, everywhere)
     wanted = request.count if given is None else given
-    choice = labelled(streets, baseline, traffic.moves, wanted, uncontrollable=left)
+    choice = labelled(streets, baseline, traffic.routes, wanted, uncontrollable=left)
     if choice.labels.max() < 1:
         raise InputError(
             f"{streets.path}: no two regions can be made that can be reached from each other"
@@ -354,14 +353,14 @@ def _peak(
             time_to_teleport=case.time_to_teleport,
             progress=progress,
         )
-    moves = Counter[tuple[int, int]]()
+    routes = Counter[tuple[int, ...]]()
     for vehicle in traffic.vehicles:
         route = vehicle.find("route")
         edges = assigned.routes.get(vehicle.get("id", ""))
         if route is not None and edges is not None:
             route.set("edges", " ".join(edges))
-            moves.update(pairwise(streets.number[edge] for edge in edges))
-    return replace(traffic, moves=moves), assigned
+            routes[tuple(streets.number[edge] for edge in edges)] += 1
+    return replace(traffic, routes=routes), assigned
 
 
 def _write_traffic(folder: Path, traffic: Traffic) -> dict[str, list[str]]:

@@ -1,10 +1,11 @@
 """Maps of regions, with gateways and outlines."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
+from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 
@@ -16,6 +17,8 @@ from nmfd.arrays import Positions
 
 CELLS = 160  # along the longer side of the raster for outlines
 POINT_SPACING_M = 40.0  # between the points that stand for an edge
+REACH = 0.05  # of the map's extent: places farther from all streets belong to no region
+PALE = 0.2  # share of its colour in the land of a region; the rest is white
 SMALLEST_RING_SHARE = 0.02  # of the area of the largest ring
 BOX = {"boxstyle": "round,pad=0.25", "facecolor": "white", "alpha": 0.85}  # of a region's name
 COLOURS = (
@@ -40,16 +43,20 @@ def region_map(
     places: Positions,
     tables: Tables,
 ) -> Axes:
-    """Draw streets in the colour of their region, and gateways.
+    """Draw regions, their streets, and gateways.
 
-    A gateway is filled if a controllable signal stands there.
+    A gateway is an arrow in the colour of the region that it leads into, filled if a controllable
+    signal stands there.
     """
     members = np.flatnonzero(streets.drivable)
+    outlines = rings_round([streets.shapes[n] for n in members], regions[members], REACH)
+    for region, ring in largest_first(outlines):
+        ax.fill(*ring.T, facecolor=pale(region), edgecolor=colour(region), linewidth=0.6, zorder=0)
     lines = LineCollection(
         [streets.shapes[n] for n in members],
         linewidths=0.6 + 0.5 * np.minimum(streets.lanes[members], 4),
         capstyle="round",
-        colors=[COLOURS[region % len(COLOURS)] for region in regions[members]],
+        colors=[colour(region) for region in regions[members]],
     )
     ax.add_collection(lines)
     ax.autoscale_view()
@@ -57,28 +64,51 @@ def region_map(
     ax.set_axis_off()
     for region, (x, y) in enumerate(places):
         title = f"{region} {names[region]}"
-        box = BOX | {"edgecolor": COLOURS[region % len(COLOURS)]}
+        box = BOX | {"edgecolor": colour(region)}
         ax.text(x, y, title, ha="center", va="center", fontsize="small", zorder=5, bbox=box)
-    controlled, free = set(), set()
+    arrows = {}
     for gateway in tables.gateways:
-        if gateway["control"] == CONTROLLED:
-            controlled.add(gateway["from_edge"])
-        else:
-            free.add(gateway["from_edge"])
-    _mark_ends(ax, streets, sorted(controlled), face="black", label="gateway with a signal")
-    _mark_ends(ax, streets, sorted(free), face="white", label="without control")
-    if tables.gateways:
-        below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.01)}
-        ax.legend(ncols=2, frameon=False, fontsize="small", **below)
+        tone = colour(gateway["target"])
+        face = tone if gateway["control"] == CONTROLLED else "white"
+        arrows[gateway["from_edge"], face] = tone
+    for (edge, face), tone in sorted(arrows.items()):
+        _arrow(ax, streets.shapes[streets.number[edge]], face, tone)
+    if arrows:
+        key = "Arrows: gateways, in the colour of the region they lead into; white: without control"
+        ax.text(0.5, -0.02, key, ha="center", va="top", fontsize="small", transform=ax.transAxes)
     return ax
 
 
-def _mark_ends(ax: Axes, streets: Streets, edges: Sequence[str], *, face: str, label: str) -> None:
-    """Draw a point at the end of every edge."""
-    if edges:
-        x, y = np.array([streets.shapes[streets.number[edge]][-1] for edge in edges]).T
-        style = {"edgecolor": "black", "linewidths": 0.8, "zorder": 4}
-        ax.scatter(x, y, s=14, facecolor=face, label=label, **style)
+def _arrow(ax: Axes, shape: Points, face: str, rim: str) -> None:
+    """Draw an arrow at the end of a street."""
+    x, y = shape[-1]
+    along = shape[-1] - shape[-2]
+    up = np.degrees(np.arctan2(along[1], along[0])) - 90.0
+    style = {"facecolor": face, "edgecolor": "black", "linewidths": 0.7, "zorder": 4}
+    if face == "white":
+        style["edgecolor"] = rim
+    ax.scatter(x, y, s=34, marker=(3, 0, up), **style)
+
+
+def colour(region: int) -> str:
+    """Return the colour of a region."""
+    return COLOURS[region % len(COLOURS)]
+
+
+def pale(region: int) -> str:
+    """Return the colour of a region's land."""
+    return to_hex(1.0 - PALE * (1.0 - np.array(to_rgb(colour(region)))))
+
+
+def largest_first(outlines: Iterable[Iterable[Points]]) -> list[tuple[int, Points]]:
+    """Return region and ring of all outlines, to be drawn in this order.
+
+    A region in the midst of another is not hidden by it.
+    """
+    rings = []
+    for region, outline in enumerate(outlines):
+        rings += [(region, ring) for ring in outline]
+    return sorted(rings, key=lambda pair: -abs(_area(pair[1])))
 
 
 def rings_round(

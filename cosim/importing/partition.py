@@ -102,7 +102,8 @@ def partition(
     controllable = []
     for signal in streets.link_signals:
         controllable.append(signal is not None and signal not in uncontrollable)
-    merged = _without_signals(streets, blocks, baseline.moves(), np.array(controllable), regions)
+    limit = UNSIGNALLED_SHARE * blocks.weight.sum() / regions
+    merged = without_signals(streets, blocks, baseline.moves(), np.array(controllable), limit)
     inside = blocks.of >= 0
     vehicles = baseline.density(streets) * streets.lane_metres
     density = np.bincount(blocks.of[inside], vehicles[inside], count) / blocks.weight
@@ -183,16 +184,19 @@ def make_blocks(streets: Streets) -> Blocks:
     return Blocks(of=of, weight=weight, core=core, position=position, joins=joins)
 
 
-def _without_signals(
+def without_signals(
     streets: Streets,
     blocks: Blocks,
     moves: Counter[tuple[int, int]],
     controllable: np.ndarray,
-    regions: int,
+    limit: float,
 ) -> np.ndarray:
     """Return a group (B,) for every block.
 
     Blocks that much traffic joins without a controllable signal share one.
+
+    controllable: (L,) for every link
+    limit: of a group [m of lanes]
     """
     flow: Counter[tuple[int, int]] = Counter()
     for (a, b), controlled in zip(streets.links, controllable, strict=True):
@@ -200,7 +204,6 @@ def _without_signals(
         if one >= 0 and one != other and not controlled:
             flow[int(one), int(other)] += moves[int(a), int(b)]
     pairs = sorted(flow, key=lambda pair: (-flow[pair], pair))
-    limit = UNSIGNALLED_SHARE * blocks.weight.sum() / regions
     label = np.arange(len(blocks.weight))
     size = blocks.weight.copy()
     for pair in pairs:

@@ -1,16 +1,18 @@
 """Answer of a study: sentences, table of the terminal, HTML page."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
 
 from cosim.evaluation import results, statistics
 from cosim.importing.importer import COMPARISONS, reported
 from cosim.reporting import html
-from cosim.studying.stages import LABELS, Level, Loading, Outcome
+from cosim.studying.stages import LABELS, Level, Loading, Outcome, compared
 from cosim.studying.verdict import FEWEST_SEEDS, NOTHING_PERCENT, Answer, Verdict
-from cosim.sumo.net import network_folder
+from cosim.sumo.net import edge_shapes, network_folder
 from nmfd.model.scenario import Scenario
 from nmfd.runs import files
 from nmfd.runs.run_many import TABLE
@@ -18,6 +20,7 @@ from nmfd.runs.tables import NARROW, text_table, wrapped
 from nmfd.studies.benchmark import REFERENCE
 
 PAGE = "study.html"
+MOST_QUEUES = 10
 HALF_RANGE = 50.0  # of the drawn changes (%); larger ones end there
 NO_COMPARISON = "Not compared with plain SUMO: the scenario was not imported by this study"
 
@@ -50,7 +53,24 @@ class Study:
 
     @property
     def recommended(self) -> tuple[Level, Outcome] | None:
-        """The best strategy that can be recommended, and its demand.
+        """The strategy to recommend, and its demand.
+
+        That is the simplest one that is not told apart from the best.
+        """
+        found = self.best
+        if found is None:
+            return None
+        level, best = found
+        simplest_first = list(LABELS)
+        alike = []
+        for one in level.outcomes:
+            if self._sound(one) and not told_apart(best, one):
+                alike.append(one)
+        return level, min(alike, key=lambda one: simplest_first.index(one.strategy))
+
+    @property
+    def best(self) -> tuple[Level, Outcome] | None:
+        """The strategy that saves most, and its demand.
 
         That is the lowest demand at which there is one. It gains there, and neither harms nor
         leaves more trips unserved at any demand.
@@ -83,6 +103,11 @@ class Study:
         return found
 
 
+def told_apart(best: Outcome, other: Outcome) -> bool:
+    """Return True if the common seeds show that the best one saves more."""
+    return compared(best.spent, other.spent).answer is Answer.GAINS
+
+
 def harmful(one: Outcome) -> bool:
     """Return True if harm is the verdict, or likelier than not."""
     if one.verdict is None:
@@ -96,21 +121,31 @@ def _percent(one: Outcome) -> float:
 
 def answer(study: Study) -> str:
     """Return the answer to the engineer's question in one sentence."""
-    best = study.recommended
-    if best is not None:
-        level, one = best
+    found = study.recommended
+    if found is not None:
+        level, one = found
         assert one.verdict is not None
         saved = one.verdict.change.removeprefix("-")
         chance = f"the odds are {_chance(one.verdict.odds.gains)} that it is more than"
         begins = "Yes" if level is study.levels[0] else "Not today, but with more traffic"
         return (
             f"{begins}: {one.label} would save {saved} of the time spent {_at(level)}; "
-            f"{chance} {NOTHING_PERCENT:g} %."
+            f"{chance} {NOTHING_PERCENT:g} %.{_not_told_apart(study, one)}"
         )
     if study.undecided:
         labels = dict.fromkeys(one.label for _, one in study.undecided)
         return f"Cannot say yet: {', '.join(labels)} may help or not; nothing else does."
     return "No: nothing that was tried saves time without leaving more trips unserved."
+
+
+def _not_told_apart(study: Study, simpler: Outcome) -> str:
+    """Return a sentence on the best strategy, "" if it is recommended."""
+    assert study.best is not None
+    _, best = study.best
+    if best is simpler or best.verdict is None:
+        return ""
+    saved = best.verdict.change.removeprefix("-")
+    return f" With {saved}, {best.label} is not told apart from that, which is simpler."
 
 
 def next_line(study: Study) -> str:
@@ -284,6 +319,8 @@ def write(study: Study) -> Path:
         trust=trust(study),
         map=shown,
         map_demand=f"{demand:g}",
+        queues=queues(finished, demand, names),
+        queue_names=[LABELS[name] for name in names],
         map_names=" and ".join(LABELS[name] for name in names),
         manifest=html.made_by(finished),
         table=TABLE,
@@ -291,6 +328,36 @@ def write(study: Study) -> Path:
     )
     files.write_text(study.page, text)
     return study.page
+
+
+def queues(finished: results.Finished, demand: float, names: Sequence[str]) -> list[dict]:
+    """Return the streets with the longest queues, by those of the first strategy.
+
+    A row has the street, its region, the signal at its end, where it ends (x, y) [m], and the
+    longest queue [veh] of every strategy, mean over their common seeds.
+    """
+    city = finished.map()
+    titles = finished.scenario.network.titles
+    runs = statistics.common_runs(finished.level(demand), names)
+    means = [np.mean([run["queue_max"] for run in of], axis=0) for of in runs if of]
+    if not means:
+        return []
+    shapes = edge_shapes(city)
+    rows = []
+    for edge in np.argsort(-means[0], kind="stable")[:MOST_QUEUES]:
+        name = city.edges[edge]
+        x, y = shapes[edge][-1]
+        rows.append(
+            {
+                "street": name,
+                "region": titles[city.edge_region[edge]],
+                "signal": city.signals.get(name, "–"),
+                "x": round(float(x)),
+                "y": round(float(y)),
+                "queues": [f"{mean[edge]:.0f}" for mean in means],
+            }
+        )
+    return rows
 
 
 def _shown(level: Level) -> dict[str, object]:

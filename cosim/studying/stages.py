@@ -30,12 +30,13 @@ from nmfd.studies import fit_quality
 from nmfd.studies.benchmark import REFERENCE
 from nmfd.types import Result
 
-FIRST_SEED = 1000
+LOADING_SEED = 1000  # it chooses the demand levels, and judges no strategy
+FIRST_SEED = 1001
 NEAR_CRITICAL = 0.8  # of the critical accumulation, below which gates stay open
 # More trips left than without control, as a share of all, that rule a strategy out.
 UNSERVED_SHARE = 0.001
-# Strategy -> its name in tables. Drivers are asked every minute: a full city can lock under
-# guidance that asks once per region.
+# Strategy -> its name in tables, the simplest first. Drivers are asked every minute: a full city
+# can lock under guidance that asks once per region.
 EVERYWHERE = {
     "actuated": "actuated signals",
     "max-pressure": "max-pressure signals",
@@ -90,16 +91,17 @@ class Runner:
     out: Path
     workers: int
 
-    def planned(self, names: Sequence[str], levels: Sequence[float], seeds: int) -> list[Run]:
-        """Return runs with the first seeds.
+    def planned(
+        self, names: Sequence[str], levels: Sequence[float], seeds: Sequence[int]
+    ) -> list[Run]:
+        """Return runs of strategies at demand levels.
 
         The expected time of a run comes from finished ones, if there are any.
 
         Raises: InputError if a run is impossible
         """
         strategies = [parse(name) for name in names]
-        chosen = range(FIRST_SEED, FIRST_SEED + seeds)
-        runs = evaluation.plan([(self.scenario, levels)], strategies, chosen)
+        runs = evaluation.plan([(self.scenario, levels)], strategies, seeds)
         pace = self._seconds_per_trip() / SECONDS_PER_TRIP
         return [replace(run, expected=run.expected * pace) for run in runs]
 
@@ -111,7 +113,9 @@ class Runner:
         spent = rows["wall_time_s"] + rows["setup_time_s"]
         return float(spent.sum() / max(rows["trips"].sum(), 1))
 
-    def done(self, names: Sequence[str], levels: Sequence[float], seeds: int) -> pd.DataFrame:
+    def done(
+        self, names: Sequence[str], levels: Sequence[float], seeds: Sequence[int]
+    ) -> pd.DataFrame:
         """Do the runs that are not finished; return a row for each.
 
         A failed run has no row.
@@ -123,19 +127,18 @@ class Runner:
         raise_failures(rows[rows["controller"] == REFERENCE])
         rows = results.finished_rows(rows)
         wanted = rows["controller"].isin(names) & rows["demand"].isin(levels)
-        last = FIRST_SEED + seeds - 1
-        return rows[wanted & rows["seed"].between(FIRST_SEED, last)]
+        return rows[wanted & rows["seed"].isin(seeds)]
 
     def result(self, level: float) -> Result:
-        """Return the first run without control at a demand level."""
-        return results.read_run(self.out, REFERENCE, FIRST_SEED, demand=level)
+        """Return the loading run at a demand level."""
+        return results.read_run(self.out, REFERENCE, LOADING_SEED, demand=level)
 
     def impossible(self) -> dict[str, str]:
         """Return the strategies that cannot run in this city, with the reason."""
         reasons = {}
         for name in (*EVERYWHERE, *AT_CRITICAL):
             try:
-                self.planned([name], LEVELS[:1], 1)
+                self.planned([name], LEVELS[:1], [FIRST_SEED])
             except InputError as error:
                 reasons[name] = str(error)
         return reasons
@@ -164,7 +167,7 @@ def loading(runner: Runner) -> Loading:
     say(f"Loading without control, until the city breaks: demand times {_listed(LEVELS)}")
     for first in range(0, len(LEVELS), runner.workers):
         levels = LEVELS[first : first + runner.workers]
-        rows = runner.done([REFERENCE], levels, 1).set_index("demand")
+        rows = runner.done([REFERENCE], levels, [LOADING_SEED]).set_index("demand")
         for level in levels:
             row = rows.loc[level]
             left[level] = unfinished(row) / max(row["trips"], 1)
@@ -232,7 +235,7 @@ def measured(runner: Runner, load: Loading, runs: Sequence[Result]) -> RegionalM
         guided=False,
         options=(),
         levels=list(load.left),
-        seeds=[FIRST_SEED],
+        seeds=[LOADING_SEED],
         iterations=ITERATIONS,
         out=runner.out,
         workers=runner.workers,
@@ -265,12 +268,14 @@ class Outcome:
     verdict: None for the reference
     means: column of runs.csv -> mean over its seeds
     more_left: trips left more than without control, paired by seed, share of all [-]
+    spent: seed -> time spent [veh s]
     """
 
     strategy: str
     verdict: Verdict | None
     means: Mapping[str, float]
     more_left: float = 0.0
+    spent: Mapping[int, float] = field(default_factory=dict)
 
     @property
     def label(self) -> str:
@@ -314,7 +319,7 @@ def level_of(
         f"Strategies at demand times {level:g}: no control and {len(names)} others, "
         f"{seeds} seeds first"
     )
-    rows = runner.done([REFERENCE, *names], [level], seeds)
+    rows = runner.done([REFERENCE, *names], [level], first_seeds(seeds))
     outcomes = {}
     left_out = dict(skipped)
     for name in (REFERENCE, *names):
@@ -332,9 +337,14 @@ def level_of(
         seeds = more_seeds(seeds, [outcomes[name].verdict for name in undecided], most)
         labels = ", ".join(LABELS[name] for name in undecided)
         say(f"Not decided: {labels}; now with {seeds} seeds")
-        rows = runner.done([REFERENCE, *undecided], [level], seeds)
+        rows = runner.done([REFERENCE, *undecided], [level], first_seeds(seeds))
         for name in (REFERENCE, *undecided):
             outcomes[name] = outcome(rows, level, name)
+
+
+def first_seeds(count: int) -> range:
+    """Return the first seeds of the comparison."""
+    return range(FIRST_SEED, FIRST_SEED + count)
 
 
 def more_seeds(seeds: int, undecided: Sequence[Verdict | None], most: int) -> int:
@@ -354,16 +364,29 @@ def outcome(rows: pd.DataFrame, level: float, name: str) -> Outcome:
     """Return what a strategy achieved against no control on common seeds."""
     own = rows[rows["controller"] == name]
     means = own.mean(numeric_only=True).to_dict()
-    if name == REFERENCE:
-        return Outcome(strategy=name, verdict=None, means=means)
     spent = statistics.by_seed(rows, level, name)
+    if name == REFERENCE:
+        return Outcome(strategy=name, verdict=None, means=means, spent=spent)
     reference = statistics.by_seed(rows, level, REFERENCE)
-    common = sorted(set(spent) & set(reference))
-    changes = [percent_change(spent[seed], reference[seed]) for seed in common]
-    before = rows[(rows["controller"] == REFERENCE) & rows["seed"].isin(common)]
+    before = rows[(rows["controller"] == REFERENCE) & rows["seed"].isin(spent)]
     more = own.apply(unfinished, axis=1).mean() - before.apply(unfinished, axis=1).mean()
     share = float(more / max(before["trips"].mean(), 1))
-    return Outcome(strategy=name, verdict=judge(changes), means=means, more_left=share)
+    return Outcome(
+        strategy=name,
+        verdict=compared(spent, reference),
+        means=means,
+        more_left=share,
+        spent=spent,
+    )
+
+
+def compared(spent: Mapping[int, float], reference: Mapping[int, float]) -> Verdict:
+    """Judge the change of the time spent against a reference.
+
+    spent, reference: seed -> time spent [veh s]; the seeds of both count
+    """
+    common = sorted(set(spent) & set(reference))
+    return judge([percent_change(spent[seed], reference[seed]) for seed in common])
 
 
 def _listed(levels: Sequence[float] | Mapping[float, float]) -> str:

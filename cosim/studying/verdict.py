@@ -139,6 +139,6 @@ def seeds_needed(mean: float, deviation: float) -> int | None:
         margin = NOTHING_PERCENT - margin
     for seeds in range(FEWEST_SEEDS, MOST_NEEDED + 1):
         half = stdtrit(seeds - 1, CERTAIN) * deviation / math.sqrt(seeds)
-        if half < margin:
+        if half <= margin:
             return seeds
     return None

@@ -19,6 +19,7 @@ from bokeh.models import (
 from bokeh.plotting import figure
 from bokeh.transform import linear_cmap
 
+from cosim.importing import maps
 from cosim.sumo.arrays import PerEdge, Points
 from cosim.sumo.net import JAM_SPACING
 from cosim.view import colours
@@ -89,6 +90,7 @@ class CityMap:
         self.regions = self._add_regions()
         self.streets = self._add_streets()
         far = self._add_gates(picture.boundaries)
+        far.parts.append(self._add_ways(far))
         near = self._add_gates(picture.gates)
         self.gates = (far, near)
         self._add_numbers()
@@ -124,27 +126,22 @@ class CityMap:
         of_rings = self.regions.data["region"]
         width = np.ones(len(of_rings))
         line = [colours.FAINT] * len(of_rings)
-        fill = [colours.LAND] * len(of_rings)
         for n, of_ring in enumerate(of_rings):
             if of_ring == region:
                 width[n] = 2.5
                 line[n] = colours.CHOSEN
-                fill[n] = colours.CHOSEN_LAND
-        patch(self.regions, width=width, line=line, fill=fill)
+        patch(self.regions, width=width, line=line)
 
     def _add_regions(self) -> ColumnDataSource:
-        regions = []
-        rings = []
-        for region, outline in enumerate(self._picture.outlines):
-            for ring in outline:
-                regions.append(region)
-                rings.append(ring)
+        outlines = maps.largest_first(self._picture.outlines)
+        regions = [region for region, _ in outlines]
+        rings = [ring for _, ring in outlines]
         source = _source(
             **_lines(rings),
             region=regions,
             width=np.ones(len(rings)),
             line=[colours.FAINT] * len(rings),
-            fill=[colours.LAND] * len(rings),
+            fill=[maps.pale(region) for region in regions],
         )
         style = {"fill_color": "fill", "line_color": "line", "line_width": "width"}
         self.plot.patches("xs", "ys", source=source, **style)
@@ -194,12 +191,12 @@ class CityMap:
             halo=np.zeros(len(gates)),
             size=np.where(signal, 2.0 * GATE_RADIUS + 2.0, GATE_RADIUS),
             radius=np.where(signal, GATE_RADIUS, 0.0),
-            rim=np.where(signal, colours.INK, colours.FAINT).tolist(),
+            rim=[maps.colour(gate.target) for gate in gates],
         )
         plot = self.plot
         glow = {"size": "halo", "color": colours.QUEUE, "alpha": 0.3, "line_color": None}
         halo = plot.scatter("x", "y", source=source, **glow)
-        disc = {"size": "size", "fill_color": colours.PAPER, "line_color": "rim"}
+        disc = {"size": "size", "fill_color": colours.PAPER, "line_color": "rim", "line_width": 2}
         discs = plot.scatter("x", "y", source=source, **disc)
         wedges = plot.wedge(
             "x",
@@ -221,6 +218,11 @@ class CityMap:
         )
         members = [list(gate.gateways) for gate in gates]
         return Gates(members, source, [halo, discs, wedges])
+
+    def _add_ways(self, gates: Gates) -> Any:
+        """Write beside each gate from which region into which it leads."""
+        style = {"text_font_size": "11px", "text_color": colours.INK, "text_baseline": "middle"}
+        return self.plot.text("x", "y", text="way", source=gates.source, x_offset=9, **style)
 
     def _add_numbers(self) -> None:
         x, y = self._picture.places.astype(np.float32).T

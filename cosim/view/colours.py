@@ -12,7 +12,6 @@ LINE = "#d5dae0"
 PAPER = "#ffffff"
 LAND = "#f3f5f7"
 CHOSEN = "#0b5c8a"
-CHOSEN_LAND = "#dcebf5"
 GREEN = "#0b7a5b"
 QUEUE = "#a3123a"
 DASHES = ("solid", "dashed")  # of the runs side by side

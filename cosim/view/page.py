@@ -39,8 +39,8 @@ TOP_SHARE = 0.02  # of the streets; short ones would leave all others pale
 LONGEST = 30  # characters of a name beside a plot; the table of numbers has all
 NARROWEST = 330  # pixels, of a plot; on a narrower screen plots stand below each other
 KEY = (
-    f"<span style='color:{colours.GREEN}'>◕</span> gates of a boundary, closer each gate; "
-    "green: share of its original green time &ensp; "
+    f"<span style='color:{colours.GREEN}'>◕</span> gates from region → region, closer each gate; "
+    "rim: colour of the region entered; green: share of its original green time &ensp; "
     f"<span style='color:{colours.QUEUE}'>●</span> halo: queue before it &ensp; ➍ protected region"
 )
 HEADS = (
@@ -216,7 +216,7 @@ def with_slider(
         words.append(page.numbers.text)
     of_region = Film()
     for one in page.maps:
-        of_region.add(one.regions, ["width", "line", "fill"])
+        of_region.add(one.regions, ["width", "line"])
     for line in page.curves.lines:
         of_region.add(line, OF_REGION)
     of_region.add(page.curves.critical, ["x", "y"])
