@@ -35,7 +35,7 @@ class Limits(NamedTuple):
 
 
 class Entered(NamedTuple):
-    """Vehicles that start elsewhere and enter a region, by where they first enter.
+    """Vehicles from elsewhere that enter a region, by where they do first.
 
     held: past gates with room
     """
