@@ -31,7 +31,8 @@ Job = Callable[[], Any]
 NEVER_ANSWERED = 124  # exit status of a process whose controller does not answer
 WATCH_S = 1.0  # between two looks at a decision
 POLL_S = 0.2  # longest wait without a look at Ctrl-C, which Windows needs
-PRELOADED = ("xarray",)
+# If dask is installed, xarray imports it with the first Dataset of a process.
+PRELOADED = ("xarray", "dask.array")
 ALSO_THERE = ("torch", "casadi")  # preloaded if this process has them, as its jobs then need them
 NAME = "run"  # of the processes
 STARTING = threading.Lock()  # held while a process starts
