@@ -35,7 +35,7 @@ class Limits(NamedTuple):
 
 
 class Entered(NamedTuple):
-    """Vehicles that start elsewhere and enter a region, by where they first enter.
+    """Vehicles from elsewhere, by where they first enter a region.
 
     held: past gates with room
     """

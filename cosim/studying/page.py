@@ -328,7 +328,7 @@ def write(study: Study) -> Path:
 
 
 def queues(finished: results.Finished, demand: float, names: Sequence[str]) -> list[dict]:
-    """Return the streets with the longest queues, by those of the first strategy.
+    """Return the streets with the longest queues of the first strategy.
 
     A row has the street, its region, the signal at its end, where it ends (x, y) [m], and the
     longest queue [veh] of every strategy, mean over their common seeds.
