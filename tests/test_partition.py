@@ -12,7 +12,7 @@ from tiny_city import pieces
 from cosim.importing.baseline import INTERVAL_S, Baseline
 from cosim.importing.boundaries import Turns, with_room
 from cosim.importing.choice import choose, densest_region
-from cosim.importing.partition import finish, make_blocks, own_regions, partition
+from cosim.importing.partition import finish, make_blocks, names, own_regions, partition
 from cosim.importing.quality import doubts
 from cosim.importing.streets import read_streets
 from nmfd.errors import InputError
@@ -192,6 +192,11 @@ def test_a_vehicle_counts_once_where_it_first_enters_from_elsewhere(streets):
     assert Turns(streets, routes, held).entered(inside) == (5, 3)
     assert Turns(streets, routes, ~held).entered(inside) == (3, 5)
     assert Turns(streets, {}, held).entered(inside) == (0, 0)
+
+
+def test_a_region_round_the_centre_is_a_ring(streets):
+    inside = (np.abs(streets.centre - 600.0) < 310.0).all(axis=1)
+    assert names(streets, inside.astype(int)) == ("ring", "centre")
 
 
 def test_a_gate_needs_room_before_it(streets):

@@ -35,7 +35,7 @@ class Limits(NamedTuple):
 
 
 class Entered(NamedTuple):
-    """Vehicles from elsewhere that enter a region, by where they do first.
+    """Vehicles from elsewhere, by where they first enter a region.
 
     held: past gates with room
     """

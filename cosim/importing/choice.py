@@ -146,17 +146,20 @@ def choose(
     chosen = judged(by_density[0])
     if best:
         most = max(one.net for one in best.values())
-        enough = [number for number, one in best.items() if one.net >= ENOUGH * most]
-        chosen = best[min(enough, default=min(best))]
-    return Choice(labels=chosen.labels, reason=_reason(chosen, plain, sum(routes.values())))
+        least = most - (1.0 - ENOUGH) * abs(most)
+        chosen = best[min(number for number, one in best.items() if one.net >= least)]
+    reason = f"{CHOSEN}{chosen.labels.max() + 1}"
+    if regions is None:
+        reason += f", the fewest whose gates hold {ENOUGH:.0%} of the most"
+    reason += f"; {_gates_text(chosen, plain, sum(routes.values()))}"
+    return Choice(labels=chosen.labels, reason=reason)
 
 
-def _reason(chosen: _Found, plain: _Found, trips: int) -> str:
-    """Return why these regions are chosen; plain: the best by density alone."""
-    number = int(chosen.labels.max()) + 1
+def _gates_text(chosen: _Found, plain: _Found, trips: int) -> str:
+    """Return what gates hold; plain: the best by density alone."""
     held, leaked = chosen.entered
     return (
-        f"{CHOSEN}{number} regions: of {trips:,} vehicles {held:,} first enter the densest one "
+        f"of {trips:,} vehicles {held:,} first enter the densest one "
         f"past gates with room and {leaked:,} elsewhere; by density alone these were "
         f"{plain.entered.held:,} and {plain.entered.leaked:,}"
     )

@@ -371,15 +371,16 @@ def _gravity(streets: Streets, members: np.ndarray) -> np.ndarray:
 
 
 def names(streets: Streets, regions: EdgeNumbers) -> tuple[str, ...]:
-    """Name each region by its place: centre, north, south-west 2, ..."""
+    """Name each region by its place: centre, ring, north, south-west 2, ..."""
     places, middle = positions(streets, regions), _gravity(streets, regions >= 0)
-    radius = np.sqrt(
-        np.average(((streets.centre - middle) ** 2).sum(axis=1), weights=streets.lane_metres)
-    )
+    away = ((streets.centre - middle) ** 2).sum(axis=1)
+    mean = np.average(away, weights=streets.lane_metres)
     plain: list[str] = []
-    for x, y in places - middle:
-        if np.hypot(x, y) < CENTRAL_SHARE * radius:
-            plain.append("centre")
+    for region, (x, y) in enumerate(places - middle):
+        if np.hypot(x, y) < CENTRAL_SHARE * np.sqrt(mean):
+            own = regions == region
+            around = np.average(away[own], weights=streets.lane_metres[own] + 1e-6) > mean
+            plain.append("ring" if around else "centre")
         else:
             plain.append(DIRECTIONS[round(np.arctan2(y, x) / (np.pi / 4)) % 8])
     numbered = []
