@@ -67,7 +67,7 @@ def test_help_is_quick_fits_a_screen_and_shows_examples(package):
     )
     lines = (done.stdout + done.stderr).splitlines()  # without arguments, the help is shown
     assert lines[0].startswith("Usage: ")
-    assert len(lines) <= 24
+    assert len(lines) <= 26
     assert max(map(len, lines)) <= 80
     assert f"Begin with `{package}" in " ".join(lines)
 

@@ -22,7 +22,7 @@ FREE = 10.0  # m/s
 SLOWER = 0.8  # while unloading
 
 
-def meandata(edges, loads, freq=300.0):
+def meandata(streets, loads, freq=300.0):
     """edgeData with equally many vehicles on all edges, which drive slower while they get fewer;
     a vehicle on a junction does not count."""
     lines = ["<meandata>"]
@@ -32,9 +32,9 @@ def meandata(edges, loads, freq=300.0):
             speed *= SLOWER
         lines.append(f'<interval begin="{k * freq}" end="{(k + 1) * freq}">')
         lines.append('<edge id=":A0_0" sampledSeconds="900" speed="1"/>')
-        for edge in edges:
+        for edge, length in zip(streets.edges, streets.length, strict=True):
             about = f'sampledSeconds="{load * freq}" speed="{speed}" arrived="1"'
-            lines.append(f'<edge id="{edge}" {about}/>')
+            lines.append(f'<edge id="{edge}" density="{1000 * load / length}" {about}/>')
         lines.append("</interval>")
     return "\n".join([*lines, "</meandata>"])
 
@@ -44,9 +44,10 @@ def made(tmp_path_factory):
     """A network, edgeData up to 24 vehicles on each edge and down again, and a table of regions."""
     folder = tmp_path_factory.mktemp("made")
     net = tiny_city.network(folder)
-    edges = read_streets(net).edges
+    streets = read_streets(net)
+    edges = streets.edges
     loads = [*range(1, 25), *range(23, 0, -1)]
-    (folder / "edges.xml").write_text(meandata(edges, loads))
+    (folder / "edges.xml").write_text(meandata(streets, loads))
     west = [int("A" not in edge and "B" not in edge) for edge in edges]
     pd.DataFrame({"edge": edges, "region": west}).to_csv(folder / "own.csv", index=False)
     return folder
@@ -58,7 +59,7 @@ def test_the_curve_that_made_the_data_comes_back(made, tmp_path):
     edges = np.bincount(found.regions["region"])
     samples = pd.read_csv(tmp_path / "samples.csv")
     first = samples[samples["region"] == found.network.region_names[0]]
-    assert first["accumulation_veh"].tolist()[:2] == [edges[0], 2.0 * edges[0]]
+    assert first["accumulation_veh"].tolist()[:2] == pytest.approx([edges[0], 2 * edges[0]])
     production = 3.6 * 2.0 * edges[0] * FREE * (1.0 - 2.0 / FULL)
     assert first["production_veh_km_h"][1] == pytest.approx(production, rel=1e-4)
     assert (first["arrived_veh"] == edges[0]).all()
@@ -96,11 +97,15 @@ ONE = '<interval begin="0" end="{}">{}</interval>'
         ("day,interval\n", "is not SUMO's edgeData"),
         ("<net/>", "expected <meandata>, got a file of <net>"),
         ("<meandata></meandata>", "has no edges; put <edgeData"),
-        (ONE.format(60, EDGE.format(9, "")), "edge A0A1: speed: missing"),
+        (ONE.format(60, EDGE.format(9, "")), "edge A0A1: density: missing"),
+        (ONE.format(60, EDGE.format(9, 'density="1"')), "edge A0A1: speed: missing"),
         (ONE.format(60, '<edge id="A0A1"/>'), "edge A0A1: sampledSeconds: missing"),
         (2 * ONE.format(60, EDGE.format(0, "")), "of 0 s to 60 s begins before 60 s"),
         (ONE.format(60, '<edge id="none" sampledSeconds="0"/>'), "edge none is not in"),
-        (ONE.format(60, EDGE.format(9, 'speed="1"')), "has vehicles in 1 intervals; an MFD needs"),
+        (
+            ONE.format(60, EDGE.format(9, 'density="1" speed="1"')),
+            "has vehicles in 1 intervals; an MFD needs",
+        ),
     ],
 )
 def test_one_clear_line(made, tmp_path, content, expected):
@@ -123,10 +128,9 @@ def test_missing_files_and_odd_numbers(made, tmp_path):
 
 @pytest.mark.slow
 def test_the_accumulations_are_those_of_the_run(tmp_path):
-    """Vehicles on junctions are in neither of the two means. SUMO counts a vehicle on an edge until
-    its rear has left, so that a locked region holds up to a tenth more. `identify` fits its MFD to
-    outflows, and to accumulations with the vehicles on junctions: in the centre the critical ones
-    differ by less than 15 %, and production over the mean trip length is the outflow."""
+    """Vehicles on junctions are in neither of the two means. `identify` fits its MFD to outflows,
+    and to accumulations with the vehicles on junctions: in the centre the critical ones differ by
+    less than 20 %, and production over the mean trip length is the outflow."""
     measure = tmp_path / "edges.add.xml"
     output = tmp_path / "edges.xml"
     measure.write_text(f'<additional><edgeData id="a" freq="90" file="{output}"/></additional>')
@@ -139,7 +143,7 @@ def test_the_accumulations_are_those_of_the_run(tmp_path):
     names = list(found.network.region_names)
     vehicles = tables["accumulation_veh"][names].to_numpy()
     production = tables["production_veh_km_h"][names].to_numpy() / 3.6
-    assert vehicles == pytest.approx(run["mean_accumulation"], rel=0.12, abs=3.0)
+    assert vehicles == pytest.approx(run["mean_accumulation"], rel=0.1, abs=3.0)
     assert production == pytest.approx(run["production"], rel=0.15, abs=20.0)
     outflow = regional_outflow(run, run.step)
     trip_length = production.sum(axis=0) / outflow.sum(axis=0)
@@ -150,4 +154,4 @@ def test_the_accumulations_are_those_of_the_run(tmp_path):
     cloud = outflow_samples(scenario.network, [run])[centre]
     identified = mfd.fit(*fit_quality.own_points(cloud).T)
     critical = found.fits["critical_veh"][centre]
-    assert critical == pytest.approx(identified.critical, rel=0.15)
+    assert critical == pytest.approx(identified.critical, rel=0.2)

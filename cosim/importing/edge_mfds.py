@@ -2,13 +2,13 @@
 
 With the edges of a region and an interval of T seconds (Edie, 1963),
 
-    accumulation   n = sum of sampledSeconds / T               [veh]
-    production     P = sum of sampledSeconds times speed / T   [veh km/h]
+    accumulation   n = sum of density times length   [veh]
+    production     P = sum of distance / T           [veh km/h]
 
 P / n is the mean speed, and P over the lane-kilometres the mean flow per lane. The outflow of a
 region is not there, as edgeData has no turns; it is about P over the mean trip length within it.
 
-`nmfd identify` does the same for tables of detectors.
+Edges on junctions do not count. `nmfd identify` does the same for tables of detectors.
 """
 
 from collections.abc import Mapping, Sequence
@@ -99,7 +99,8 @@ def edge_mfds(net: Path, edge_data: Sequence[Path], regions: str, out: Path) -> 
     for day, path in enumerate(edge_data):
         rows = read_edge_data(path)
         numbers = numbers_of(rows["edge"], streets, path)
-        days.append(rows.assign(day=day, number=numbers))
+        vehicles = rows["density"] * streets.length[numbers] / 1000.0
+        days.append(rows.assign(day=day, number=numbers, vehicles=vehicles))
     rows = pd.concat(days, ignore_index=True)
     baseline = _baseline(streets, rows, len(days))
     if isinstance(wanted, int):
@@ -130,13 +131,14 @@ def edge_mfds(net: Path, edge_data: Sequence[Path], regions: str, out: Path) -> 
 def _baseline(streets: Streets, rows: pd.DataFrame, days: int) -> Baseline:
     """Return presence and turns, by which regions are found.
 
-    rows: EdgeRow, day and number
+    rows: EdgeRow, day, number and vehicles
     """
-    longest = (rows["end"] - rows["begin"]).max()
+    length = rows["end"] - rows["begin"]
+    longest = length.max()
     window = longest * np.ceil(INTERVAL_S / longest)
     place = ((rows["begin"] - rows["begin"].min()) / window).astype(int)
     presence = np.zeros((place.max() + 1, len(streets.edges)))
-    time = rows["time"] * INTERVAL_S / window / days
+    time = rows["vehicles"] * length * INTERVAL_S / window / days
     np.add.at(presence, (place, rows["number"]), time)
     edges = rows.groupby("number")[["left", "entered"]].sum()
     counts = edges.reindex(range(len(streets.edges)), fill_value=0.0)
@@ -159,15 +161,14 @@ def _turns(streets: Streets, left: PerEdge, entered: PerEdge) -> Mapping[Way, in
 def _samples(
     rows: pd.DataFrame, labels: EdgeNumbers, region_names: Sequence[str], lane_km: PerRegion
 ) -> pd.DataFrame:
-    """Return EdgeMfds.samples. rows: EdgeRow, day and number"""
+    """Return EdgeMfds.samples. rows: EdgeRow, day, number and vehicles"""
     region = labels[rows["number"]]
     keys = ["region", "day", "begin"]
     sums = rows.assign(region=region).groupby(keys)
-    table = sums[["time", "distance", "arrived"]].sum().join(sums["end"].first()).reset_index()
-    length = table["end"] - table["begin"]
+    table = sums[["vehicles", "distance", "arrived"]].sum().join(sums["end"].first()).reset_index()
     lanes = lane_km[table["region"]]
-    accumulation = table["time"] / length
-    production = 3.6 * table["distance"] / length
+    accumulation = table["vehicles"]
+    production = 3.6 * table["distance"] / (table["end"] - table["begin"])
     return pd.DataFrame(
         {
             "region": np.array(region_names)[table["region"]],

@@ -21,8 +21,8 @@ class EdgeRow(NamedTuple):
     """One edge in one interval.
 
     begin, end: of the interval (s)
-    time: spent by all vehicles on the edge (veh s)
-    distance: driven by them there (veh m)
+    density: of all lanes (veh/km)
+    distance: driven by all vehicles there (veh m)
     entered, left: vehicles that came from another edge, and went on to another one
     arrived: vehicles that ended their trip there
     """
@@ -30,7 +30,7 @@ class EdgeRow(NamedTuple):
     begin: float
     end: float
     edge: str
-    time: float
+    density: float
     distance: float
     entered: float
     left: float
@@ -40,8 +40,8 @@ class EdgeRow(NamedTuple):
 def read_edge_data(path: Path, needed: str = "sampledSeconds") -> pd.DataFrame:
     """Return the edges outside junctions as rows with the columns of EdgeRow.
 
-    SUMO counts a vehicle on every edge that it covers. So edges on junctions are left out: their
-    vehicles count for the edges before and after as well.
+    density and distance count a vehicle where its front is; sampledSeconds counts it on every edge
+    that it covers.
 
     needed: attribute that every edge must have
 
@@ -63,10 +63,9 @@ def read_edge_data(path: Path, needed: str = "sampledSeconds") -> pd.DataFrame:
                 raise ValueError(f"interval of {begin:g} s to {end:g} s begins before {last:g} s")
             last = end
             for edge in element.iter("edge"):
-                if attribute(edge, "id").startswith(ON_JUNCTION):
-                    continue
-                attribute(edge, needed)
-                rows.append(_row(edge, begin, end))
+                if not attribute(edge, "id").startswith(ON_JUNCTION):
+                    attribute(edge, needed)
+                    rows.append(_row(edge, begin, end))
             element.clear()
     if not rows:
         raise InputError(f"{path}: has no edges; {REMEDY}")
@@ -76,17 +75,22 @@ def read_edge_data(path: Path, needed: str = "sampledSeconds") -> pd.DataFrame:
 def _row(edge: ElementTree.Element, begin: float, end: float) -> EdgeRow:
     """Return an <edge>; attributes that are not there are 0.
 
-    Raises: ValueError for a time without a speed
+    Raises: ValueError for a time without a density, or without a distance and a speed
     """
-    time = float(edge.get("sampledSeconds", 0.0))
+    density = 0.0
     distance = 0.0
+    time = float(edge.get("sampledSeconds", 0.0))
     if time > 0.0:
-        distance = time * float(attribute(edge, "speed"))
+        density = float(attribute(edge, "density"))
+        if "distance" in edge.attrib:
+            distance = float(attribute(edge, "distance"))
+        else:  # of an older SUMO
+            distance = time * float(attribute(edge, "speed"))
     return EdgeRow(
         begin=begin,
         end=end,
         edge=attribute(edge, "id"),
-        time=time,
+        density=density,
         distance=distance,
         entered=float(edge.get("entered", 0.0)),
         left=float(edge.get("left", 0.0)),
