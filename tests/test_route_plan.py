@@ -187,7 +187,7 @@ def test_a_plan_is_made_followed_and_resumed(tmp_path):
     assert (scenario / "plan.csv.gz").read_bytes() == first
     assert [run.stat().st_mtime_ns for run in runs] == before
     assert len(read_driven(tmp_path / "runs" / "routes-2.xml")) > 100
-    evaluate = ("evaluate", scenario, "--seeds", "7,", "--demand", 2, "--out", tmp_path / "other")
+    evaluate = ("evaluate", scenario, "--seeds", "7-7", "--demand", 2, "--out", tmp_path / "other")
     good(cosim(*evaluate, "--controllers", "planned+guided+compliance-50,no-control"))
     again = cosim(*evaluate, "--controllers", "planned+max-pressure", "--set", "sumo.routes=[]")
     assert "sumo.planned" in error_line(again)
