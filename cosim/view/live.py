@@ -4,7 +4,6 @@ The server answers on this machine only.
 """
 
 import logging
-import math
 import multiprocessing
 import queue
 import re
@@ -69,8 +68,6 @@ h1 { font: 600 22px sans-serif; margin: 8px 6px; overflow-wrap: anywhere; }
 {{ super() }}
 {% endblock %}
 """
-LOADING_S = 2.0  # after which the terminal says what is under way
-POLL_S = 0.05
 HOSTS = ("localhost", "127.0.0.1", "[::1]")  # names of this machine that a browser may ask for
 
 
@@ -371,15 +368,10 @@ def watch(jobs: Sequence[Simulation], *, port: int = 0, browse: bool = False) ->
     """
     logging.getLogger("bokeh").setLevel(logging.ERROR)
     show = Show(jobs)
-    said_at = time.monotonic() + LOADING_S
     try:
         while show.picture is None and not show.over:
             show.update()
-            time.sleep(POLL_S)
-            if time.monotonic() > said_at:
-                said_at = math.inf
-                name = jobs[0].scenario.name
-                print(f"cosim: SUMO loads {name}; the page follows", file=sys.stderr)
+            time.sleep(0.05)
         if show.picture is not None:
             server = PageServer(show, port)
             print(f"cosim: Watch it at {server.address}", file=sys.stderr)
