@@ -108,11 +108,11 @@ def in_processes(
                 number = live.pop(future)
                 yield number, _outcome(future, limits[number])
     finally:  # after Ctrl-C there are some
+        for future in live:  # first, as pebble raises errors of its own for processes that died
+            future.cancel()
         for process in multiprocessing.active_children():
             if live and process.name == NAME:
                 process.kill()
-        for future in live:
-            future.cancel()
 
 
 def in_subprocess(job: Job, folder: str) -> Any:
