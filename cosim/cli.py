@@ -424,12 +424,7 @@ def get(name: str | None) -> None:
     help="Box in degrees to download from OpenStreetMap, instead of a file.",
 )
 @click.option("--left-hand", is_flag=True, help="OpenStreetMap: traffic keeps left.")
-@click.option(
-    "--regions",
-    default="auto",
-    metavar="N|auto|CSV",
-    help="Number of regions to find, auto, or a table edge,region.",
-)
+@REGIONS
 @ROUTES
 @COUNTS
 @click.option(

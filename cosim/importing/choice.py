@@ -5,6 +5,7 @@ place: the ring and centre of perimeter control.
 """
 
 from collections.abc import Collection, Iterator, Sequence
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ from cosim.importing.boundaries import (
 )
 from cosim.importing.partition import (
     SMALLEST_SHARE,
+    block_density,
     connect,
     features,
     finish,
@@ -176,19 +178,15 @@ class _Search:
         limit = LARGEST_CLUSTER * 1000.0 * SMALLEST_LANE_KM
         controllable = with_room(streets, uncontrollable)
         group = without_signals(streets, blocks, baseline.moves(), controllable, limit)
-        density = baseline.density(streets)
         of = np.where(blocks.of >= 0, group[blocks.of], -1)
-        self._clusters = Clusters.made(streets, of, density)
-        inside = blocks.of >= 0
-        vehicles = np.bincount(
-            blocks.of[inside], (density * streets.lane_metres)[inside], len(blocks.weight)
-        )
-        smooth = features(blocks, vehicles / blocks.weight)[:, 0]
+        self._clusters = Clusters.made(streets, of, baseline.density(streets))
+        smooth = features(blocks, block_density(streets, blocks, baseline))[:, 0]
         metres = np.bincount(group, blocks.weight)
         away = np.hypot(*(blocks.position - blocks.position[np.argmax(smooth)]).T)
         self._away = np.bincount(group, blocks.weight * away) / metres
+        self.by_density = cache(self._by_density)
 
-    def by_density(self, regions: int) -> EdgeNumbers:
+    def _by_density(self, regions: int) -> EdgeNumbers:
         """Return regions (E,) by density alone, a single one if that is asked for."""
         if regions < FEWEST_REGIONS:
             return np.zeros(len(self._streets.edges), dtype=int)

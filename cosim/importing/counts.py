@@ -79,7 +79,7 @@ def sampled(counts: Path, streets: Streets, folder: Path, seed: int, progress: P
     progress("trips from counts")
     rows = read_edge_data(counts, ENTERED)
     numbers_of(rows["edge"], streets, counts)
-    if not rows["entered"].sum():
+    if not rows[ENTERED].sum():
         raise InputError(f"{counts}: all counts ({ENTERED}) are 0; give counted vehicles")
     peak = morning_peak(streets, level=1.0, begin=0.0, seed=seed)
     candidates = folder / "candidates.rou.xml"

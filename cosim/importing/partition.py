@@ -104,15 +104,19 @@ def partition(
         controllable.append(signal is not None and signal not in uncontrollable)
     limit = UNSIGNALLED_SHARE * blocks.weight.sum() / regions
     merged = without_signals(streets, blocks, baseline.moves(), np.array(controllable), limit)
-    inside = blocks.of >= 0
-    vehicles = baseline.density(streets) * streets.lane_metres
-    density = np.bincount(blocks.of[inside], vehicles[inside], count) / blocks.weight
     weight = np.bincount(merged, blocks.weight)
     means = []  # of merged blocks, which then look alike
-    for axis in features(blocks, density).T:
+    for axis in features(blocks, block_density(streets, blocks, baseline)).T:
         means.append(np.bincount(merged, blocks.weight * axis) / weight)
     labels = cluster(blocks, np.stack(means, axis=1)[merged], regions)
-    return finish(streets, np.where(inside, labels[blocks.of], -1))
+    return finish(streets, np.where(blocks.of >= 0, labels[blocks.of], -1))
+
+
+def block_density(streets: Streets, blocks: Blocks, baseline: Baseline) -> Float[np.ndarray, " B"]:
+    """Return the density of every block without control (veh/m of lane)."""
+    inside = blocks.of >= 0
+    vehicles = baseline.density(streets) * streets.lane_metres
+    return np.bincount(blocks.of[inside], vehicles[inside], len(blocks.weight)) / blocks.weight
 
 
 def cluster(

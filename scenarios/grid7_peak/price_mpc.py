@@ -8,7 +8,7 @@ same regional model.
 Every interval it lowers the mean total time spent of MODELS rollouts over HORIZON intervals, each
 with a regional model of its own, by ITERATIONS of Adam on u and prices held over the horizon, from
 those of the last interval. The costs are the best of six pairs in SUMO at twice the demand on seed
-1100 (reference/README.md), with the fitted model of then.
+1100, found with an earlier regional model (reference/README.md).
 """
 
 import time

@@ -149,6 +149,7 @@ def rule(
     planning: PlanningModel,
     numbers: Sequence[float],
     *,
+    name: str,
     guidance: bool,
     metering: bool,
 ) -> DpcController:
@@ -159,4 +160,6 @@ def rule(
     architecture = Architecture(guidance=guidance, compact=planning.protected, metering=metering)
     policy = kind(planning.network, architecture)
     policy.numbers.data.copy_(torch.tensor(numbers, dtype=DTYPE))
-    return DpcController(policy)
+    controller = DpcController(policy)
+    controller.name = name
+    return controller

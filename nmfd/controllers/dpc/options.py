@@ -251,15 +251,14 @@ class GatingRule(Options):
     def make(self, planning: PlanningModel) -> "DpcController":
         from nmfd.controllers.dpc.compact import CompactPolicy, rule
 
-        controller = rule(
+        return rule(
             CompactPolicy,
             planning,
             Numbers(*self.numbers),
+            name=self.name,
             guidance=self.guidance,
             metering=self.metering,
         )
-        controller.name = self.name
-        return controller
 
 
 class PricingRule(GatingRule):
@@ -295,12 +294,11 @@ class ConstantControl(Options):
         from nmfd.controllers.dpc.compact import rule
         from nmfd.controllers.dpc.constant import ConstantPolicy
 
-        controller = rule(
+        return rule(
             ConstantPolicy,
             planning,
             Levels(*self.numbers),
+            name=self.name,
             guidance=self.guidance,
             metering=self.metering,
         )
-        controller.name = self.name
-        return controller
