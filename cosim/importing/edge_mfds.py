@@ -5,10 +5,12 @@ With the edges of a region and an interval of T seconds (Edie, 1963),
     accumulation   n = sum of density times length   [veh]
     production     P = sum of distance / T           [veh km/h]
 
-P / n is the mean speed, and P over the lane-kilometres the mean flow per lane. The outflow of a
-region is not there, as edgeData has no turns; it is about P over the mean trip length within it.
+P / n is the mean speed, and P over the lane-kilometres the mean flow per lane. The outflow counts
+trips that ended in the region and vehicles that left it. edgeData has no turns: those that leave an
+edge are divided as the next edges are entered.
 
-Edges on junctions do not count. `nmfd identify` does the same for tables of detectors.
+Edges on junctions do not count. `cosim identify` counts outflow, too, but divides transfers by what
+the gates let pass. `nmfd identify` does the same as here for tables of detectors.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,7 +24,7 @@ from cosim.importing.baseline import INTERVAL_S, Baseline, Way
 from cosim.importing.choice import AUTO, Choice, labelled, number_of
 from cosim.importing.partition import digraph, names, own_regions, partition, positions
 from cosim.importing.streets import Streets, numbers_of, read_streets
-from cosim.sumo.arrays import EdgeNumbers, PerEdge
+from cosim.sumo.arrays import EdgeNumbers, Points
 from cosim.sumo.edge_data import read_edge_data
 from nmfd.arrays import PerRegion
 from nmfd.errors import InputError
@@ -34,9 +36,13 @@ from nmfd.studies import fit_quality, plots
 from nmfd.studies.measured import U_MAX, U_MIN, samples_of
 
 PRODUCTION = "production_veh_km_h"
+OUTFLOW = "outflow_veh_s"
+KEYS = ["region", "day", "begin"]  # of a sample
 CAPTION = """\
-critical: accumulation at the largest production, its density in veh per lane-km; "above": not seen
+critical: accumulation [veh] at the largest production, its density in veh per lane-km; "above": not
+seen
 production: the largest of the fitted curve [veh km/h]; speed: there [km/h]
+by outflow: accumulation at the largest outflow
 hysteresis: excess of production while loading over unloading at the same accumulation
 R2: share of the variance that the curve explains"""
 
@@ -48,10 +54,11 @@ class EdgeMfds:
     regions: edge and region of every edge
     chosen: why there are so many regions, "" if the user said how many
     samples: a row per region, file (day) and interval, with accumulation_veh, production_veh_km_h,
-        density_veh_km and flow_veh_h (both per lane), speed_km_h and arrived_veh (trips that ended
-        there)
+        density_veh_km and flow_veh_h (both per lane), speed_km_h, arrived_veh (trips that ended
+        there) and outflow_veh_s
     network: its MFDs give the production [veh km/h]
-    fits: a row per region: fit_quality.region_fits, and lane_km
+    fits: a row per region: fit_quality.region_fits, lane_km and outflow_critical_veh (NaN: not
+        seen)
     out: folder of files
     """
 
@@ -110,12 +117,15 @@ def edge_mfds(net: Path, edge_data: Sequence[Path], regions: str, out: Path) -> 
         choice = labelled(streets, baseline, pairs, wanted)
     region_names = names(streets, choice.labels)
     lane_km = np.bincount(choice.labels, streets.lane_metres) / 1000.0
-    samples = _samples(rows, choice.labels, region_names, lane_km)
+    outflow = _outflow(streets, rows, choice.labels)
+    samples = _samples(rows, choice.labels, region_names, lane_km, outflow)
     network = _network(streets, choice.labels, region_names, samples)
     clouds = samples_of(samples, region_names, PRODUCTION)
     fits = fit_quality.region_fits(network, clouds, lane_km=lane_km)
     # One run has few samples, so that one of either branch is enough.
     fits["hysteresis"] = [fit_quality.hysteresis(cloud, fewest=1) for cloud in clouds]
+    outflows = samples_of(samples, region_names, OUTFLOW)
+    fits["outflow_critical_veh"] = [_critical(cloud) for cloud in outflows]
     found = EdgeMfds(
         regions=pd.DataFrame({"edge": streets.edges, "region": choice.labels}),
         chosen=choice.reason,
@@ -140,32 +150,66 @@ def _baseline(streets: Streets, rows: pd.DataFrame, days: int) -> Baseline:
     presence = np.zeros((place.max() + 1, len(streets.edges)))
     time = rows["vehicles"] * length * INTERVAL_S / window / days
     np.add.at(presence, (place, rows["number"]), time)
-    edges = rows.groupby("number")[["left", "entered"]].sum()
-    counts = edges.reindex(range(len(streets.edges)), fill_value=0.0)
-    ways = _turns(streets, counts["left"].to_numpy(), counts["entered"].to_numpy())
+    pairs = streets.links.tolist()
+    vehicles = _turns(streets, rows).round().astype(int).tolist()
+    ways: dict[Way, int] = {}
+    for (edge, following), passed in zip(pairs, vehicles, strict=True):
+        ways[(edge, following), following] = passed
     return Baseline(presence=presence, ways=ways, teleports=0, waiting=0, running=0)
 
 
-def _turns(streets: Streets, left: PerEdge, entered: PerEdge) -> Mapping[Way, int]:
-    """Return the vehicles from edge to edge, about.
-
-    Those that leave an edge are divided as the next edges are entered.
-    """
+def _turns(streets: Streets, rows: pd.DataFrame) -> np.ndarray:
+    """Return the vehicles of each link from edge to edge, about (veh, (L,))."""
+    edges = len(streets.edges)
+    left = np.bincount(rows["number"], rows["left"], edges)
+    entered = np.bincount(rows["number"], rows["entered"], edges)
     source, target = streets.links.T
-    onward = np.bincount(source, entered[target], len(left))
-    flow = left[source] * entered[target] / np.maximum(onward[source], 1.0)
-    turns = zip(source.tolist(), target.tolist(), flow.round().astype(int).tolist(), strict=True)
-    return {((edge, following), following): vehicles for edge, following, vehicles in turns}
+    onward = np.bincount(source, entered[target], edges)
+    return left[source] * entered[target] / np.maximum(onward[source], 1.0)
+
+
+def _outflow(streets: Streets, rows: pd.DataFrame, labels: EdgeNumbers) -> pd.Series:
+    """Return the outflow (veh/s) by KEYS. rows: EdgeRow, day and number"""
+    regions = labels.max() + 1
+    before, after = labels[streets.links].T
+    leaves = before != after
+    outflow = {}
+    for (day, begin), interval in rows.groupby(["day", "begin"]):
+        ended = np.bincount(labels[interval["number"]], interval["arrived"], regions)
+        left = np.bincount(before[leaves], _turns(streets, interval)[leaves], regions)
+        seconds = interval["end"].iloc[0] - begin
+        for region, vehicles in enumerate(ended + left):
+            outflow[region, day, begin] = vehicles / seconds
+    series = pd.Series(outflow, name=OUTFLOW)
+    series.index.names = KEYS
+    return series
+
+
+def _critical(cloud: Mapping[str, Points]) -> float:
+    """Return the critical accumulation (veh) of samples of outflow, NaN if not seen."""
+    points = fit_quality.own_points(cloud)
+    curve = mfd.fit(*points.T)
+    if fit_quality.falls(curve, points[:, 0].max()):
+        return curve.critical
+    return float("nan")
 
 
 def _samples(
-    rows: pd.DataFrame, labels: EdgeNumbers, region_names: Sequence[str], lane_km: PerRegion
+    rows: pd.DataFrame,
+    labels: EdgeNumbers,
+    region_names: Sequence[str],
+    lane_km: PerRegion,
+    outflow: pd.Series,
 ) -> pd.DataFrame:
-    """Return EdgeMfds.samples. rows: EdgeRow, day, number and vehicles"""
+    """Return EdgeMfds.samples.
+
+    rows: EdgeRow, day, number and vehicles
+    outflow: of `_outflow`
+    """
     region = labels[rows["number"]]
-    keys = ["region", "day", "begin"]
-    sums = rows.assign(region=region).groupby(keys)
-    table = sums[["vehicles", "distance", "arrived"]].sum().join(sums["end"].first()).reset_index()
+    sums = rows.assign(region=region).groupby(KEYS)
+    totals = sums[["vehicles", "distance", "arrived"]].sum().join(sums["end"].first())
+    table = totals.join(outflow).reset_index()
     lanes = lane_km[table["region"]]
     accumulation = table["vehicles"]
     production = 3.6 * table["distance"] / (table["end"] - table["begin"])
@@ -181,6 +225,7 @@ def _samples(
             "flow_veh_h": production / lanes,
             "speed_km_h": production / accumulation.where(accumulation > 0),
             "arrived_veh": table["arrived"],
+            OUTFLOW: table[OUTFLOW],
         }
     )
 
@@ -228,6 +273,9 @@ def _row(fit: pd.Series) -> dict[str, object]:
         critical = f"above {fit['critical_above_veh']:,.0f}"
         density = "-"
         speed = "-"
+    by_outflow = "-"
+    if not np.isnan(fit["outflow_critical_veh"]):
+        by_outflow = f"{fit['outflow_critical_veh']:,.0f}"
     loop = "-"
     if not np.isnan(fit["hysteresis"]):
         loop = f"{fit['hysteresis']:+.0%}"
@@ -235,10 +283,11 @@ def _row(fit: pd.Series) -> dict[str, object]:
         "region": f"{fit['region']} {fit['name']}",
         "lane-km": f"{fit['lane_km']:.1f}",
         "samples": fit["samples"],
-        "critical [veh]": critical,
+        "critical": critical,
         "veh/lane-km": density,
         "production": f"{fit['max_outflow_veh_s']:,.0f}",
         "speed": speed,
+        "by outflow": by_outflow,
         "hysteresis": loop,
         "R2": f"{fit['r2']:.2f}",
     }
