@@ -19,9 +19,9 @@ class Streets:
     """A session: vehicles on junction x, since when they stand, and what is free of lanes a_0 and
     b_0, 50 m long unless told otherwise [m]."""
 
-    def __init__(self, standing, room, length=50.0):
+    def __init__(self, standing, room, **lengths):
         self.standing, self.free, self.set_on = standing, room, {}
-        self.length = length
+        self.lengths = lengths
         self.at = {"first": ":x_1_0", "second": ":x_2_0", "third": ":x_2_0"}
 
     def halting(self, edge):
@@ -50,7 +50,7 @@ class Streets:
         return 0
 
     def lane(self, lane):
-        return self.length, frozenset()
+        return self.lengths.get(lane, 50.0), frozenset()
 
     def room(self, lane):
         return self.free[lane]
@@ -93,9 +93,15 @@ def test_vehicles_are_set_down_where_all_have_room(standing, room, expected):
 @pytest.mark.parametrize("room, expected", [(0.2, {"first": ("a_0", 0.2)}), (-4.8, {})])
 def test_on_a_street_too_short_for_a_vehicle_it_is_set_at_the_end(room, expected):
     """A second vehicle, whose end is 4.8 m before the street, leaves no room there."""
-    streets = Streets({"first": 130.0}, {"a_0": room}, length=0.2)
+    streets = Streets({"first": 130.0}, {"a_0": room}, a_0=0.2)
     Junctions(streets, CITY).free()
     assert streets.set_on == expected
+
+
+def test_a_full_street_too_short_for_a_vehicle_does_not_keep_the_others():
+    streets = Streets({"first": 130.0, "third": 130.0}, {"a_0": -4.8, "b_0": 50.0}, a_0=0.2)
+    Junctions(streets, CITY).free()
+    assert set(streets.set_on) == {"third"}
 
 
 @pytest.mark.parametrize("room, expected", [(50.0, {"first": "a_0", "third": "b_0"}), (0.0, {})])

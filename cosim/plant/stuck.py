@@ -10,8 +10,9 @@ turn is left, and the city locks.
 On a junction, vehicles give way to each other, also to standing ones. Such a ring never ends
 without teleports. So vehicles that have stood on a junction for long are put on the streets behind
 it, if all of them have room there. On a street shorter than a vehicle it is put at the end, if
-nobody else is there. Who stands on such a street stands on the junction, too. A junction that is
-blocked by a full street stays blocked: that is gridlock, and it counts.
+nobody else is there; if somebody is, it waits, and does not keep the others. Who stands on such a
+street stands on the junction, too. A junction that is blocked by a full street stays blocked: that
+is gridlock, and it counts.
 """
 
 from collections import defaultdict
@@ -109,17 +110,19 @@ class Junctions:
     def _free(self, vehicles: list[str]) -> None:
         """Put the vehicles of one junction on the streets behind it.
 
-        Nothing happens unless there is room for all.
+        Nothing happens unless there is room for all, but for those behind a short street.
         """
         lanes: dict[str, str] = {}  # lane behind the junction -> first vehicle that goes there
         for vehicle in vehicles:
             lane = self._lane_behind(vehicle)
             if lane is None:
                 return
+            length = self._length(lane)
             needed = self._session.vehicle_length(vehicle) + 2.0 * GAP_M
-            if self._session.room(lane) < min(needed, self._length(lane)):
-                return
-            lanes.setdefault(lane, vehicle)
+            if self._session.room(lane) >= min(needed, length):
+                lanes.setdefault(lane, vehicle)
+            elif length >= SHORT_STREET_M:
+                return  # who waits for a short street may follow the vehicle that leaves it
         for lane, vehicle in lanes.items():
             position = self._session.vehicle_length(vehicle) + GAP_M
             position = min(position, self._length(lane))
