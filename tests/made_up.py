@@ -87,6 +87,8 @@ def result(scenario, strategy, *, seed, demand, city) -> Result:
         "guided": crossings * guides,
         "co2": random.uniform(0.0, 90.0, edges).astype(np.float32),
         "queue_max": random.integers(0, 30, edges),
+        "time_loss": np.full(edges, 3600.0, np.float32),
+        "passed": np.full(edges, 80.0 if acts else 60.0, np.float32),
         "trip_time_by_origin": np.where(np.arange(regions) == 2, 1300.0, 900.0)
         if guides
         else np.full(regions, 1000.0),

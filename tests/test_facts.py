@@ -176,6 +176,8 @@ def test_vehicles_under_way_have_emitted(run):
     plant, record, running, trips = run
     assert record.arrivals.sum() < 0.2 * record.departures.sum()  # hardly any trip has ended
     totals = plant.edge_totals()
+    assert totals["passed"].sum() > 2 * record.departures.sum()  # each passes several streets
+    assert 0.0 < totals["time_loss"].sum() < record.time_spent.sum() + record.other_time_spent.sum()
     assert totals["co2"].sum() == pytest.approx(trips["co2_kg"], rel=1e-5)
     edges = [plant.city.edges.index(gateway.from_edge) for gateway in plant.city.gateways]
     assert (totals["queue_max"][edges] == record.gateway_queue_max.max(axis=0)).all()

@@ -76,7 +76,8 @@ def test_from_a_scenario_to_a_page(ran, tmp_path):
     shown = (out / "study.html").read_text(encoding="utf-8")
     assert all(f"<td>{label}</td>" in shown for label in EVERYWHERE.values())
     assert "metering: not judged" in shown
-    assert shown.count('onclick="look(') == page.MOST_QUEUES
+    assert shown.count('onclick="look(') == 2 * page.MOST_PLACES
+    assert shown.count("<td>60 s, E</td>") == page.MOST_PLACES  # at signals, without control
 
 
 def test_a_folder_holds_one_study(tmp_path):

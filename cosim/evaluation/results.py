@@ -27,8 +27,10 @@ MEASURES = (
     "crossings",
     "departures",
     "guided",
+    "passed",
     "perimeter",
     "queue_max",
+    "time_loss",
     "trip_time_by_origin",
 )
 

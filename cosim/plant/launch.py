@@ -64,7 +64,7 @@ class Launch:
 
     vehicles: ids of those of the last run; held: its trips under metering
     planned: ids of its vehicles for which a plan has routes
-    trip_file: SUMO's tripinfo output; emission_file: emissions by edge at the end of the run
+    trip_file: SUMO's tripinfo output; emission_file, traffic_file: by edge, at the end of the run
     """
 
     def __init__(
@@ -97,6 +97,7 @@ class Launch:
         self.planned: frozenset[str] = frozenset()
         self.trip_file = trip_file or self._folder / "tripinfo.xml"
         self.emission_file = self._folder / "emissions.xml"
+        self.traffic_file = self._folder / "traffic.xml"
 
     def start(self, seed: int) -> Session:
         """Return a simulation in which everything random follows from `seed`."""
@@ -170,8 +171,9 @@ class Launch:
         if settings.measurement == ESTIMATE:
             additional.append(folder / "loops.add.xml")
             write_loops(self._city, self._layout, scenario.step, additional[-1])
-        additional.append(folder / "emissions.add.xml")
-        outputs.write_emission_data(additional[-1], self.emission_file.resolve())
+        additional.append(folder / "edges.add.xml")
+        files = self.emission_file.resolve(), self.traffic_file.resolve()
+        outputs.write_edge_outputs(additional[-1], *files)
         return additional
 
     def _write_vehicles(self, path: Path, seed: int) -> list[str]:

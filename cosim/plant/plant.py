@@ -22,7 +22,7 @@ from cosim.plant.stuck import Junctions
 from cosim.plant.waits import Waits
 from cosim.sumo.arrays import PerEdge
 from cosim.sumo.net import City, check_adjacency
-from cosim.sumo.outputs import TripReader, edge_emissions
+from cosim.sumo.outputs import TripReader, edge_emissions, edge_traffic
 from cosim.sumo.session import Session
 from cosim.sumo.signals import read_links
 from nmfd.model.planning import PlanningModel, planning_model
@@ -279,9 +279,14 @@ class SumoPlant:
         co2 = {edge: emitted.get(edge, 0.0) for edge in self.city.edges}
         for (_, edge), turn in self.city.over.items():
             co2[edge] += sum(emitted.get(inside, 0.0) for inside in turn)
+        traffic = edge_traffic(self._launch.traffic_file)
+        pairs = [traffic.get(edge, (0.0, 0.0)) for edge in self.city.edges]
+        time_loss, passed = np.array(pairs, np.float32).T
         return {
             "co2": np.array([*co2.values()], np.float32),
             "queue_max": self._sampler.longest_queue.astype(np.int32),
+            "time_loss": time_loss,
+            "passed": passed,
         }
 
     @property

@@ -20,7 +20,9 @@ from nmfd.runs.tables import NARROW, text_table, wrapped
 from nmfd.studies.benchmark import REFERENCE
 
 PAGE = "study.html"
-MOST_QUEUES = 10
+MOST_PLACES = 10  # streets and signals in a table
+# Level of service of a signal -> longest mean delay of a vehicle (s) (Highway Capacity Manual).
+SERVICE = {"A": 10.0, "B": 20.0, "C": 35.0, "D": 55.0, "E": 80.0, "F": math.inf}
 HALF_RANGE = 50.0  # of the drawn changes (%); larger ones end there
 NO_COMPARISON = "Not compared with plain SUMO: the scenario was not imported by this study"
 
@@ -320,7 +322,8 @@ def write(study: Study) -> Path:
         map=shown,
         map_demand=f"{demand:g}",
         queues=queues(finished, demand, names),
-        queue_names=[LABELS[name] for name in names],
+        delays=delays(finished, demand, names),
+        place_names=[LABELS[name] for name in names],
         map_names=" and ".join(LABELS[name] for name in names),
         manifest=html.made_by(finished),
         table=TABLE,
@@ -344,17 +347,57 @@ def queues(finished: results.Finished, demand: float, names: Sequence[str]) -> l
         return []
     shapes = edge_shapes(city)
     rows = []
-    for edge in np.argsort(-means[0], kind="stable")[:MOST_QUEUES]:
+    for edge in np.argsort(-means[0], kind="stable")[:MOST_PLACES]:
         name = city.edges[edge]
         x, y = shapes[edge][-1]
         rows.append(
             {
-                "street": name,
+                "place": name,
                 "region": titles[city.edge_region[edge]],
                 "signal": city.signals.get(name, "–"),
                 "x": round(float(x)),
                 "y": round(float(y)),
-                "queues": [f"{mean[edge]:.0f}" for mean in means],
+                "cells": [f"{mean[edge]:.0f}" for mean in means],
+            }
+        )
+    return rows
+
+
+def delays(finished: results.Finished, demand: float, names: Sequence[str]) -> list[dict]:
+    """Return the signals at which most time is lost under the first strategy.
+
+    A row has the signal, where it is (x, y) [m], vehicles [veh] that passed it in a run, and the
+    mean delay [s] and level of service under every strategy. The delay is the time that all
+    vehicles lost on the streets before the signal, over their number, of their common seeds.
+    """
+    city = finished.map()
+    runs = statistics.common_runs(finished.level(demand), names)
+    runs = [of for of in runs if of]
+    if not runs or any("time_loss" not in run for of in runs for run in of):
+        return []
+    before: dict[str, list[int]] = {}  # signal -> numbers of the edges that end there
+    for edge, signal in city.signals.items():
+        before.setdefault(signal, []).append(city.number[edge])
+    lost = [np.sum([run["time_loss"] for run in of], axis=0) for of in runs]
+    passed = [np.sum([run["passed"] for run in of], axis=0) for of in runs]
+    shapes = edge_shapes(city)
+    worst = sorted(before, key=lambda signal: -lost[0][before[signal]].sum())
+    rows = []
+    for signal in worst[:MOST_PLACES]:
+        edges = before[signal]
+        x, y = np.mean([shapes[edge][-1] for edge in edges], axis=0)
+        cells = []
+        for spent, count in zip(lost, passed, strict=True):
+            delay = float(spent[edges].sum() / max(count[edges].sum(), 1.0))
+            grade = next(name for name, longest in SERVICE.items() if delay <= longest)
+            cells.append(f"{delay:.0f} s, {grade}")
+        rows.append(
+            {
+                "place": signal,
+                "vehicles": f"{passed[0][edges].sum() / len(runs[0]):,.0f}",
+                "x": round(float(x)),
+                "y": round(float(y)),
+                "cells": cells,
             }
         )
     return rows

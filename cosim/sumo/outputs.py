@@ -1,8 +1,8 @@
-"""SUMO's output files: tripinfo while SUMO writes it, emissions by edge."""
+"""SUMO's output files: tripinfo while SUMO writes it, emissions and traffic by edge."""
 
 import math
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Container
+from collections.abc import Callable, Container, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree.ElementTree import Element
@@ -129,31 +129,56 @@ def options(trip_file: Path, *, detailed: bool, drawn: bool = False) -> list[str
     return texts
 
 
-def write_emission_data(path: Path, target: Path) -> None:
-    """Write an additional file that makes SUMO write emissions by edge.
+def write_edge_outputs(path: Path, emissions: Path, traffic: Path) -> None:
+    """Write an additional file that makes SUMO write two outputs over the whole run.
 
-    target: SUMO's output, over the whole run
+    emissions, traffic: SUMO's outputs by edge; emissions also of edges on junctions
     """
-    data = 'id="cosim" type="emissions" withInternal="true" excludeEmpty="true"'
-    data += f" file={quoteattr(str(target))}"
-    path.write_text(f"<additional><edgeData {data}/></additional>\n", encoding="utf-8")
+    common = 'excludeEmpty="true" file='
+    polluted = f'id="emissions" type="emissions" withInternal="true" {common}'
+    texts = [
+        f"<edgeData {polluted}{quoteattr(str(emissions))}/>",
+        f'<edgeData id="traffic" {common}{quoteattr(str(traffic))}/>',
+    ]
+    path.write_text("\n".join(["<additional>", *texts, "</additional>\n"]), encoding="utf-8")
 
 
 def edge_emissions(path: Path) -> dict[str, tuple[float, float]]:
     """Return CO2 and fuel of all vehicles (kg) by edge, also on junctions.
 
-    path: file of `write_emission_data`, complete at the end of the simulation
+    path: of `write_edge_outputs`, complete at the end of the simulation
     Raises: RunFailed for a file that is not whole
     """
     emissions = {}
+    for edge in _edges(path):
+        co2 = KG_PER_MG * float(edge["CO2_abs"])
+        fuel = KG_PER_MG * float(edge["fuel_abs"])
+        emissions[edge["id"]] = (co2, fuel)
+    return emissions
+
+
+def edge_traffic(path: Path) -> dict[str, tuple[float, float]]:
+    """Return time loss (veh s) and vehicles that passed (veh) by edge.
+
+    The time is against driving freely. Vehicles passed that left the edge or ended there.
+
+    path: of `write_edge_outputs`, complete at the end of the simulation
+    Raises: RunFailed for a file that is not whole
+    """
+    traffic = {}
+    for edge in _edges(path):
+        passed = float(edge["left"]) + float(edge["arrived"])
+        traffic[edge["id"]] = (float(edge["timeLoss"]), passed)
+    return traffic
+
+
+def _edges(path: Path) -> Iterator[Mapping[str, str]]:
+    """Yield the attributes of every edge in an output of SUMO."""
     try:
         for edge in ElementTree.parse(path).iter("edge"):
-            co2 = KG_PER_MG * float(edge.attrib["CO2_abs"])
-            fuel = KG_PER_MG * float(edge.attrib["fuel_abs"])
-            emissions[edge.attrib["id"]] = (co2, fuel)
+            yield edge.attrib
     except BROKEN as error:
         raise unfinished(path, error) from None
-    return emissions
 
 
 def unfinished(path: Path, error: Exception) -> RunFailed:
