@@ -48,6 +48,8 @@ def conducted(
             load = stages.loading(runner)
             found = stages.gates(runner, load, own=own)
             runner = replace(runner, scenario=found.scenario)
+            if own and not found.reason:
+                stages.train_gates(found.scenario)
             skipped = runner.impossible()
             levels = []
             for level in dict.fromkeys((1.0, load.under)):

@@ -18,7 +18,7 @@ from cosim.importing.importer import CHOICES, COMPARISONS, import_city, reported
 from cosim.plant.strategy import parse
 from cosim.studying.verdict import FEWEST_SEEDS, Verdict, judge
 from cosim.sumo.net import network_folder
-from nmfd.api import load_scenario
+from nmfd.api import load_scenario, train
 from nmfd.errors import InputError
 from nmfd.metrics import largest_accumulation, percent_change
 from nmfd.model.identification import ITERATIONS
@@ -32,6 +32,7 @@ from nmfd.types import Result
 
 LOADING_SEED = 1000  # it chooses the demand levels, and judges no strategy
 FIRST_SEED = 1001
+DPC = "dpc-pc"
 NEAR_CRITICAL = 0.8  # of the critical accumulation, below which gates stay open
 # More trips left than without control, as a share of all, that rule a strategy out.
 UNSERVED_SHARE = 0.001
@@ -43,7 +44,12 @@ EVERYWHERE = {
     "route-guidance+guidance-period-60": "guidance",
     "route-guidance+max-pressure+guidance-period-60": "guidance over max-pressure",
 }
-AT_CRITICAL = {"pi-gating": "PI gates", "metering": "metering"}
+AT_CRITICAL = {
+    "pi-gating": "PI gates",
+    DPC: "DPC gates",
+    "mpc-pc": "MPC gates",
+    "metering": "metering",
+}
 LABELS = {REFERENCE: "no control"} | EVERYWHERE | AT_CRITICAL
 FAILED = f"a run failed, for the reason in {TABLE}"
 MODEL_COMMENT = "Written by cosim study from runs of {} without control, demand times {}."
@@ -229,7 +235,10 @@ def gates(runner: Runner, load: Loading, *, own: bool) -> Gates:
 
 
 def measured(runner: Runner, load: Loading, runs: Sequence[Result]) -> RegionalModel:
-    """Return the regional model that is counted from runs without control."""
+    """Return the regional model that is counted from runs without control.
+
+    Its errors are those of a model without the last run, in that run.
+    """
     task = identify.Task(
         scenario=runner.scenario,
         guided=False,
@@ -242,7 +251,24 @@ def measured(runner: Runner, load: Loading, runs: Sequence[Result]) -> RegionalM
         progress=None,
     )
     static = identify.static_model(runner.scenario, runs)
-    return replace(task.model(identify.COUNTED, static, runs), placeholder=False)
+    trial = task.trial(identify.COUNTED, static, runs)
+    errors = fit_quality.held_out(trial.errors)
+    return replace(trial.model, placeholder=False, held_out=errors)
+
+
+def train_gates(scenario: Scenario) -> None:
+    """Train a DPC policy for the gates, unless that is done or the model is too bad.
+
+    It is written into the scenario's folder.
+    """
+    assert scenario.folder is not None
+    if (scenario.folder / f"{DPC}.pt").is_file():
+        return
+    say("DPC gates: training on the regional model, some minutes")
+    try:
+        train(scenario, DPC, progress=False)
+    except InputError as error:
+        say(f"DPC gates: not trained; {error}")
 
 
 def far_from_critical(runner: Runner, level: float) -> str:
