@@ -11,7 +11,7 @@ import tiny_city
 from commands import cosim, error_line, good
 
 from cosim.evaluation.move_times import Costs, Driven, Visits, read_driven, visits
-from cosim.evaluation.plan_routes import Driver, assess, changed_plan, without_loops
+from cosim.evaluation.plan_routes import Base, Driver, assess, changed_plan, without_loops
 from cosim.plant.strategy import parse
 from cosim.sumo.recorded_trips import RecordedTrips
 from cosim.sumo.route_plan import RoutePlan, planned_trips, read_plan
@@ -160,6 +160,16 @@ def test_those_who_gain_most_change_first_and_the_gap_is_relative(city):
     assert [(change.gain, change.driver) for change in found.changes] == [(20.0, 0), (10.0, 1)]
     plan = changed_plan(drivers, found.changes[:1])
     assert plan.shared_out(("a", "z"), 0, 3, 0.5) == [SHORT, SHORT, LONG]
+
+
+def test_the_best_run_with_a_plan_is_changed_and_less_after_one_without_a_gain():
+    guided = Base(0, 100.0, [])
+    first = guided.after(1, 120.0, [])
+    assert first == (1, 120.0, [], guided.share)
+    worse = first.after(2, 130.0, [])
+    assert (worse.number, worse.spent) == (1, 120.0)
+    assert worse.share < first.share
+    assert worse.after(3, 110.0, []) == (3, 110.0, [], worse.share)
 
 
 def test_loops_are_cut():

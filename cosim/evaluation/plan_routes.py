@@ -1,9 +1,10 @@
 """Planning of routes by iterated marginal costs, a SUMO run per iteration.
 
-The first plan has the routes in which guidance every minute ends. Then, in every iteration, SUMO
-runs with the plan, and a share of the drivers, those who gain most by it, change to the route of
-least cost (cosim.evaluation.move_times) at the mean travel times of the last runs. The plan of the
-run with the least total time spent is kept.
+The first plan has the routes in which guidance every minute ends. Then, in every iteration, a share
+of the drivers, those who gain most by it, change to the route of least cost
+(cosim.evaluation.move_times) at the mean travel times of the last runs, and SUMO runs with the
+plan. The routes of the run with the least total time spent are the ones that are changed: after an
+iteration without a gain fewer drivers change. The plan of that run is kept.
 
     <out>/plan-<n>.csv.gz     plan of iteration n
     <out>/iteration-<n>/      its run
@@ -47,6 +48,7 @@ from nmfd.runs.run_many import Run, locked, raise_failures, run_many
 
 FIRST = "guided+guidance-period-60"  # words of the run whose routes the first plan has
 CHANGED_SHARE = 0.04  # drivers who change to another route in one iteration
+SMALLER = 0.7  # share of these who change after an iteration without a gain
 AVERAGED_RUNS = 3  # the last ones, whose travel times are averaged
 TABLE = "plan.csv"
 GAP = "relative_gap"
@@ -104,6 +106,27 @@ class Driver(NamedTuple):
     route: Route
 
 
+class Base(NamedTuple):
+    """The best run with a plan so far, whose routes the next plan changes.
+
+    number: iteration; spent: total time spent (veh s); share: of the drivers, who change
+    """
+
+    number: int
+    spent: float
+    drivers: list[Driver]
+    share: float = CHANGED_SHARE
+
+    def after(self, number: int, spent: float, drivers: list[Driver]) -> "Base":
+        """Return the base after another iteration.
+
+        A run with a plan takes the place of the one with guidance in any case.
+        """
+        if self.number == 0 or spent < self.spent:
+            return Base(number, spent, drivers, self.share)
+        return self._replace(share=SMALLER * self.share)
+
+
 class Change(NamedTuple):
     """Another route of a driver, and the cost that it saves (s)."""
 
@@ -142,8 +165,9 @@ def plan_routes(
     city = scenario_city(scenario, chosen)
     due = _due(scenario, chosen, city, order.seed)
     end = chosen.begin + scenario.steps * scenario.step
-    rows = []
+    rows: list[dict] = []
     runs = []
+    best: Base | None = None
     total = order.iterations + 1
     with locked(order.out), watched("plan", progress, said=True) as show:
         for number in range(total):
@@ -156,20 +180,21 @@ def plan_routes(
             drivers = drivers_of(driven, due, city)
             runs.append(visits(city, [driven[name] for name in drivers], chosen.begin, end))
             costs = Costs(city, runs[-AVERAGED_RUNS:], chosen.begin)
-            found = assess(city, costs, list(drivers.values()), chosen.begin)
-            changes = found.changes[: round(CHANGED_SHARE * len(drivers))]
-            changed_plan(list(drivers.values()), changes).write(order.plan(number + 1))
+            own = list(drivers.values())
+            best = Base(number, spent, own) if best is None else best.after(number, spent, own)
+            found = assess(city, costs, best.drivers, chosen.begin)
+            changes = found.changes[: round(best.share * len(best.drivers))]
+            changed_plan(best.drivers, changes).write(order.plan(number + 1))
             rows.append({"iteration": number, TTS: spent, GAP: found.gap})
             files.write_table(order.out / TABLE, Table(rows))
             text = f"total time spent {spent:.4g} veh s, relative gap {found.gap:.3f}"
             _say(f"iteration {number}: {text}", progress)
             if show:
                 show(number + 1, total)
-    table = Table(rows)
-    best = int(table[TTS][1:].idxmin())
+    assert best is not None
     with files.atomic(file) as temporary:
-        shutil.copyfile(order.plan(best), temporary)
-    return table
+        shutil.copyfile(order.plan(best.number), temporary)
+    return Table(rows)
 
 
 def _due(scenario: Scenario, chosen: Settings, city: City, seed: int) -> dict[str, float]:
