@@ -51,7 +51,7 @@ def uninterrupted() -> Iterator[None]:
 
     It is for code that an interruption would leave with a lock held.
     """
-    held: list[int] = []
+    held = []
     before = {}
     # Python runs handlers in the main thread only, and lets no other thread set them.
     if threading.current_thread() is threading.main_thread():

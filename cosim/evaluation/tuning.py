@@ -86,7 +86,7 @@ class Tuning:
     def space(self) -> dict[str, Range]:
         """Range of every option."""
         declared = self.declared
-        space: dict[str, Range] = {}
+        space = {}
         for name, (low, high) in self.options.items():
             if name in declared and declared[name].annotation is int:
                 space[name] = IntDistribution(math.ceil(low), math.floor(high))
@@ -139,7 +139,7 @@ class Tuning:
 
         An option without a value has the middle of its range.
         """
-        point: dict[str, float] = {}
+        point = {}
         for name, span in self.space.items():
             key, index = _key_and_index(name)
             value = self.value(key)

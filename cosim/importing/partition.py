@@ -379,7 +379,7 @@ def names(streets: Streets, regions: EdgeNumbers) -> tuple[str, ...]:
     places, middle = positions(streets, regions), _gravity(streets, regions >= 0)
     away = ((streets.centre - middle) ** 2).sum(axis=1)
     mean = np.average(away, weights=streets.lane_metres)
-    plain: list[str] = []
+    plain = []
     for region, (x, y) in enumerate(places - middle):
         if np.hypot(x, y) < CENTRAL_SHARE * np.sqrt(mean):
             own = regions == region

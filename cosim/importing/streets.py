@@ -126,10 +126,10 @@ def read_streets(net: Path, additional: Iterable[Path] = ()) -> Streets:
     The latter replace those of the network.
     Raises: InputError
     """
-    rows: dict[str, _Edge] = {}
+    rows = {}
     links: list[Mapping[str, str]] = []
     roundabouts: list[list[str]] = []
-    logics: dict[str, Logic] = {}
+    logics = {}
     with network_root(net) as root:
         for element in root:
             if element.tag == "edge" and element.get("function", "normal") in NORMAL:

@@ -167,7 +167,7 @@ def _windows(programme: Programme, link: int) -> tuple[dict[int, _Window], bool]
     green = [phase.state[link] in GREEN for phase in phases]
     if all(green):
         return dict.fromkeys(range(len(phases)), _Window(0.0, programme.cycle)), True
-    windows: dict[int, _Window] = {}
+    windows = {}
     begin = 0.0
     for first, phase in enumerate(phases):
         if green[first] and not green[first - 1]:

@@ -332,7 +332,7 @@ def edge_shapes(city: City) -> list[Points]:
 
     It lies midway between the outermost lanes for cars.
     """
-    shapes: dict[str, Points] = {}
+    shapes = {}
     with network_root(city.net_file) as root:
         for edge in root.iterfind("edge"):
             lanes = [_shape(lane) for lane in edge.iter("lane") if for_cars(lane)]
@@ -366,7 +366,7 @@ def _read_net(path: Path) -> _Net:
     """Read a SUMO network. Raises InputError."""
     lanes_of: dict[str, list[_Lane]] = {}
     internal: dict[str, _Crossing] = {}
-    connections: list[Connection] = []
+    connections = []
     with network_root(path) as root:
         for element in root.iterfind("edge"):
             edge = attribute(element, "id")
@@ -445,7 +445,7 @@ def read_regions(path: Path, regions: int = 10**6) -> dict[str, int]:
         raise InputError(
             f"{path}: line 1: expected edge,region, got {','.join(header) or 'nothing'} instead"
         )
-    region_of: dict[str, int] = {}
+    region_of = {}
     for number, row in enumerate(rows, start=2):
         if not row:
             continue

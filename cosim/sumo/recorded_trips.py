@@ -90,8 +90,8 @@ def read_recorded_trips(paths: Sequence[Path]) -> RecordedTrips:
     Raises: InputError
     """
     elements: list[ElementTree.Element] = []
-    departs: list[float] = []
-    known: set[str] = set()
+    departs = []
+    known = set()
     for path in paths:
         root = read_xml(path)
         if root.tag != "routes":
@@ -308,7 +308,7 @@ def merge(path: Path, beside: Sequence[Path], rest: Path) -> list[Path]:
     QUEUED_AFTER, as in the city's own files. Returns both files, types first.
     """
     queue: list[tuple[float, float, ElementTree.Element]] = []  # time, place among those then
-    others: list[ElementTree.Element] = []
+    others = []
     places = Counter[float]()
     for element in read_xml(path):
         depart = float(element.get("depart", 0))
@@ -347,9 +347,9 @@ def write_held_trips(
     """
     texts = [xml_text(element) for element in originals.types]
     written = set[int]()
-    departs: list[float] = []
-    origins: list[int] = []
-    destinations: list[int] = []
+    departs = []
+    origins = []
+    destinations = []
     orders: list[Mapping[str, str]] = []
     for depart, n, name in drawn:
         element = originals.elements[n]

@@ -218,8 +218,8 @@ def read_signals(
     red and turns on red only. Of several programmes the last one counts, as in SUMO: first those
     of the network file, then those of `additional` files.
     """
-    signals: list[Signal] = []
-    others: dict[str, str] = {}
+    signals = []
+    others = {}
     known = _read(city.net_file, additional)
     for name, element in sorted(known.programmes.items()):
         cars: list[Link] = []

@@ -81,9 +81,9 @@ def build(network: RegionalModel) -> Acyclic:
     cells = {(i, i, i, j): int(number) for (i, j), number in np.ndenumerate(start)}
     queue = list(cells)
     move_from: list[int] = []
-    move_to: list[int] = []
-    move_next: list[int] = []
-    move_onward: list[bool] = []
+    move_to = []
+    move_next = []
+    move_onward = []
     fallback = {}
     for o, g, i, j in queue:  # grows during the loop
         if i == j:

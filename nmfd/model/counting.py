@@ -275,7 +275,7 @@ def _fall(
     n, outflow: of the runs, from the critical accumulation; the outflow does not rise (veh, veh/s)
     jam: beyond all (veh)
     """
-    points: list[float] = []
+    points = []
     levels: list[float] = []
     last = float(n[0])
     for share in FALLS:

@@ -97,7 +97,7 @@ def read_counts(
     remedy = "" if skip_bad else "correct it, or leave such rows out with --skip-bad"
     parts = []
     left = {MARKED: 0, BAD: 0, DOUBLED: 0}
-    cities: set[str] = set()
+    cities = set()
     for chunk in _chunks(path, COUNTS, ("error", "city", "region")):
         _check_keys(chunk, "day", path, once=False)
         _check_keys(chunk, "detid", path, once=False)

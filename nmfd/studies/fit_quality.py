@@ -337,7 +337,7 @@ def predictions(
         critical = network.known_critical
     longest = max(len(run.demand) for run in runs)
     ahead = min(max(1, round(AHEAD_S / scheme["step"])), longest)
-    columns: dict[str, object] = {}
+    columns = {}
     for when, intervals in (("next_interval", 1), ("ahead", ahead)):
         errors = identification.prediction_errors(network, runs, intervals, **scheme)
         states = identification.windows(runs, intervals).states.sum(-1).numpy()
