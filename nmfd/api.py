@@ -99,8 +99,9 @@ def loaded(
     if not isinstance(scenario, Scenario):
         scenario = load_scenario(scenario, settings)
     if not 0.0 < demand <= MOST_DEMAND:
-        allowed = f"expected a number above 0 up to {MOST_DEMAND:g}"
-        raise InputError(f"demand: {allowed}, got {demand:g} instead")
+        raise InputError(
+            f"demand: expected a number above 0 up to {MOST_DEMAND:g}, got {demand:g} instead"
+        )
     return with_demand(scenario, steps=steps, factor=demand)
 
 
@@ -598,8 +599,9 @@ def check_policies(policies: Mapping[str, Path], strategies: Sequence[Strategy])
     for name in policies:
         if name not in known:
             near = did_you_mean(name, known)
-            problem = f"{name!r} is not among {', '.join(known)}{near}; add it there"
-            raise InputError(f"--policy: {problem}")
+            raise InputError(
+                f"--policy: {name!r} is not among {', '.join(known)}{near}; add it there"
+            )
 
 
 def _check_plant(plant: str | Plant) -> None:

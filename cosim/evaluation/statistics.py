@@ -18,7 +18,7 @@ from cosim.sumo.net import City
 from nmfd.arrays import PerRegion
 from nmfd.metrics import COUNTED, decision_ms, percent_change
 from nmfd.runs import config
-from nmfd.runs.tables import NARROW, markdown_table, text_table, wrapped
+from nmfd.runs.tables import NARROW, cell, markdown_table, text_table, wrapped
 from nmfd.studies import benchmark
 from nmfd.studies.benchmark import REFERENCE, interval
 from nmfd.types import Result
@@ -38,6 +38,7 @@ PAIR_COLUMNS = [
     "half_interval_percent",
     "significant",
 ]
+WHOLE = "{:,.0f}"  # form of a number
 NAME_WIDTH = 28  # characters, beyond which a name continues in the next line
 # Of the table in the terminal, after controller, seeds, TTS and change.
 BRIEF = ["completed", "trip [s]", "backlog [veh]", "teleports", "removed [veh]", "CO2 [kg]"]
@@ -229,7 +230,7 @@ def shown(table: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
     for row, many in zip(table.to_dict("records"), _many_teleports(table), strict=True):
         half = row[f"half_interval_{TTS}"]
         spread = "" if math.isnan(half) else f" ± {half:.1e}"
-        times = [_seconds(row[f"{kind}_trip_time_s"]) for kind in ("mean", "median", "p95")]
+        times = [cell(row[f"{kind}_trip_time_s"], WHOLE) for kind in ("mean", "median", "p95")]
         queue = f"{row['gateway_queue_mean_veh']:.1f} / {row['gateway_queue_max_veh']:.0f}"
         line = {
             "controller": row["controller"],
@@ -242,14 +243,14 @@ def shown(table: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
             "backlog [veh s]": f"{row['total_backlog_veh_s']:.2e}",
             "teleports": _marked(f"{row['teleports']:.0f}", many),
             "trip [s]": " / ".join(times),
-            "finished [s]": _seconds(row["mean_finished_trip_time_s"]),
-            "departure delay [s]": _seconds(row["mean_departure_delay_s"]),
-            "delay [s]": _seconds(row["mean_time_loss_s"]),
-            "public transport [s]": _seconds(row.get("public_transport_delay_s", math.nan)),
+            "finished [s]": cell(row["mean_finished_trip_time_s"], WHOLE),
+            "departure delay [s]": cell(row["mean_departure_delay_s"], WHOLE),
+            "delay [s]": cell(row["mean_time_loss_s"], WHOLE),
+            "public transport [s]": cell(row.get("public_transport_delay_s", math.nan), WHOLE),
             "other [veh s]": f"{row['other_time_spent_veh_s']:.2e}",
             "CO2 [kg]": f"{row['co2_kg']:,.0f}",
             "queue [veh]": queue,
-            "longest [veh]": _seconds(row.get("longest_queue_veh", math.nan)),
+            "longest [veh]": cell(row.get("longest_queue_veh", math.nan), WHOLE),
             "full": f"{100 * row['gateway_full_share']:.1f} %",
             "decision [ms]": decision_ms(row),
         }
@@ -261,11 +262,6 @@ def shown(table: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
     outcomes = whole.loc[:, :"teleports"]
     costs = whole.loc[:, "trip [s]":]
     return outcomes.reset_index(), costs.reset_index()
-
-
-def _seconds(value: float) -> str:
-    """Return a number for a cell, "-" if it is unknown."""
-    return "-" if math.isnan(value) else f"{value:,.0f}"
 
 
 def _marked(number: str, doubtful: bool) -> str:
@@ -298,7 +294,10 @@ def brief(table: pd.DataFrame) -> pd.DataFrame:
     whole["controller"] = whole["controller"].map(_in_lines)
     first = list(outcomes)[:4]
     columns = [*first, *BRIEF]
-    while len(columns) > len(first) and text_width(whole[columns]) > NARROW:
+    while len(columns) > len(first):
+        lines = text_table(whole[columns].to_dict("records")).splitlines()
+        if max(map(len, lines)) <= NARROW:
+            break
         columns.pop()
     return whole[columns]
 
@@ -308,11 +307,6 @@ def _in_lines(name: str) -> str:
     words = name.replace("+", " +")
     lines = textwrap.wrap(words, NAME_WIDTH, break_long_words=False, break_on_hyphens=False)
     return "\n".join(line.replace(" +", "+") for line in lines)
-
-
-def text_width(table: pd.DataFrame) -> int:
-    """Return the width of a table as text (characters)."""
-    return max(map(len, text_table(table.to_dict("records")).splitlines()))
 
 
 def text(rows: pd.DataFrame, *, explain: bool = False) -> str:

@@ -221,8 +221,9 @@ def _as_requested(case: SumoInput, request: Request) -> SumoInput:
     if request.end is not None:
         end = request.end
     if begin < 0 or (end is not None and end <= begin):
-        window = f"begin {begin:g} s, end {end} s"
-        raise InputError(f"{case.source}: expected 0 s <= begin < end, got {window}")
+        raise InputError(
+            f"{case.source}: expected 0 s <= begin < end, got begin {begin:g} s, end {end} s"
+        )
     return replace(case, begin=begin, end=end, routes=(*case.routes, *request.routes))
 
 
@@ -240,7 +241,11 @@ def _imported(
         given = own_regions(streets, request.regions)
     counted = None
     if request.counts is not None:
-        _check_only_counts(request, case)
+        if case.routes or request.demand is not None:
+            raise InputError(
+                f"--counts: {case.source} has vehicles of its own; omit --routes and --demand, or "
+                "give the network alone"
+            )
         counted = sampled(request.counts, streets, scratch, request.seed, progress)
         case = replace(case, routes=(counted.routes,))
     traffic = read_traffic(case, streets, request.seed)
@@ -295,15 +300,6 @@ def _imported(
         assigned=assigned,
         same=same,
     )
-
-
-def _check_only_counts(request: Request, case: SumoInput) -> None:
-    """Raise InputError if there are vehicles beside those of counts."""
-    if case.routes or request.demand is not None:
-        raise InputError(
-            f"--counts: {case.source} has vehicles of its own; omit --routes and --demand, or give "
-            "the network alone"
-        )
 
 
 def _peak(

@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from cosim.importing.case import seconds
 from cosim.sumo import signals
 from cosim.sumo.arrays import EdgeMask, EdgeNumbers, PerEdge, Points
-from cosim.sumo.net import NORMAL, for_cars, points_along, size
+from cosim.sumo.net import NORMAL, for_cars, points_along, points_of, size
 from cosim.sumo.xml_files import attribute, network_root, read_xml
 from nmfd.errors import InputError
 
@@ -217,27 +217,17 @@ def _edge(element: ElementTree.Element) -> _Edge:
     lanes = list(element.iter("lane"))
     car_lanes = [lane for lane in lanes if for_cars(lane)]
     shape = element.get("shape") or attribute(lanes[len(lanes) // 2], "shape")
-    points = []
-    for point in shape.split():
-        x, y = point.split(",")[:2]
-        points.append([float(x), float(y)])
     return _Edge(
         cars=frozenset(int(attribute(lane, "index")) for lane in car_lanes),
         length=size((car_lanes or lanes)[0], "length"),
         speed=max(size(lane, "speed") for lane in car_lanes or lanes),
-        shape=np.array(points),
+        shape=points_of(shape),
         start=attribute(element, "from"),
         end=attribute(element, "to"),
     )
 
 
 def _logic(element: ElementTree.Element, path: Path) -> Logic:
-    phases = list(element.iter("phase"))
     where = f"{path}: tlLogic {element.get('id')}: phase duration"
-    kind = element.get("type", "static")
-    if kind == "static" and any(phase.get("next") for phase in phases):
-        kind = "branching"
-    cycle = sum(seconds(phase.get("duration", "0"), where) for phase in phases)
-    programme = element.get("programID", "0")
-    states = tuple(phase.get("state", "") for phase in phases)
-    return Logic(programme=programme, kind=kind, cycle=cycle, states=states)
+    cycle = sum(seconds(phase.get("duration", "0"), where) for phase in element.iter("phase"))
+    return Logic(**vars(signals.logic_of(element)), cycle=cycle)

@@ -383,7 +383,9 @@ class ResponsiveSignal:
 
     def play(self, now: float) -> None:
         """Set the state from `now` [s] on, or leave the signal to SUMO."""
-        base = self._state_underneath()
+        base = self._session.signal_state(self._signal)
+        if self._held:
+            base = self._session.state_underneath(self._signal, self._programme)
         if base == self._base and now < self._next - 1e-6:
             return
         before = self._base
@@ -406,11 +408,6 @@ class ResponsiveSignal:
             self._next = now
         elif self._held or self._limited:
             self._hold("".join(shown), now)
-
-    def _state_underneath(self) -> str:
-        if self._held:
-            return self._session.state_underneath(self._signal, self._programme)
-        return self._session.signal_state(self._signal)
 
     def green_time(self) -> dict[str, dict[int, Green]]:
         """Return signal -> gateway link -> green so far."""

@@ -20,7 +20,7 @@ from cosim.plant.settings import (
 )
 from cosim.plant.strategy import Strategy
 from cosim.sumo.net import City, city_of
-from cosim.sumo.programs import run_tool
+from cosim.sumo.programs import last_words, run_tool
 from cosim.sumo.session import Phase
 from cosim.sumo.signals import (
     HELD,
@@ -174,7 +174,7 @@ def _plan(tool: str, city: City, plan: Path, *options: str) -> None:
     files = ("-n", str(city.net_file.resolve()), "-r", "planned.xml", "-o", plan.name)
     result = run_tool(tool, *files, *options, folder=plan.parent)
     if result.returncode:
-        words = (result.stderr.strip() or "no message").splitlines()[-1]
+        words = last_words(result)
         raise InputError(
             f"{city.net_file}: {tool} cannot plan its signals ({words}); choose other signals"
         )

@@ -246,8 +246,10 @@ def _with_city(strategy: Strategy, city: Settings | str) -> Strategy:
             values[key] = value
             labels.append(label)
         elif values[key] != value:
-            problem = f"{label_of(key, values[key])} and {label} exclude each other"
-            raise InputError(f"strategy {strategy.name!r}: {problem}; omit one of them")
+            raise InputError(
+                f"strategy {strategy.name!r}: {label_of(key, values[key])} and {label} exclude "
+                "each other; omit one of them"
+            )
     return replace(
         strategy,
         name="+".join([strategy.name, *labels]),
@@ -268,8 +270,10 @@ def _check_controller(name: str, first: str) -> None:
         if first.endswith(".py") or "(" in first:
             raise error
         where = f"controller {first!r}" if first == name else f"strategy {name!r}: {first!r}"
-        allowed = f"{', '.join(CONTROLLERS)} or file.py:Class, with words joined by +"
-        raise InputError(f"{where} is unknown{near}; choose from {allowed}: {_allowed()}") from None
+        raise InputError(
+            f"{where} is unknown{near}; choose from {', '.join(CONTROLLERS)} or file.py:Class, "
+            f"with words joined by +: {_allowed()}"
+        ) from None
 
 
 def _plain_words() -> dict[str, Word]:

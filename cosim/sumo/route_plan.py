@@ -96,8 +96,10 @@ def read_plan(paths: Iterable[Path], city: City) -> RoutePlan:
             route = tuple(row.route.split())
             unknown = [edge for edge in route if edge not in city.number]
             if unknown:
-                problem = f"edge {unknown[0]} is not in {city.net_file}"
-                raise InputError(f"{path}: row {row.Index}: {problem}; make it with cosim plan")
+                raise InputError(
+                    f"{path}: row {row.Index}: edge {unknown[0]} is not in {city.net_file}; make "
+                    "it with cosim plan"
+                )
             plan.add(row.begin, route, row.drivers)
     return plan
 

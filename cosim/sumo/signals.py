@@ -174,7 +174,7 @@ def without_effect(options: Mapping[str, str], mesoscopic: bool) -> str:
 
 def read_logics(net: Path, additional: Iterable[Path] = ()) -> dict[str, Logic]:
     """Return signal -> the programme that runs. Raises InputError."""
-    return {name: _logic(element) for name, element in _read(net, additional).programmes.items()}
+    return {name: logic_of(element) for name, element in _read(net, additional).programmes.items()}
 
 
 def read_cycles(net: Path, additional: Iterable[Path] = ()) -> dict[str, Cycle]:
@@ -301,7 +301,8 @@ def _file(root: ElementTree.Element) -> _File:
     return _File(links=dict(links), programmes=programmes, timetabled=frozenset(switched))
 
 
-def _logic(element: ElementTree.Element) -> Logic:
+def logic_of(element: ElementTree.Element) -> Logic:
+    """Return the programme of a <tlLogic>."""
     rows = list(element.iter("phase"))
     kind = element.get("type", STATIC)
     if kind == STATIC and any(row.get("next") for row in rows):
@@ -312,7 +313,7 @@ def _logic(element: ElementTree.Element) -> Logic:
 
 def _not_simple(element: ElementTree.Element, kinds: Collection[str]) -> str:
     """Return why a <tlLogic> cannot give way to another, "" if it can."""
-    logic = _logic(element)
+    logic = logic_of(element)
     if logic.programme == OFF:
         return SWITCHED_OFF
     if any(row.get("next") for row in element.iter("phase")):

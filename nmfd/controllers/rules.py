@@ -136,10 +136,8 @@ def filled(planning: PlanningModel, region: int) -> float:
     """
     network = planning.network
     passing = _passing(planning)
-    duration = passing  # share of time in a region, by destination
-    if network.exit_rates is not None:
-        duration = passing / network.exit_rates
-    in_total = duration.sum(axis=1)
+    # Share of time in a region, by destination.
+    in_total = (passing / network.relative_rates).sum(axis=1)
     bound = (network.nominal_splits[:, region] * passing).sum(axis=1)
     largest = np.array([mfd.capacity for mfd in network.mfds])
     sent = largest * bound / np.where(in_total > 0.0, in_total, 1.0)

@@ -167,9 +167,10 @@ class Strategy:
         """
         if self.labels:
             labels = "+".join(self.labels)
-            remedy = f"on the regional model use {self.controller.name}"
-            problem = f"+{labels} needs a city in SUMO (cosim); {remedy}"
-            raise InputError(f"strategy {self.name!r}: {problem}")
+            raise InputError(
+                f"strategy {self.name!r}: +{labels} needs a city in SUMO (cosim); on the regional "
+                f"model use {self.controller.name}"
+            )
         return self
 
     def table(self, scenario: Scenario) -> str:
@@ -190,9 +191,9 @@ class Strategy:
         best = [table for table, count in fitting.items() if count == max(fitting.values())]
         if len(best) > 1:
             tables = " and ".join(f'[controllers."{table}"]' for table in best)
-            problem = f'fit it equally well; add a table [controllers."{self.name}"]'
             raise InputError(
-                f"scenario.toml: strategy {self.name!r}: the tables {tables} {problem}"
+                f"scenario.toml: strategy {self.name!r}: the tables {tables} fit it equally well; "
+                f'add a table [controllers."{self.name}"]'
             )
         return best[0] if best else name
 
@@ -320,8 +321,9 @@ class Strategy:
             path = shipped.found(named, shipped.SCENARIO)
         if not path.is_file():
             command = reads.command.format(folder=folder, name=table)
-            problem = f"no such {reads.text} for {kind.name}; make one with: {command}"
-            raise InputError(f"{path}: {problem}")
+            raise InputError(
+                f"{path}: no such {reads.text} for {kind.name}; make one with: {command}"
+            )
         return path
 
     def fingerprint(self, scenario: Scenario, policy: Path | None = None) -> dict[str, Any]:
@@ -399,8 +401,10 @@ def parse(controller: ControllerLike) -> Strategy:
         return Strategy(name=controller, controller=_kind(controller, first), labels=labels)
     methods = (getattr(controller, name, None) for name in ("reset", "act"))
     if isinstance(controller, type) or not all(map(callable, methods)):
-        expected = "a name, options such as nmfd.PiGating(), or an object with reset and act"
-        raise InputError(f"controller: expected {expected}, got {controller!r}")
+        raise InputError(
+            "controller: expected a name, options such as nmfd.PiGating(), or an object with "
+            f"reset and act, got {controller!r}"
+        )
     name = str(getattr(controller, "name", type(controller).__name__))
     return Strategy(name=name, controller=Given(name=name, controller=controller))
 
@@ -456,15 +460,18 @@ def _kind(name: str, first: str) -> BuiltIn | FromFile:
         try:
             table = tomllib.loads(f"options = {{{match['options']}}}")["options"]
         except tomllib.TOMLDecodeError:
-            form = f"{match['name']}(key=value, ...), values as in scenario.toml"
-            raise InputError(f"controller {first!r}: expected {form}") from None
+            raise InputError(
+                f"controller {first!r}: expected {match['name']}(key=value, ...), values as in "
+                "scenario.toml"
+            ) from None
         return named(kind.of_table(table, f"controller {first!r}", ""))
     if first.endswith(".py"):
         raise InputError(f"controller {first}: name its class, such as {first}:MyController")
     where = f"controller {first!r}" if first == name else f"strategy {name!r}: {first!r}"
     hint = did_you_mean(first, CONTROLLERS)
-    allowed = f"{', '.join(CONTROLLERS)} or file.py:Class"
-    raise InputError(f"{where} is unknown{hint}; choose from {allowed}")
+    raise InputError(
+        f"{where} is unknown{hint}; choose from {', '.join(CONTROLLERS)} or file.py:Class"
+    )
 
 
 S = TypeVar("S", bound=Strategy)
@@ -489,8 +496,9 @@ def parse_many(
     else:
         controllers = [given]
     if not any(controllers):
-        nothing = "expected at least one controller, got none; name one, such as no-control"
-        raise InputError(f"controllers: {nothing}")
+        raise InputError(
+            "controllers: expected at least one controller, got none; name one, such as no-control"
+        )
     plain: dict[str, S] = {}
     order: list[str | S] = []  # patterns, and strategies
     for controller in controllers:
@@ -518,8 +526,10 @@ def _check_same(one: Strategy, other: Strategy) -> None:
     if not isinstance(one.controller, Given) or not isinstance(other.controller, Given):
         return
     if one.controller.controller is not other.controller.controller:
-        remedy = "give each object an attribute `name` of its own"
-        raise InputError(f"controllers: two have the name {one.name!r}; {remedy}")
+        raise InputError(
+            f"controllers: two have the name {one.name!r}; give each object an attribute `name` of "
+            "its own"
+        )
 
 
 def _is_pattern(name: str) -> bool:
@@ -536,8 +546,9 @@ def _matching(pattern: str, scenario: Scenario, parse: Callable[[Any], S]) -> li
     matching = [one for one in known if fnmatchcase(one.name, pattern)]
     if not matching:
         names = ", ".join(one.name for one in known)
-        problem = f"no controller here matches {pattern!r}; choose from {names}"
-        raise InputError(f"controllers: {problem}")
+        raise InputError(
+            f"controllers: no controller here matches {pattern!r}; choose from {names}"
+        )
     return matching
 
 

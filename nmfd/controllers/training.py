@@ -65,9 +65,10 @@ def settings(scenario: Scenario, strategy: Strategy, steps: int | None = None) -
         problem = "cannot be trained; choose dpc-pc or dpc-pcrg"
         raise InputError(f"--controller: {strategy.name!r} {problem}")
     if table != strategy.name:
-        needs = f'needs a table [controllers."{strategy.name}"] in {scenario.where}'
-        remedy = f"add one, or train {name}"
-        raise InputError(f"--controller: {strategy.name!r} {needs} with its differences; {remedy}")
+        raise InputError(
+            f'--controller: {strategy.name!r} needs a table [controllers."{strategy.name}"] in '
+            f"{scenario.where} with its differences; add one, or train {name}"
+        )
     prefix = f"controllers.{table}."
     check_fit(setup, strategy.own_planning(scenario), f"{scenario.where}: {prefix}")
     if setup.local and setup.guides:
@@ -136,8 +137,10 @@ class Task:
         parts: tuple[object, ...] = (self.cost, self.sample)
         for part in parts:
             if part is not None and not callable(part):
-                got = f"got {self.cost!r} and {self.sample!r}"
-                raise InputError(f"cost, sample: expected functions, {got}; see nmfd.train")
+                raise InputError(
+                    f"cost, sample: expected functions, got {self.cost!r} and {self.sample!r}; see "
+                    "nmfd.train"
+                )
         for pair in self.constraints:
             if not (isinstance(pair, tuple) and len(pair) == 2 and callable(pair[0])):
                 raise InputError(
@@ -377,9 +380,11 @@ class TrainingRun:
         self._clear_gradients()
         norm = torch.nn.utils.clip_grad_norm_(self._policy.parameters(), self._recipe.clip)
         if self._task.own and not norm.isfinite():
-            cost = f"the cost is {loss.item():.4g} and the norm of its gradient {norm.item():.4g}"
-            remedy = "look for 0 / 0, log(0) and sqrt(0) in your own functions"
-            raise InputError(f"{self._task.own}: in step {self.done} {cost}; {remedy}")
+            raise InputError(
+                f"{self._task.own}: in step {self.done} the cost is {loss.item():.4g} and the norm "
+                f"of its gradient {norm.item():.4g}; look for 0 / 0, log(0) and sqrt(0) in your "
+                "own functions"
+            )
         self._optimizer.step()
         if isinstance(self._policy, CompactPolicy):
             self._policy.bound()
@@ -430,10 +435,11 @@ class TrainingRun:
             )
             start_fits = x.shape == (batch, *rollout.start.shape)
             if not start_fits or demand.shape[1:] != x.shape or len(demand) < 2:
-                wanted = f"start ({batch}, R, R) and demand (T, {batch}, R, R)"
-                where = f"R = {len(rollout.start)} and T > 1"
-                got = f"{tuple(x.shape)} and {tuple(demand.shape)}"
-                raise InputError(f"sample: expected {wanted} with {where}, got {got}; return these")
+                raise InputError(
+                    f"sample: expected start ({batch}, R, R) and demand (T, {batch}, R, R) with R "
+                    f"= {len(rollout.start)} and T > 1, got {tuple(x.shape)} and "
+                    f"{tuple(demand.shape)}; return these"
+                )
             return x, demand
         setup = self._setup
         levels = (setup.demand_low, setup.demand_high)

@@ -287,8 +287,9 @@ def read_detectors(
         _check_keys(named, "detid", regions)
         table = table.drop(columns="region", errors="ignore").merge(named, how="left")
     if "region" not in table:
-        remedy = "give it there, or a table detid,region with --regions"
-        raise InputError(f"{where}: has no column region; {remedy}")
+        raise InputError(
+            f"{where}: has no column region; give it there, or a table detid,region with --regions"
+        )
     table = table.set_index("detid")
     table = table[table["region"].notna() & (table["region"].str.strip() != "")]
     missing = set(detids) - set(table.index)
@@ -384,8 +385,10 @@ def _check_region(name: str, regions: Sequence[str], where: Path | str) -> int:
     Raises: InputError
     """
     if name not in regions:
-        known = f"{did_you_mean(str(name), regions)}; there are {', '.join(regions)}"
-        raise InputError(f"{where}: region {name!r} has no detector{known}")
+        raise InputError(
+            f"{where}: region {name!r} has no detector{did_you_mean(str(name), regions)}; there "
+            f"are {', '.join(regions)}"
+        )
     return list(regions).index(name)
 
 
@@ -401,8 +404,10 @@ def _chunks(
         header = list(pd.read_csv(path, nrows=0, skipinitialspace=True).columns)
         missing = [name for name in needed if name not in header]
         if missing:
-            known = f"{did_you_mean(missing[0], header)}; needed: {', '.join(needed)}"
-            raise InputError(f"{path}: column {missing[0]} is missing{known}")
+            raise InputError(
+                f"{path}: column {missing[0]} is missing{did_you_mean(missing[0], header)}; "
+                f"needed: {', '.join(needed)}"
+            )
         names = [name for name in header if name in (*needed, *optional)]
         yield from pd.read_csv(
             path, dtype=str, chunksize=CHUNK_ROWS, usecols=names, skipinitialspace=True

@@ -117,8 +117,10 @@ def check_name(path: Path | str) -> None:
     try:
         absolute.encode()
     except UnicodeEncodeError:
-        problem = "the name is not UTF-8, and SUMO and netCDF cannot open it"
-        raise InputError(f"{absolute}: {problem}; rename the file or folder") from None
+        raise InputError(
+            f"{absolute}: the name is not UTF-8, and SUMO and netCDF cannot open it; rename the "
+            "file or folder"
+        ) from None
 
 
 def file_hash(path: Path) -> str:

@@ -220,8 +220,10 @@ def check_names(runs: Sequence[Run]) -> None:
     """Raise InputError for a run whose name is too long for a file."""
     for run in runs:
         if len(run.name.encode()) > LONGEST_NAME:
-            problem = f"its name is longer than the {LONGEST_NAME} bytes that a file may have"
-            raise InputError(f"controller {run.place.controller}: {problem}; shorten it")
+            raise InputError(
+                f"controller {run.place.controller}: its name is longer than the {LONGEST_NAME} "
+                "bytes that a file may have; shorten it"
+            )
 
 
 def raise_failures(rows: "Table") -> None:
@@ -303,8 +305,9 @@ def locked(out: Path, mark: str = MANIFEST) -> Iterator[None]:
                 if [path.name for path in out.glob("*")] == [LOCK]:
                     shutil.rmtree(out, ignore_errors=True)
     except Timeout:
-        problem = "another process is writing to it; wait for its end"
-        raise InputError(f"{out}: {problem}, or {remedy}") from None
+        raise InputError(
+            f"{out}: another process is writing to it; wait for its end, or {remedy}"
+        ) from None
 
 
 class FolderOfRuns(BaseModel):
@@ -335,8 +338,9 @@ def read_manifest(folder: Path) -> dict:
     try:
         manifest = Manifest.model_validate_json(file.read_bytes())
     except (OSError, ValueError):
-        remedy = "choose another folder with --out"
-        raise InputError(f"{file}: is no manifest of runs, or damaged; {remedy}") from None
+        raise InputError(
+            f"{file}: is no manifest of runs, or damaged; choose another folder with --out"
+        ) from None
     return manifest.model_dump()
 
 
@@ -486,9 +490,10 @@ def _check_kept(out: Path, runs: Sequence[Run], kept: Mapping[str, Kept]) -> Non
             continue
         changed = _differing(kept[run.file].key, run.json_key)
         if changed:
-            remedy = "choose another folder with --out, or add --overwrite to do it again"
-            problem = f"is a run with other settings ({changed} changed)"
-            raise InputError(f"{out / run.file}: {problem}; {remedy}")
+            raise InputError(
+                f"{out / run.file}: is a run with other settings ({changed} changed); choose "
+                "another folder with --out, or add --overwrite to do it again"
+            )
 
 
 def _differing(one: Mapping, other: Mapping) -> str:

@@ -428,9 +428,7 @@ def _limits(
     leaving: (P, E), 1 where a turn leaves a pair
     step, vehicles: those of the Relaxation
     """
-    exit_rates = np.ones(len(pairs))
-    if network.exit_rates is not None:
-        exit_rates = network.exit_rates[*pairs.T]
+    exit_rates = network.relative_rates[*pairs.T]
     blocks = []
     for region in np.unique(pairs[:, 0]):
         there = pairs[:, 0] == region

@@ -21,7 +21,7 @@ from nmfd.controllers.dpc.numbers import (
 )
 from nmfd.model.planning import PlanningModel
 from nmfd.model.scenario import Scenario
-from nmfd.runs import config, shipped
+from nmfd.runs import shipped
 from nmfd.runs.config import Flow, Problem, Share, Text, Texts, got, setting, whole
 
 if TYPE_CHECKING:

@@ -129,9 +129,6 @@ def build(
     number = np.zeros(regions, dtype=int)  # of a destination
     number[destinations] = np.arange(count)
     cells = np.arange(regions * count)
-    rates = network.exit_rates
-    if rates is None:
-        rates = np.ones(network.adjacency.shape)
     detours = network.detours
     if detours is not None:
         detours = detours[here, onward, bound]
@@ -139,7 +136,7 @@ def build(
     if capacity is not None:
         capacity = capacity[tuple(edges.T)]
     return Turns(
-        exit_rates=rates[:, destinations].ravel(),
+        exit_rates=network.relative_rates[:, destinations].ravel(),
         detours=detours,
         storage=network.storage,
         capacity=capacity,
