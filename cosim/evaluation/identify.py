@@ -379,7 +379,7 @@ def identify(
     strategy = parse("no-control", None if city == "own" else city)
     options = [word for word in strategy.labels if word != "guided"]
     both = city is None and network is None and without_model(first)
-    main = out or Path("runs") / f"{files.file_name(first.name)}-identify"
+    main = files.folder_of(first.name, "identify", out)
     report: list[str] = []
     try:
         for guided in [False, True] if both else [strategy.guides]:

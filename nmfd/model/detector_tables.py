@@ -256,10 +256,10 @@ def _sums_of_others(flow: np.ndarray) -> np.ndarray:
 
 
 def read_detectors(
-    path: Path | None,
-    regions: Path | None,
+    path: Path | str | None,
+    regions: Path | str | None,
     counts: pd.DataFrame,
-    where: Path,
+    where: Path | str,
     city: str | None = None,
 ) -> pd.DataFrame:
     """Return region, lane_km, pos_km, x_m, y_m of all detectors, by detid.
@@ -301,7 +301,7 @@ def read_detectors(
     return _placed(table.loc[detids])
 
 
-def _read_links(path: Path, detids: Sequence[str], city: str | None) -> pd.DataFrame:
+def _read_links(path: Path | str, detids: Sequence[str], city: str | None) -> pd.DataFrame:
     """Return the rows of detectors.csv for these detectors.
 
     Raises: InputError
@@ -337,7 +337,7 @@ def _placed(table: pd.DataFrame) -> pd.DataFrame:
     return out[["region", "lane_km", "pos_km", "x_m", "y_m"]]
 
 
-def read_about(path: Path | None, regions: Sequence[str]) -> pd.DataFrame:
+def read_about(path: Path | str | None, regions: Sequence[str]) -> pd.DataFrame:
     """Return lane_km, trip_length, x, y by region, NaN where unknown.
 
     Raises: InputError
@@ -356,7 +356,7 @@ def read_about(path: Path | None, regions: Sequence[str]) -> pd.DataFrame:
     return table.reindex(index=list(regions), columns=columns)
 
 
-def read_pairs(path: Path, regions: Sequence[str]) -> np.ndarray:
+def read_pairs(path: Path | str, regions: Sequence[str]) -> np.ndarray:
     """Return (R, R) bool: pairs region, neighbour of a csv file, both ways.
 
     Raises: InputError
@@ -369,8 +369,7 @@ def read_pairs(path: Path, regions: Sequence[str]) -> np.ndarray:
         i = _check_region(region, regions, where)
         h = _check_region(neighbour, regions, where)
         adjacency[i, h] = i != h
-        adjacency[h, i] = i != h
-    return adjacency
+    return adjacency | adjacency.T
 
 
 def omitted(left: Mapping[str, int]) -> str:
@@ -393,7 +392,7 @@ def _check_region(name: str, regions: Sequence[str], where: Path | str) -> int:
 
 
 def _chunks(
-    path: Path, needed: Sequence[str], optional: Sequence[str] = ()
+    path: Path | str, needed: Sequence[str], optional: Sequence[str] = ()
 ) -> Iterator[pd.DataFrame]:
     """Yield the columns of a csv file as texts, in parts.
 
@@ -420,7 +419,7 @@ def _chunks(
 
 
 def _numbers(
-    table: pd.DataFrame, limits: Mapping[str, Limit], path: Path, remedy: str = "correct it"
+    table: pd.DataFrame, limits: Mapping[str, Limit], path: Path | str, remedy: str = "correct it"
 ) -> pd.DataFrame:
     """Return the rows with all columns of `limits` within them.
 
@@ -448,7 +447,7 @@ def _numbers(
     return table.assign(**values)[good]
 
 
-def _check_keys(table: pd.DataFrame, key: str, path: Path, *, once: bool = True) -> None:
+def _check_keys(table: pd.DataFrame, key: str, path: Path | str, *, once: bool = True) -> None:
     """Check that no key is missing.
 
     once: no key is doubled, either
