@@ -299,20 +299,19 @@ class Identified:
         files.write_table(out / "samples.csv", table, float_format="%.6g")
         plots.draw_mfds(out / "mfd.png", self.model, self.samples)
         own = network_folder(self.task.scenario.network)
-        write_model(self.model, own, target, self._comment())
-        files.write_text(target / authority.FILE, self.verdict.text())
-
-    def _comment(self) -> str:
-        """Return the comment above the model that says where it comes from."""
         name = self.task.scenario.name
         seeds = self.task.seeds
         controllers = ", ".join(dict.fromkeys(run.controller for run in self.runs))
         times = ", ".join(f"{level:g}" for level in self.task.levels)
-        return (
+        write_model(
+            self.model,
+            own,
+            target,
             f"Written by cosim identify from {len(self.runs)} runs of {name} under {controllers};\n"
             f"# rates and MFDs are {self.method}; loading runs: demand times {times}, "
-            f"seeds {min(seeds)} to {max(seeds)}."
+            f"seeds {min(seeds)} to {max(seeds)}.",
         )
+        files.write_text(target / authority.FILE, self.verdict.text())
 
 
 def section(heading: str, sentences: Sequence[str]) -> str:

@@ -261,7 +261,10 @@ class Reading:
         source: its element, or that of its flow; routes: ids of shared ones
         """
         if vehicle.place is not None or source is None:
-            element = _on_road(vehicle)
+            lane, position = vehicle.place or ("best", "base")
+            place = {"departLane": lane, "departPos": position, "departSpeed": "max"}
+            element = Element("vehicle", {**_drawn(vehicle), "type": vehicle.type, **place})
+            SubElement(element, "route", {"edges": " ".join(vehicle.edges)})
             self._notes[ON_ROAD] += 1
         else:
             element = _single(vehicle, source, routes)
@@ -369,15 +372,6 @@ def _drawn(vehicle: Departure) -> dict[str, str]:
         "depart": f"{vehicle.depart:.10g}",
         "speedFactor": f"{vehicle.speed_factor:.6g}",
     }
-
-
-def _on_road(vehicle: Departure) -> Element:
-    """Return a vehicle that is on the road in a loaded state."""
-    lane, position = vehicle.place or ("best", "base")
-    place = {"departLane": lane, "departPos": position, "departSpeed": "max"}
-    element = Element("vehicle", {**_drawn(vehicle), "type": vehicle.type, **place})
-    SubElement(element, "route", {"edges": " ".join(vehicle.edges)})
-    return element
 
 
 def _single(vehicle: Departure, source: Element, routes: Container[str]) -> Element:

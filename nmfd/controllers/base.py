@@ -40,8 +40,8 @@ class Options(Settings):
 
     @property
     def guides(self) -> bool:
-        """True if the controller may guide routes."""
-        return False
+        """True if the controller may guide routes: its constant or option `guidance`."""
+        return bool(getattr(self, "guidance", False))
 
     @property
     def reads(self) -> FileKind | None:

@@ -30,10 +30,6 @@ class Bound(Options):
     plan: Text | Path | None = setting("plan file; by default SCENARIO/NAME.npz", None)
 
     @property
-    def guides(self) -> bool:
-        return self.guidance
-
-    @property
     def reads(self) -> FileKind:
         return PLAN
 

@@ -39,10 +39,7 @@ class RouteGuidance(Options):
     """
 
     plans: ClassVar[bool] = False
-
-    @property
-    def guides(self) -> bool:
-        return True
+    guidance: ClassVar[bool] = True
 
     def make(self, planning: PlanningModel) -> Controller:
         network = planning.network
@@ -269,10 +266,6 @@ class Probing(SetPoint):
     plans: ClassVar[bool] = False
 
     guidance: bool = setting("split ratios are drawn as well", False)
-
-    @property
-    def guides(self) -> bool:
-        return self.guidance
 
     def make(self, planning: PlanningModel) -> Controller:
         return Excitation(planning, self)

@@ -80,11 +80,11 @@ class BuiltIn:
         return self.options(**self.fixed)
 
 
-def _named(name: str, text: str, options: type[Options], **fixed: Any) -> tuple[str, BuiltIn]:
-    return name, BuiltIn(name=name, text=text, options=options, fixed=fixed)
+def _named(name: str, text: str, options: type[Options], **fixed: Any) -> BuiltIn:
+    return BuiltIn(name=name, text=text, options=options, fixed=fixed)
 
 
-def _pair(name: str, text: str, options: type[Options], **fixed: Any) -> list[tuple[str, BuiltIn]]:
+def _pair(name: str, text: str, options: type[Options], **fixed: Any) -> list[BuiltIn]:
     """Return a controller without ("pc") and with route guidance ("pcrg")."""
     alone = f"{text}, perimeter control"
     both = f"{alone} and route guidance"
@@ -94,8 +94,9 @@ def _pair(name: str, text: str, options: type[Options], **fixed: Any) -> list[tu
     ]
 
 
-CONTROLLERS: Mapping[str, BuiltIn] = dict(
-    [
+CONTROLLERS: Mapping[str, BuiltIn] = {
+    kind.name: kind
+    for kind in [
         _named("no-control", "open perimeter, no guidance: the reference", NoControl),
         _named("route-guidance", "guidance by travel times alone", RouteGuidance),
         _named("pi-gating", "PI control of the protected regions", PiGating),
@@ -113,7 +114,7 @@ CONTROLLERS: Mapping[str, BuiltIn] = dict(
         *_pair("dpc-{}", "trained policy", Dpc),
         *_pair("bound-{}", "best plan with all demand known (nmfd bound)", Bound),
     ]
-)
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,11 +203,9 @@ class Strategy:
 
         Raises: InputError
         """
-        if isinstance(self.controller, BuiltIn):
-            return self._options(self.controller, scenario)
-        return None
-
-    def _options(self, kind: BuiltIn, scenario: Scenario) -> Options:
+        kind = self.controller
+        if not isinstance(kind, BuiltIn):
+            return None
         if kind.given is not None:
             return kind.given
         prefix = f"controllers.{self.table(scenario)}."
@@ -223,9 +222,9 @@ class Strategy:
         if isinstance(kind, Given):
             return kind.controller
         planning = self.own_planning(scenario)
-        if isinstance(kind, FromFile):
+        options = self.options(scenario)
+        if not isinstance(kind, BuiltIn) or options is None:
             return custom.OwnController(kind.name, planning)
-        options = self._options(kind, scenario)
         where = f"{kind.name}: "
         if kind.given is None:
             where = f"{planning.where}: controllers.{self.table(scenario)}."
@@ -312,7 +311,8 @@ class Strategy:
             return None
         folder = scenario.folder or Path()
         table = self.table(scenario)
-        named = self._options(kind, scenario).file if policy is None else policy
+        options = self.options(scenario)
+        named = options.file if policy is None and options is not None else policy
         if named is None:
             path = folder / (table + reads.suffix)
         elif policy is None and kind.given is None:
@@ -523,9 +523,9 @@ def parse_many(
 
 def _check_same(one: Strategy, other: Strategy) -> None:
     """Raise InputError if two controller objects have the same name."""
-    if not isinstance(one.controller, Given) or not isinstance(other.controller, Given):
-        return
-    if one.controller.controller is not other.controller.controller:
+    kinds = (one.controller, other.controller)
+    objects = [kind.controller for kind in kinds if isinstance(kind, Given)]
+    if len(objects) > 1 and objects[0] is not objects[1]:
         raise InputError(
             f"controllers: two have the name {one.name!r}; give each object an attribute `name` of "
             "its own"

@@ -285,7 +285,9 @@ def _network(network: RegionalModel, model: _Model, runs: Sequence[Observed]) ->
     assert p.capacity is not None
     assert p.storage is not None
     rates = p.exit_rates.double().numpy()
-    mean = _mean_exit_rates(rates, runs)
+    weight = sum(run.accumulation.sum(axis=0) for run in runs)
+    weight[weight.sum(axis=1) == 0] = 1.0  # empty in all runs
+    mean = (weight * rates).sum(axis=1) / weight.sum(axis=1)
     curves = [vars(p.mfd)[name].tolist() for name in ("a", "b", "c", "jam")]
     mfds = []
     for a, b, c, jam, factor in zip(*curves, mean, strict=True):
@@ -298,13 +300,6 @@ def _network(network: RegionalModel, model: _Model, runs: Sequence[Observed]) ->
         capacity=p.capacity.double().numpy() * network.u_max * network.adjacency,
         storage=p.storage.double().numpy(),
     )
-
-
-def _mean_exit_rates(rates: Float[np.ndarray, "R R"], runs: Sequence[Observed]) -> PerRegion:
-    """Return the exit rate (R,) [-] of the average vehicle in each region."""
-    weight = sum(run.accumulation.sum(axis=0) for run in runs)
-    weight[weight.sum(axis=1) == 0] = 1.0  # empty in all runs
-    return (weight * rates).sum(axis=1) / weight.sum(axis=1)
 
 
 def prediction_errors(

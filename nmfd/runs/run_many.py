@@ -185,7 +185,8 @@ def run_many(
             raise KeyboardInterrupt(left) from None
         finally:
             table = _table([rows[name] for name in keys if name in rows])
-            _write_rows(out, kept)
+            content = {"made_by": _made_by(), "runs": kept}
+            write_text(out / ROWS, json.dumps(content, default=lambda numbers: numbers.tolist()))
             write_if_changed(out / TABLE, table.to_csv(index=False))
     return table
 
@@ -198,22 +199,17 @@ def finished_table(out: Path) -> "pd.DataFrame":
     """
     import pandas as pd  # takes half a second
 
-    kept = _kept_runs(out, _files_in(out / TABLE))
+    names = []
+    with suppress(OSError, KeyError, TypeError, ValueError, csv.Error):
+        for row in csv.DictReader((out / TABLE).read_text(encoding="utf-8").splitlines()):
+            run = run_name(row["controller"], int(row["seed"]))
+            names.append(file_of(row.get("folder", ""), run))
+    kept = _kept_runs(out, names)
     rows = []
     for name, key in _keys(_manifest(out)["folders"], kept).items():
         if not _differing(kept[name].key, key):
             rows.append(kept[name].row)
     return pd.read_csv(io.StringIO(_table(rows).to_csv(index=False)))
-
-
-def _files_in(table: Path) -> list[str]:
-    """Return the files of the runs in runs.csv, as far as it can be read."""
-    names = []
-    with suppress(OSError, KeyError, TypeError, ValueError, csv.Error):
-        for row in csv.DictReader(table.read_text(encoding="utf-8").splitlines()):
-            run = run_name(row["controller"], int(row["seed"]))
-            names.append(file_of(row.get("folder", ""), run))
-    return names
 
 
 def check_names(runs: Sequence[Run]) -> None:
@@ -414,12 +410,6 @@ class Kept(NamedTuple):
     row: dict[str, Any]
     key: dict[str, Any]
     stamp: Stamp
-
-
-def _write_rows(out: Path, kept: Mapping[str, Kept]) -> None:
-    """Write the rows of finished runs for the next call."""
-    content = {"made_by": _made_by(), "runs": kept}
-    write_text(out / ROWS, json.dumps(content, default=lambda numbers: numbers.tolist()))
 
 
 def _known_rows(out: Path) -> dict[str, Kept]:

@@ -172,7 +172,13 @@ def identify(
     names = sorted(
         set(stations["region"]), key=lambda name: name.rjust(9) if name.isdecimal() else name
     )
-    _check_units(rows, counts)
+    speed = rows["flow"].sum() * VEHICLE_LENGTH_M / 3600.0 / max(rows["occ"].sum(), 1e-9)
+    if not SPEEDS_M_S[0] <= speed <= SPEEDS_M_S[1]:
+        raise InputError(
+            f"{counts}: flow and occ give a mean speed of {speed:.3g} m/s, with "
+            f"{VEHICLE_LENGTH_M:g} m for a vehicle over a loop; expected flow in veh/h per lane, "
+            "not per interval, and occ as a share, not percent"
+        )
     days = rows["day"].nunique()
     read = f"{len(rows):,} rows of {rows['detid'].nunique()} detectors on {days} days; "
     read += f"left out: {detector_tables.omitted(omitted)}"
@@ -198,20 +204,6 @@ def identify(
     identified = _fitted(data, counts, name=out.absolute().name, adjacency=adjacency)
     identified.write(out, counts.name)
     return identified
-
-
-def _check_units(rows: pd.DataFrame, counts: Path) -> None:
-    """Check that flow and occupancy give a plausible mean speed.
-
-    Raises: InputError
-    """
-    speed = rows["flow"].sum() * VEHICLE_LENGTH_M / 3600.0 / max(rows["occ"].sum(), 1e-9)
-    if not SPEEDS_M_S[0] <= speed <= SPEEDS_M_S[1]:
-        raise InputError(
-            f"{counts}: flow and occ give a mean speed of {speed:.3g} m/s, with "
-            f"{VEHICLE_LENGTH_M:g} m for a vehicle over a loop; expected flow in veh/h per lane, "
-            "not per interval, and occ as a share, not percent"
-        )
 
 
 def _left_lines(

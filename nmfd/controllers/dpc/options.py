@@ -247,10 +247,6 @@ class GatingRule(Options):
     numbers: NumbersOption = setting(MEANING, Numbers(), unit="-")
     metering: bool = setting("trips wait while regions are full; for +metering", False)
 
-    @property
-    def guides(self) -> bool:
-        return self.guidance
-
     def misfit(self, planning: PlanningModel) -> Problem | None:
         possible = min(self.numbers) >= 0.0
         allowed = "8 to 12 numbers >= 0"
@@ -276,10 +272,6 @@ class ConstantControl(Options):
     guidance: bool = setting("prices guide drivers", True)
     metering: bool = setting("trips wait beyond a rate; for +metering", False)
     name: ClassVar[str] = "constant"
-
-    @property
-    def guides(self) -> bool:
-        return self.guidance
 
     def misfit(self, planning: PlanningModel) -> Problem | None:
         possible = min(self.numbers) >= 0.0 and Levels(*self.numbers).gate <= 1.0

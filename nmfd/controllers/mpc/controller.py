@@ -92,10 +92,6 @@ class EconomicMpc(Options):
         return self
 
     @property
-    def guides(self) -> bool:
-        return self.guidance
-
-    @property
     def reads(self) -> FileKind | None:
         return VALUE if self.terminal else None
 
