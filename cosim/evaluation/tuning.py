@@ -124,15 +124,13 @@ class Tuning:
 
     def value(self, key: str) -> Any:
         """Return an option of the scenario, or its default, or else None."""
+        options = self.strategy.options(self.scenario)
+        if options is not None:
+            return getattr(options, key, None)
         tables = self.scenario.controller_options
         name = self.strategy.controller.name
         own = {**tables.get(name, {}), **tables.get(self.strategy.table(self.scenario), {})}
-        if key in own:
-            return own[key]
-        declared = self.declared.get(key)
-        if declared is None or declared.is_required():
-            return None
-        return declared.default
+        return own.get(key)
 
     def first(self) -> dict[str, float]:
         """Return the scenario's options within the ranges.

@@ -381,10 +381,11 @@ class Strategy:
 ControllerLike: TypeAlias = str | Options | Controller | Strategy
 
 
-def parse(controller: ControllerLike) -> Strategy:
+def parse(controller: ControllerLike, words: str = "") -> Strategy:
     """Return the strategy of a controller.
 
     controller: a name, options, or an object with `reset` and `act`
+    words: that labels may be, for the error of an unknown controller
     Raises: InputError for an unknown controller or options that are wrong
 
     >>> strategy = parse("pi-gating+max-pressure")
@@ -398,7 +399,7 @@ def parse(controller: ControllerLike) -> Strategy:
         return Strategy(name=kind.name, controller=kind)
     if isinstance(controller, str):
         first, labels = split(controller)
-        return Strategy(name=controller, controller=_kind(controller, first), labels=labels)
+        return Strategy(name=controller, controller=_kind(controller, first, words), labels=labels)
     methods = (getattr(controller, name, None) for name in ("reset", "act"))
     if isinstance(controller, type) or not all(map(callable, methods)):
         raise InputError(
@@ -445,9 +446,10 @@ def named(options: Options) -> BuiltIn:
     return replace(kind, name=name, given=options)
 
 
-def _kind(name: str, first: str) -> BuiltIn | FromFile:
+def _kind(name: str, first: str, words: str = "") -> BuiltIn | FromFile:
     """Return the controller of the name `first` in `name`.
 
+    words: as in `parse`
     Raises: InputError if it is unknown
     """
     if custom.FILE_AND_CLASS.fullmatch(first):
@@ -468,10 +470,11 @@ def _kind(name: str, first: str) -> BuiltIn | FromFile:
     if first.endswith(".py"):
         raise InputError(f"controller {first}: name its class, such as {first}:MyController")
     where = f"controller {first!r}" if first == name else f"strategy {name!r}: {first!r}"
-    hint = did_you_mean(first, CONTROLLERS)
-    raise InputError(
-        f"{where} is unknown{hint}; choose from {', '.join(CONTROLLERS)} or file.py:Class"
-    )
+    hint = did_you_mean(first, [*CONTROLLERS, *parts_of(words.partition(" (")[0])])
+    allowed = f"{', '.join(CONTROLLERS)} or file.py:Class"
+    if words:
+        allowed += f", with words joined by +: {words}"
+    raise InputError(f"{where} is unknown{hint}; choose from {allowed}")
 
 
 S = TypeVar("S", bound=Strategy)
