@@ -349,25 +349,23 @@ def ranking(rows: pd.DataFrame) -> str:
 
     rows: of several scenarios
     """
-    changes: dict[str, list[float]] = {}
+    tables = []
     note = ""
     for _, here in rows.groupby(["scenario", "demand"], sort=False):
         common = on_common_seeds(here)
         if len(common) < len(here):
             note = "\n\nControllers have different seeds: only those that all have count."
         table = statistics(common)
-        change = table["change_percent"].mask(table["controller"] == table["against"], 0.0)
-        if change.isna().any():  # no vehicle spent time
-            continue
-        for name, value in zip(table["controller"], change, strict=True):
-            changes.setdefault(name, []).append(value)
-    most = max(map(len, changes.values()), default=0)
+        table["change"] = table["change_percent"].mask(table["controller"] == table["against"], 0.0)
+        if table["change"].notna().all():  # else no vehicle spent time
+            tables.append(table[["controller", "change"]])
     lines = []
-    order = sorted(changes, key=lambda name: (-len(changes[name]), float(np.mean(changes[name]))))
-    for place, name in enumerate(order, 1):
-        each = changes[name]
-        rank = place if len(each) == most else "-"
-        lines.append([rank, name, f"{np.mean(each):+.1f} %", len(each)])
+    if tables:
+        changes = pd.concat(tables).groupby("controller", sort=False)["change"]
+        means = changes.agg(["size", "mean"]).sort_values(["size", "mean"], ascending=[False, True])
+        for place, (name, places, mean) in enumerate(means.itertuples(), 1):
+            rank = place if places == means["size"].max() else "-"
+            lines.append([rank, name, f"{mean:+.1f} %", places])
     headings = ["rank", "controller", "mean change of TTS", "scenarios and demand levels"]
     return markdown_table(headings, lines) + note
 

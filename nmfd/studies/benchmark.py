@@ -248,10 +248,12 @@ def _level_table(done: "pd.DataFrame") -> str:
     for name, group in groups.items():
         spent = group["total_time_spent_veh_s"].tolist()
         mean = group.mean(numeric_only=True).to_dict()
+        spread = interval(spent)
+        half = "" if math.isnan(spread) else f" ± {_scientific(spread, 1)}"
         line = {
             "controller": name,
             "seeds": len(group),
-            "TTS [veh s]": _with_interval(spent),
+            "TTS [veh s]": _scientific(statistics.fmean(spent)) + half,
             "change": "" if name == against else _percent(spent, reference),
         }
         if with_bound:
@@ -276,12 +278,6 @@ def _level_table(done: "pd.DataFrame") -> str:
     if impossible:
         caption += IMPOSSIBLE_CAPTION
     return text_table(lines + impossible, caption)
-
-
-def _with_interval(values: Sequence[float]) -> str:
-    mean = _scientific(statistics.fmean(values))
-    spread = interval(values)
-    return mean if math.isnan(spread) else f"{mean} ± {_scientific(spread, 1)}"
 
 
 def _percent(values: Sequence[float], reference: Sequence[float]) -> str:

@@ -90,7 +90,11 @@ def compute(
         progress(0, steps, "lower bound")
     lower = lower_bound(scenario, guidance=guidance)
     starts = neutral_starts(scenario.network, steps, guidance=guidance)
-    for controller in _starting_controllers(scenario, guidance=guidance):
+    controllers = ["pi-gating"] if scenario.protected else []
+    for trained in ["dpc-pc", "dpc-pcrg"] if guidance else ["dpc-pc"]:
+        if scenario.folder and (scenario.folder / f"{trained}.pt").is_file():
+            controllers.append(trained)
+    for controller in controllers:
         if progress:
             progress(0, steps, f"closed loop {controller}")
         policy = parse(controller).make(scenario)
@@ -98,18 +102,6 @@ def compute(
         starts[controller] = Start(result["perimeter"], result["splits"])
     plan = solve(scenario, starts, guidance=guidance, iterations=iterations, progress=progress)
     return replace(plan, lower=lower)
-
-
-def _starting_controllers(scenario: Scenario, *, guidance: bool) -> list[str]:
-    """Return the controllers whose closed loops are starts."""
-    names = []
-    if scenario.protected:
-        names.append("pi-gating")
-    policies = ["dpc-pc", "dpc-pcrg"] if guidance else ["dpc-pc"]
-    for policy in policies:
-        if scenario.folder and (scenario.folder / f"{policy}.pt").is_file():
-            names.append(policy)
-    return names
 
 
 def neutral_starts(network: RegionalModel, steps: int, *, guidance: bool) -> dict[str, Start]:
