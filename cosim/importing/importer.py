@@ -27,7 +27,7 @@ from cosim.importing.partition import own_regions
 from cosim.importing.streets import Streets, read_streets
 from cosim.sumo.arrays import EdgeNumbers
 from cosim.sumo.net import load_city
-from cosim.sumo.signals import timetabled, without_effect
+from cosim.sumo.signals import read_files, without_effect
 from cosim.sumo.xml_files import check_path
 from nmfd.errors import InputError
 from nmfd.model import authority
@@ -272,7 +272,7 @@ def _imported(
         progress("simulating the city's own files")
         same = _compared(request, case, traffic, clock, baseline, simulated_meso)
     progress("partition")
-    switched = sorted(timetabled(case.net, case.additional))
+    switched = sorted(read_files(case.net, case.additional).timetabled)
     everywhere = without_effect(case.options, mesoscopic)
     left = quality.left_alone(streets, switched, everywhere)
     wanted = request.count if given is None else given

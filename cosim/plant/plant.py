@@ -24,7 +24,7 @@ from cosim.sumo.arrays import PerEdge
 from cosim.sumo.net import City, check_adjacency
 from cosim.sumo.outputs import TripReader, edge_emissions
 from cosim.sumo.session import Session
-from cosim.sumo.signals import read_links
+from cosim.sumo.signals import read_files
 from nmfd.model.planning import PlanningModel, planning_model
 from nmfd.model.scenario import Scenario
 from nmfd.types import Controls, Observation, State
@@ -164,7 +164,7 @@ class SumoPlant:
         self._waits = None
         if not settings.mesoscopic:  # that model has no lanes
             self._junctions = Junctions(session, city)
-            self._waits = Waits(session, read_links(city.net_file), self.actuation.states)
+            self._waits = Waits(session, read_files(city.net_file).links, self.actuation.states)
         self._state = meter.state(0, 0.0)
         self._recorder = Recorder(meter, self._guide, self.actuation)
         self._observer.began(city, self._state)

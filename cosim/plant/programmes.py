@@ -29,9 +29,8 @@ from cosim.sumo.signals import (
     Signal,
     held_city,
     phases_of,
-    read_logics,
+    read_files,
     read_signals,
-    timetabled,
     without_effect,
 )
 from cosim.sumo.xml_files import attribute, read_xml
@@ -60,7 +59,7 @@ def scenario_city(scenario: Scenario, settings: Settings) -> City:
     """
     city = city_of(scenario.network)
     additional = own_files(scenario, settings.additional)
-    logics = read_logics(city.net_file, additional)
+    logics = read_files(city.net_file, additional).logics
     return held_city(city, logics, _left_alone(city, settings, additional, logics))
 
 
@@ -100,7 +99,7 @@ def _left_alone(
     if everywhere:
         return dict.fromkeys(signals, everywhere)
     reasons = dict.fromkeys(settings.leave_signals, "left alone by the scenario")
-    reasons |= dict.fromkeys(timetabled(city.net_file, additional), TIMETABLE)
+    reasons |= dict.fromkeys(read_files(city.net_file, additional).timetabled, TIMETABLE)
     return {signal: reasons[signal] for signal in signals if signal in reasons}
 
 
