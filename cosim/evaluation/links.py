@@ -161,15 +161,15 @@ def _movement_arrays(
     for movement, foe in sorted(_foes(city)):
         if movement in number and foe in number:
             pairs.append((number[movement], number[foe]))
-    lengths = [len(one.light) for one in lights]
+    lengths = np.array([len(one.light) for one in lights])
     yielding, foe_of = np.array(pairs, dtype=int).reshape(-1, 2).T
     return {
         "movement_link": np.array([streets.link_of[movement] for movement in streets.movements]),
         "speed": np.array(speeds),
         "yielding": yielding,
         "foe": foe_of,
-        "cycle": np.array(lengths),
-        "begin": np.concatenate([[0], np.cumsum(lengths)[:-1]]),
+        "cycle": lengths,
+        "begin": np.cumsum(lengths) - lengths,
         "light": np.concatenate([one.light for one in lights]),
         "yields": np.concatenate([one.yields for one in lights]),
         "gated": np.array([movement in gated for movement in streets.movements]),

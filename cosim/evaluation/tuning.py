@@ -29,7 +29,6 @@ from optuna.samplers import CmaEsSampler
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import FrozenTrial, TrialState
-from pydantic.fields import FieldInfo
 
 from cosim.evaluation.results import finished_rows
 from cosim.evaluation.runs import city_key, runs_of
@@ -85,7 +84,8 @@ class Tuning:
     @cached_property
     def space(self) -> dict[str, Range]:
         """Range of every option."""
-        declared = self.declared
+        options = self.strategy.options(self.scenario)
+        declared = {} if options is None else type(options).model_fields
         space = {}
         for name, (low, high) in self.options.items():
             if name in declared and declared[name].annotation is int:
@@ -115,12 +115,6 @@ class Tuning:
         tables = dict(self.scenario.controller_options)
         tables[name] = {**tables.get(name, {}), **table}
         return replace(self.scenario, controller_options=tables)
-
-    @property
-    def declared(self) -> Mapping[str, FieldInfo]:
-        """Declared options of the controller, none for the user's own code."""
-        options = self.strategy.options(self.scenario)
-        return {} if options is None else type(options).model_fields
 
     def value(self, key: str) -> Any:
         """Return an option of the scenario, or its default, or else None."""
@@ -374,9 +368,7 @@ def _write(order: Tuning, study: optuna.Study) -> pd.DataFrame:
     scores = table[SCORE]
     if scores.isna().all():
         return table
-    best = int(table.loc[scores.idxmin(), "candidate"])
-    values = {name: study.trials[best].params[name] for name in order.options}
-    tuned = order.tuned(values).controller_options[order.strategy.table(order.scenario)]
+    tuned = best_of(order, table).controller_options[order.strategy.table(order.scenario)]
     first = "failed" if math.isnan(scores[0]) else f"{scores[0]:.4g} veh s"
     lines = [f"# Best of {len(table)} candidates: {scores.min():.4g} veh s; the first: {first}"]
     lines.append(f'[controllers."{order.strategy.name}"]')

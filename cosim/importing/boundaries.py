@@ -54,10 +54,7 @@ def with_room(streets: Streets, uncontrollable: Collection[str]) -> Bool[np.ndar
     free = np.array([signal is None for signal in streets.link_signals], dtype=bool)
     room = streets.lane_metres.copy()
     np.add.at(room, behind[free], streets.lane_metres[before[free]])
-    gates = []
-    for signal in streets.link_signals:
-        gates.append(signal is not None and signal not in uncontrollable)
-    return np.array(gates, dtype=bool) & (room[before] >= ROOM_M)
+    return streets.controllable(uncontrollable) & (room[before] >= ROOM_M)
 
 
 class Turns:
@@ -113,8 +110,7 @@ class Clusters:
         count = int(of.max()) + 1
         lanes = streets.lane_metres[inside]
         mean = np.average(density[inside], weights=lanes)
-        ends = of[streets.links]
-        ends = ends[(ends >= 0).all(axis=1) & (ends[:, 0] != ends[:, 1])]
+        ends = streets.between(of)
         neighbours = graph(np.concatenate([ends, ends[:, ::-1]]), count)
         neighbours.sum_duplicates()
         return cls(

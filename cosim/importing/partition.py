@@ -99,11 +99,9 @@ def partition(
             f"--regions: expected at most {count}, the streets of {streets.path}, got {regions} "
             "instead"
         )
-    controllable = []
-    for signal in streets.link_signals:
-        controllable.append(signal is not None and signal not in uncontrollable)
+    controllable = streets.controllable(uncontrollable)
     limit = UNSIGNALLED_SHARE * blocks.weight.sum() / regions
-    merged = without_signals(streets, blocks, baseline.moves(), np.array(controllable), limit)
+    merged = without_signals(streets, blocks, baseline.moves(), controllable, limit)
     weight = np.bincount(merged, blocks.weight)
     means = []  # of merged blocks, which then look alike
     for axis in features(blocks, block_density(streets, blocks, baseline)).T:
@@ -180,8 +178,7 @@ def make_blocks(streets: Streets) -> Blocks:
 
     weight = total(lanes)
     position = np.stack([total(axis * lanes) / weight for axis in streets.centre.T], axis=1)
-    ends = of[streets.links]
-    ends = ends[(ends >= 0).all(axis=1) & (ends[:, 0] != ends[:, 1])]
+    ends = streets.between(of)
     joins = graph(np.concatenate([ends, ends[:, ::-1]]), count)
     joins.sum_duplicates()
     core = total(lanes * streets.core)
@@ -268,8 +265,7 @@ def pieces_of(streets: Streets, regions: EdgeNumbers) -> EdgeNumbers:
 
     The connections of the main part join the edges of a piece.
     """
-    inside = streets.main_part
-    links = streets.links[inside[streets.links].all(axis=1)]
+    links = streets.main_links
     kept = links[regions[links[:, 0]] == regions[links[:, 1]]]
     _, piece = connected_components(graph(kept, len(regions)), directed=False)
     return piece
@@ -282,7 +278,7 @@ def connect(streets: Streets, regions: EdgeNumbers) -> EdgeNumbers:
     """
     regions = regions.copy()
     inside = streets.main_part
-    links = streets.links[inside[streets.links].all(axis=1)]
+    links = streets.main_links
     for _ in range(len(regions)):
         piece = pieces_of(streets, regions)
         weight = np.bincount(piece, streets.lane_metres)
@@ -321,7 +317,7 @@ def _not_reachable(streets: Streets, regions: np.ndarray) -> int | None:
     """
     inside = streets.main_part
     used, numbers = np.unique(regions[inside], return_inverse=True)
-    links = np.searchsorted(used, regions[streets.links[inside[streets.links].all(axis=1)]])
+    links = np.searchsorted(used, regions[streets.main_links])
     _, part = connected_components(graph(links, len(used)), directed=True, connection="strong")
     size = np.bincount(numbers, streets.lane_metres[inside])
     outside = np.flatnonzero(part != np.argmax(np.bincount(part, size)))

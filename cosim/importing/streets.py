@@ -1,7 +1,7 @@
 """Road graph of a SUMO network as arrays, with signal programmes."""
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
@@ -73,6 +73,27 @@ class Streets:
     def lane_metres(self) -> PerEdge:
         """Length times lanes for cars (E,) [m]."""
         return self.length * self.lanes
+
+    def controllable(self, left_alone: Collection[str]) -> Bool[np.ndarray, " L"]:
+        """Return the links (L,) that perimeter control can hold.
+
+        left_alone: signals that it does not use
+        """
+        signals = [signal and signal not in left_alone for signal in self.link_signals]
+        return np.array(signals, dtype=bool)
+
+    @property
+    def main_links(self) -> Int[np.ndarray, "_ 2"]:
+        """Links within the main part."""
+        return self.links[self.main_part[self.links].all(axis=1)]
+
+    def between(self, labels: EdgeNumbers) -> Int[np.ndarray, "_ 2"]:
+        """Return the pairs of different labels that links join.
+
+        labels: (E,), -1 for none
+        """
+        ends = labels[self.links]
+        return ends[(ends >= 0).all(axis=1) & (ends[:, 0] != ends[:, 1])]
 
     @property
     def parts(self) -> int:

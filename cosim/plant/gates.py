@@ -35,6 +35,15 @@ class Green(NamedTuple):
     shown: float = 0.0
     ungated: float = 0.0
 
+    def later(self, seconds: float, light: str, base: str) -> "Green":
+        """Return the green after some seconds of a light instead of `base`."""
+        shown, ungated = self
+        if light in GREEN:
+            shown += seconds
+        if base in GREEN:
+            ungated += seconds
+        return Green(shown, ungated)
+
 
 class GatewaySignal:
     """A fixed-time signal with gateway links.
@@ -72,7 +81,7 @@ class GatewaySignal:
         if self.next_change >= step_end:
             return
         for movement in self._movements.values():
-            movement.count(now - self._since)
+            movement.green = movement.green.later(now - self._since, movement.shown, movement.base)
         while self._cycle_start + self._cycle < step_end:
             self._cycle_start += self._cycle
         phase = bisect_left(self._ends, step_end - self._cycle_start)
@@ -139,15 +148,6 @@ class _Movement:
         self.windows, self._always = _windows(programme, link)
         self.begin = -NEVER
         self.cut_at = NEVER
-
-    def count(self, seconds: float) -> None:
-        """Count the time since the last change as green if it was."""
-        shown, ungated = self.green
-        if self.shown in GREEN:
-            shown += seconds
-        if self.base in GREEN:
-            ungated += seconds
-        self.green = Green(shown, ungated)
 
     def end_of(self, window: _Window) -> float:
         """Return the end of the green in the present window [s]."""
@@ -294,12 +294,7 @@ class Ration:
 
     def green_time(self, now: float) -> Green:
         """Return the green before `now` [s]."""
-        shown, ungated = self._green
-        if self._light in GREEN:
-            shown += now - self._since
-        if self._base in GREEN:
-            ungated += now - self._since
-        return Green(shown, ungated)
+        return self._green.later(now - self._since, self._light, self._base)
 
     def opened(self, now: float) -> bool:
         """Return True if the present green began at `now` [s]."""

@@ -407,20 +407,15 @@ def read_scenario(folder: Path | str, settings: Mapping[str, Any] | None = None)
     if max(table.protected, default=0) >= network.regions:
         allowed = f"a list of distinct whole numbers from 0 to {network.regions - 1}"
         raise config.error(path, "protected", config.got(allowed, list(table.protected)))
-    _check_initial(table.initial, network.regions, path)
+    if table.initial:
+        lengths = {len(table.initial), *map(len, table.initial)}
+        if lengths != {network.regions} or min(map(min, table.initial)) < 0:
+            allowed = f"{network.regions} lists of {network.regions} numbers from 0 up"
+            rows = [list(row) for row in table.initial]
+            raise config.error(path, "initial", config.got(allowed, rows))
     scenario = Scenario(**values)
     _ = scenario.ordered_faults
     return scenario
-
-
-def _check_initial(rows: tuple[Numbers, ...], regions: int, path: Path) -> None:
-    """Raise InputError unless there are no rows, or R of R numbers from 0 up."""
-    if not rows:
-        return
-    lengths = {len(rows), *map(len, rows)}
-    if lengths != {regions} or min(map(min, rows)) < 0:
-        allowed = f"{regions} lists of {regions} numbers from 0 up"
-        raise config.error(path, "initial", config.got(allowed, [list(row) for row in rows]))
 
 
 def read_tables(folder: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:

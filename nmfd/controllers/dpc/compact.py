@@ -86,9 +86,7 @@ class CompactPolicy(Policy):
         else:
             gate = memory[..., 0, :]
             share = (0.5 + (gate.unsqueeze(-2) + relief)).clamp(0.0, 1.0)
-        share = torch.where(self.held, share, torch.ones_like(share))
-        perimeter = self.box.low + (self.box.high - self.box.low) * share
-        return perimeter * self.box.allowed, None
+        return self.box.opened(torch.where(self.held, share, torch.ones_like(share))), None
 
     def remember(self, x: PerPair, memory: Memory | None) -> Memory | None:
         """Return v and e after the states x; None without integral action.

@@ -93,7 +93,11 @@ class PerimeterLayer(nn.Module):
         self.register_buffer("allowed", torch.as_tensor(allowed, dtype=DTYPE), persistent=False)
 
     def forward(self, numbers: PerBoundary) -> PerBoundary:
-        return (self.low + (self.high - self.low) * torch.sigmoid(numbers)) * self.allowed
+        return self.opened(torch.sigmoid(numbers))
+
+    def opened(self, share: PerBoundary) -> PerBoundary:
+        """Return u that is u_min for a share of 0 and u_max for 1 (-)."""
+        return (self.low + (self.high - self.low) * share) * self.allowed
 
 
 class SplitsLayer(nn.Module):
