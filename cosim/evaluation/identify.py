@@ -11,7 +11,7 @@ error (nmfd.model.identification), and the better of the two is written.
 import os
 import re
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -35,7 +35,7 @@ from nmfd.model.planning import GUIDED
 from nmfd.model.regional_model import RegionalModel, network_toml
 from nmfd.model.scenario import Scenario
 from nmfd.runs import config, files, shipped
-from nmfd.runs.progress import watched
+from nmfd.runs.progress import Show, watched
 from nmfd.runs.run_many import locked, raise_failures, run_many
 from nmfd.runs.tables import NARROW, wrapped
 from nmfd.studies import fit_quality, plots
@@ -73,7 +73,7 @@ class Task:
     iterations: int
     out: Path
     workers: int
-    progress: Callable[..., None] | None
+    progress: Show
 
     def loading_runs(self, stage: int, **setup: object) -> list[Result]:
         """Do the runs of stage 0 or 1 that are not finished; return all of them.
@@ -189,7 +189,7 @@ class Task:
             return fitted
         return min(counted, fitted, key=lambda trial: trial.error)
 
-    def _progress(self, stage: str) -> Callable[..., None] | None:
+    def _progress(self, stage: str) -> Show:
         """Return a progress function whose notes begin with the stage."""
         show = self.progress
         if show is None:

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from cosim.importing.streets import Streets, graph
-from cosim.sumo.arrays import EdgeNumbers, PerEdge
+from cosim.importing.streets import LinkMask, Streets, graph
+from cosim.sumo.arrays import EdgeMask, EdgeNumbers, PerEdge
 
 ROOM_M = 75.0  # of lanes before a gate, for ten vehicles; with less it holds nobody
 Routes = Mapping[tuple[int, ...], int]  # edges -> number of vehicles
@@ -44,7 +44,7 @@ class Entered(NamedTuple):
     leaked: int
 
 
-def with_room(streets: Streets, uncontrollable: Collection[str]) -> Bool[np.ndarray, " L"]:
+def with_room(streets: Streets, uncontrollable: Collection[str]) -> LinkMask:
     """Return the links (L,) at which a gate can hold vehicles.
 
     They have a signal, and ROOM_M on the edge before it and those that lead there past no signal.
@@ -60,7 +60,7 @@ def with_room(streets: Streets, uncontrollable: Collection[str]) -> Bool[np.ndar
 class Turns:
     """Turns of all vehicles from edge to edge, in the order of their routes."""
 
-    def __init__(self, streets: Streets, routes: Routes, held: Bool[np.ndarray, " L"]):
+    def __init__(self, streets: Streets, routes: Routes, held: LinkMask):
         """held: links at which a gate can hold vehicles"""
         used = [route for route in routes if len(route) > 1]
         lengths = [len(route) for route in used]
@@ -78,7 +78,7 @@ class Turns:
         turns = zip(self._source.tolist(), self._target.tolist(), strict=True)
         self._held = np.array([turn in gates for turn in turns], dtype=bool)
 
-    def entered(self, inside: Bool[np.ndarray, " E"]) -> Entered:
+    def entered(self, inside: EdgeMask) -> Entered:
         """Return how vehicles from elsewhere enter the edges `inside`."""
         enters = np.flatnonzero(~inside[self._source] & inside[self._target] & ~inside[self._start])
         first = enters[np.diff(self._route[enters], prepend=-1) > 0]

@@ -4,7 +4,7 @@ import gzip
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -34,7 +34,7 @@ from nmfd.model import authority
 from nmfd.model.authority import Verdict
 from nmfd.model.regional_model import RegionalModel, network_toml
 from nmfd.runs.files import temporary_folder
-from nmfd.runs.progress import watched
+from nmfd.runs.progress import Show, watched
 from nmfd.studies import plots
 
 # For cars: beyond, the run without control is mesoscopic, so that it takes a minute.
@@ -199,7 +199,7 @@ def _check_new(folder: Path) -> None:
         raise InputError(f"--out: {folder} exists; choose another name, or remove it")
 
 
-def _progress(show: Callable[..., None] | None) -> Progress:
+def _progress(show: Show) -> Progress:
     """Return a callback for stages from one for numbers, which may be None."""
 
     def progress(stage: str, share: float = 0.0) -> None:

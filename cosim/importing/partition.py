@@ -42,6 +42,7 @@ DIRECTIONS = (
 )
 CENTRAL_SHARE = 0.35  # of the city's radius, within which a region is the centre
 MAX_EXTRA_CLUSTERS = 20  # beyond the requested number, among which enough large ones are searched
+PerBlock = Float[np.ndarray, " B"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,9 +56,9 @@ class Blocks:
     joins: (B, B) symmetric, number of connections between two blocks
     """
 
-    of: Int[np.ndarray, " E"]
-    weight: Float[np.ndarray, " B"]
-    core: Float[np.ndarray, " B"]
+    of: EdgeNumbers
+    weight: PerBlock
+    core: PerBlock
     position: Float[np.ndarray, "B 2"]
     joins: csr_array
 
@@ -110,7 +111,7 @@ def partition(
     return finish(streets, np.where(blocks.of >= 0, labels[blocks.of], -1))
 
 
-def block_density(streets: Streets, blocks: Blocks, baseline: Baseline) -> Float[np.ndarray, " B"]:
+def block_density(streets: Streets, blocks: Blocks, baseline: Baseline) -> PerBlock:
     """Return the density of every block without control (veh/m of lane)."""
     inside = blocks.of >= 0
     vehicles = baseline.density(streets) * streets.lane_metres
@@ -142,7 +143,7 @@ def cluster(
     return best
 
 
-def features(blocks: Blocks, density: Float[np.ndarray, " B"]) -> Float[np.ndarray, "B 3"]:
+def features(blocks: Blocks, density: PerBlock) -> Float[np.ndarray, "B 3"]:
     """Return density of the neighbourhood and position of each block.
 
     Each has variance 1 over the city's lanes.

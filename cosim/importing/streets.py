@@ -20,6 +20,9 @@ from cosim.sumo.net import NORMAL, for_cars, points_along, points_of, size
 from cosim.sumo.xml_files import attribute, network_root, read_xml
 from nmfd.errors import InputError
 
+Pairs = Int[np.ndarray, "_ 2"]
+LinkMask = Bool[np.ndarray, " L"]
+
 
 @dataclass(frozen=True, kw_only=True)
 class Logic(signals.Logic):
@@ -58,7 +61,7 @@ class Streets:
     centre: Float[np.ndarray, "E 2"]
     junctions: Int[np.ndarray, "E 2"]
     links: Int[np.ndarray, "L 2"]
-    all_links: Int[np.ndarray, "_ 2"]
+    all_links: Pairs
     link_signals: tuple[str | None, ...]
     roundabouts: tuple[tuple[int, ...], ...]
     logics: Mapping[str, Logic]
@@ -74,7 +77,7 @@ class Streets:
         """Length times lanes for cars (E,) [m]."""
         return self.length * self.lanes
 
-    def controllable(self, left_alone: Collection[str]) -> Bool[np.ndarray, " L"]:
+    def controllable(self, left_alone: Collection[str]) -> LinkMask:
         """Return the links (L,) that perimeter control can hold.
 
         left_alone: signals that it does not use
@@ -83,11 +86,11 @@ class Streets:
         return np.array(signals, dtype=bool)
 
     @property
-    def main_links(self) -> Int[np.ndarray, "_ 2"]:
+    def main_links(self) -> Pairs:
         """Links within the main part."""
         return self.links[self.main_part[self.links].all(axis=1)]
 
-    def between(self, labels: EdgeNumbers) -> Int[np.ndarray, "_ 2"]:
+    def between(self, labels: EdgeNumbers) -> Pairs:
         """Return the pairs of different labels that links join.
 
         labels: (E,), -1 for none
@@ -122,7 +125,7 @@ class Streets:
         return (part == np.argmax(weight)) & self.drivable
 
 
-def graph(pairs: Int[np.ndarray, "_ 2"], size: int) -> csr_array:
+def graph(pairs: Pairs, size: int) -> csr_array:
     """Return a matrix (size, size) with a one for every pair (n, 2)."""
     return csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(size, size))
 

@@ -34,6 +34,7 @@ from nmfd.model.planning import PlanningModel
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs.config import error
+from nmfd.runs.progress import Show
 from nmfd.tensors import one_thread
 from nmfd.types import Observation
 
@@ -169,7 +170,7 @@ def train(
     device: str = "cpu",
     compiled: bool = False,
     anyway: bool = False,
-    progress: Callable[[int, int, str], None] | None = None,
+    progress: Show = None,
 ) -> Any:
     """Train the policy of a strategy.
 
@@ -345,7 +346,7 @@ class TrainingRun:
             self.bar = self.best
             self._policy.load_state_dict(first)
 
-    def descend(self, progress: Callable[[int, int, str], None] | None) -> None:
+    def descend(self, progress: Show) -> None:
         """Take the steps of a descent that are left."""
         steps = self._setup.steps
         while self.done < steps:

@@ -14,7 +14,7 @@ rates, because congestion follows at once.
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -28,6 +28,7 @@ from nmfd.metrics import largest_accumulation
 from nmfd.model import dynamics
 from nmfd.model.mfd import Cubic, of_numbers
 from nmfd.model.regional_model import RegionalModel
+from nmfd.runs.progress import Show
 from nmfd.tensors import one_thread
 
 HORIZON = 10  # control intervals
@@ -182,7 +183,7 @@ def fit(
     fastest: PerRegion | None = None,
     iterations: int = ITERATIONS,
     seed: int = 0,
-    progress: Callable[[int, int, str], None] | None = None,
+    progress: Show = None,
 ) -> RegionalModel:
     """Return `network` with the parameters that predict `runs` best.
 

@@ -31,7 +31,7 @@ it if the nominal splits follow shortest paths.
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -52,6 +52,7 @@ from nmfd.model.mfd import Mfd
 from nmfd.model.plant import NmfdPlant
 from nmfd.model.regional_model import LEAST_LIMIT, RegionalModel
 from nmfd.model.scenario import Scenario
+from nmfd.runs.progress import Show
 from nmfd.tensors import one_thread
 
 ITERATIONS = 1500
@@ -60,7 +61,6 @@ INSIDE = 0.02  # distance of starts from the edge of the admissible set, where t
 # Lines above the MFD of a region, in the relaxation: from its slope at 0 to the critical
 # accumulation.
 LINES = 16
-Note = Callable[[int, int, str], None]  # takes done, all, note
 
 
 class Start(NamedTuple):
@@ -71,7 +71,7 @@ class Start(NamedTuple):
 
 
 def compute(
-    scenario: Scenario, name: str, *, iterations: int = ITERATIONS, progress: Note | None = None
+    scenario: Scenario, name: str, *, iterations: int = ITERATIONS, progress: Show = None
 ) -> Plan:
     """Return the best plan found, with the lower bound.
 
@@ -132,7 +132,7 @@ def solve(
     *,
     guidance: bool,
     iterations: int = ITERATIONS,
-    progress: Note | None = None,
+    progress: Show = None,
 ) -> Plan:
     """Return the best plan by separate descents.
 
