@@ -8,6 +8,7 @@ from typing import TypeAlias
 import numpy as np
 
 from cosim.sumo.net import City, Connection, connections_for_cars
+from nmfd.arrays import Arrays
 from nmfd.errors import InputError
 
 Route: TypeAlias = tuple[str, ...]
@@ -133,7 +134,7 @@ class Counts:
                 self.ending[link, destination] += share
 
 
-def link_arrays(streets: Streets) -> dict[str, np.ndarray]:
+def link_arrays(streets: Streets) -> Arrays:
     """Return the arrays of links and lanes."""
     city = streets.city
     names = [street for street, _ in streets.links]
@@ -155,7 +156,7 @@ def link_arrays(streets: Streets) -> dict[str, np.ndarray]:
 
 def vehicle_arrays(
     streets: Streets, free_time: np.ndarray, counts: Counts, draws: Sequence[Counts]
-) -> dict[str, np.ndarray]:
+) -> Arrays:
     """Return the arrays of turns, entries and cells.
 
     free_time: of the links (s, (L,))
