@@ -267,9 +267,7 @@ def frames(picture: CityPicture, result: Any) -> list[Frame]:
         states.append(state)
     made = [first(picture, result["gateway_green"].shape[1], states[0])]
     for k, state in enumerate(states[1:]):
-        controls = Controls(
-            perimeter=result["perimeter"][k], splits=None, note=str(result["note"][k])
-        )
+        controls = Controls(perimeter=result["perimeter"][k], note=str(result["note"][k]))
         row = {name: result[name][k] for name in ROW}
         made.append(after(picture, made[-1], controls, state, row))
     return made

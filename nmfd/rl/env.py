@@ -113,7 +113,7 @@ class Interface:
         perimeter = self._open.copy()
         perimeter[self._boundaries] = low + (high - low) * opening
         if self._turns is None:
-            return Controls(perimeter=perimeter, splits=None)
+            return Controls(perimeter=perimeter)
         weight = np.zeros_like(self._fixed)
         weight[self._turns] = np.exp(LOGIT_SCALE * action[self._gates :])
         sums = weight.sum(axis=1, keepdims=True)
