@@ -78,20 +78,12 @@ def by_seed(
     return dict(zip(part["seed"], part[column], strict=True))
 
 
-def groups(rows: pd.DataFrame) -> dict[float, list[str]]:
-    """Return demand level -> controllers, in the order of the rows."""
-    return {
-        level: list(part["controller"].unique())
-        for level, part in rows.groupby("demand", sort=True)
-    }
-
-
 def compared_with(rows: pd.DataFrame) -> str:
     """Return the reference controller: no-control, or else the first one.
 
     Only controllers that every level and enough seeds have are chosen from, if there are any.
     """
-    everywhere = set.intersection(*map(set, groups(rows).values()))
+    everywhere = set.intersection(*rows.groupby("demand")["controller"].agg(set))
     seeds = rows.groupby("controller", sort=False)["seed"].nunique()
     names = list(seeds.index[seeds >= min(FEWEST_SEEDS, seeds.max())])
     return benchmark.compared_with([name for name in names if name in everywhere] or names)
@@ -114,11 +106,9 @@ def statistics(rows: pd.DataFrame) -> pd.DataFrame:
     rows: of one scenario, one per run
     """
     out = []
-    for level, names in groups(rows).items():
-        here = rows[rows["demand"] == level]
+    for level, here in rows.groupby("demand", sort=True):
         against = compared_with(here)
-        for name in names:
-            part = here[here["controller"] == name]
+        for name, part in here.groupby("controller", sort=False):
             reference = by_seed(rows, level, against) if name != against else {}
             pair = paired(by_seed(rows, level, name), reference)
             row = {
@@ -210,8 +200,8 @@ def pairs(rows: pd.DataFrame) -> pd.DataFrame:
     There is a row for each pair at each demand level.
     """
     out = []
-    for level, names in groups(rows).items():
-        for name, other in permutations(names, 2):
+    for level, here in rows.groupby("demand", sort=True):
+        for name, other in permutations(here["controller"].unique(), 2):
             pair = paired(by_seed(rows, level, name), by_seed(rows, level, other))
             out.append((level, name, other, *pair, pair.significant))
     return pd.DataFrame(out, columns=PAIR_COLUMNS)

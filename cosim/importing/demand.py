@@ -16,7 +16,7 @@ from cosim.importing.case import SumoInput, seconds
 from cosim.importing.streets import Streets
 from cosim.sumo.arrays import PerTrip, TripNumbers
 from cosim.sumo.departures import Departure, Departures, original, read_departures
-from cosim.sumo.recorded_trips import BOUND, QUEUED_AFTER
+from cosim.sumo.recorded_trips import BOUND, QUEUED_AFTER, named_edges
 from nmfd.errors import InputError
 from nmfd.runs.files import temporary_folder
 
@@ -163,7 +163,7 @@ class Reading:
         if is_endless and self._end is None:
             self._end = self._case.begin + ENDLESS_FLOW_S
             self._notes[ENDLESS] = int(ENDLESS_FLOW_S)
-        for edge in _edges(element):
+        for edge in named_edges(element):
             if edge not in self._streets.number:
                 self._astray[name] = edge
                 return _stand_in(element, self._streets)
@@ -342,13 +342,6 @@ def _index(text: str, default: int) -> int:
 def _waits(element: Element) -> bool:
     """Return True for a vehicle or flow that departs when somebody else comes."""
     return element.get("depart", element.get("begin")) in TRIGGERED
-
-
-def _edges(element: Element) -> list[str]:
-    """Return the edges that a vehicle names, without those of shared routes."""
-    texts = [element.get(key, "") for key in ("from", "to", "via")]
-    texts += [route.get("edges", "") for route in element.iter("route")]
-    return " ".join(texts).split()
 
 
 def _stand_in(element: Element, streets: Streets) -> Element:

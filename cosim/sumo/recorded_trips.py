@@ -153,17 +153,19 @@ def check_edges(originals: RecordedTrips, city: City, where: str) -> None:
     SUMO would drop it silently.
     """
     for element in originals.elements:
-        edges = [element.get(key) for key in ("from", "to") if element.get(key)]
-        edges += element.get("via", "").split()
-        route = element.find("route")
-        if route is not None:
-            edges += route.get("edges", "").split()
-        for edge in edges:
+        for edge in named_edges(element):
             if edge not in city.region_of:
                 raise InputError(
                     f"{where}: {element.tag} {element.get('id')}: edge {edge} is not in "
                     f"{city.net_file}; remove the vehicle, or give the routes of this network"
                 )
+
+
+def named_edges(element: ElementTree.Element) -> list[str]:
+    """Return the edges that a vehicle names, without those of shared routes."""
+    texts = [element.get(key, "") for key in ("from", "to", "via")]
+    texts += [route.get("edges", "") for route in element.iter("route")]
+    return " ".join(texts).split()
 
 
 def read_routes(paths: Sequence[Path]) -> dict[str, tuple[str, ...]]:
