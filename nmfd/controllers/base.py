@@ -40,7 +40,10 @@ class Options(Settings):
 
     @property
     def guides(self) -> bool:
-        """True if the controller may guide routes: its constant or option `guidance`."""
+        """True if the controller may guide routes.
+
+        Its constant or option `guidance` says so.
+        """
         return bool(getattr(self, "guidance", False))
 
     @property
