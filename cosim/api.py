@@ -26,9 +26,9 @@ from cosim.sumo.trips import PLANNING_SEEDS
 from nmfd.api import (
     Controllers,
     ScenarioLike,
-    check_policies,
     levels_of,
     loaded,
+    policy_files,
     seeds_of,
 )
 from nmfd.api import catalogue as regional_catalogue
@@ -37,7 +37,7 @@ from nmfd.errors import RunFailed
 from nmfd.metrics import summary
 from nmfd.model.scenario import Scenario
 from nmfd.runs import shipped
-from nmfd.runs.files import default_folder, file_name, write_table
+from nmfd.runs.files import default_folder, folder_of, write_table
 from nmfd.runs.frame import Table
 from nmfd.runs.progress import Progress, watched
 from nmfd.runs.run_many import Run, locked, raise_failures, run_many
@@ -125,8 +125,7 @@ def run_controllers(
     """
     loaded_one = loaded(scenario, steps=steps)
     strategies = _reference_first(parse_many(controllers, loaded_one, lambda one: parse(one, city)))
-    files = {name: Path(file) for name, file in (policies or {}).items()}
-    check_policies(files, strategies)
+    files = policy_files(policies, strategies)
     out = default_folder(loaded_one.name) if out is None else Path(out)
     runs = runs_of(loaded_one, strategies, [seed], demand=demand, policies=files)
     with locked(out):
@@ -311,13 +310,10 @@ def planned(
     suite = [(loaded(one, steps=steps), levels) for one, levels in suite]
     first = suite[0][0]
     strategies = parse_many(controllers, first, lambda one: parse(one, city))
-    files = {name: Path(file) for name, file in (policies or {}).items()}
-    check_policies(files, strategies)
+    files = policy_files(policies, strategies)
     chosen = seeds_of(10 if seeds is None else seeds, FIRST_SEED)
-    if out is None:
-        stem = file_name(name if len(suite) > 1 else first.name)
-        out = Path("runs") / f"{stem}-evaluate"
-    return evaluation.plan(suite, strategies, chosen, files), Path(out)
+    folder = folder_of(name if len(suite) > 1 else first.name, "evaluate", out)
+    return evaluation.plan(suite, strategies, chosen, files), folder
 
 
 def compare(folder: Path | str) -> Table:
@@ -348,8 +344,7 @@ def report(
     """
     from cosim.reporting import html
 
-    given = [folders] if isinstance(folders, str | Path) else folders
-    paths = [Path(folder) for folder in given]
+    paths = _paths(folders)
     runs = [results.read(path) for path in paths]
     with locked(paths[0]) if out is None else nullcontext():
         page = paths[0] / "report.html" if out is None else Path(out)
@@ -403,7 +398,7 @@ def tune(
     strategy = parse(controller, city)
     kind = strategy.controller
     if isinstance(kind, BuiltIn) and kind.given is not None:
-        plain = BuiltIn(name=_base(kind), text=kind.text, options=kind.options, fixed=kind.fixed)
+        plain = replace(kind, name=kind.name.partition("(")[0], given=None)
         given = kind.given.model_dump(exclude_unset=True, exclude=set(kind.fixed))
         tables = {**one.controller_options, plain.name: given}
         one = replace(one, controller_options=tables)
@@ -416,7 +411,7 @@ def tune(
         levels=levels_of(demand),
         trials=candidates,
         search_seed=search_seed,
-        out=Path("runs") / f"{file_name(one.name)}-tune" if out is None else Path(out),
+        out=folder_of(one.name, "tune", out),
     )
     table = tuning.tune(order, workers=workers, time_limit=time_limit, progress=progress)
     best = strategy.options(tuning.best_of(order, table))
@@ -456,11 +451,10 @@ def plan(
     if plan_file is None:
         folder = one.folder or Path()
         plan_file = shipped.beside(folder, PLAN, "--plan-file FILE", scenario=True)
-    out = Path("runs", f"{file_name(one.name)}-plan") if out is None else Path(out)
     order = plan_routes.Planning(
         scenario=one,
         strategy=parse(controller, city),
-        out=out,
+        out=folder_of(one.name, "plan", out),
         demand=demand,
         seed=seed,
         iterations=iterations,
@@ -469,7 +463,7 @@ def plan(
         order, Path(plan_file), time_limit=time_limit, overwrite=overwrite, progress=progress
     )
     table.attrs["plan"] = str(plan_file)
-    table.attrs["folder"] = str(out)
+    table.attrs["folder"] = str(order.out)
     return table
 
 
@@ -537,11 +531,8 @@ def mfd(
     from cosim.importing.edge_mfds import edge_mfds
 
     net = Path(net)
-    given = [edge_data] if isinstance(edge_data, str | Path) else edge_data
-    folder = Path("runs", f"{file_name(net.name.partition('.')[0])}-mfd")
-    if out is not None:
-        folder = Path(out)
-    return edge_mfds(net, [Path(file) for file in given], str(regions), folder)
+    folder = folder_of(net.name.partition(".")[0], "mfd", out)
+    return edge_mfds(net, _paths(edge_data), str(regions), folder)
 
 
 def links(
@@ -566,8 +557,9 @@ def catalogue() -> dict[str, dict[str, str]]:
     return regional_catalogue() | {"Words behind a controller, for a city": words}
 
 
-def _base(kind: BuiltIn) -> str:
-    return kind.name.partition("(")[0]
+def _paths(files: Path | str | Sequence[Path | str]) -> list[Path]:
+    given = [files] if isinstance(files, str | Path) else files
+    return [Path(file) for file in given]
 
 
 def _reference_first(strategies: Sequence[Strategy]) -> list[Strategy]:

@@ -25,8 +25,9 @@ from nmfd.cli import (
     TIME_LIMIT,
     VERSION,
     Commands,
-    ControllerName,
     combined,
+    controller_option,
+    file_option,
     listed,
     out_option,
     parsed,
@@ -35,14 +36,12 @@ from nmfd.cli import (
 )
 from nmfd.errors import InputError
 
-CONTROLLER = click.option(
-    "--controller",
-    type=ControllerName(),
-    required=True,
-    metavar="NAME[+...]",
-    help="Controller from `nmfd show` or FILE:Class, and options of the city, joined by +: "
+CONTROLLER = controller_option(
+    "pi-gating or dpc-pc",
+    "Controller from `nmfd show` or FILE:Class, and options of the city, joined by +: "
     "actuated or max-pressure (signals), rerouting-N and compliance-N (percent of drivers), "
     "guided, guidance-period-N (s), planned, metering, estimate.",
+    "NAME[+...]",
 )
 AGAINST = click.option(
     "--against", metavar="NAME[+...]", help="Second controller, run on the same trips."
@@ -58,18 +57,10 @@ WORKERS = click.option(
     help="Parallel runs.",
 )
 RUNNING = combined(WORKERS, SCHEDULER, TIME_LIMIT, OVERWRITE)
-ROUTES = click.option(
-    "--routes",
-    type=FILE,
-    multiple=True,
-    metavar="FILE",
-    help="File of vehicles or flows. May be repeated.",
-)
-COUNTS = click.option(
+ROUTES = file_option("--routes", "File of vehicles or flows. May be repeated.", multiple=True)
+COUNTS = file_option(
     "--counts",
-    type=FILE,
-    metavar="FILE",
-    help="edgeData of SUMO, of whose counts (entered) trips are made, for a city without demand.",
+    "edgeData of SUMO, of whose counts (entered) trips are made, for a city without demand.",
 )
 REGIONS = click.option(
     "--regions",
@@ -136,12 +127,7 @@ def demo(out: Path) -> None:
 @ONE_DEMAND
 @TIME_LIMIT
 @OVERWRITE
-@click.option(
-    "--policy",
-    type=FILE,
-    metavar="FILE",
-    help="Policy file of --controller. [default: SCENARIO/NAME.pt]",
-)
+@file_option("--policy", "Policy file of --controller. [default: SCENARIO/NAME.pt]")
 @EXPLAIN
 @out_option("runs/SCENARIO-TIME")
 def run(
@@ -314,9 +300,7 @@ def compare(folder: Path) -> None:
 @click.option(
     "--seed", type=SEED, help="Seed of the runs on the map. [default: the first that both have]"
 )
-@click.option(
-    "--out", type=FILE, metavar="FILE", help="Page. [default: report.html in the first RUN]"
-)
+@file_option("--out", "Page. [default: report.html in the first RUN]")
 def report(folders: tuple[Path, ...], **options: Any) -> None:
     """Write one HTML page about finished runs.
 
@@ -378,9 +362,7 @@ def tune(scenario: Path, settings: dict, controller: str, **how: Any) -> None:
 @click.option("--iterations", type=COUNT, default=9, help="Runs after the one with guidance.")
 @click.option("--seed", type=SEED, default=1000, help="Seed of trips and drivers.")
 @ONE_DEMAND
-@click.option(
-    "--plan-file", type=FILE, metavar="FILE", help="The plan. [default: SCENARIO/plan.csv.gz]"
-)
+@file_option("--plan-file", "The plan. [default: SCENARIO/plan.csv.gz]")
 @TIME_LIMIT
 @OVERWRITE
 @out_option("runs/SCENARIO-plan")
@@ -558,7 +540,7 @@ def mfd(net: Path, edge_data: tuple[Path, ...], explain: bool, **options: Any) -
 
 @main.command()
 @SCENARIO
-@click.option("--out", type=FILE, metavar="FILE", help="File. [default: SCENARIO/links.npz]")
+@file_option("--out", "File. [default: SCENARIO/links.npz]")
 def links(scenario: Path, settings: dict, out: Path | None) -> None:
     """Write the streets of a SUMO city as a plant without SUMO.
 

@@ -26,7 +26,7 @@ from nmfd.controllers.strategy import (
 from nmfd.errors import InputError, did_you_mean
 from nmfd.model.scenario import Scenario, read_scenario, with_demand
 from nmfd.runs import shipped
-from nmfd.runs.files import default_folder, file_name, run_name
+from nmfd.runs.files import default_folder, folder_of, run_name
 from nmfd.runs.progress import Progress, watched
 from nmfd.runs.run_many import Run, locked, run_many
 from nmfd.runs.run_many import raise_failures as raise_failures
@@ -99,8 +99,9 @@ def loaded(
     if not isinstance(scenario, Scenario):
         scenario = load_scenario(scenario, settings)
     if not 0.0 < demand <= MOST_DEMAND:
-        allowed = f"expected a number above 0 up to {MOST_DEMAND:g}"
-        raise InputError(f"demand: {allowed}, got {demand:g} instead")
+        raise InputError(
+            f"demand: expected a number above 0 up to {MOST_DEMAND:g}, got {demand:g} instead"
+        )
     return with_demand(scenario, steps=steps, factor=demand)
 
 
@@ -247,10 +248,9 @@ def benchmark(
     levels = levels_of(demand)
     scenarios = {level: loaded(scenario, steps=steps, demand=level) for level in levels}
     first = scenarios[levels[0]]
-    files = {name: Path(file) for name, file in (policies or {}).items()}
     _check_plant(plant)
     strategies = parse_many(controllers, first, _regional)
-    check_policies(files, strategies)
+    files = policy_files(policies, strategies)
     runs = []
     lower = {}
     for level, one in scenarios.items():
@@ -513,7 +513,7 @@ def show(scenario: ScenarioLike, *, out: Path | str | None = None) -> list[Path]
     out: folder, runs/SCENARIO-show if None
     """
     scenario = loaded(scenario)
-    folder = Path("runs") / f"{file_name(scenario.name)}-show" if out is None else Path(out)
+    folder = folder_of(scenario.name, "show", out)
     folder.mkdir(parents=True, exist_ok=True)
     return benchmark_study.draw_scenario(folder, scenario)
 
@@ -589,17 +589,22 @@ def _regional(controller: ControllerLike) -> Strategy:
     return parse(controller).regional()
 
 
-def check_policies(policies: Mapping[str, Path], strategies: Sequence[Strategy]) -> None:
-    """Check that every policy file is of one of the strategies.
+def policy_files(
+    policies: Mapping[str, Path | str] | None, strategies: Sequence[Strategy]
+) -> dict[str, Path]:
+    """Return the policy files by strategy.
 
-    Raises: InputError
+    Raises: InputError for a file of none of the strategies
     """
     known = [strategy.name for strategy in strategies]
-    for name in policies:
+    files = {name: Path(file) for name, file in (policies or {}).items()}
+    for name in files:
         if name not in known:
             near = did_you_mean(name, known)
-            problem = f"{name!r} is not among {', '.join(known)}{near}; add it there"
-            raise InputError(f"--policy: {problem}")
+            raise InputError(
+                f"--policy: {name!r} is not among {', '.join(known)}{near}; add it there"
+            )
+    return files
 
 
 def _check_plant(plant: str | Plant) -> None:

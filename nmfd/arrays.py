@@ -22,3 +22,4 @@ Hops = Int[np.ndarray, "R R"]
 Intervals = Float[np.ndarray, " T"]
 # Places on a map [m], or pairs of accumulation and outflow.
 Points = Float[np.ndarray, "_ 2"]
+Arrays = dict[str, np.ndarray]  # by name

@@ -156,7 +156,7 @@ def combined(*decorators: Callable) -> Callable:
 class ControllerName(click.types.StringParamType):
     """Name of a controller; the error without one names `examples`."""
 
-    def __init__(self, examples: str = "pi-gating or dpc-pc"):
+    def __init__(self, examples: str):
         self.examples = examples
 
     def get_missing_message(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
@@ -273,6 +273,17 @@ DEMAND = click.option(
     default="1",
     help="Factors that multiply the demand.",
 )
+
+
+def file_option(name: str, text: str, metavar: str = "FILE", **more: Any) -> Callable:
+    """Return the option of a file."""
+    return click.option(name, type=FILE, metavar=metavar, help=text, **more)
+
+
+def controller_option(examples: str, text: str, metavar: str = "NAME") -> Callable:
+    """Return the option --controller; the error without one names `examples`."""
+    kind = ControllerName(examples)
+    return click.option("--controller", type=kind, required=True, metavar=metavar, help=text)
 
 
 def seeds_option(default: int, text: str, *others: str) -> Callable:
@@ -415,13 +426,7 @@ def robustness(scenario: Path, settings: dict, out: Path | None, **options: Any)
 
 @main.command()
 @SCENARIO
-@click.option(
-    "--controller",
-    type=ControllerName("dpc-pc"),
-    required=True,
-    metavar="NAME",
-    help="dpc-pc or dpc-pcrg.",
-)
+@controller_option("dpc-pc", "dpc-pc or dpc-pcrg.")
 @seed_option("Seed of the initial weights and the training states.")
 @click.option("--steps", type=COUNT, help="Adam steps. [default: as in scenario.toml, else 400]")
 @click.option(
@@ -431,7 +436,7 @@ def robustness(scenario: Path, settings: dict, out: Path | None, **options: Any)
 @click.option(
     "--anyway", is_flag=True, help="Train even if model or gateways make it pointless; see errors."
 )
-@click.option("--out", type=FILE, metavar="FILE", help="Policy file. [default: SCENARIO/NAME.pt]")
+@file_option("--out", "Policy file. [default: SCENARIO/NAME.pt]")
 def train(scenario: Path, settings: dict, controller: str, **options: Any) -> None:
     """Train a DPC policy on a scenario.
 
@@ -448,14 +453,8 @@ def train(scenario: Path, settings: dict, controller: str, **options: Any) -> No
 
 @main.command()
 @SCENARIO
-@click.option(
-    "--controller",
-    type=ControllerName("bound-pc"),
-    required=True,
-    metavar="NAME",
-    help="bound-pc or bound-pcrg.",
-)
-@click.option("--out", type=FILE, metavar="FILE", help="Plan file. [default: SCENARIO/NAME.npz]")
+@controller_option("bound-pc", "bound-pc or bound-pcrg.")
+@file_option("--out", "Plan file. [default: SCENARIO/NAME.npz]")
 def bound(scenario: Path, settings: dict, controller: str, **options: Any) -> None:
     """Find the best plan for known demand, and a lower bound.
 
@@ -499,27 +498,14 @@ def new_controller(file: Path) -> None:
 
 @main.command()
 @click.argument("counts", type=FILE)
-@click.option(
+@file_option(
     "--detectors",
-    type=FILE,
-    metavar="CSV",
-    help="Table: detid, length (km), lanes, linkid, pos, long and lat or x and y, region.",
+    "Table: detid, length (km), lanes, linkid, pos, long and lat or x and y, region.",
+    "CSV",
 )
-@click.option(
-    "--regions",
-    type=FILE,
-    metavar="CSV",
-    help="Table detid,region, unless another table has regions.",
-)
-@click.option(
-    "--about",
-    type=FILE,
-    metavar="CSV",
-    help="Table of regions: region, lane_km, trip_length, x, y (m).",
-)
-@click.option(
-    "--adjacency", type=FILE, metavar="CSV", help="Table region,neighbour. [default: by position]"
-)
+@file_option("--regions", "Table detid,region, unless another table has regions.", "CSV")
+@file_option("--about", "Table of regions: region, lane_km, trip_length, x, y (m).", "CSV")
+@file_option("--adjacency", "Table region,neighbour. [default: by position]", "CSV")
 @click.option(
     "--trip-length",
     type=float,

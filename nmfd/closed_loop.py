@@ -4,7 +4,7 @@ import copy
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -14,6 +14,7 @@ from nmfd import __version__, faults
 from nmfd.model.commands import admissible
 from nmfd.model.scenario import Scenario
 from nmfd.runs.pool import Watchdog
+from nmfd.runs.progress import Show
 from nmfd.types import EXPECTED, Controller, Controls, Observation, Plant, Result, State, Status
 
 PATIENCE = 10.0  # deadlines after which a decision ends the process of a run
@@ -39,7 +40,7 @@ def run(
     scenario: Scenario,
     *,
     seed: int,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Show = None,
 ) -> Result:
     """Drive `plant` with `controller` for `scenario.steps` control intervals.
 

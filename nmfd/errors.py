@@ -41,8 +41,10 @@ def need(what: str, extra: str, *modules: str) -> None:
     """
     missing = [module for module in modules if find_spec(module) is None]
     if missing:
-        remedy = f"install the extra {extra} with: pip install -e '.[{extra}]'"
-        raise InputError(f"{what}: needs {', '.join(missing)}; {remedy}")
+        raise InputError(
+            f"{what}: needs {', '.join(missing)}; install the extra {extra} with: pip install -e "
+            f"'.[{extra}]'"
+        )
 
 
 @contextmanager
@@ -51,7 +53,7 @@ def uninterrupted() -> Iterator[None]:
 
     It is for code that an interruption would leave with a lock held.
     """
-    held: list[int] = []
+    held = []
     before = {}
     # Python runs handlers in the main thread only, and lets no other thread set them.
     if threading.current_thread() is threading.main_thread():

@@ -11,7 +11,6 @@ from commands import good, nmfd
 
 from nmfd.api import load_scenario
 from nmfd.controllers import training
-from nmfd.controllers.base import from_table
 from nmfd.controllers.dpc.compact import FILL_TIME_S, CompactPolicy
 from nmfd.controllers.dpc.numbers import Numbers
 from nmfd.controllers.dpc.options import ConstantControl
@@ -27,7 +26,7 @@ from nmfd.controllers.dpc.single_changes import (
     UNPRICED,
     changed_policies,
 )
-from nmfd.controllers.rules import PiGating
+from nmfd.controllers.rules import scenario_gate
 from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
 from nmfd.model.planning import planning_model
@@ -125,7 +124,7 @@ def test_with_an_integral_it_contains_the_pi_gate_and_relief_comes_on_top(networ
         protected=(CENTRE,),
         controller_options={"pi-gating": {"set_point": [0.8 * critical], "kp": 1.2, "ki": ki}},
     )
-    gate = from_table(PiGating, planning, "pi-gating").make(planning)
+    gate = scenario_gate(planning)
     numbers = Numbers(set_point=0.8, gain=1.2 / span, integral=ki * planning.step / span)
     alone, relieved = (
         DpcController(policy(network, numbers._replace(relief=relief), guidance=False))

@@ -18,7 +18,7 @@ from cosim.importing.quality import left_alone
 from cosim.importing.streets import read_streets
 from cosim.plant.settings import settings
 from cosim.sumo.recorded_trips import draw, read_recorded_trips
-from cosim.sumo.signals import timetabled
+from cosim.sumo.signals import read_files
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
 
@@ -314,7 +314,7 @@ def test_signals_that_cannot_be_controlled(net, city, tmp_path):
     them."""
     config = city(additional='<tlLogic id="B1" programID="off" type="static" offset="0"/>')
     case = read_sumo_input(config)
-    switched = timetabled(case.net, case.additional)
+    switched = read_files(case.net, case.additional).timetabled
     found = left_alone(read_streets(case.net, case.additional), switched)
     assert found == {"B1": "switched off"}
     text = re.sub(r'<tlLogic id="C2".*?</tlLogic>', "", net.read_text(), flags=re.DOTALL)

@@ -15,7 +15,10 @@ def crossing_times(city: City) -> PerRegion:
     of it, on streets of the region; 0 if there is no such way.
     """
     times = np.zeros(city.regions)
-    streets = _street_times(city)
+    # From the end of a street to that of the next one (s, (E, E)).
+    first, second = city.move_edges.T
+    shape = (len(city.edges),) * 2
+    streets = csr_array((city.move_time + city.free_time[second], (first, second)), shape=shape)
     for region in range(city.regions):
         entries = [gateway for gateway in city.gateways if gateway.target == region]
         exits = [gateway for gateway in city.gateways if gateway.source == region]
@@ -31,14 +34,3 @@ def crossing_times(city: City) -> PerRegion:
         if used.size:
             times[region] = np.median(used)
     return times
-
-
-def _street_times(city: City) -> csr_array:
-    """Return the free-flow time from the end of edge a to that of edge b.
-
-    Its unit is s, its shape (E, E); only successors have an entry.
-    """
-    first, second = city.move_edges.T
-    times = city.move_time + city.free_time[second]
-    size = len(city.edges)
-    return csr_array((times, (first, second)), shape=(size, size))

@@ -11,7 +11,7 @@ error (nmfd.model.identification), and the better of the two is written.
 import os
 import re
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -35,7 +35,7 @@ from nmfd.model.planning import GUIDED
 from nmfd.model.regional_model import RegionalModel, network_toml
 from nmfd.model.scenario import Scenario
 from nmfd.runs import config, files, shipped
-from nmfd.runs.progress import watched
+from nmfd.runs.progress import Show, watched
 from nmfd.runs.run_many import locked, raise_failures, run_many
 from nmfd.runs.tables import NARROW, wrapped
 from nmfd.studies import fit_quality, plots
@@ -73,7 +73,7 @@ class Task:
     iterations: int
     out: Path
     workers: int
-    progress: Callable[..., None] | None
+    progress: Show
 
     def loading_runs(self, stage: int, **setup: object) -> list[Result]:
         """Do the runs of stage 0 or 1 that are not finished; return all of them.
@@ -189,7 +189,7 @@ class Task:
             return fitted
         return min(counted, fitted, key=lambda trial: trial.error)
 
-    def _progress(self, stage: str) -> Callable[..., None] | None:
+    def _progress(self, stage: str) -> Show:
         """Return a progress function whose notes begin with the stage."""
         show = self.progress
         if show is None:
@@ -299,20 +299,19 @@ class Identified:
         files.write_table(out / "samples.csv", table, float_format="%.6g")
         plots.draw_mfds(out / "mfd.png", self.model, self.samples)
         own = network_folder(self.task.scenario.network)
-        write_model(self.model, own, target, self._comment())
-        files.write_text(target / authority.FILE, self.verdict.text())
-
-    def _comment(self) -> str:
-        """Return the comment above the model that says where it comes from."""
         name = self.task.scenario.name
         seeds = self.task.seeds
         controllers = ", ".join(dict.fromkeys(run.controller for run in self.runs))
         times = ", ".join(f"{level:g}" for level in self.task.levels)
-        return (
+        write_model(
+            self.model,
+            own,
+            target,
             f"Written by cosim identify from {len(self.runs)} runs of {name} under {controllers};\n"
             f"# rates and MFDs are {self.method}; loading runs: demand times {times}, "
-            f"seeds {min(seeds)} to {max(seeds)}."
+            f"seeds {min(seeds)} to {max(seeds)}.",
         )
+        files.write_text(target / authority.FILE, self.verdict.text())
 
 
 def section(heading: str, sentences: Sequence[str]) -> str:
@@ -379,7 +378,7 @@ def identify(
     strategy = parse("no-control", None if city == "own" else city)
     options = [word for word in strategy.labels if word != "guided"]
     both = city is None and network is None and without_model(first)
-    main = out or Path("runs") / f"{files.file_name(first.name)}-identify"
+    main = files.folder_of(first.name, "identify", out)
     report: list[str] = []
     try:
         for guided in [False, True] if both else [strategy.guides]:

@@ -2,12 +2,13 @@
 
 import itertools
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TypeAlias
 
 import numpy as np
 
 from cosim.sumo.net import City, Connection, connections_for_cars
+from nmfd.arrays import Arrays
 from nmfd.errors import InputError
 
 Route: TypeAlias = tuple[str, ...]
@@ -133,7 +134,7 @@ class Counts:
                 self.ending[link, destination] += share
 
 
-def link_arrays(streets: Streets) -> dict[str, np.ndarray]:
+def link_arrays(streets: Streets) -> Arrays:
     """Return the arrays of links and lanes."""
     city = streets.city
     names = [street for street, _ in streets.links]
@@ -155,7 +156,7 @@ def link_arrays(streets: Streets) -> dict[str, np.ndarray]:
 
 def vehicle_arrays(
     streets: Streets, free_time: np.ndarray, counts: Counts, draws: Sequence[Counts]
-) -> dict[str, np.ndarray]:
+) -> Arrays:
     """Return the arrays of turns, entries and cells.
 
     free_time: of the links (s, (L,))
@@ -179,8 +180,14 @@ def vehicle_arrays(
     entry_number = {entry: number for number, entry in enumerate(entries)}
     cells = sorted(counts.cells)
     source = [entry_number[streets.link_of[turn[0]], destination] for turn, destination in cells]
-    where = [streets.city.region_of[streets.links[link][0]] for link, _ in entries]
-    shares = _Shares(entries, cells, np.array(source), where)
+    pairs = [(streets.city.region_of[streets.links[link][0]], j) for link, j in entries]
+    every = [counts, *draws]
+    entering = np.array([[one.entering[entry] for entry in entries] for one in every])
+    ending = np.array([[one.ending[entry] for entry in entries] for one in every])
+    beginning = np.array([[one.beginning[entry] for entry in entries] for one in every])
+    trips = np.array([[one.trips[pair] for pair in pairs] for one in every], dtype=float)
+    vehicles = np.array([[one.cells[cell] for cell in cells] for one in every])
+    leaving = np.array([np.bincount(source, some, len(entries)) for some in vehicles])
     return {
         "turn_movement": np.array([number_of[movement] for movement, _ in turns]),
         "turn_link": np.array([link for _, link in turns]),
@@ -188,58 +195,22 @@ def vehicle_arrays(
         "server": server,
         "entry_link": np.array([link for link, _ in entries]),
         "destination": np.array([destination for _, destination in entries]),
-        "ending": shares.of(shares.ending, counts, draws),
-        "origin": shares.of(shares.origin, counts, draws),
+        "ending": _shares(ending, entering),
+        "origin": _shares(beginning, trips),
         "cell_turn": np.array([turn_number[turn] for turn, _ in cells]),
         "cell_entry": np.array(source),
         "cell_onward": np.array([entry_number[turn[1], j] for turn, j in cells]),
-        "cell_share": shares.of(shares.onward, counts, draws),
+        "cell_share": _shares(vehicles, leaving[:, source]),
     }
 
 
-class _Shares:
-    """Shares of entries and cells; NaN where a draw has no vehicle."""
+def _shares(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
+    """Return shares by draw (-, (D, n)).
 
-    def __init__(
-        self,
-        entries: Sequence[tuple[int, int]],
-        cells: Sequence[tuple[Turn, int]],
-        source: np.ndarray,
-        region: Sequence[int],
-    ):
-        """source: entry of each cell (C,); region: of each entry"""
-        self._entries = entries
-        self._cells = cells
-        self._source = source
-        self._pairs = [(i, j) for i, (_, j) in zip(region, entries, strict=True)]
+    Where a draw has no vehicle, the share is that of all draws together.
 
-    def of(
-        self,
-        share: Callable[[Counts], np.ndarray],
-        counts: Counts,
-        draws: Sequence[Counts],
-    ) -> np.ndarray:
-        """Return a share by draw (D, n).
-
-        It is that of all draws together where one has no vehicle.
-        """
-        with np.errstate(invalid="ignore"):
-            together = np.nan_to_num(share(counts))
-            rows = [share(draw) for draw in draws]
-        return np.where(np.isnan(rows), together, rows)
-
-    def ending(self, counts: Counts) -> np.ndarray:
-        """Return the share of the vehicles of each entry whose trip ends there."""
-        entering = np.array([counts.entering[entry] for entry in self._entries])
-        return np.array([counts.ending[entry] for entry in self._entries]) / entering
-
-    def origin(self, counts: Counts) -> np.ndarray:
-        """Return the share of the trips between two regions that begin here."""
-        trips = np.array([float(counts.trips[pair]) for pair in self._pairs])
-        return np.array([counts.beginning[entry] for entry in self._entries]) / trips
-
-    def onward(self, counts: Counts) -> np.ndarray:
-        """Return the share of each cell of the vehicles that leave its entry."""
-        vehicles = np.array([counts.cells[cell] for cell in self._cells])
-        leaving = np.bincount(self._source, vehicles, len(self._entries))
-        return vehicles / leaving[self._source]
+    part, whole: vehicles of all draws together, then of each ((1 + D, n))
+    """
+    with np.errstate(invalid="ignore"):
+        together, *by_draw = part / whole
+    return np.where(np.isnan(by_draw), np.nan_to_num(together), by_draw)

@@ -28,6 +28,7 @@ from cosim.sumo.net import City, Connection, city_of
 from cosim.sumo.signals import HELD, Cycle, Signal, read_cycles, read_signals
 from cosim.sumo.trips import PLANNING_SEEDS, make_trips
 from cosim.sumo.xml_files import attribute, network_root
+from nmfd.arrays import Arrays
 from nmfd.model.links.network import FILE, LinkNetwork
 from nmfd.model.scenario import Scenario
 from nmfd.runs import shipped
@@ -137,7 +138,7 @@ def _movement_arrays(
     cycles: Mapping[str, Cycle],
     begin: float,
     gated: Collection[Movement],
-) -> dict[str, np.ndarray]:
+) -> Arrays:
     """Return the arrays of movements, lights and right of way.
 
     begin: time of the first second (s)
@@ -161,15 +162,15 @@ def _movement_arrays(
     for movement, foe in sorted(_foes(city)):
         if movement in number and foe in number:
             pairs.append((number[movement], number[foe]))
-    lengths = [len(one.light) for one in lights]
+    lengths = np.array([len(one.light) for one in lights])
     yielding, foe_of = np.array(pairs, dtype=int).reshape(-1, 2).T
     return {
         "movement_link": np.array([streets.link_of[movement] for movement in streets.movements]),
         "speed": np.array(speeds),
         "yielding": yielding,
         "foe": foe_of,
-        "cycle": np.array(lengths),
-        "begin": np.concatenate([[0], np.cumsum(lengths)[:-1]]),
+        "cycle": lengths,
+        "begin": np.cumsum(lengths) - lengths,
         "light": np.concatenate([one.light for one in lights]),
         "yields": np.concatenate([one.yields for one in lights]),
         "gated": np.array([movement in gated for movement in streets.movements]),
@@ -197,9 +198,7 @@ def _shown(connection: Connection, cycles: Mapping[str, Cycle], begin: float) ->
     return Lights(light, yields)
 
 
-def _stage_arrays(
-    streets: Streets, counts: Counts, signals: Sequence[Signal]
-) -> dict[str, np.ndarray]:
+def _stage_arrays(streets: Streets, counts: Counts, signals: Sequence[Signal]) -> Arrays:
     """Return the arrays of the signals that can choose their stages."""
     number_of = {signal.id: number for number, signal in enumerate(signals)}
     phases = [stages_of(signal) for signal in signals]
@@ -239,9 +238,7 @@ def _stage_arrays(
     }
 
 
-def _pressure_arrays(
-    streets: Streets, roads: Roads, phases: Sequence[Sequence[int]]
-) -> dict[str, np.ndarray]:
+def _pressure_arrays(streets: Streets, roads: Roads, phases: Sequence[Sequence[int]]) -> Arrays:
     """Return the weights of cosim.plant.max_pressure.
 
     The lanes of a link share its vehicles.

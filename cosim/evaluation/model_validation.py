@@ -20,7 +20,7 @@ from nmfd.model.mfd import held_up
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs import files
-from nmfd.runs.tables import text_table
+from nmfd.runs.tables import cell, text_table
 from nmfd.studies.benchmark import draw_accumulations
 from nmfd.studies.fit_quality import SITUATIONS, SPILLBACK, predictions
 from nmfd.types import Result
@@ -163,14 +163,13 @@ def prediction_table(rows: pd.DataFrame) -> str:
         first = group.iloc[0]
         mean = {}
         for name, share in group.filter(like="rmse_share").mean().items():
-            mean[name] = "-" if np.isnan(share) else f"{100 * share:.1f} %"
-        most = group["most_share"].max()
+            mean[name] = cell(100 * share, "{:.1f} %")
         line = {
             "demand": f"{demand:g}",
             "controller": controller,
             "runs": first["runs"],
             "model": Path(first["model"]).name,
-            "most": "-" if np.isnan(most) else f"{most:.1f}",
+            "most": cell(group["most_share"].max(), "{:.1f}"),
             "whole run": mean["whole_run_rmse_share"],
             "next interval": mean["next_interval_rmse_share"],
             "if nothing changed": mean["next_interval_persistence_rmse_share"],
@@ -180,8 +179,7 @@ def prediction_table(rows: pd.DataFrame) -> str:
         for name in SITUATIONS:
             errors = group[[f"{name}_rmse_veh", f"{name}_persistence_rmse_veh"]]
             model, as_now = np.sqrt((errors**2).mean())
-            both = "-" if np.isnan(model) else f"{model:.0f} ({as_now:.0f}) veh"
-            line[f"{name} (as now)"] = both
+            line[f"{name} (as now)"] = cell(model, f"{{:.0f}} ({as_now:.0f}) veh")
         lines.append(line)
     return text_table(lines, CAPTION)
 

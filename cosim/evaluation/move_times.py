@@ -9,17 +9,16 @@ time that grows in proportion to the flow).
 import math
 from collections.abc import Iterable, Sequence
 from heapq import heappop, heappush
-from itertools import pairwise
+from itertools import pairwise, takewhile
 from pathlib import Path
 from typing import NamedTuple
-from xml.etree import ElementTree
 
 import numpy as np
 from jaxtyping import Float
 
 from cosim.sumo.net import City
 from cosim.sumo.outputs import unfinished
-from cosim.sumo.xml_files import BROKEN, attribute
+from cosim.sumo.xml_files import BROKEN, attribute, elements_of
 
 PERIOD_S = 300.0  # in which travel times are averaged
 PRIOR_VEH = 2.0  # that count besides, with the mean time of all moves from the edge
@@ -50,21 +49,15 @@ def read_driven(path: Path) -> dict[str, Driven]:
     """Return vehicle -> route. Raise RunFailed for a file that is not whole."""
     driven = {}
     try:
-        for _, element in ElementTree.iterparse(path):
-            if element.tag != "vehicle":
-                continue
+        for element in elements_of(path, "vehicle"):
             route = element.find("route")
-            if route is not None:
-                left = []
-                for text in route.get("exitTimes", "").split():
-                    time = float(text)
-                    if time < 0.0:
-                        break
-                    left.append(time)
-                depart = float(attribute(element, "depart"))
-                edges = tuple(attribute(route, "edges").split())
-                driven[attribute(element, "id")] = Driven(depart, edges, tuple(left))
-            element.clear()
+            if route is None:
+                continue
+            times = map(float, route.get("exitTimes", "").split())
+            left = tuple(takewhile(lambda time: time >= 0.0, times))
+            depart = float(attribute(element, "depart"))
+            edges = tuple(attribute(route, "edges").split())
+            driven[attribute(element, "id")] = Driven(depart, edges, left)
     except BROKEN as error:
         raise unfinished(path, error) from None
     return driven

@@ -116,8 +116,10 @@ def read(path: Path, scenario: str | None = None) -> Finished:
     """
     rows = finished_rows(finished_table(path))
     if rows.empty or "sumo" not in set(rows["plant"]):
-        remedy = "give a folder of `cosim run` or `cosim evaluate`"
-        raise InputError(f"{path}: holds no finished runs in SUMO; {remedy}")
+        raise InputError(
+            f"{path}: holds no finished runs in SUMO; give a folder of `cosim run` or `cosim "
+            "evaluate`"
+        )
     manifest = read_manifest(path)
     rows = rows[rows["scenario"] == (scenario or rows["scenario"].iloc[0])]
     levels = []
@@ -182,6 +184,8 @@ def read_run(
         raise InputError(f"{folder}: holds no finished run of {name} with seed {seed}")
     if len(places) > 1:
         where = ", ".join(path.parent.relative_to(folder).as_posix() for path in places)
-        problem = f"holds several runs of {name} with seed {seed} ({where})"
-        raise InputError(f"{folder}: {problem}; give demand or scenario")
+        raise InputError(
+            f"{folder}: holds several runs of {name} with seed {seed} ({where}); give demand or "
+            "scenario"
+        )
     return Result.read(places[0])

@@ -4,7 +4,7 @@ import json
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,6 +27,7 @@ from nmfd.arrays import PerRegion
 from nmfd.model.scenario import Scenario, with_demand
 from nmfd.runs import config
 from nmfd.runs.files import atomic
+from nmfd.runs.progress import Show
 from nmfd.types import Result
 
 # Share of an edge's room: a queue that reaches its upstream end leaves gaps that move backwards.
@@ -59,7 +60,7 @@ class Simulation:
 def simulate(
     job: Simulation,
     *,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Show = None,
     observer: Observer | None = None,
     gui: bool = False,
 ) -> Result:

@@ -18,7 +18,7 @@ from cosim.sumo.net import City
 from nmfd.arrays import PerRegion
 from nmfd.metrics import COUNTED, decision_ms, percent_change
 from nmfd.runs import config
-from nmfd.runs.tables import NARROW, markdown_table, text_table, wrapped
+from nmfd.runs.tables import NARROW, cell, markdown_table, text_table, wrapped
 from nmfd.studies import benchmark
 from nmfd.studies.benchmark import REFERENCE, interval
 from nmfd.types import Result
@@ -38,6 +38,7 @@ PAIR_COLUMNS = [
     "half_interval_percent",
     "significant",
 ]
+WHOLE = "{:,.0f}"  # form of a number
 NAME_WIDTH = 28  # characters, beyond which a name continues in the next line
 # Of the table in the terminal, after controller, seeds, TTS and change.
 BRIEF = ["completed", "trip [s]", "backlog [veh]", "teleports", "removed [veh]", "CO2 [kg]"]
@@ -77,20 +78,12 @@ def by_seed(
     return dict(zip(part["seed"], part[column], strict=True))
 
 
-def groups(rows: pd.DataFrame) -> dict[float, list[str]]:
-    """Return demand level -> controllers, in the order of the rows."""
-    return {
-        level: list(part["controller"].unique())
-        for level, part in rows.groupby("demand", sort=True)
-    }
-
-
 def compared_with(rows: pd.DataFrame) -> str:
     """Return the reference controller: no-control, or else the first one.
 
     Only controllers that every level and enough seeds have are chosen from, if there are any.
     """
-    everywhere = set.intersection(*map(set, groups(rows).values()))
+    everywhere = set.intersection(*rows.groupby("demand")["controller"].agg(set))
     seeds = rows.groupby("controller", sort=False)["seed"].nunique()
     names = list(seeds.index[seeds >= min(FEWEST_SEEDS, seeds.max())])
     return benchmark.compared_with([name for name in names if name in everywhere] or names)
@@ -113,11 +106,9 @@ def statistics(rows: pd.DataFrame) -> pd.DataFrame:
     rows: of one scenario, one per run
     """
     out = []
-    for level, names in groups(rows).items():
-        here = rows[rows["demand"] == level]
+    for level, here in rows.groupby("demand", sort=True):
         against = compared_with(here)
-        for name in names:
-            part = here[here["controller"] == name]
+        for name, part in here.groupby("controller", sort=False):
             reference = by_seed(rows, level, against) if name != against else {}
             pair = paired(by_seed(rows, level, name), reference)
             row = {
@@ -209,8 +200,8 @@ def pairs(rows: pd.DataFrame) -> pd.DataFrame:
     There is a row for each pair at each demand level.
     """
     out = []
-    for level, names in groups(rows).items():
-        for name, other in permutations(names, 2):
+    for level, here in rows.groupby("demand", sort=True):
+        for name, other in permutations(here["controller"].unique(), 2):
             pair = paired(by_seed(rows, level, name), by_seed(rows, level, other))
             out.append((level, name, other, *pair, pair.significant))
     return pd.DataFrame(out, columns=PAIR_COLUMNS)
@@ -229,7 +220,7 @@ def shown(table: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
     for row, many in zip(table.to_dict("records"), _many_teleports(table), strict=True):
         half = row[f"half_interval_{TTS}"]
         spread = "" if math.isnan(half) else f" ± {half:.1e}"
-        times = [_seconds(row[f"{kind}_trip_time_s"]) for kind in ("mean", "median", "p95")]
+        times = [cell(row[f"{kind}_trip_time_s"], WHOLE) for kind in ("mean", "median", "p95")]
         queue = f"{row['gateway_queue_mean_veh']:.1f} / {row['gateway_queue_max_veh']:.0f}"
         line = {
             "controller": row["controller"],
@@ -242,14 +233,14 @@ def shown(table: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
             "backlog [veh s]": f"{row['total_backlog_veh_s']:.2e}",
             "teleports": _marked(f"{row['teleports']:.0f}", many),
             "trip [s]": " / ".join(times),
-            "finished [s]": _seconds(row["mean_finished_trip_time_s"]),
-            "departure delay [s]": _seconds(row["mean_departure_delay_s"]),
-            "delay [s]": _seconds(row["mean_time_loss_s"]),
-            "public transport [s]": _seconds(row.get("public_transport_delay_s", math.nan)),
+            "finished [s]": cell(row["mean_finished_trip_time_s"], WHOLE),
+            "departure delay [s]": cell(row["mean_departure_delay_s"], WHOLE),
+            "delay [s]": cell(row["mean_time_loss_s"], WHOLE),
+            "public transport [s]": cell(row.get("public_transport_delay_s", math.nan), WHOLE),
             "other [veh s]": f"{row['other_time_spent_veh_s']:.2e}",
             "CO2 [kg]": f"{row['co2_kg']:,.0f}",
             "queue [veh]": queue,
-            "longest [veh]": _seconds(row.get("longest_queue_veh", math.nan)),
+            "longest [veh]": cell(row.get("longest_queue_veh", math.nan), WHOLE),
             "full": f"{100 * row['gateway_full_share']:.1f} %",
             "decision [ms]": decision_ms(row),
         }
@@ -261,11 +252,6 @@ def shown(table: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
     outcomes = whole.loc[:, :"teleports"]
     costs = whole.loc[:, "trip [s]":]
     return outcomes.reset_index(), costs.reset_index()
-
-
-def _seconds(value: float) -> str:
-    """Return a number for a cell, "-" if it is unknown."""
-    return "-" if math.isnan(value) else f"{value:,.0f}"
 
 
 def _marked(number: str, doubtful: bool) -> str:
@@ -298,7 +284,10 @@ def brief(table: pd.DataFrame) -> pd.DataFrame:
     whole["controller"] = whole["controller"].map(_in_lines)
     first = list(outcomes)[:4]
     columns = [*first, *BRIEF]
-    while len(columns) > len(first) and text_width(whole[columns]) > NARROW:
+    while len(columns) > len(first):
+        lines = text_table(whole[columns].to_dict("records")).splitlines()
+        if max(map(len, lines)) <= NARROW:
+            break
         columns.pop()
     return whole[columns]
 
@@ -308,11 +297,6 @@ def _in_lines(name: str) -> str:
     words = name.replace("+", " +")
     lines = textwrap.wrap(words, NAME_WIDTH, break_long_words=False, break_on_hyphens=False)
     return "\n".join(line.replace(" +", "+") for line in lines)
-
-
-def text_width(table: pd.DataFrame) -> int:
-    """Return the width of a table as text (characters)."""
-    return max(map(len, text_table(table.to_dict("records")).splitlines()))
 
 
 def text(rows: pd.DataFrame, *, explain: bool = False) -> str:
@@ -355,25 +339,23 @@ def ranking(rows: pd.DataFrame) -> str:
 
     rows: of several scenarios
     """
-    changes: dict[str, list[float]] = {}
+    tables = []
     note = ""
     for _, here in rows.groupby(["scenario", "demand"], sort=False):
         common = on_common_seeds(here)
         if len(common) < len(here):
             note = "\n\nControllers have different seeds: only those that all have count."
         table = statistics(common)
-        change = table["change_percent"].mask(table["controller"] == table["against"], 0.0)
-        if change.isna().any():  # no vehicle spent time
-            continue
-        for name, value in zip(table["controller"], change, strict=True):
-            changes.setdefault(name, []).append(value)
-    most = max(map(len, changes.values()), default=0)
+        table["change"] = table["change_percent"].mask(table["controller"] == table["against"], 0.0)
+        if table["change"].notna().all():  # else no vehicle spent time
+            tables.append(table[["controller", "change"]])
     lines = []
-    order = sorted(changes, key=lambda name: (-len(changes[name]), float(np.mean(changes[name]))))
-    for place, name in enumerate(order, 1):
-        each = changes[name]
-        rank = place if len(each) == most else "-"
-        lines.append([rank, name, f"{np.mean(each):+.1f} %", len(each)])
+    if tables:
+        changes = pd.concat(tables).groupby("controller", sort=False)["change"]
+        means = changes.agg(["size", "mean"]).sort_values(["size", "mean"], ascending=[False, True])
+        for place, (name, places, mean) in enumerate(means.itertuples(), 1):
+            rank = place if places == means["size"].max() else "-"
+            lines.append([rank, name, f"{mean:+.1f} %", places])
     headings = ["rank", "controller", "mean change of TTS", "scenarios and demand levels"]
     return markdown_table(headings, lines) + note
 

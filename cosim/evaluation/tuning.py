@@ -29,7 +29,6 @@ from optuna.samplers import CmaEsSampler
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import FrozenTrial, TrialState
-from pydantic.fields import FieldInfo
 
 from cosim.evaluation.results import finished_rows
 from cosim.evaluation.runs import city_key, runs_of
@@ -85,8 +84,9 @@ class Tuning:
     @cached_property
     def space(self) -> dict[str, Range]:
         """Range of every option."""
-        declared = self.declared
-        space: dict[str, Range] = {}
+        options = self.strategy.options(self.scenario)
+        declared = {} if options is None else type(options).model_fields
+        space = {}
         for name, (low, high) in self.options.items():
             if name in declared and declared[name].annotation is int:
                 space[name] = IntDistribution(math.ceil(low), math.floor(high))
@@ -116,30 +116,22 @@ class Tuning:
         tables[name] = {**tables.get(name, {}), **table}
         return replace(self.scenario, controller_options=tables)
 
-    @property
-    def declared(self) -> Mapping[str, FieldInfo]:
-        """Declared options of the controller, none for the user's own code."""
-        options = self.strategy.options(self.scenario)
-        return {} if options is None else type(options).model_fields
-
     def value(self, key: str) -> Any:
         """Return an option of the scenario, or its default, or else None."""
+        options = self.strategy.options(self.scenario)
+        if options is not None:
+            return getattr(options, key, None)
         tables = self.scenario.controller_options
         name = self.strategy.controller.name
         own = {**tables.get(name, {}), **tables.get(self.strategy.table(self.scenario), {})}
-        if key in own:
-            return own[key]
-        declared = self.declared.get(key)
-        if declared is None or declared.is_required():
-            return None
-        return declared.default
+        return own.get(key)
 
     def first(self) -> dict[str, float]:
         """Return the scenario's options within the ranges.
 
         An option without a value has the middle of its range.
         """
-        point: dict[str, float] = {}
+        point = {}
         for name, span in self.space.items():
             key, index = _key_and_index(name)
             value = self.value(key)
@@ -376,9 +368,7 @@ def _write(order: Tuning, study: optuna.Study) -> pd.DataFrame:
     scores = table[SCORE]
     if scores.isna().all():
         return table
-    best = int(table.loc[scores.idxmin(), "candidate"])
-    values = {name: study.trials[best].params[name] for name in order.options}
-    tuned = order.tuned(values).controller_options[order.strategy.table(order.scenario)]
+    tuned = best_of(order, table).controller_options[order.strategy.table(order.scenario)]
     first = "failed" if math.isnan(scores[0]) else f"{scores[0]:.4g} veh s"
     lines = [f"# Best of {len(table)} candidates: {scores.min():.4g} veh s; the first: {first}"]
     lines.append(f'[controllers."{order.strategy.name}"]')

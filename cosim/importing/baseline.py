@@ -3,7 +3,6 @@
 They give the densities of its streets, and the routes driven.
 """
 
-import xml.etree.ElementTree as ElementTree
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -26,7 +25,7 @@ from cosim.sumo.recorded_trips import (
     run_files,
     write_recorded_trips,
 )
-from cosim.sumo.xml_files import attribute, child, file_list, read_xml
+from cosim.sumo.xml_files import attribute, child, elements_of, file_list, read_xml
 from nmfd.arrays import PerRegion, PerTurn
 from nmfd.runs.files import temporary_folder
 
@@ -148,7 +147,7 @@ def averaged_runs(
     options |= times
     # A vehicle with a new route by a rerouter makes SUMO fail when it writes the times of the edges
     # it has left.
-    if _reroutes(additional):
+    if any(read_xml(path).find(".//routeProbReroute") is not None for path in additional):
         options["vehroute-output.exit-times"] = "false"
     runs = []
     for seed in range(seeds):
@@ -175,19 +174,11 @@ def averaged_runs(
     return replace(runs[0], presence=np.mean([run.presence for run in runs], axis=0))
 
 
-def _reroutes(additional: Sequence[Path]) -> bool:
-    """Return True if a rerouter of the files gives new routes."""
-    for path in additional:
-        if next(read_xml(path).iter("routeProbReroute"), None) is not None:
-            return True
-    return False
-
-
 def _measured(
     folder: Path, streets: Streets, begin: float, end: float, vehicles: Collection[str]
 ) -> Baseline:
     """Read the outputs of a run with these vehicles of the demand."""
-    statistic = ElementTree.parse(folder / "statistic.xml").getroot()
+    statistic = read_xml(folder / "statistic.xml")
     totals = child(statistic, "vehicleTripStatistics")
     duration = float(attribute(totals, "duration"))
     loss = float(attribute(totals, "timeLoss"))
@@ -216,35 +207,28 @@ def _presence(path: Path, streets: Streets, begin: float, end: float) -> np.ndar
     """Read Baseline.presence from SUMO's edgeData."""
     intervals = max(1, int(np.ceil((end - begin) / INTERVAL_S)))
     presence = np.zeros((intervals, len(streets.edges)))
-    for _, element in ElementTree.iterparse(path):
-        if element.tag != "interval":
-            continue
+    for element in elements_of(path, "interval"):
         k = int((float(attribute(element, "begin")) - begin) / INTERVAL_S + 0.5)
         if k < intervals:
             for edge in element:
                 n = streets.number.get(attribute(edge, "id"))
                 if n is not None:
                     presence[k, n] += float(attribute(edge, "sampledSeconds"))
-        element.clear()
     return presence
 
 
 def _ways(path: Path, streets: Streets) -> Counter[Way]:
     """Read Baseline.ways from SUMO's vehroute output."""
     ways: Counter[Way] = Counter()
-    for _, element in ElementTree.iterparse(path):
-        if element.tag != "vehicle":
-            continue
+    for element in elements_of(path, "vehicle"):
         route = element.find("route")
-        if route is not None and route.get("edges"):
-            edges = [streets.number.get(edge, -1) for edge in attribute(route, "edges").split()]
-            times = route.get("exitTimes", "").split()
-            if times:
-                left = [float(time) >= 0 for time in times]
-            else:
-                left = [element.get("arrival") is not None] * len(edges)
-            driven = tuple(n for n, gone in zip(edges, left, strict=False) if gone and n >= 0)
-            if edges[-1] >= 0:
-                ways[driven, edges[-1]] += 1
-        element.clear()
+        if route is None or not route.get("edges"):
+            continue
+        edges = [streets.number.get(edge, -1) for edge in attribute(route, "edges").split()]
+        left = [float(time) >= 0 for time in route.get("exitTimes", "").split()]
+        if not left:
+            left = [element.get("arrival") is not None] * len(edges)
+        driven = tuple(n for n, gone in zip(edges, left, strict=False) if gone and n >= 0)
+        if edges[-1] >= 0:
+            ways[driven, edges[-1]] += 1
     return ways

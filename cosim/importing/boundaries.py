@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from cosim.importing.streets import Streets, graph
-from cosim.sumo.arrays import EdgeNumbers, PerEdge
+from cosim.importing.streets import LinkMask, Streets, graph
+from cosim.sumo.arrays import EdgeMask, EdgeNumbers, PerEdge
 
 ROOM_M = 75.0  # of lanes before a gate, for ten vehicles; with less it holds nobody
 Routes = Mapping[tuple[int, ...], int]  # edges -> number of vehicles
@@ -44,7 +44,7 @@ class Entered(NamedTuple):
     leaked: int
 
 
-def with_room(streets: Streets, uncontrollable: Collection[str]) -> Bool[np.ndarray, " L"]:
+def with_room(streets: Streets, uncontrollable: Collection[str]) -> LinkMask:
     """Return the links (L,) at which a gate can hold vehicles.
 
     They have a signal, and ROOM_M on the edge before it and those that lead there past no signal.
@@ -54,16 +54,13 @@ def with_room(streets: Streets, uncontrollable: Collection[str]) -> Bool[np.ndar
     free = np.array([signal is None for signal in streets.link_signals], dtype=bool)
     room = streets.lane_metres.copy()
     np.add.at(room, behind[free], streets.lane_metres[before[free]])
-    gates = []
-    for signal in streets.link_signals:
-        gates.append(signal is not None and signal not in uncontrollable)
-    return np.array(gates, dtype=bool) & (room[before] >= ROOM_M)
+    return streets.controllable(uncontrollable) & (room[before] >= ROOM_M)
 
 
 class Turns:
     """Turns of all vehicles from edge to edge, in the order of their routes."""
 
-    def __init__(self, streets: Streets, routes: Routes, held: Bool[np.ndarray, " L"]):
+    def __init__(self, streets: Streets, routes: Routes, held: LinkMask):
         """held: links at which a gate can hold vehicles"""
         used = [route for route in routes if len(route) > 1]
         lengths = [len(route) for route in used]
@@ -81,7 +78,7 @@ class Turns:
         turns = zip(self._source.tolist(), self._target.tolist(), strict=True)
         self._held = np.array([turn in gates for turn in turns], dtype=bool)
 
-    def entered(self, inside: Bool[np.ndarray, " E"]) -> Entered:
+    def entered(self, inside: EdgeMask) -> Entered:
         """Return how vehicles from elsewhere enter the edges `inside`."""
         enters = np.flatnonzero(~inside[self._source] & inside[self._target] & ~inside[self._start])
         first = enters[np.diff(self._route[enters], prepend=-1) > 0]
@@ -113,8 +110,7 @@ class Clusters:
         count = int(of.max()) + 1
         lanes = streets.lane_metres[inside]
         mean = np.average(density[inside], weights=lanes)
-        ends = of[streets.links]
-        ends = ends[(ends >= 0).all(axis=1) & (ends[:, 0] != ends[:, 1])]
+        ends = streets.between(of)
         neighbours = graph(np.concatenate([ends, ends[:, ::-1]]), count)
         neighbours.sum_duplicates()
         return cls(

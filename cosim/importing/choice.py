@@ -153,18 +153,13 @@ def choose(
     reason = f"{CHOSEN}{chosen.labels.max() + 1}"
     if regions is None:
         reason += f", the fewest whose gates hold {ENOUGH:.0%} of the most"
-    reason += f"; {_gates_text(chosen, plain, sum(routes.values()))}"
-    return Choice(labels=chosen.labels, reason=reason)
-
-
-def _gates_text(chosen: _Found, plain: _Found, trips: int) -> str:
-    """Return what gates hold; plain: the best by density alone."""
     held, leaked = chosen.entered
-    return (
-        f"of {trips:,} vehicles {held:,} first enter the densest one "
-        f"past gates with room and {leaked:,} elsewhere; by density alone these were "
+    reason += (
+        f"; of {sum(routes.values()):,} vehicles {held:,} first enter the densest one past gates "
+        f"with room and {leaked:,} elsewhere; by density alone these were "
         f"{plain.entered.held:,} and {plain.entered.leaked:,}"
     )
+    return Choice(labels=chosen.labels, reason=reason)
 
 
 class _Search:

@@ -1,7 +1,6 @@
 """Comparison of an imported city with plain SUMO, trip by trip."""
 
 import math
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ from cosim.importing import quiet_files
 from cosim.importing.case import SumoInput
 from cosim.sumo.programs import run_sumo
 from cosim.sumo.recorded_trips import MESOSCOPIC
-from cosim.sumo.xml_files import attribute
+from cosim.sumo.xml_files import attribute, elements_of
 from nmfd.runs.files import temporary_folder
 
 # Options of SUMO beside tripinfo-output.
@@ -72,9 +71,7 @@ def read_trips(path: Path, end: float) -> dict[str, Trip]:
     end: of the simulation [s]
     """
     trips = {}
-    for _, element in ElementTree.iterparse(path):
-        if element.tag != "tripinfo":
-            continue
+    for element in elements_of(path, "tripinfo"):
         depart = float(attribute(element, "depart"))
         arrival = float(attribute(element, "arrival"))
         waited = float(attribute(element, "departDelay"))
@@ -86,7 +83,6 @@ def read_trips(path: Path, end: float) -> dict[str, Trip]:
             removed = bool(element.get("vaporized"))
             trip = trip._replace(arrival=arrival, metres=metres, removed=removed)
         trips[attribute(element, "id")] = trip
-        element.clear()
     return trips
 
 

@@ -17,7 +17,7 @@ from cosim.importing.demand import wrapped
 from cosim.importing.generated import ANYWHERE, morning_peak
 from cosim.importing.streets import Streets, numbers_of
 from cosim.sumo.edge_data import read_edge_data
-from cosim.sumo.programs import run_tool
+from cosim.sumo.programs import last_words, run_tool
 from cosim.sumo.xml_files import attribute, read_xml
 from nmfd.errors import InputError
 
@@ -93,7 +93,7 @@ def sampled(counts: Path, streets: Streets, folder: Path, seed: int, progress: P
     how += ["--prefix", "counted", "--attributes", attributes]
     done = run_tool("routeSampler.py", *files, *how, folder=folder)
     if done.returncode:
-        reason = (done.stderr.splitlines() or ["no reason given"])[-1]
+        reason = last_words(done)
         raise InputError(f"{counts}: routeSampler.py finds no trips: {reason}; correct the counts")
     measured = np.zeros(len(streets.edges))
     missing = np.zeros(len(streets.edges))

@@ -107,7 +107,7 @@ def trips_inside(
     links = set()
     for source, target in streets.all_links:
         links.add((streets.edges[source], streets.edges[target]))
-    inside: dict[str, Trip] = {}
+    inside = {}
     for trip in trips:
         stretch = longest_stretch(trip.edges, streets.number, links)
         if trip.vehicle in inside or len(stretch) < 2:

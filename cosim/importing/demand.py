@@ -16,7 +16,7 @@ from cosim.importing.case import SumoInput, seconds
 from cosim.importing.streets import Streets
 from cosim.sumo.arrays import PerTrip, TripNumbers
 from cosim.sumo.departures import Departure, Departures, original, read_departures
-from cosim.sumo.recorded_trips import BOUND, QUEUED_AFTER
+from cosim.sumo.recorded_trips import BOUND, QUEUED_AFTER, named_edges
 from nmfd.errors import InputError
 from nmfd.runs.files import temporary_folder
 
@@ -163,7 +163,7 @@ class Reading:
         if is_endless and self._end is None:
             self._end = self._case.begin + ENDLESS_FLOW_S
             self._notes[ENDLESS] = int(ENDLESS_FLOW_S)
-        for edge in _edges(element):
+        for edge in named_edges(element):
             if edge not in self._streets.number:
                 self._astray[name] = edge
                 return _stand_in(element, self._streets)
@@ -261,7 +261,10 @@ class Reading:
         source: its element, or that of its flow; routes: ids of shared ones
         """
         if vehicle.place is not None or source is None:
-            element = _on_road(vehicle)
+            lane, position = vehicle.place or ("best", "base")
+            place = {"departLane": lane, "departPos": position, "departSpeed": "max"}
+            element = Element("vehicle", {**_drawn(vehicle), "type": vehicle.type, **place})
+            SubElement(element, "route", {"edges": " ".join(vehicle.edges)})
             self._notes[ON_ROAD] += 1
         else:
             element = _single(vehicle, source, routes)
@@ -341,13 +344,6 @@ def _waits(element: Element) -> bool:
     return element.get("depart", element.get("begin")) in TRIGGERED
 
 
-def _edges(element: Element) -> list[str]:
-    """Return the edges that a vehicle names, without those of shared routes."""
-    texts = [element.get(key, "") for key in ("from", "to", "via")]
-    texts += [route.get("edges", "") for route in element.iter("route")]
-    return " ".join(texts).split()
-
-
 def _stand_in(element: Element, streets: Streets) -> Element:
     """Return what SUMO can read for a vehicle on an unknown edge.
 
@@ -369,15 +365,6 @@ def _drawn(vehicle: Departure) -> dict[str, str]:
         "depart": f"{vehicle.depart:.10g}",
         "speedFactor": f"{vehicle.speed_factor:.6g}",
     }
-
-
-def _on_road(vehicle: Departure) -> Element:
-    """Return a vehicle that is on the road in a loaded state."""
-    lane, position = vehicle.place or ("best", "base")
-    place = {"departLane": lane, "departPos": position, "departSpeed": "max"}
-    element = Element("vehicle", {**_drawn(vehicle), "type": vehicle.type, **place})
-    SubElement(element, "route", {"edges": " ".join(vehicle.edges)})
-    return element
 
 
 def _single(vehicle: Departure, source: Element, routes: Container[str]) -> Element:

@@ -64,7 +64,11 @@ def morning_peak(streets: Streets, *, level: float, begin: float, seed: int) -> 
     inside = level * PEAK_DENSITY * float(streets.lane_metres[streets.core].sum())
     count = max(1, round(inside / mean * (RAMP_UP_S / 2 + FLAT_S + RAMP_DOWN_S / 2)))
     first, last = ends.draw(count)
-    depart = begin + np.sort(_times(random.random(count)))
+    # Departures of a trapezoid.
+    clock = np.linspace(0.0, RAMP_UP_S + FLAT_S + RAMP_DOWN_S, 541)
+    rate = np.minimum(np.minimum(clock / RAMP_UP_S, 1.0), (clock[-1] - clock) / RAMP_DOWN_S)
+    share = np.concatenate([[0.0], np.cumsum((rate[1:] + rate[:-1]) / 2)])
+    depart = begin + np.sort(np.interp(random.random(count), share / share[-1], clock))
     routes = routed((first, last))
     kept = np.array([bool(route) for route in routes])
     vehicles = []
@@ -142,11 +146,3 @@ class _Ends:
         if turned.any():
             options = self._rim[turned]
         return int(self._pick(options, self._fast[options], 1)[0])
-
-
-def _times(uniform: np.ndarray) -> np.ndarray:
-    """Return departures [s] of a trapezoid from uniform random numbers."""
-    clock = np.linspace(0.0, RAMP_UP_S + FLAT_S + RAMP_DOWN_S, 541)
-    rate = np.minimum(np.minimum(clock / RAMP_UP_S, 1.0), (clock[-1] - clock) / RAMP_DOWN_S)
-    share = np.concatenate([[0.0], np.cumsum((rate[1:] + rate[:-1]) / 2)])
-    return np.interp(uniform, share / share[-1], clock)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from cosim.importing.cut import Plan, cut
+from cosim.sumo.programs import last_words
 from nmfd.errors import InputError, did_you_mean
 from nmfd.runs import config
 from nmfd.runs.files import temporary_folder
@@ -55,11 +56,9 @@ def get(name: str, out: Path) -> str:
             (folder / contents / "NOTICE.cosim.txt").write_text(notice, encoding="utf-8")
             os.replace(folder / contents, out)
         except (OSError, StopIteration, subprocess.CalledProcessError) as error:
-            words = getattr(error, "stderr", "") or str(error)
-            reason = " ".join(words.strip().splitlines()[-1:])
             raise InputError(
-                f"{name}: {contents} of {source} cannot be fetched ({reason}); try again with "
-                "internet access"
+                f"{name}: {contents} of {source} cannot be fetched ({last_words(error)}); try "
+                "again with internet access"
             ) from None
     start = str(out / city["start"])
     if "regions" in city:

@@ -4,7 +4,7 @@ import gzip
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,14 +27,14 @@ from cosim.importing.partition import own_regions
 from cosim.importing.streets import Streets, read_streets
 from cosim.sumo.arrays import EdgeNumbers
 from cosim.sumo.net import load_city
-from cosim.sumo.signals import timetabled, without_effect
+from cosim.sumo.signals import read_files, without_effect
 from cosim.sumo.xml_files import check_path
 from nmfd.errors import InputError
 from nmfd.model import authority
 from nmfd.model.authority import Verdict
 from nmfd.model.regional_model import RegionalModel, network_toml
 from nmfd.runs.files import temporary_folder
-from nmfd.runs.progress import watched
+from nmfd.runs.progress import Show, watched
 from nmfd.studies import plots
 
 # For cars: beyond, the run without control is mesoscopic, so that it takes a minute.
@@ -199,7 +199,7 @@ def _check_new(folder: Path) -> None:
         raise InputError(f"--out: {folder} exists; choose another name, or remove it")
 
 
-def _progress(show: Callable[..., None] | None) -> Progress:
+def _progress(show: Show) -> Progress:
     """Return a callback for stages from one for numbers, which may be None."""
 
     def progress(stage: str, share: float = 0.0) -> None:
@@ -221,8 +221,9 @@ def _as_requested(case: SumoInput, request: Request) -> SumoInput:
     if request.end is not None:
         end = request.end
     if begin < 0 or (end is not None and end <= begin):
-        window = f"begin {begin:g} s, end {end} s"
-        raise InputError(f"{case.source}: expected 0 s <= begin < end, got {window}")
+        raise InputError(
+            f"{case.source}: expected 0 s <= begin < end, got begin {begin:g} s, end {end} s"
+        )
     return replace(case, begin=begin, end=end, routes=(*case.routes, *request.routes))
 
 
@@ -240,7 +241,11 @@ def _imported(
         given = own_regions(streets, request.regions)
     counted = None
     if request.counts is not None:
-        _check_only_counts(request, case)
+        if case.routes or request.demand is not None:
+            raise InputError(
+                f"--counts: {case.source} has vehicles of its own; omit --routes and --demand, or "
+                "give the network alone"
+            )
         counted = sampled(request.counts, streets, scratch, request.seed, progress)
         case = replace(case, routes=(counted.routes,))
     traffic = read_traffic(case, streets, request.seed)
@@ -267,7 +272,7 @@ def _imported(
         progress("simulating the city's own files")
         same = _compared(request, case, traffic, clock, baseline, simulated_meso)
     progress("partition")
-    switched = sorted(timetabled(case.net, case.additional))
+    switched = sorted(read_files(case.net, case.additional).timetabled)
     everywhere = without_effect(case.options, mesoscopic)
     left = quality.left_alone(streets, switched, everywhere)
     wanted = request.count if given is None else given
@@ -295,15 +300,6 @@ def _imported(
         assigned=assigned,
         same=same,
     )
-
-
-def _check_only_counts(request: Request, case: SumoInput) -> None:
-    """Raise InputError if there are vehicles beside those of counts."""
-    if case.routes or request.demand is not None:
-        raise InputError(
-            f"--counts: {case.source} has vehicles of its own; omit --routes and --demand, or give "
-            "the network alone"
-        )
 
 
 def _peak(

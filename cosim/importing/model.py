@@ -157,7 +157,6 @@ def scenario_text(
     files: routes, background and additional -> file names beside it
     values: name, network_path, protected (region), factor of the demand, mesoscopic
     """
-    fastest = max(mfd.rate_up_to_jam(0.0) for mfd in network.mfds)
     return filled(
         Path(__file__).with_name("scenario.toml.j2"),
         network=network,
@@ -165,6 +164,6 @@ def scenario_text(
         case=case,
         times=options(case, clock),
         lists={**files, "leave_signals": leave},
-        substeps=int(np.ceil(clock.step / min(30.0, 0.5 / fastest))),
+        substeps=int(np.ceil(clock.step / min(30.0, 0.5 / network.free_rates.max()))),
         **values,
     )

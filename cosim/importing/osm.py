@@ -4,7 +4,7 @@ import re
 import subprocess
 from pathlib import Path
 
-from cosim.sumo.programs import HOME, run_sumo, run_tool
+from cosim.sumo.programs import HOME, last_words, run_sumo, run_tool
 from cosim.sumo.xml_files import file_list
 from nmfd.errors import InputError
 
@@ -64,11 +64,9 @@ def fetch(box: Box, folder: Path) -> Path:
         ).check_returncode()
         return next(folder.glob("osm_bbox.osm.xml.gz"))
     except (subprocess.SubprocessError, StopIteration) as error:
-        words = getattr(error, "stderr", "") or str(error)
-        reason = " ".join(words.strip().splitlines()[-1:])
         raise InputError(
-            f"--bbox: {where}: osmGet.py got nothing from OpenStreetMap ({reason}); without "
-            "internet access give a file of the area, exported at "
+            f"--bbox: {where}: osmGet.py got nothing from OpenStreetMap ({last_words(error)}); "
+            "without internet access give a file of the area, exported at "
             "https://www.openstreetmap.org/export"
         ) from None
 

@@ -42,6 +42,7 @@ DIRECTIONS = (
 )
 CENTRAL_SHARE = 0.35  # of the city's radius, within which a region is the centre
 MAX_EXTRA_CLUSTERS = 20  # beyond the requested number, among which enough large ones are searched
+PerBlock = Float[np.ndarray, " B"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,9 +56,9 @@ class Blocks:
     joins: (B, B) symmetric, number of connections between two blocks
     """
 
-    of: Int[np.ndarray, " E"]
-    weight: Float[np.ndarray, " B"]
-    core: Float[np.ndarray, " B"]
+    of: EdgeNumbers
+    weight: PerBlock
+    core: PerBlock
     position: Float[np.ndarray, "B 2"]
     joins: csr_array
 
@@ -99,11 +100,9 @@ def partition(
             f"--regions: expected at most {count}, the streets of {streets.path}, got {regions} "
             "instead"
         )
-    controllable = []
-    for signal in streets.link_signals:
-        controllable.append(signal is not None and signal not in uncontrollable)
+    controllable = streets.controllable(uncontrollable)
     limit = UNSIGNALLED_SHARE * blocks.weight.sum() / regions
-    merged = without_signals(streets, blocks, baseline.moves(), np.array(controllable), limit)
+    merged = without_signals(streets, blocks, baseline.moves(), controllable, limit)
     weight = np.bincount(merged, blocks.weight)
     means = []  # of merged blocks, which then look alike
     for axis in features(blocks, block_density(streets, blocks, baseline)).T:
@@ -112,7 +111,7 @@ def partition(
     return finish(streets, np.where(blocks.of >= 0, labels[blocks.of], -1))
 
 
-def block_density(streets: Streets, blocks: Blocks, baseline: Baseline) -> Float[np.ndarray, " B"]:
+def block_density(streets: Streets, blocks: Blocks, baseline: Baseline) -> PerBlock:
     """Return the density of every block without control (veh/m of lane)."""
     inside = blocks.of >= 0
     vehicles = baseline.density(streets) * streets.lane_metres
@@ -144,7 +143,7 @@ def cluster(
     return best
 
 
-def features(blocks: Blocks, density: Float[np.ndarray, " B"]) -> Float[np.ndarray, "B 3"]:
+def features(blocks: Blocks, density: PerBlock) -> Float[np.ndarray, "B 3"]:
     """Return density of the neighbourhood and position of each block.
 
     Each has variance 1 over the city's lanes.
@@ -180,8 +179,7 @@ def make_blocks(streets: Streets) -> Blocks:
 
     weight = total(lanes)
     position = np.stack([total(axis * lanes) / weight for axis in streets.centre.T], axis=1)
-    ends = of[streets.links]
-    ends = ends[(ends >= 0).all(axis=1) & (ends[:, 0] != ends[:, 1])]
+    ends = streets.between(of)
     joins = graph(np.concatenate([ends, ends[:, ::-1]]), count)
     joins.sum_duplicates()
     core = total(lanes * streets.core)
@@ -268,8 +266,7 @@ def pieces_of(streets: Streets, regions: EdgeNumbers) -> EdgeNumbers:
 
     The connections of the main part join the edges of a piece.
     """
-    inside = streets.main_part
-    links = streets.links[inside[streets.links].all(axis=1)]
+    links = streets.main_links
     kept = links[regions[links[:, 0]] == regions[links[:, 1]]]
     _, piece = connected_components(graph(kept, len(regions)), directed=False)
     return piece
@@ -282,7 +279,7 @@ def connect(streets: Streets, regions: EdgeNumbers) -> EdgeNumbers:
     """
     regions = regions.copy()
     inside = streets.main_part
-    links = streets.links[inside[streets.links].all(axis=1)]
+    links = streets.main_links
     for _ in range(len(regions)):
         piece = pieces_of(streets, regions)
         weight = np.bincount(piece, streets.lane_metres)
@@ -321,7 +318,7 @@ def _not_reachable(streets: Streets, regions: np.ndarray) -> int | None:
     """
     inside = streets.main_part
     used, numbers = np.unique(regions[inside], return_inverse=True)
-    links = np.searchsorted(used, regions[streets.links[inside[streets.links].all(axis=1)]])
+    links = np.searchsorted(used, regions[streets.main_links])
     _, part = connected_components(graph(links, len(used)), directed=True, connection="strong")
     size = np.bincount(numbers, streets.lane_metres[inside])
     outside = np.flatnonzero(part != np.argmax(np.bincount(part, size)))
@@ -379,7 +376,7 @@ def names(streets: Streets, regions: EdgeNumbers) -> tuple[str, ...]:
     places, middle = positions(streets, regions), _gravity(streets, regions >= 0)
     away = ((streets.centre - middle) ** 2).sum(axis=1)
     mean = np.average(away, weights=streets.lane_metres)
-    plain: list[str] = []
+    plain = []
     for region, (x, y) in enumerate(places - middle):
         if np.hypot(x, y) < CENTRAL_SHARE * np.sqrt(mean):
             own = regions == region

@@ -12,7 +12,7 @@ from cosim.importing.baseline import INTERVAL_S, Baseline
 from cosim.importing.partition import pieces_of
 from cosim.importing.streets import Streets
 from cosim.sumo.arrays import EdgeMask, EdgeNumbers, PerTrip
-from cosim.sumo.net import City, Gateway
+from cosim.sumo.net import City
 from cosim.sumo.signals import CONTROLLED, STATIC, TIMETABLE, control, unfit
 from nmfd.model import authority
 from nmfd.model.authority import Boundaries, Verdict
@@ -54,7 +54,22 @@ def tables(
     gateways = []
     for gateway in city.gateways:
         move = streets.number[gateway.from_edge], streets.number[gateway.to_edge]
-        gateways.append(_gateway(gateway, streets, left_alone, moves[move]))
+        logic = streets.logics.get(gateway.signal or "")
+        kind = "" if logic is None else logic.kind
+        gateways.append(
+            {
+                "source": gateway.source,
+                "target": gateway.target,
+                "from_edge": gateway.from_edge,
+                "to_edge": gateway.to_edge,
+                "lanes": " ".join(map(str, gateway.lanes)),
+                "signal": gateway.signal or "",
+                "links": " ".join(map(str, gateway.links)),
+                "control": control(gateway, streets.logics, left_alone),
+                "kind": "fixed" if kind == STATIC else kind,
+                "flow_veh": moves[move],
+            }
+        )
     approaches = pd.Series(
         {edge: regions[streets.number[edge]] for edge in city.signals}, dtype=int
     )
@@ -85,29 +100,6 @@ def tables(
         rows.append(row(str(n), name, regions == n, own))
     rows.append(row("all", "all regions", regions >= 0, gateways))
     return Tables(quality=rows, gateways=gateways)
-
-
-def _gateway(
-    gateway: Gateway, streets: Streets, left_alone: Mapping[str, str], flow: int
-) -> dict[str, object]:
-    """Return a row of gateways.csv.
-
-    flow: vehicles that passed in the run without control
-    """
-    logic = streets.logics.get(gateway.signal or "")
-    kind = "" if logic is None else logic.kind
-    return {
-        "source": gateway.source,
-        "target": gateway.target,
-        "from_edge": gateway.from_edge,
-        "to_edge": gateway.to_edge,
-        "lanes": " ".join(map(str, gateway.lanes)),
-        "signal": gateway.signal or "",
-        "links": " ".join(map(str, gateway.links)),
-        "control": control(gateway, streets.logics, left_alone),
-        "kind": "fixed" if kind == STATIC else kind,
-        "flow_veh": flow,
-    }
 
 
 def doubts(streets: Streets, regions: EdgeNumbers, names: Sequence[str]) -> list[str]:

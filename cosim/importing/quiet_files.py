@@ -27,10 +27,8 @@ def read(case: SumoInput) -> list[Element]:
     for tag, paths in (("additional", case.additional), ("routes", case.routes)):
         for path in paths:
             root = Element(tag)
-            for element in read_xml(path):
-                if element.tag not in DROPPED:
-                    _silence(element)
-                    root.append(element)
+            root.extend(element for element in read_xml(path) if element.tag not in DROPPED)
+            _silence(root)
             files.append(root)
     return files
 
@@ -45,9 +43,9 @@ def write(files: Sequence[Element], folder: Path) -> dict[str, str]:
     return {option: file_list(names) for option, names in paths.items()}
 
 
-def _silence(element: Element) -> None:
-    """Redirect the files that an element writes to nowhere."""
-    for part in element.iter():
+def _silence(root: Element) -> None:
+    """Redirect the files that elements write to nowhere."""
+    for part in root.iter():
         if part.tag.endswith(WRITERS):
             for key in ("file", "output"):
                 if key in part.attrib:

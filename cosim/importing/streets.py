@@ -1,7 +1,7 @@
 """Road graph of a SUMO network as arrays, with signal programmes."""
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -9,16 +9,19 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from cosim.importing.case import seconds
 from cosim.sumo import signals
 from cosim.sumo.arrays import EdgeMask, EdgeNumbers, PerEdge, Points
-from cosim.sumo.net import NORMAL, for_cars, points_along, size
+from cosim.sumo.net import NORMAL, for_cars, points_along, points_of, size
 from cosim.sumo.xml_files import attribute, network_root, read_xml
 from nmfd.errors import InputError
+
+Pairs = Int[np.ndarray, "_ 2"]
+LinkMask = Bool[np.ndarray, " L"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +61,7 @@ class Streets:
     centre: Float[np.ndarray, "E 2"]
     junctions: Int[np.ndarray, "E 2"]
     links: Int[np.ndarray, "L 2"]
-    all_links: Int[np.ndarray, "_ 2"]
+    all_links: Pairs
     link_signals: tuple[str | None, ...]
     roundabouts: tuple[tuple[int, ...], ...]
     logics: Mapping[str, Logic]
@@ -73,6 +76,27 @@ class Streets:
     def lane_metres(self) -> PerEdge:
         """Length times lanes for cars (E,) [m]."""
         return self.length * self.lanes
+
+    def controllable(self, left_alone: Collection[str]) -> LinkMask:
+        """Return the links (L,) that perimeter control can hold.
+
+        left_alone: signals that it does not use
+        """
+        signals = [signal and signal not in left_alone for signal in self.link_signals]
+        return np.array(signals, dtype=bool)
+
+    @property
+    def main_links(self) -> Pairs:
+        """Links within the main part."""
+        return self.links[self.main_part[self.links].all(axis=1)]
+
+    def between(self, labels: EdgeNumbers) -> Pairs:
+        """Return the pairs of different labels that links join.
+
+        labels: (E,), -1 for none
+        """
+        ends = labels[self.links]
+        return ends[(ends >= 0).all(axis=1) & (ends[:, 0] != ends[:, 1])]
 
     @property
     def parts(self) -> int:
@@ -101,7 +125,7 @@ class Streets:
         return (part == np.argmax(weight)) & self.drivable
 
 
-def graph(pairs: Int[np.ndarray, "_ 2"], size: int) -> csr_array:
+def graph(pairs: Pairs, size: int) -> csr_array:
     """Return a matrix (size, size) with a one for every pair (n, 2)."""
     return csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(size, size))
 
@@ -126,10 +150,10 @@ def read_streets(net: Path, additional: Iterable[Path] = ()) -> Streets:
     The latter replace those of the network.
     Raises: InputError
     """
-    rows: dict[str, _Edge] = {}
+    rows = {}
     links: list[Mapping[str, str]] = []
     roundabouts: list[list[str]] = []
-    logics: dict[str, Logic] = {}
+    logics = {}
     with network_root(net) as root:
         for element in root:
             if element.tag == "edge" and element.get("function", "normal") in NORMAL:
@@ -217,27 +241,17 @@ def _edge(element: ElementTree.Element) -> _Edge:
     lanes = list(element.iter("lane"))
     car_lanes = [lane for lane in lanes if for_cars(lane)]
     shape = element.get("shape") or attribute(lanes[len(lanes) // 2], "shape")
-    points = []
-    for point in shape.split():
-        x, y = point.split(",")[:2]
-        points.append([float(x), float(y)])
     return _Edge(
         cars=frozenset(int(attribute(lane, "index")) for lane in car_lanes),
         length=size((car_lanes or lanes)[0], "length"),
         speed=max(size(lane, "speed") for lane in car_lanes or lanes),
-        shape=np.array(points),
+        shape=points_of(shape),
         start=attribute(element, "from"),
         end=attribute(element, "to"),
     )
 
 
 def _logic(element: ElementTree.Element, path: Path) -> Logic:
-    phases = list(element.iter("phase"))
     where = f"{path}: tlLogic {element.get('id')}: phase duration"
-    kind = element.get("type", "static")
-    if kind == "static" and any(phase.get("next") for phase in phases):
-        kind = "branching"
-    cycle = sum(seconds(phase.get("duration", "0"), where) for phase in phases)
-    programme = element.get("programID", "0")
-    states = tuple(phase.get("state", "") for phase in phases)
-    return Logic(programme=programme, kind=kind, cycle=cycle, states=states)
+    cycle = sum(seconds(phase.get("duration", "0"), where) for phase in element.iter("phase"))
+    return Logic(**vars(signals.logic_of(element)), cycle=cycle)

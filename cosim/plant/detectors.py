@@ -70,7 +70,7 @@ def lay_out(city: City, share: float) -> Layout:
     random = np.random.default_rng(LAYOUT)
     # Place of the loop within the part of the link that it stands for, as a share.
     place = random.uniform(0.02, 0.98, len(city.edges))
-    edges: list[int] = []
+    edges = []
     for region in range(city.regions):
         own = np.flatnonzero(city.edge_region == region)
         count = int(np.ceil(share * len(own) - 1e-9))

@@ -35,6 +35,15 @@ class Green(NamedTuple):
     shown: float = 0.0
     ungated: float = 0.0
 
+    def later(self, seconds: float, light: str, base: str) -> "Green":
+        """Return the green after some seconds of a light instead of `base`."""
+        shown, ungated = self
+        if light in GREEN:
+            shown += seconds
+        if base in GREEN:
+            ungated += seconds
+        return Green(shown, ungated)
+
 
 class GatewaySignal:
     """A fixed-time signal with gateway links.
@@ -72,7 +81,7 @@ class GatewaySignal:
         if self.next_change >= step_end:
             return
         for movement in self._movements.values():
-            movement.count(now - self._since)
+            movement.green = movement.green.later(now - self._since, movement.shown, movement.base)
         while self._cycle_start + self._cycle < step_end:
             self._cycle_start += self._cycle
         phase = bisect_left(self._ends, step_end - self._cycle_start)
@@ -140,15 +149,6 @@ class _Movement:
         self.begin = -NEVER
         self.cut_at = NEVER
 
-    def count(self, seconds: float) -> None:
-        """Count the time since the last change as green if it was."""
-        shown, ungated = self.green
-        if self.shown in GREEN:
-            shown += seconds
-        if self.base in GREEN:
-            ungated += seconds
-        self.green = Green(shown, ungated)
-
     def end_of(self, window: _Window) -> float:
         """Return the end of the green in the present window [s]."""
         if self.share >= 1.0:
@@ -167,7 +167,7 @@ def _windows(programme: Programme, link: int) -> tuple[dict[int, _Window], bool]
     green = [phase.state[link] in GREEN for phase in phases]
     if all(green):
         return dict.fromkeys(range(len(phases)), _Window(0.0, programme.cycle)), True
-    windows: dict[int, _Window] = {}
+    windows = {}
     begin = 0.0
     for first, phase in enumerate(phases):
         if green[first] and not green[first - 1]:
@@ -294,12 +294,7 @@ class Ration:
 
     def green_time(self, now: float) -> Green:
         """Return the green before `now` [s]."""
-        shown, ungated = self._green
-        if self._light in GREEN:
-            shown += now - self._since
-        if self._base in GREEN:
-            ungated += now - self._since
-        return Green(shown, ungated)
+        return self._green.later(now - self._since, self._light, self._base)
 
     def opened(self, now: float) -> bool:
         """Return True if the present green began at `now` [s]."""
@@ -383,7 +378,9 @@ class ResponsiveSignal:
 
     def play(self, now: float) -> None:
         """Set the state from `now` [s] on, or leave the signal to SUMO."""
-        base = self._state_underneath()
+        base = self._session.signal_state(self._signal)
+        if self._held:
+            base = self._session.state_underneath(self._signal, self._programme)
         if base == self._base and now < self._next - 1e-6:
             return
         before = self._base
@@ -406,11 +403,6 @@ class ResponsiveSignal:
             self._next = now
         elif self._held or self._limited:
             self._hold("".join(shown), now)
-
-    def _state_underneath(self) -> str:
-        if self._held:
-            return self._session.state_underneath(self._signal, self._programme)
-        return self._session.signal_state(self._signal)
 
     def green_time(self) -> dict[str, dict[int, Green]]:
         """Return signal -> gateway link -> green so far."""

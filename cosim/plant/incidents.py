@@ -69,8 +69,8 @@ class Incidents:
 
     def begin(self, k: int) -> None:
         """Start the faults of control interval k, and end those that are over."""
-        closed: set[str] = set()
-        silent: set[str] = set()
+        closed = set()
+        silent = set()
         for fault in self._faults:
             if not fault.active(k):
                 continue

@@ -217,8 +217,10 @@ class Launch:
             compliance=settings.compliance,
         )
         if not trips.planned:
-            problem = "no trip begins and ends on the same edges as a route of the plan"
-            raise InputError(f"{where}: {problem}; make the plan with cosim plan, or omit it")
+            raise InputError(
+                f"{where}: no trip begins and ends on the same edges as a route of the plan; make "
+                "the plan with cosim plan, or omit it"
+            )
         return trips
 
     def _vehicles_of(self, seed: int) -> RecordedTrips:

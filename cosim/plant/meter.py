@@ -182,7 +182,7 @@ class Meter:
     def observe(self) -> list[Event]:
         """Account for the last simulation step; return departures, then entries."""
         session = self._session
-        events: list[Event] = []
+        events = []
         arrived = list(session.arrived())
         for vehicle in session.loaded():
             try:

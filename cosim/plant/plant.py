@@ -24,7 +24,8 @@ from cosim.sumo.arrays import PerEdge
 from cosim.sumo.net import City, check_adjacency
 from cosim.sumo.outputs import TripReader, edge_emissions, edge_traffic
 from cosim.sumo.session import Session
-from cosim.sumo.signals import read_links
+from cosim.sumo.signals import read_files
+from nmfd.arrays import Arrays
 from nmfd.model.planning import PlanningModel, planning_model
 from nmfd.model.scenario import Scenario
 from nmfd.types import Controls, Observation, State
@@ -164,7 +165,7 @@ class SumoPlant:
         self._waits = None
         if not settings.mesoscopic:  # that model has no lanes
             self._junctions = Junctions(session, city)
-            self._waits = Waits(session, read_links(city.net_file), self.actuation.states)
+            self._waits = Waits(session, read_files(city.net_file).links, self.actuation.states)
         self._state = meter.state(0, 0.0)
         self._recorder = Recorder(meter, self._guide, self.actuation)
         self._observer.began(city, self._state)
@@ -236,7 +237,7 @@ class SumoPlant:
         self._end_session()
         self._launch.close()
 
-    def record(self) -> dict[str, np.ndarray]:
+    def record(self) -> Arrays:
         """Return the arrays of cosim.plant.record.RECORD since the reset."""
         return self._recorder.record()
 
@@ -270,7 +271,7 @@ class SumoPlant:
         co2, fuel = np.array([(0.0, 0.0), *self._emissions.values()]).sum(axis=0).tolist()
         return {"co2_kg": co2, "fuel_kg": fuel}
 
-    def edge_totals(self) -> dict[str, np.ndarray]:
+    def edge_totals(self) -> Arrays:
         """Return the arrays of cosim.plant.record.TOTALS over edges.
 
         Call it after `trip_facts`.

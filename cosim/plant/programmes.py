@@ -20,7 +20,7 @@ from cosim.plant.settings import (
 )
 from cosim.plant.strategy import Strategy
 from cosim.sumo.net import City, city_of
-from cosim.sumo.programs import run_tool
+from cosim.sumo.programs import last_words, run_tool
 from cosim.sumo.session import Phase
 from cosim.sumo.signals import (
     HELD,
@@ -29,9 +29,8 @@ from cosim.sumo.signals import (
     Signal,
     held_city,
     phases_of,
-    read_logics,
+    read_files,
     read_signals,
-    timetabled,
     without_effect,
 )
 from cosim.sumo.xml_files import attribute, read_xml
@@ -60,7 +59,7 @@ def scenario_city(scenario: Scenario, settings: Settings) -> City:
     """
     city = city_of(scenario.network)
     additional = own_files(scenario, settings.additional)
-    logics = read_logics(city.net_file, additional)
+    logics = read_files(city.net_file, additional).logics
     return held_city(city, logics, _left_alone(city, settings, additional, logics))
 
 
@@ -100,7 +99,7 @@ def _left_alone(
     if everywhere:
         return dict.fromkeys(signals, everywhere)
     reasons = dict.fromkeys(settings.leave_signals, "left alone by the scenario")
-    reasons |= dict.fromkeys(timetabled(city.net_file, additional), TIMETABLE)
+    reasons |= dict.fromkeys(read_files(city.net_file, additional).timetabled, TIMETABLE)
     return {signal: reasons[signal] for signal in signals if signal in reasons}
 
 
@@ -174,7 +173,7 @@ def _plan(tool: str, city: City, plan: Path, *options: str) -> None:
     files = ("-n", str(city.net_file.resolve()), "-r", "planned.xml", "-o", plan.name)
     result = run_tool(tool, *files, *options, folder=plan.parent)
     if result.returncode:
-        words = (result.stderr.strip() or "no message").splitlines()[-1]
+        words = last_words(result)
         raise InputError(
             f"{city.net_file}: {tool} cannot plan its signals ({words}); choose other signals"
         )

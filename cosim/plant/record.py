@@ -9,6 +9,7 @@ from cosim.plant.actuation import Actuation
 from cosim.plant.guidance import Guide
 from cosim.plant.meter import Meter
 from cosim.plant.sampling import StreetMeans
+from nmfd.arrays import Arrays
 from nmfd.runs import config
 from nmfd.types import Quantity, Result
 
@@ -70,17 +71,17 @@ class Recorder:
         self._meter = meter
         self._guide = guide
         self._actuation = actuation
-        self._rows: list[dict[str, np.ndarray]] = []
+        self._rows: list[Arrays] = []
         self._before = self._totals()
 
-    def add(self, streets: StreetMeans) -> dict[str, np.ndarray]:
+    def add(self, streets: StreetMeans) -> Arrays:
         """Add and return the row of the interval that has just ended.
 
         streets: its means
         """
         totals = self._totals()
         actuation = self._actuation
-        row: dict[str, np.ndarray] = {}
+        row: Arrays = {}
         for name, total in totals.items():
             added = total - self._before[name]
             if added.dtype.kind == "i":
@@ -101,7 +102,7 @@ class Recorder:
         self._before = totals
         return row
 
-    def record(self) -> dict[str, np.ndarray]:
+    def record(self) -> Arrays:
         """Return the arrays of RECORD over all control intervals so far."""
         return {key: np.stack([row[key] for row in self._rows]) for key in self._rows[0]}
 
@@ -110,13 +111,13 @@ class Recorder:
         for name, total in self._booked().items():
             self._rows[-1][name] = self._rows[-1][name] + total - self._before[name]
 
-    def _booked(self) -> dict[str, np.ndarray]:
+    def _booked(self) -> Arrays:
         """Return the books so far."""
         booked = {name: getattr(self._meter, name).copy() for name in BOOKS}
         booked["other_time_spent"], booked["time_spent"] = self._meter.time_spent()
         return booked
 
-    def _totals(self) -> dict[str, np.ndarray]:
+    def _totals(self) -> Arrays:
         """Return everything that is counted from the beginning."""
         totals = self._booked()
         totals["teleports"] = np.array(self._meter.teleports)

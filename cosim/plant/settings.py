@@ -159,8 +159,11 @@ class Settings(config.Settings):
             if remedy is not None:
                 raise Problem("options", f"{option} is set by every run itself; {remedy}")
         if self.measurement == ESTIMATE and self.detector_share == self.probe_share == 0:
-            problem = '"estimate" needs sumo.detector_share or sumo.probe_share, but both are 0'
-            raise Problem("measurement", f"{problem}; raise one of them")
+            raise Problem(
+                "measurement",
+                '"estimate" needs sumo.detector_share or sumo.probe_share, but both are 0; '
+                "raise one of them",
+            )
         return self
 
 
@@ -172,8 +175,11 @@ def settings(scenario: "Scenario") -> Settings:
     """
     path = scenario.where
     if scenario.initial is not None:
-        remedy = "remove it, or use the regional model (nmfd)"
-        raise config.error(path, "initial", f"a city in SUMO begins empty; {remedy}")
+        raise config.error(
+            path,
+            "initial",
+            "a city in SUMO begins empty; remove it, or use the regional model (nmfd)",
+        )
     result = config.checked(Settings, scenario.sumo, path, "sumo.")
     check_files(scenario, result)
     steps = scenario.step / result.step_length
@@ -203,9 +209,12 @@ def check_plannable(scenario: "Scenario", settings: Settings) -> None:
     Raises: InputError
     """
     if not settings.routes:
-        problem = "every seed draws other trips from the demand, which no plan knows"
-        remedy = "plan routes in a city that is imported with its vehicles"
-        raise config.error(scenario.where, "sumo.planned", f"{problem}; {remedy}")
+        raise config.error(
+            scenario.where,
+            "sumo.planned",
+            "every seed draws other trips from the demand, which no plan knows; plan routes in a "
+            "city that is imported with its vehicles",
+        )
 
 
 def own_files(scenario: "Scenario", names: Texts) -> list[Path]:
@@ -227,5 +236,6 @@ def check_lanes(scenario: "Scenario", settings: Settings) -> None:
         problem = f"measurement: {ESTIMATE} needs loop detectors on lanes"
     if problem:
         problem += ", but SUMO's mesoscopic model has no lanes"
-        remedy = "omit it, or import the city without --mesoscopic"
-        raise InputError(f"{scenario.where}: sumo.{problem}; {remedy}")
+        raise InputError(
+            f"{scenario.where}: sumo.{problem}; omit it, or import the city without --mesoscopic"
+        )

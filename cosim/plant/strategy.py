@@ -24,7 +24,7 @@ from cosim.plant.settings import (
     settings,
 )
 from nmfd.controllers import strategy as regional
-from nmfd.controllers.strategy import ALONE, CONTROLLERS, ControllerLike, Given, split
+from nmfd.controllers.strategy import ALONE, ControllerLike, Given, split
 from nmfd.errors import InputError, did_you_mean
 from nmfd.model.planning import GUIDED
 from nmfd.model.scenario import Scenario
@@ -138,9 +138,7 @@ def parse(controller: ControllerLike, city: Settings | str | None = None) -> Str
         first, labels = split(controller)
         if setting_of(first) is not None:
             controller = "+".join([ALONE, first, *labels])
-        elif first not in CONTROLLERS:
-            _check_controller(name, first)
-    parsed = regional.parse(controller)
+    parsed = regional.parse(controller, _allowed())
     strategy = Strategy(name=name or parsed.name, controller=parsed.controller)
     strategy = _with_words(strategy, parsed.labels)
     return strategy if city is None else _with_city(strategy, city)
@@ -246,30 +244,16 @@ def _with_city(strategy: Strategy, city: Settings | str) -> Strategy:
             values[key] = value
             labels.append(label)
         elif values[key] != value:
-            problem = f"{label_of(key, values[key])} and {label} exclude each other"
-            raise InputError(f"strategy {strategy.name!r}: {problem}; omit one of them")
+            raise InputError(
+                f"strategy {strategy.name!r}: {label_of(key, values[key])} and {label} exclude "
+                "each other; omit one of them"
+            )
     return replace(
         strategy,
         name="+".join([strategy.name, *labels]),
         labels=(*strategy.labels, *labels),
         city=Settings(**values),
     )
-
-
-def _check_controller(name: str, first: str) -> None:
-    """Check that there is such a controller.
-
-    Raises: InputError that knows the words, too
-    """
-    try:
-        regional.parse(first)
-    except InputError as error:
-        near = did_you_mean(first, [*CONTROLLERS, *_words()])
-        if first.endswith(".py") or "(" in first:
-            raise error
-        where = f"controller {first!r}" if first == name else f"strategy {name!r}: {first!r}"
-        allowed = f"{', '.join(CONTROLLERS)} or file.py:Class, with words joined by +"
-        raise InputError(f"{where} is unknown{near}; choose from {allowed}: {_allowed()}") from None
 
 
 def _plain_words() -> dict[str, Word]:

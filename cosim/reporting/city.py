@@ -12,7 +12,7 @@ from cosim.importing import maps, quality
 from cosim.importing.streets import read_streets
 from cosim.plant.settings import own_files, settings
 from cosim.sumo import net
-from cosim.sumo.signals import timetabled, without_effect
+from cosim.sumo.signals import read_files, without_effect
 from nmfd.api import load_scenario
 from nmfd.model.regional_model import RegionalModel, load_network
 from nmfd.model.scenario import Scenario
@@ -76,7 +76,7 @@ class City:
             members = streets.drivable & (regions == region)
             places.append(streets.centre[members].mean(axis=0))
         reasons = dict.fromkeys(left, "left alone by the scenario")
-        timetables = timetabled(built.net_file, additional)
+        timetables = read_files(built.net_file, additional).timetabled
         reasons |= quality.left_alone(streets, timetables, switched_off)
         names = self.network.region_names
         self._streets = streets

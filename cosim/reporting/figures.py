@@ -86,10 +86,9 @@ def draw_levels(out: Path, rows: pd.DataFrame) -> None:
     against = statistics.compared_with(rows)
     ratios: dict[str, dict] = defaultdict(dict)
     shares: dict[str, dict] = defaultdict(dict)
-    for level, names in statistics.groups(rows).items():
+    for level, here in rows.groupby("demand", sort=True):
         reference = statistics.by_seed(rows, level, against)
-        for name in names:
-            part = rows[(rows["demand"] == level) & (rows["controller"] == name)]
+        for name, part in here.groupby("controller", sort=False):
             served = part["completed_veh"] / part["trips"].clip(lower=1)
             shares[name][level] = served.mean(), interval(list(served))
             pair = statistics.paired(statistics.by_seed(rows, level, name), reference)

@@ -47,7 +47,7 @@ def read_edge_data(path: Path, needed: str = "sampledSeconds") -> pd.DataFrame:
 
     Raises: InputError for another file, or overlapping intervals
     """
-    rows: list[EdgeRow] = []
+    rows = []
     last = -float("inf")
     with stream_of(path, KIND, REMEDY) as stream:
         events = ElementTree.iterparse(stream, events=("start", "end"))

@@ -213,8 +213,10 @@ def city_files(network: RegionalModel) -> CityFiles:
     path = folder / "network.toml"
     content = config.read(path)
     if "sumo" not in content:
-        remedy = "use nmfd benchmark, or add [sumo] with net and regions"
-        raise InputError(f"{path}: sumo: missing; this network has no city to simulate: {remedy}")
+        raise InputError(
+            f"{path}: sumo: missing; this network has no city to simulate: use nmfd benchmark, or "
+            "add [sumo] with net and regions"
+        )
     table = config.checked(CityTable, content["sumo"], path, "sumo.")
     files = CityFiles(folder / table.net, folder / table.regions)
     for key, file in zip(("net", "regions"), files, strict=True):
@@ -332,23 +334,23 @@ def edge_shapes(city: City) -> list[Points]:
 
     It lies midway between the outermost lanes for cars.
     """
-    shapes: dict[str, Points] = {}
+    shapes = {}
     with network_root(city.net_file) as root:
         for edge in root.iterfind("edge"):
-            lanes = [_shape(lane) for lane in edge.iter("lane") if for_cars(lane)]
+            lanes = [attribute(lane, "shape") for lane in edge.iter("lane") if for_cars(lane)]
             if not lanes:
                 continue
-            shape = lanes[0]
-            if len(lanes[0]) == len(lanes[-1]):
-                shape = (lanes[0] + lanes[-1]) / 2
+            shape = points_of(lanes[0])
+            last = points_of(lanes[-1])
+            if len(shape) == len(last):
+                shape = (shape + last) / 2
             shapes[attribute(edge, "id")] = shape
     return [shapes[edge] for edge in city.edges]
 
 
-def _shape(lane: ElementTree.Element) -> Points:
-    """Return the line of a <lane>, (n, 2) (m), without heights."""
-    points = attribute(lane, "shape").split()
-    return np.array([point.split(",")[:2] for point in points], dtype=float)
+def points_of(shape: str) -> Points:
+    """Return a line of a SUMO network, (n, 2) (m), without heights."""
+    return np.array([point.split(",")[:2] for point in shape.split()], dtype=float)
 
 
 def points_along(shape: Points, marks: Callable[[float], ArrayLike]) -> Float[np.ndarray, "*n 2"]:
@@ -366,7 +368,7 @@ def _read_net(path: Path) -> _Net:
     """Read a SUMO network. Raises InputError."""
     lanes_of: dict[str, list[_Lane]] = {}
     internal: dict[str, _Crossing] = {}
-    connections: list[Connection] = []
+    connections = []
     with network_root(path) as root:
         for element in root.iterfind("edge"):
             edge = attribute(element, "id")
@@ -445,14 +447,14 @@ def read_regions(path: Path, regions: int = 10**6) -> dict[str, int]:
         raise InputError(
             f"{path}: line 1: expected edge,region, got {','.join(header) or 'nothing'} instead"
         )
-    region_of: dict[str, int] = {}
+    region_of = {}
     for number, row in enumerate(rows, start=2):
         if not row:
             continue
         if len(row) != 2 or not row[1].isdecimal() or len(row[1]) > 9 or int(row[1]) >= regions:
-            expected = f"an edge and a region from 0 to {regions - 1}"
             raise InputError(
-                f"{path}: line {number}: expected {expected}, got {','.join(row)} instead"
+                f"{path}: line {number}: expected an edge and a region from 0 to {regions - 1}, "
+                f"got {','.join(row)} instead"
             )
         if row[0] in region_of:
             raise InputError(
@@ -537,23 +539,18 @@ def _gateways(links: Sequence[Connection], region_of: Mapping[str, int]) -> tupl
             movements.setdefault((source, target, link.source, link.target), []).append(link)
     gateways = []
     for (source, target, from_edge, to_edge), members in sorted(movements.items()):
+        signals = {link.signal for link in members}
         gateway = Gateway(
             source=source,
             target=target,
             from_edge=from_edge,
             to_edge=to_edge,
-            signal=_common_signal(members),
+            signal=signals.pop() if len(signals) == 1 else None,
             links=tuple(sorted(link.link for link in members if link.signal)),
             lanes=tuple(sorted({link.lane for link in members})),
         )
         gateways.append(gateway)
     return tuple(gateways)
-
-
-def _common_signal(links: list[Connection]) -> str | None:
-    """Return the signal of all links of a movement, None without one."""
-    signals = {link.signal for link in links}
-    return signals.pop() if len(signals) == 1 else None
 
 
 def gateway_movements(city: City) -> dict[str, dict[int, int]]:

@@ -29,6 +29,12 @@ def run_sumo(program: str, options: Mapping[str, object], *flags: str, where: st
         raise InputError(f"{where}: {program} cannot run it: {reason}; correct the input")
 
 
+def last_words(said: object) -> str:
+    """Return the last line of what a program or an error says."""
+    words = getattr(said, "stderr", "") or str(said)
+    return " ".join(words.strip().splitlines()[-1:])
+
+
 def run_tool(
     tool: str, *arguments: str, folder: Path, seconds: float | None = None
 ) -> subprocess.CompletedProcess:

@@ -90,8 +90,8 @@ def read_recorded_trips(paths: Sequence[Path]) -> RecordedTrips:
     Raises: InputError
     """
     elements: list[ElementTree.Element] = []
-    departs: list[float] = []
-    known: set[str] = set()
+    departs = []
+    known = set()
     for path in paths:
         root = read_xml(path)
         if root.tag != "routes":
@@ -153,17 +153,19 @@ def check_edges(originals: RecordedTrips, city: City, where: str) -> None:
     SUMO would drop it silently.
     """
     for element in originals.elements:
-        edges = [element.get(key) for key in ("from", "to") if element.get(key)]
-        edges += element.get("via", "").split()
-        route = element.find("route")
-        if route is not None:
-            edges += route.get("edges", "").split()
-        for edge in edges:
+        for edge in named_edges(element):
             if edge not in city.region_of:
                 raise InputError(
                     f"{where}: {element.tag} {element.get('id')}: edge {edge} is not in "
                     f"{city.net_file}; remove the vehicle, or give the routes of this network"
                 )
+
+
+def named_edges(element: ElementTree.Element) -> list[str]:
+    """Return the edges that a vehicle names, without those of shared routes."""
+    texts = [element.get(key, "") for key in ("from", "to", "via")]
+    texts += [route.get("edges", "") for route in element.iter("route")]
+    return " ".join(texts).split()
 
 
 def read_routes(paths: Sequence[Path]) -> dict[str, tuple[str, ...]]:
@@ -308,7 +310,7 @@ def merge(path: Path, beside: Sequence[Path], rest: Path) -> list[Path]:
     QUEUED_AFTER, as in the city's own files. Returns both files, types first.
     """
     queue: list[tuple[float, float, ElementTree.Element]] = []  # time, place among those then
-    others: list[ElementTree.Element] = []
+    others = []
     places = Counter[float]()
     for element in read_xml(path):
         depart = float(element.get("depart", 0))
@@ -347,9 +349,9 @@ def write_held_trips(
     """
     texts = [xml_text(element) for element in originals.types]
     written = set[int]()
-    departs: list[float] = []
-    origins: list[int] = []
-    destinations: list[int] = []
+    departs = []
+    origins = []
+    destinations = []
     orders: list[Mapping[str, str]] = []
     for depart, n, name in drawn:
         element = originals.elements[n]

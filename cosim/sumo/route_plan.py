@@ -96,8 +96,10 @@ def read_plan(paths: Iterable[Path], city: City) -> RoutePlan:
             route = tuple(row.route.split())
             unknown = [edge for edge in route if edge not in city.number]
             if unknown:
-                problem = f"edge {unknown[0]} is not in {city.net_file}"
-                raise InputError(f"{path}: row {row.Index}: {problem}; make it with cosim plan")
+                raise InputError(
+                    f"{path}: row {row.Index}: edge {unknown[0]} is not in {city.net_file}; make "
+                    "it with cosim plan"
+                )
             plan.add(row.begin, route, row.drivers)
     return plan
 
@@ -160,7 +162,13 @@ def planned_trips(
     for place, (_, n, _) in enumerate(drawn):
         element = originals.elements[n]
         if place in routes and follows[place]:
-            element = _on_route(element, routes[place])
+            kept = {}
+            for key, value in element.attrib.items():
+                if key not in ("route", "from", "to"):
+                    kept[key] = value
+            element = ElementTree.Element("vehicle", kept)
+            ElementTree.SubElement(element, "route", edges=" ".join(routes[place]))
+            element.extend(part for part in element if part.tag != "route")
         elements.append(element)
     departures: PerTrip = np.array([row[0] for row in drawn])
     return PlannedTrips(
@@ -168,15 +176,3 @@ def planned_trips(
         drawn=[(row[0], place, row[2]) for place, row in enumerate(drawn)],
         planned=frozenset(drawn[place][2] for place in routes),
     )
-
-
-def _on_route(element: ElementTree.Element, route: Route) -> ElementTree.Element:
-    """Return a vehicle with another route."""
-    kept = {}
-    for key, value in element.attrib.items():
-        if key not in ("route", "from", "to"):
-            kept[key] = value
-    vehicle = ElementTree.Element("vehicle", kept)
-    ElementTree.SubElement(vehicle, "route", edges=" ".join(route))
-    vehicle.extend(part for part in element if part.tag != "route")
-    return vehicle

@@ -91,8 +91,8 @@ class Cycle(NamedTuple):
     phases: tuple[Phase, ...]
 
 
-class _File(NamedTuple):
-    """The signals of one file.
+class SignalFile(NamedTuple):
+    """The signals of one file, or of several.
 
     links: signal -> its links, without those of crossings
     programmes: signal -> the last <tlLogic>, which is the one that SUMO runs
@@ -102,6 +102,11 @@ class _File(NamedTuple):
     links: Mapping[str, Sequence[Link]]
     programmes: Mapping[str, ElementTree.Element]
     timetabled: frozenset[str]
+
+    @property
+    def logics(self) -> dict[str, Logic]:
+        """Signal -> the programme that runs."""
+        return {name: logic_of(element) for name, element in self.programmes.items()}
 
 
 def is_stage(state: str) -> bool:
@@ -172,22 +177,12 @@ def without_effect(options: Mapping[str, str], mesoscopic: bool) -> str:
     return ""
 
 
-def read_logics(net: Path, additional: Iterable[Path] = ()) -> dict[str, Logic]:
-    """Return signal -> the programme that runs. Raises InputError."""
-    return {name: _logic(element) for name, element in _read(net, additional).programmes.items()}
-
-
-def read_cycles(net: Path, additional: Iterable[Path] = ()) -> dict[str, Cycle]:
+def read_cycles(net: Path, additional: Iterable[Path]) -> dict[str, Cycle]:
     """Return signal -> cycle of the programme that runs. Raises InputError."""
     cycles = {}
-    for name, logic in _read(net, additional).programmes.items():
+    for name, logic in read_files(net, additional).programmes.items():
         cycles[name] = Cycle(logic.get("offset", "0"), phases_of(logic))
     return cycles
-
-
-def read_links(net: Path) -> Mapping[str, Sequence[Link]]:
-    """Return signal -> its links, without crossings. Raises InputError."""
-    return _read(net, ()).links
 
 
 def running_logic(programme: Programme) -> Logic:
@@ -201,14 +196,6 @@ def running_logic(programme: Programme) -> Logic:
     return Logic(programme=programme.id, kind=kind, states=states)
 
 
-def timetabled(net: Path, additional: Iterable[Path] = ()) -> frozenset[str]:
-    """Return the signals whose programme a timetable (WAUT) changes.
-
-    Raises InputError.
-    """
-    return _read(net, additional).timetabled
-
-
 def read_signals(
     city: City, additional: Iterable[Path] = (), kinds: Collection[str] = (STATIC,)
 ) -> tuple[list[Signal], dict[str, str]]:
@@ -218,9 +205,9 @@ def read_signals(
     red and turns on red only. Of several programmes the last one counts, as in SUMO: first those
     of the network file, then those of `additional` files.
     """
-    signals: list[Signal] = []
-    others: dict[str, str] = {}
-    known = _read(city.net_file, additional)
+    signals = []
+    others = {}
+    known = read_files(city.net_file, additional)
     for name, element in sorted(known.programmes.items()):
         cars: list[Link] = []
         closed: list[Link] = []
@@ -260,8 +247,11 @@ def phases_of(logic: ElementTree.Element) -> tuple[Phase, ...]:
     return tuple(phases)
 
 
-def _read(net: Path, additional: Iterable[Path]) -> _File:
-    """Return the signals of a network, with those of additional files."""
+def read_files(net: Path, additional: Iterable[Path] = ()) -> SignalFile:
+    """Return the signals of a network, with those of additional files.
+
+    Raises: InputError
+    """
     stamp = net.stat().st_mtime_ns if net.is_file() else 0
     network = _network(net, stamp)
     programmes = dict(network.programmes)
@@ -270,11 +260,11 @@ def _read(net: Path, additional: Iterable[Path]) -> _File:
         more = _file(read_xml(path))
         programmes |= more.programmes
         switched |= more.timetabled
-    return _File(links=network.links, programmes=programmes, timetabled=frozenset(switched))
+    return network._replace(programmes=programmes, timetabled=frozenset(switched))
 
 
 @lru_cache(maxsize=2)  # a large city takes seconds, and a run asks several times
-def _network(net: Path, stamp: int) -> _File:
+def _network(net: Path, stamp: int) -> SignalFile:
     """Return the signals of a network file.
 
     stamp: time of its last change, for the cache
@@ -282,7 +272,7 @@ def _network(net: Path, stamp: int) -> _File:
     return _file(read_xml(net))
 
 
-def _file(root: ElementTree.Element) -> _File:
+def _file(root: ElementTree.Element) -> SignalFile:
     links = defaultdict[str, list[Link]](list)
     for connection in root.iter("connection"):
         source = attribute(connection, "from")
@@ -298,10 +288,11 @@ def _file(root: ElementTree.Element) -> _File:
         links[signal].append(link)
     programmes = {attribute(logic, "id"): logic for logic in root.iter("tlLogic")}
     switched = {attribute(switch, "junctionID") for switch in root.iter("wautJunction")}
-    return _File(links=dict(links), programmes=programmes, timetabled=frozenset(switched))
+    return SignalFile(dict(links), programmes, frozenset(switched))
 
 
-def _logic(element: ElementTree.Element) -> Logic:
+def logic_of(element: ElementTree.Element) -> Logic:
+    """Return the programme of a <tlLogic>."""
     rows = list(element.iter("phase"))
     kind = element.get("type", STATIC)
     if kind == STATIC and any(row.get("next") for row in rows):
@@ -312,7 +303,7 @@ def _logic(element: ElementTree.Element) -> Logic:
 
 def _not_simple(element: ElementTree.Element, kinds: Collection[str]) -> str:
     """Return why a <tlLogic> cannot give way to another, "" if it can."""
-    logic = _logic(element)
+    logic = logic_of(element)
     if logic.programme == OFF:
         return SWITCHED_OFF
     if any(row.get("next") for row in element.iter("phase")):

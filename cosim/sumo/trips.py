@@ -24,6 +24,7 @@ POCKET_M = 80.0  # a longer edge is no turn pocket
 # Of trips that plans are made for, none of an evaluation.
 PLANNING_SEEDS = (778_001, 778_002, 778_003, 778_004)
 PEAK_S = 900.0  # the Highway Capacity Manual designs for the busiest quarter of the peak hour
+Noise = Float[np.ndarray, "classes E"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,7 +199,7 @@ def _draw(ends: _Ends, uniform: float) -> str:
     return ends.edges[min(n, len(ends.edges) - 1)]
 
 
-def perception(edges: int, rng: np.random.Generator) -> Float[np.ndarray, "classes E"]:
+def perception(edges: int, rng: np.random.Generator) -> Noise:
     """Draw the factors [-] on travel times by class of drivers."""
     return np.exp(CLASS_SPREAD * rng.standard_normal((DRIVER_CLASSES, edges)))
 
@@ -207,7 +208,7 @@ def routes_in(
     city: City,
     ends: tuple[TripNumbers, TripNumbers],
     tastes: TripNumbers,
-    noise: Float[np.ndarray, "classes E"],
+    noise: Noise,
 ) -> list[tuple[str, ...]]:
     """Return `fastest_routes` in a city, as ids of edges."""
     routes = fastest_routes(
@@ -224,7 +225,7 @@ def routes_in(
 def fastest_routes(
     ends: tuple[TripNumbers, TripNumbers],
     tastes: TripNumbers,
-    noise: Float[np.ndarray, "classes E"],
+    noise: Noise,
     *,
     time: PerEdge,
     links: Int[np.ndarray, "M 2"],

@@ -85,6 +85,14 @@ def read_xml(path: Path, depth: int = 0) -> ElementTree.Element:
     return root
 
 
+def elements_of(path: Path, tag: str) -> Iterator[ElementTree.Element]:
+    """Yield the elements `tag` of a large file of SUMO's, and forget each."""
+    for _, element in ElementTree.iterparse(path):
+        if element.tag == tag:
+            yield element
+            element.clear()
+
+
 def xml_text(element: ElementTree.Element, own: Mapping[str, str] = {}) -> str:
     """Return an element as ElementTree.tostring does, in less time.
 

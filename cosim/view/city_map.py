@@ -90,7 +90,10 @@ class CityMap:
         self.regions = self._add_regions()
         self.streets = self._add_streets()
         far = self._add_gates(picture.boundaries)
-        far.parts.append(self._add_ways(far))
+        style = {"text_font_size": "11px", "text_color": colours.INK, "text_baseline": "middle"}
+        # From which region into which a gate leads, beside it.
+        ways = self.plot.text("x", "y", text="way", source=far.source, x_offset=9, **style)
+        far.parts.append(ways)
         near = self._add_gates(picture.gates)
         self.gates = (far, near)
         self._add_numbers()
@@ -218,11 +221,6 @@ class CityMap:
         )
         members = [list(gate.gateways) for gate in gates]
         return Gates(members, source, [halo, discs, wedges])
-
-    def _add_ways(self, gates: Gates) -> Any:
-        """Write beside each gate from which region into which it leads."""
-        style = {"text_font_size": "11px", "text_color": colours.INK, "text_baseline": "middle"}
-        return self.plot.text("x", "y", text="way", source=gates.source, x_offset=9, **style)
 
     def _add_numbers(self) -> None:
         x, y = self._picture.places.astype(np.float32).T

@@ -201,7 +201,9 @@ def with_slider(
     """
     page = Page(picture, {name: tones[name] for name in runs}, totals)
     whole = list(runs.values())
-    padded = _padded(whole)
+    longest = max(map(len, whole))
+    # The last frame of shorter runs stays.
+    padded = [[*frames, *[frames[-1]] * (longest - len(frames))] for frames in whole]
     begin = _begin(padded)
     over_time = Film()
     for one in page.maps:
@@ -210,7 +212,7 @@ def with_slider(
         for gates in one.gates:
             over_time.add(gates.source, ["end", "green", "queue", "halo"])
     words = []
-    for k in range(len(padded[0])):
+    for k in range(longest):
         page.show([frames[k] for frames in padded], k * picture.step)
         over_time.record()
         words.append(page.numbers.text)
@@ -236,7 +238,7 @@ def with_slider(
     step = picture.step / MINUTE
     slider = Slider(
         start=0.0,
-        end=(len(padded[0]) - 1) * step,
+        end=(longest - 1) * step,
         value=begin * step,
         step=step,
         title="time [min]",
@@ -327,12 +329,6 @@ def _busiest(picture: CityPicture) -> int:
         gates[gate.source] += 1
         gates[gate.target] += 1
     return gates.index(max(gates))
-
-
-def _padded(runs: Sequence[Sequence[Frame]]) -> list[list[Frame]]:
-    """Return runs of the same length; the last frame of shorter ones stays."""
-    longest = max(map(len, runs))
-    return [[*frames, *[frames[-1]] * (longest - len(frames))] for frames in runs]
 
 
 def _begin(runs: Sequence[Sequence[Frame]]) -> int:

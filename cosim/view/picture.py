@@ -123,7 +123,6 @@ class CityPicture:
         region = city.edge_region
         middles = np.array([shape.mean(axis=0) for shape in shapes])
         lanes = np.array([city.lanes[edge] for edge in city.edges])
-        lane_metres = np.array([city.length[edge] * city.lanes[edge] for edge in city.edges])
         curves = []
         for mfd in network.mfds:
             x = np.linspace(0.0, min(mfd.jam, CURVE_END * mfd.critical), CURVE_POINTS)
@@ -133,7 +132,7 @@ class CityPicture:
             region_names=network.region_names,
             edges=city.edges,
             shapes=shapes,
-            lane_km=lane_metres / 1000.0,
+            lane_km=city.lane_metres / 1000.0,
             lanes=lanes,
             region=region,
             outlines=rings_round(shapes, region, REGION_REACH),
@@ -268,9 +267,7 @@ def frames(picture: CityPicture, result: Any) -> list[Frame]:
         states.append(state)
     made = [first(picture, result["gateway_green"].shape[1], states[0])]
     for k, state in enumerate(states[1:]):
-        controls = Controls(
-            perimeter=result["perimeter"][k], splits=None, note=str(result["note"][k])
-        )
+        controls = Controls(perimeter=result["perimeter"][k], note=str(result["note"][k]))
         row = {name: result[name][k] for name in ROW}
         made.append(after(picture, made[-1], controls, state, row))
     return made

@@ -1,7 +1,7 @@
 """Base class of the built-in controllers, which are their options."""
 
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, Self, TypeVar
+from typing import Any, ClassVar, NamedTuple, Self
 
 from nmfd.errors import InputError
 from nmfd.model.planning import PlanningModel
@@ -40,8 +40,11 @@ class Options(Settings):
 
     @property
     def guides(self) -> bool:
-        """True if the controller may guide routes."""
-        return False
+        """True if the controller may guide routes.
+
+        Its constant or option `guidance` says so.
+        """
+        return bool(getattr(self, "guidance", False))
 
     @property
     def reads(self) -> FileKind | None:
@@ -79,18 +82,3 @@ def check_fit(options: Options, planning: PlanningModel, where: str) -> None:
     problem = options.misfit(planning)
     if problem is not None:
         raise InputError(f"{where}{problem.key}: {problem}")
-
-
-Declared = TypeVar("Declared", bound=Options)
-
-
-def from_table(declaration: type[Declared], planning: PlanningModel, name: str) -> Declared:
-    """Return the options of the scenario's table [controllers.NAME].
-
-    Raises: InputError
-    """
-    prefix = f"controllers.{name}."
-    table = planning.controller_options.get(name, {})
-    options = config.checked(declaration, table, planning.where, prefix)
-    check_fit(options, planning, f"{planning.where}: {prefix}")
-    return options

@@ -33,8 +33,10 @@ def load(name: str) -> Any:
     cls = name.rpartition(":")[2]
     check_name(path)
     if not path.is_file():
-        remedy = f"write one with: nmfd new-controller {path}"
-        raise InputError(f"{path}: no such file for controller {name}; {remedy}")
+        raise InputError(
+            f"{path}: no such file for controller {name}; write one with: nmfd new-controller "
+            f"{path}"
+        )
     key = f"{path}:{path.stat().st_mtime_ns}"
     if key not in sys.modules:
         module = sys.modules[key] = ModuleType(key)  # dataclasses look up their module there
@@ -72,8 +74,10 @@ def object_fingerprint(controller: Controller) -> str:
         content = cloudpickle.dumps(controller)
     except Exception as error:
         name = type(controller).__name__
-        reason = f"cannot be pickled ({error}); leave out files, locks and threads"
-        raise InputError(f"controller {name}: {reason}, or put the class into a file") from None
+        raise InputError(
+            f"controller {name}: cannot be pickled ({error}); leave out files, locks and threads, "
+            "or put the class into a file"
+        ) from None
     return hashlib.sha256(content).hexdigest()[:16]
 
 
@@ -123,5 +127,4 @@ def _located(name: str, doing: str, function: Callable, *arguments: Any) -> Any:
         if isinstance(error, SyntaxError):
             where = f"{error.filename}:{error.lineno}"
         text = " ".join(str(error).split())
-        problem = f"{type(error).__name__}: {text}"
-        raise InputError(f"{where}: {name}: {doing}: {problem}") from error
+        raise InputError(f"{where}: {name}: {doing}: {type(error).__name__}: {text}") from error

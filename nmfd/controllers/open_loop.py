@@ -30,10 +30,6 @@ class Bound(Options):
     plan: Text | Path | None = setting("plan file; by default SCENARIO/NAME.npz", None)
 
     @property
-    def guides(self) -> bool:
-        return self.guidance
-
-    @property
     def reads(self) -> FileKind:
         return PLAN
 
@@ -122,8 +118,10 @@ def read(path: Path, scenario: Scenario, *, guidance: bool) -> Plan:
     except Exception:
         raise InputError(f"{path}: is no plan; compute one with 'nmfd bound'") from None
     if model != model_hash(scenario):
-        problem = f"was computed for another demand or network than {scenario.name}'s"
-        raise InputError(f"{path}: {problem}; compute it again")
+        raise InputError(
+            f"{path}: was computed for another demand or network than {scenario.name}'s; compute "
+            "it again"
+        )
     if (plan.splits is not None) != guidance:
         raise InputError(f"{path}: is a plan of {plan.name}; choose another file")
     return plan

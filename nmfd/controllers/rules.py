@@ -5,10 +5,10 @@ from typing import ClassVar
 import numpy as np
 
 from nmfd.arrays import PerPair, PerRegion
-from nmfd.controllers.base import Options
+from nmfd.controllers.base import Options, check_fit
 from nmfd.errors import InputError
 from nmfd.model.planning import PlanningModel
-from nmfd.runs.config import PositiveNumbers, Problem, got, setting
+from nmfd.runs.config import PositiveNumbers, Problem, checked, got, setting
 from nmfd.types import Controller, Controls, Observation
 
 # PI gating: shares of an error that one control interval corrects, as gates fill the region.
@@ -39,10 +39,7 @@ class RouteGuidance(Options):
     """
 
     plans: ClassVar[bool] = False
-
-    @property
-    def guides(self) -> bool:
-        return True
+    guidance: ClassVar[bool] = True
 
     def make(self, planning: PlanningModel) -> Controller:
         network = planning.network
@@ -109,11 +106,21 @@ class PiGating(SetPoint):
     def make(self, planning: PlanningModel) -> "PiGate":
         """Return the controller. Raise InputError without a protected region."""
         if not planning.protected:
-            last = planning.network.regions - 1
-            remedy = f"add protected = [<region>, ...] with regions from 0 to {last}"
-            problem = "pi-gating needs at least one protected region, got none"
-            raise InputError(f"{planning.where}: protected: {problem}; {remedy}")
+            raise InputError(
+                f"{planning.where}: protected: pi-gating needs at least one protected region, got "
+                "none; add protected = [<region>, ...] with regions from 0 to "
+                f"{planning.network.regions - 1}"
+            )
         return PiGate(planning, self)
+
+
+def scenario_gate(planning: PlanningModel) -> "PiGate":
+    """Return PI gating with the scenario's options. Raise InputError."""
+    prefix = "controllers.pi-gating."
+    table = planning.controller_options.get("pi-gating", {})
+    options = checked(PiGating, table, planning.where, prefix)
+    check_fit(options, planning, f"{planning.where}: {prefix}")
+    return options.make(planning)
 
 
 def filled(planning: PlanningModel, region: int) -> float:
@@ -126,10 +133,8 @@ def filled(planning: PlanningModel, region: int) -> float:
     """
     network = planning.network
     passing = _passing(planning)
-    duration = passing  # share of time in a region, by destination
-    if network.exit_rates is not None:
-        duration = passing / network.exit_rates
-    in_total = duration.sum(axis=1)
+    # Share of time in a region, by destination.
+    in_total = (passing / network.relative_rates).sum(axis=1)
     bound = (network.nominal_splits[:, region] * passing).sum(axis=1)
     largest = np.array([mfd.capacity for mfd in network.mfds])
     sent = largest * bound / np.where(in_total > 0.0, in_total, 1.0)
@@ -189,7 +194,15 @@ class PiGate:
         if set_point is None:
             set_point = tuple(mfd.reaching(options.outflow_share) for mfd in mfds)
         self.set_point = np.array(set_point)
-        self._kp, self._ki = self._gains(planning, options)
+        vehicles = np.array([filled(planning, region) for region in planning.protected])
+        fill = np.maximum(vehicles / critical, LEAST_FILL)
+        # Gains of every protected region, the integral one times the control interval ((P,), -).
+        self._kp = PROPORTIONAL_SHARE / fill
+        if options.kp is not None:
+            self._kp = np.full(len(fill), options.kp)
+        self._ki = INTEGRAL_SHARE / fill
+        if options.ki is not None:
+            self._ki = np.full(len(fill), options.ki * planning.step)
         self._open = network.open_perimeter
         self._entries = network.adjacency[:, self.regions]
         self._bounds = network.u_min, network.u_max
@@ -198,18 +211,6 @@ class PiGate:
     def reset(self, seed: int = 0) -> None:
         self._gate = np.full(len(self.regions), self._bounds[1])
         self._before: np.ndarray | None = None
-
-    def _gains(self, planning: PlanningModel, options: PiGating) -> tuple[PerRegion, PerRegion]:
-        """Return kp and ki dt of every protected region ((P,), -)."""
-        vehicles = np.array([filled(planning, region) for region in planning.protected])
-        fill = np.maximum(vehicles / self.critical, LEAST_FILL)
-        kp = PROPORTIONAL_SHARE / fill
-        if options.kp is not None:
-            kp = np.full(len(fill), options.kp)
-        ki = INTEGRAL_SHARE / fill
-        if options.ki is not None:
-            ki = np.full(len(fill), options.ki * planning.step)
-        return kp, ki
 
     def act(self, observation: Observation) -> Controls:
         now = observation.accumulation.sum(axis=1)[self.regions]
@@ -265,10 +266,6 @@ class Probing(SetPoint):
     plans: ClassVar[bool] = False
 
     guidance: bool = setting("split ratios are drawn as well", False)
-
-    @property
-    def guides(self) -> bool:
-        return self.guidance
 
     def make(self, planning: PlanningModel) -> Controller:
         return Excitation(planning, self)

@@ -80,11 +80,11 @@ class BuiltIn:
         return self.options(**self.fixed)
 
 
-def _named(name: str, text: str, options: type[Options], **fixed: Any) -> tuple[str, BuiltIn]:
-    return name, BuiltIn(name=name, text=text, options=options, fixed=fixed)
+def _named(name: str, text: str, options: type[Options], **fixed: Any) -> BuiltIn:
+    return BuiltIn(name=name, text=text, options=options, fixed=fixed)
 
 
-def _pair(name: str, text: str, options: type[Options], **fixed: Any) -> list[tuple[str, BuiltIn]]:
+def _pair(name: str, text: str, options: type[Options], **fixed: Any) -> list[BuiltIn]:
     """Return a controller without ("pc") and with route guidance ("pcrg")."""
     alone = f"{text}, perimeter control"
     both = f"{alone} and route guidance"
@@ -94,8 +94,9 @@ def _pair(name: str, text: str, options: type[Options], **fixed: Any) -> list[tu
     ]
 
 
-CONTROLLERS: Mapping[str, BuiltIn] = dict(
-    [
+CONTROLLERS: Mapping[str, BuiltIn] = {
+    kind.name: kind
+    for kind in [
         _named("no-control", "open perimeter, no guidance: the reference", NoControl),
         _named("route-guidance", "guidance by travel times alone", RouteGuidance),
         _named("pi-gating", "PI control of the protected regions", PiGating),
@@ -113,7 +114,7 @@ CONTROLLERS: Mapping[str, BuiltIn] = dict(
         *_pair("dpc-{}", "trained policy", Dpc),
         *_pair("bound-{}", "best plan with all demand known (nmfd bound)", Bound),
     ]
-)
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,9 +168,10 @@ class Strategy:
         """
         if self.labels:
             labels = "+".join(self.labels)
-            remedy = f"on the regional model use {self.controller.name}"
-            problem = f"+{labels} needs a city in SUMO (cosim); {remedy}"
-            raise InputError(f"strategy {self.name!r}: {problem}")
+            raise InputError(
+                f"strategy {self.name!r}: +{labels} needs a city in SUMO (cosim); on the regional "
+                f"model use {self.controller.name}"
+            )
         return self
 
     def table(self, scenario: Scenario) -> str:
@@ -190,9 +192,9 @@ class Strategy:
         best = [table for table, count in fitting.items() if count == max(fitting.values())]
         if len(best) > 1:
             tables = " and ".join(f'[controllers."{table}"]' for table in best)
-            problem = f'fit it equally well; add a table [controllers."{self.name}"]'
             raise InputError(
-                f"scenario.toml: strategy {self.name!r}: the tables {tables} {problem}"
+                f"scenario.toml: strategy {self.name!r}: the tables {tables} fit it equally well; "
+                f'add a table [controllers."{self.name}"]'
             )
         return best[0] if best else name
 
@@ -201,11 +203,9 @@ class Strategy:
 
         Raises: InputError
         """
-        if isinstance(self.controller, BuiltIn):
-            return self._options(self.controller, scenario)
-        return None
-
-    def _options(self, kind: BuiltIn, scenario: Scenario) -> Options:
+        kind = self.controller
+        if not isinstance(kind, BuiltIn):
+            return None
         if kind.given is not None:
             return kind.given
         prefix = f"controllers.{self.table(scenario)}."
@@ -222,9 +222,9 @@ class Strategy:
         if isinstance(kind, Given):
             return kind.controller
         planning = self.own_planning(scenario)
-        if isinstance(kind, FromFile):
+        options = self.options(scenario)
+        if not isinstance(kind, BuiltIn) or options is None:
             return custom.OwnController(kind.name, planning)
-        options = self._options(kind, scenario)
         where = f"{kind.name}: "
         if kind.given is None:
             where = f"{planning.where}: controllers.{self.table(scenario)}."
@@ -311,7 +311,8 @@ class Strategy:
             return None
         folder = scenario.folder or Path()
         table = self.table(scenario)
-        named = self._options(kind, scenario).file if policy is None else policy
+        options = self.options(scenario)
+        named = options.file if policy is None and options is not None else policy
         if named is None:
             path = folder / (table + reads.suffix)
         elif policy is None and kind.given is None:
@@ -320,8 +321,9 @@ class Strategy:
             path = shipped.found(named, shipped.SCENARIO)
         if not path.is_file():
             command = reads.command.format(folder=folder, name=table)
-            problem = f"no such {reads.text} for {kind.name}; make one with: {command}"
-            raise InputError(f"{path}: {problem}")
+            raise InputError(
+                f"{path}: no such {reads.text} for {kind.name}; make one with: {command}"
+            )
         return path
 
     def fingerprint(self, scenario: Scenario, policy: Path | None = None) -> dict[str, Any]:
@@ -379,10 +381,11 @@ class Strategy:
 ControllerLike: TypeAlias = str | Options | Controller | Strategy
 
 
-def parse(controller: ControllerLike) -> Strategy:
+def parse(controller: ControllerLike, words: str = "") -> Strategy:
     """Return the strategy of a controller.
 
     controller: a name, options, or an object with `reset` and `act`
+    words: that labels may be, for the error of an unknown controller
     Raises: InputError for an unknown controller or options that are wrong
 
     >>> strategy = parse("pi-gating+max-pressure")
@@ -396,11 +399,13 @@ def parse(controller: ControllerLike) -> Strategy:
         return Strategy(name=kind.name, controller=kind)
     if isinstance(controller, str):
         first, labels = split(controller)
-        return Strategy(name=controller, controller=_kind(controller, first), labels=labels)
+        return Strategy(name=controller, controller=_kind(controller, first, words), labels=labels)
     methods = (getattr(controller, name, None) for name in ("reset", "act"))
     if isinstance(controller, type) or not all(map(callable, methods)):
-        expected = "a name, options such as nmfd.PiGating(), or an object with reset and act"
-        raise InputError(f"controller: expected {expected}, got {controller!r}")
+        raise InputError(
+            "controller: expected a name, options such as nmfd.PiGating(), or an object with "
+            f"reset and act, got {controller!r}"
+        )
     name = str(getattr(controller, "name", type(controller).__name__))
     return Strategy(name=name, controller=Given(name=name, controller=controller))
 
@@ -441,9 +446,10 @@ def named(options: Options) -> BuiltIn:
     return replace(kind, name=name, given=options)
 
 
-def _kind(name: str, first: str) -> BuiltIn | FromFile:
+def _kind(name: str, first: str, words: str = "") -> BuiltIn | FromFile:
     """Return the controller of the name `first` in `name`.
 
+    words: as in `parse`
     Raises: InputError if it is unknown
     """
     if custom.FILE_AND_CLASS.fullmatch(first):
@@ -456,14 +462,18 @@ def _kind(name: str, first: str) -> BuiltIn | FromFile:
         try:
             table = tomllib.loads(f"options = {{{match['options']}}}")["options"]
         except tomllib.TOMLDecodeError:
-            form = f"{match['name']}(key=value, ...), values as in scenario.toml"
-            raise InputError(f"controller {first!r}: expected {form}") from None
+            raise InputError(
+                f"controller {first!r}: expected {match['name']}(key=value, ...), values as in "
+                "scenario.toml"
+            ) from None
         return named(kind.of_table(table, f"controller {first!r}", ""))
     if first.endswith(".py"):
         raise InputError(f"controller {first}: name its class, such as {first}:MyController")
     where = f"controller {first!r}" if first == name else f"strategy {name!r}: {first!r}"
-    hint = did_you_mean(first, CONTROLLERS)
+    hint = did_you_mean(first, [*CONTROLLERS, *parts_of(words.partition(" (")[0])])
     allowed = f"{', '.join(CONTROLLERS)} or file.py:Class"
+    if words:
+        allowed += f", with words joined by +: {words}"
     raise InputError(f"{where} is unknown{hint}; choose from {allowed}")
 
 
@@ -489,8 +499,9 @@ def parse_many(
     else:
         controllers = [given]
     if not any(controllers):
-        nothing = "expected at least one controller, got none; name one, such as no-control"
-        raise InputError(f"controllers: {nothing}")
+        raise InputError(
+            "controllers: expected at least one controller, got none; name one, such as no-control"
+        )
     plain: dict[str, S] = {}
     order: list[str | S] = []  # patterns, and strategies
     for controller in controllers:
@@ -515,11 +526,13 @@ def parse_many(
 
 def _check_same(one: Strategy, other: Strategy) -> None:
     """Raise InputError if two controller objects have the same name."""
-    if not isinstance(one.controller, Given) or not isinstance(other.controller, Given):
-        return
-    if one.controller.controller is not other.controller.controller:
-        remedy = "give each object an attribute `name` of its own"
-        raise InputError(f"controllers: two have the name {one.name!r}; {remedy}")
+    kinds = (one.controller, other.controller)
+    objects = [kind.controller for kind in kinds if isinstance(kind, Given)]
+    if len(objects) > 1 and objects[0] is not objects[1]:
+        raise InputError(
+            f"controllers: two have the name {one.name!r}; give each object an attribute `name` of "
+            "its own"
+        )
 
 
 def _is_pattern(name: str) -> bool:
@@ -536,8 +549,9 @@ def _matching(pattern: str, scenario: Scenario, parse: Callable[[Any], S]) -> li
     matching = [one for one in known if fnmatchcase(one.name, pattern)]
     if not matching:
         names = ", ".join(one.name for one in known)
-        problem = f"no controller here matches {pattern!r}; choose from {names}"
-        raise InputError(f"controllers: {problem}")
+        raise InputError(
+            f"controllers: no controller here matches {pattern!r}; choose from {names}"
+        )
     return matching
 
 

@@ -34,6 +34,7 @@ from nmfd.model.planning import PlanningModel
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs.config import error
+from nmfd.runs.progress import Show
 from nmfd.tensors import one_thread
 from nmfd.types import Observation
 
@@ -65,9 +66,10 @@ def settings(scenario: Scenario, strategy: Strategy, steps: int | None = None) -
         problem = "cannot be trained; choose dpc-pc or dpc-pcrg"
         raise InputError(f"--controller: {strategy.name!r} {problem}")
     if table != strategy.name:
-        needs = f'needs a table [controllers."{strategy.name}"] in {scenario.where}'
-        remedy = f"add one, or train {name}"
-        raise InputError(f"--controller: {strategy.name!r} {needs} with its differences; {remedy}")
+        raise InputError(
+            f'--controller: {strategy.name!r} needs a table [controllers."{strategy.name}"] in '
+            f"{scenario.where} with its differences; add one, or train {name}"
+        )
     prefix = f"controllers.{table}."
     check_fit(setup, strategy.own_planning(scenario), f"{scenario.where}: {prefix}")
     if setup.local and setup.guides:
@@ -136,8 +138,10 @@ class Task:
         parts: tuple[object, ...] = (self.cost, self.sample)
         for part in parts:
             if part is not None and not callable(part):
-                got = f"got {self.cost!r} and {self.sample!r}"
-                raise InputError(f"cost, sample: expected functions, {got}; see nmfd.train")
+                raise InputError(
+                    f"cost, sample: expected functions, got {self.cost!r} and {self.sample!r}; see "
+                    "nmfd.train"
+                )
         for pair in self.constraints:
             if not (isinstance(pair, tuple) and len(pair) == 2 and callable(pair[0])):
                 raise InputError(
@@ -166,7 +170,7 @@ def train(
     device: str = "cpu",
     compiled: bool = False,
     anyway: bool = False,
-    progress: Callable[[int, int, str], None] | None = None,
+    progress: Show = None,
 ) -> Any:
     """Train the policy of a strategy.
 
@@ -342,7 +346,7 @@ class TrainingRun:
             self.bar = self.best
             self._policy.load_state_dict(first)
 
-    def descend(self, progress: Callable[[int, int, str], None] | None) -> None:
+    def descend(self, progress: Show) -> None:
         """Take the steps of a descent that are left."""
         steps = self._setup.steps
         while self.done < steps:
@@ -377,9 +381,11 @@ class TrainingRun:
         self._clear_gradients()
         norm = torch.nn.utils.clip_grad_norm_(self._policy.parameters(), self._recipe.clip)
         if self._task.own and not norm.isfinite():
-            cost = f"the cost is {loss.item():.4g} and the norm of its gradient {norm.item():.4g}"
-            remedy = "look for 0 / 0, log(0) and sqrt(0) in your own functions"
-            raise InputError(f"{self._task.own}: in step {self.done} {cost}; {remedy}")
+            raise InputError(
+                f"{self._task.own}: in step {self.done} the cost is {loss.item():.4g} and the norm "
+                f"of its gradient {norm.item():.4g}; look for 0 / 0, log(0) and sqrt(0) in your "
+                "own functions"
+            )
         self._optimizer.step()
         if isinstance(self._policy, CompactPolicy):
             self._policy.bound()
@@ -430,10 +436,11 @@ class TrainingRun:
             )
             start_fits = x.shape == (batch, *rollout.start.shape)
             if not start_fits or demand.shape[1:] != x.shape or len(demand) < 2:
-                wanted = f"start ({batch}, R, R) and demand (T, {batch}, R, R)"
-                where = f"R = {len(rollout.start)} and T > 1"
-                got = f"{tuple(x.shape)} and {tuple(demand.shape)}"
-                raise InputError(f"sample: expected {wanted} with {where}, got {got}; return these")
+                raise InputError(
+                    f"sample: expected start ({batch}, R, R) and demand (T, {batch}, R, R) with R "
+                    f"= {len(rollout.start)} and T > 1, got {tuple(x.shape)} and "
+                    f"{tuple(demand.shape)}; return these"
+                )
             return x, demand
         setup = self._setup
         levels = (setup.demand_low, setup.demand_high)

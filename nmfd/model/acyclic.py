@@ -81,9 +81,9 @@ def build(network: RegionalModel) -> Acyclic:
     cells = {(i, i, i, j): int(number) for (i, j), number in np.ndenumerate(start)}
     queue = list(cells)
     move_from: list[int] = []
-    move_to: list[int] = []
-    move_next: list[int] = []
-    move_onward: list[bool] = []
+    move_to = []
+    move_next = []
+    move_onward = []
     fallback = {}
     for o, g, i, j in queue:  # grows during the loop
         if i == j:
@@ -91,7 +91,8 @@ def build(network: RegionalModel) -> Acyclic:
         cell = cells[o, g, i, j]
         neighbours = np.flatnonzero(network.adjacency[i]).tolist()
         allowed = [h for h in neighbours if h not in (o, g)]
-        least_bad = min(allowed or neighbours, key=lambda h: _badness(network, i, h, j))
+        turns_back = ~network.split_mask[i, :, j]
+        least_bad = min(allowed or neighbours, key=lambda h: (turns_back[h], network.hops[h, j], h))
         # In a dead end turning back is the least-bad move, counted like every forced move.
         for h in allowed or [least_bad]:
             target = o, i, h, j
@@ -105,9 +106,6 @@ def build(network: RegionalModel) -> Acyclic:
             move_next.append(h)
             move_onward.append(bool(allowed))
     origin, previous, region, destination = np.array(list(cells), dtype=int).T
-    rates = network.exit_rates
-    if rates is None:
-        rates = np.ones(network.adjacency.shape)
     detours = network.detours
     if detours is not None:
         detours = detours[region[move_from], move_next, destination[move_from]]
@@ -123,16 +121,11 @@ def build(network: RegionalModel) -> Acyclic:
         move_onward=np.array(move_onward, dtype=bool),
         fallback=np.array([fallback.get(n, -1) for n in range(len(cells))]),
         mfd=stacked(network.mfds, np.array),
-        exit_rates=rates[region, destination],
+        exit_rates=network.relative_rates[region, destination],
         detours=detours,
         capacity=network.open_capacity,
         storage=network.storage,
     )
-
-
-def _badness(network: RegionalModel, i: int, h: int, j: int) -> tuple[bool, int, int]:
-    """Return a key for next regions h from i to j, least for the best one."""
-    return not network.split_mask[i, h, j], network.hops[h, j], h
 
 
 def shares(model: Acyclic, splits: PerTurn) -> tuple[PerMove, Bool[np.ndarray, " C"]]:

@@ -46,7 +46,10 @@ class Answer(nn.Module):
         x: accumulations (veh, (..., R, R))
         prices: (-, (..., R))
         """
-        p = self._on_own_device()
+        device = self.own.device  # to which the module was moved
+        if self._model.adjacency.device != device:
+            self._model = dynamics.parameters(self._network, dtype=torch.float32, device=device)
+        p = self._model
         free = p.mfd.rate_up_to_jam(torch.zeros_like(p.mfd.jam), torch)
         rate = torch.maximum(dynamics.rate(p, x.sum(-1)), free / MAX_DELAY_FACTOR)
         leaving = rate.unsqueeze(-1)
@@ -72,10 +75,3 @@ class Answer(nn.Module):
         more = (costs - least).clamp(min=0.0)
         weight = self.own * torch.exp(-more / self.dispersion)
         return weight / weight.sum(-2, keepdim=True).clamp(min=1e-9)
-
-    def _on_own_device(self) -> dynamics.Parameters:
-        """Return the parameters on the device to which the module was moved."""
-        device = self.own.device
-        if self._model.adjacency.device != device:
-            self._model = dynamics.parameters(self._network, dtype=torch.float32, device=device)
-        return self._model

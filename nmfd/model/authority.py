@@ -2,14 +2,12 @@
 
 Control helps only if vehicles on their way into a region that becomes critical pass signals under
 control. The measure is the share of all vehicles filling such a region, from elsewhere or starting
-there, that a gateway could hold. `judge` finds the answer and the numbers, `sentences` the words.
+there, that a gateway could hold.
 """
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any
 
 import numpy as np
 from jaxtyping import Int, Real
@@ -118,7 +116,6 @@ class Judgement:
     load: highest accumulation as a multiple of the critical one (-, (R,)), NaN if that was not seen
     holdable: share of the vehicles filling each region that a gateway could hold (-, (R,))
     critical: the regions that become critical
-    protect: the regions to protect
     """
 
     answer: Answer
@@ -131,7 +128,6 @@ class Judgement:
     load: PerRegion
     holdable: PerRegion
     critical: list[int]
-    protect: tuple[int, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,22 +147,6 @@ class Verdict:
 
 
 def verdict(
-    network: RegionalModel, boundaries: Boundaries, *, scenario: str, **observed: Any
-) -> Verdict:
-    """Return the verdict.
-
-    scenario: its folder, for commands
-    observed: the other arguments of `judge`
-    """
-    judgement = judge(network, boundaries, **observed)
-    return Verdict(
-        sentences=sentences(judgement, scenario),
-        boundaries=boundaries,
-        protect=judgement.protect,
-    )
-
-
-def judge(
     network: RegionalModel,
     boundaries: Boundaries,
     *,
@@ -175,11 +155,13 @@ def judge(
     waiting: float,
     slowness: float,
     where: str,
-) -> Judgement:
-    """Return the answer, the numbers behind it, and the regions to protect.
+    scenario: str,
+) -> Verdict:
+    """Return the verdict: the answer, its grounds, and what to do next.
 
     most: highest accumulation in any run (veh, (R,))
     started, waiting, slowness, where: those of the Judgement
+    scenario: its folder, for commands
     """
     load = most / network.seen_critical
     filling = boundaries.flow.sum(axis=0) + started
@@ -194,13 +176,17 @@ def judge(
         answer = Answer.GUESSED
     elif critical:
         largest = max(holdable[region] for region in critical)
-        answer, least = _by_share(largest)
-        protect = tuple(region for region in critical if holdable[region] >= least)
+        if largest <= NOTHING:
+            answer = Answer.POWERLESS
+        else:
+            answer = Answer.USEFUL if largest >= ENOUGH else Answer.WEAK
+            least = min(largest, ENOUGH)  # only the best one if none is enough
+            protect = tuple(region for region in critical if holdable[region] >= least)
     elif waiting > WAITING_SHARE * started.sum() or slowness > SLOW:
         answer = Answer.CROWDED
     else:
         answer = Answer.FREE
-    return Judgement(
+    judgement = Judgement(
         answer=answer,
         network=network,
         boundaries=boundaries,
@@ -211,30 +197,11 @@ def judge(
         load=load,
         holdable=holdable,
         critical=critical,
-        protect=protect,
     )
-
-
-def _by_share(largest: float) -> tuple[Answer, float]:
-    """Return the answer, and the share of a region that is worth protecting.
-
-    largest: share of what fills a critical region that gateways could hold (-)
-    """
-    if largest <= NOTHING:
-        return Answer.POWERLESS, math.inf
-    if largest < ENOUGH:
-        return Answer.WEAK, largest  # only the best one
-    return Answer.USEFUL, ENOUGH
-
-
-def sentences(judgement: Judgement, scenario: str) -> tuple[str, ...]:
-    """Return the answer, its grounds, and what to do next, a sentence each.
-
-    scenario: its folder, for commands
-    """
-    remedies = [f"Next, {remedy}" for remedy in _remedies(judgement.answer, scenario)]
+    remedies = [f"Next, {remedy}" for remedy in _remedies(answer, scenario)]
     first = f"Can perimeter control help? {_answer_text(judgement)}"
-    return (first, *_facts(judgement), *remedies)
+    sentences = (first, *_facts(judgement), *remedies)
+    return Verdict(sentences=sentences, boundaries=boundaries, protect=protect)
 
 
 def _answer_text(judgement: Judgement) -> str:

@@ -27,8 +27,9 @@ def admissible(controls: object, network: RegionalModel, where: str) -> Controls
     """
     if not isinstance(controls, Controls):
         got = type(controls).__name__
-        problem = f"expected nmfd.Controls, got {got} instead"
-        raise InputError(f"{where}: {problem}; return nmfd.Controls(perimeter=u)")
+        raise InputError(
+            f"{where}: expected nmfd.Controls, got {got} instead; return nmfd.Controls(perimeter=u)"
+        )
     gates = network.adjacency
     low = np.where(gates, network.u_min, -np.inf)
     high = np.where(gates, network.u_max, np.inf)
@@ -68,8 +69,10 @@ def _splits(splits: ArrayLike | None, network: RegionalModel, where: str) -> np.
     wrong = np.argwhere(needed & (abs(sums - 1.0) > SUM_TOLERANCE))
     if len(wrong):
         i, j = wrong[0].tolist()
-        found = f"{sums[i, j]:g} for [i, j] = [{i}, {j}]"
-        raise InputError(f"{where}: expected a sum of 1 over h, got {found} instead")
+        raise InputError(
+            f"{where}: expected a sum of 1 over h, got {sums[i, j]:g} for [i, j] = [{i}, {j}] "
+            "instead"
+        )
     scale = np.where(needed & (abs(sums - 1.0) > ROUNDING), sums, 1.0)
     return shares / scale[:, None, :]
 

@@ -123,16 +123,9 @@ def counted(
     for share in STORAGES:
         storage = np.where(locked, share * most, start.storage)
         found.append(_counted(replace(start, storage=storage), counts, fastest, lane_km))
-    errors = []
-    for model in found:
-        off = prediction_errors(model, runs, _horizon(runs), **scheme)
-        errors.append((off**2).mean())
+    horizon = min(HORIZON, max(len(run.demand) for run in runs))
+    errors = [(prediction_errors(one, runs, horizon, **scheme) ** 2).mean() for one in found]
     return found[int(np.argmin(errors))]
-
-
-def _horizon(runs: Sequence[Observed]) -> int:
-    """Return the control intervals of the predictions that judge a storage."""
-    return min(HORIZON, max(len(run.demand) for run in runs))
 
 
 def _counted(
@@ -166,12 +159,6 @@ def _rates(model: RegionalModel, counts: Counts) -> np.ndarray:
     return np.stack([mfd.rate(n[:, i]) for i, mfd in enumerate(model.mfds)], axis=1)
 
 
-def _wishes(model: RegionalModel, counts: Counts) -> np.ndarray:
-    """Return k_ij q_i x_ij / D_ij (veh/s, (N, R, R)), as if nothing limits."""
-    wishes = model.exit_rates * _rates(model, counts)[..., None] * counts.inside
-    return wishes / _durations(model, counts)
-
-
 def _durations(model: RegionalModel, counts: Counts) -> np.ndarray:
     """Return D_ij, the mean time in i by the next regions (-, (N, R, R))."""
     detours = model.detours
@@ -188,7 +175,8 @@ def _boundary_shares(model: RegionalModel, counts: Counts, wish: np.ndarray) -> 
 
 def _desired_flows(model: RegionalModel, counts: Counts) -> np.ndarray:
     """Return the desired flow over each boundary (veh/s, (N, R, R))."""
-    onward = _wishes(model, counts) * ~np.eye(model.regions, dtype=bool)
+    leaving = model.exit_rates * _rates(model, counts)[..., None] * counts.inside
+    onward = leaving / _durations(model, counts) * ~np.eye(model.regions, dtype=bool)
     return np.einsum("nihj,nij->nih", counts.splits, onward)
 
 
@@ -275,7 +263,7 @@ def _fall(
     n, outflow: of the runs, from the critical accumulation; the outflow does not rise (veh, veh/s)
     jam: beyond all (veh)
     """
-    points: list[float] = []
+    points = []
     levels: list[float] = []
     last = float(n[0])
     for share in FALLS:

@@ -97,7 +97,7 @@ def read_counts(
     remedy = "" if skip_bad else "correct it, or leave such rows out with --skip-bad"
     parts = []
     left = {MARKED: 0, BAD: 0, DOUBLED: 0}
-    cities: set[str] = set()
+    cities = set()
     for chunk in _chunks(path, COUNTS, ("error", "city", "region")):
         _check_keys(chunk, "day", path, once=False)
         _check_keys(chunk, "detid", path, once=False)
@@ -256,10 +256,10 @@ def _sums_of_others(flow: np.ndarray) -> np.ndarray:
 
 
 def read_detectors(
-    path: Path | None,
-    regions: Path | None,
+    path: Path | str | None,
+    regions: Path | str | None,
     counts: pd.DataFrame,
-    where: Path,
+    where: Path | str,
     city: str | None = None,
 ) -> pd.DataFrame:
     """Return region, lane_km, pos_km, x_m, y_m of all detectors, by detid.
@@ -287,8 +287,9 @@ def read_detectors(
         _check_keys(named, "detid", regions)
         table = table.drop(columns="region", errors="ignore").merge(named, how="left")
     if "region" not in table:
-        remedy = "give it there, or a table detid,region with --regions"
-        raise InputError(f"{where}: has no column region; {remedy}")
+        raise InputError(
+            f"{where}: has no column region; give it there, or a table detid,region with --regions"
+        )
     table = table.set_index("detid")
     table = table[table["region"].notna() & (table["region"].str.strip() != "")]
     missing = set(detids) - set(table.index)
@@ -300,7 +301,7 @@ def read_detectors(
     return _placed(table.loc[detids])
 
 
-def _read_links(path: Path, detids: Sequence[str], city: str | None) -> pd.DataFrame:
+def _read_links(path: Path | str, detids: Sequence[str], city: str | None) -> pd.DataFrame:
     """Return the rows of detectors.csv for these detectors.
 
     Raises: InputError
@@ -336,7 +337,7 @@ def _placed(table: pd.DataFrame) -> pd.DataFrame:
     return out[["region", "lane_km", "pos_km", "x_m", "y_m"]]
 
 
-def read_about(path: Path | None, regions: Sequence[str]) -> pd.DataFrame:
+def read_about(path: Path | str | None, regions: Sequence[str]) -> pd.DataFrame:
     """Return lane_km, trip_length, x, y by region, NaN where unknown.
 
     Raises: InputError
@@ -355,7 +356,7 @@ def read_about(path: Path | None, regions: Sequence[str]) -> pd.DataFrame:
     return table.reindex(index=list(regions), columns=columns)
 
 
-def read_pairs(path: Path, regions: Sequence[str]) -> np.ndarray:
+def read_pairs(path: Path | str, regions: Sequence[str]) -> np.ndarray:
     """Return (R, R) bool: pairs region, neighbour of a csv file, both ways.
 
     Raises: InputError
@@ -368,8 +369,7 @@ def read_pairs(path: Path, regions: Sequence[str]) -> np.ndarray:
         i = _check_region(region, regions, where)
         h = _check_region(neighbour, regions, where)
         adjacency[i, h] = i != h
-        adjacency[h, i] = i != h
-    return adjacency
+    return adjacency | adjacency.T
 
 
 def omitted(left: Mapping[str, int]) -> str:
@@ -384,13 +384,15 @@ def _check_region(name: str, regions: Sequence[str], where: Path | str) -> int:
     Raises: InputError
     """
     if name not in regions:
-        known = f"{did_you_mean(str(name), regions)}; there are {', '.join(regions)}"
-        raise InputError(f"{where}: region {name!r} has no detector{known}")
+        raise InputError(
+            f"{where}: region {name!r} has no detector{did_you_mean(str(name), regions)}; there "
+            f"are {', '.join(regions)}"
+        )
     return list(regions).index(name)
 
 
 def _chunks(
-    path: Path, needed: Sequence[str], optional: Sequence[str] = ()
+    path: Path | str, needed: Sequence[str], optional: Sequence[str] = ()
 ) -> Iterator[pd.DataFrame]:
     """Yield the columns of a csv file as texts, in parts.
 
@@ -401,8 +403,10 @@ def _chunks(
         header = list(pd.read_csv(path, nrows=0, skipinitialspace=True).columns)
         missing = [name for name in needed if name not in header]
         if missing:
-            known = f"{did_you_mean(missing[0], header)}; needed: {', '.join(needed)}"
-            raise InputError(f"{path}: column {missing[0]} is missing{known}")
+            raise InputError(
+                f"{path}: column {missing[0]} is missing{did_you_mean(missing[0], header)}; "
+                f"needed: {', '.join(needed)}"
+            )
         names = [name for name in header if name in (*needed, *optional)]
         yield from pd.read_csv(
             path, dtype=str, chunksize=CHUNK_ROWS, usecols=names, skipinitialspace=True
@@ -415,7 +419,7 @@ def _chunks(
 
 
 def _numbers(
-    table: pd.DataFrame, limits: Mapping[str, Limit], path: Path, remedy: str = "correct it"
+    table: pd.DataFrame, limits: Mapping[str, Limit], path: Path | str, remedy: str = "correct it"
 ) -> pd.DataFrame:
     """Return the rows with all columns of `limits` within them.
 
@@ -443,7 +447,7 @@ def _numbers(
     return table.assign(**values)[good]
 
 
-def _check_keys(table: pd.DataFrame, key: str, path: Path, *, once: bool = True) -> None:
+def _check_keys(table: pd.DataFrame, key: str, path: Path | str, *, once: bool = True) -> None:
     """Check that no key is missing.
 
     once: no key is doubled, either

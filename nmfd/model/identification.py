@@ -14,7 +14,7 @@ rates, because congestion follows at once.
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -28,6 +28,7 @@ from nmfd.metrics import largest_accumulation
 from nmfd.model import dynamics
 from nmfd.model.mfd import Cubic, of_numbers
 from nmfd.model.regional_model import RegionalModel
+from nmfd.runs.progress import Show
 from nmfd.tensors import one_thread
 
 HORIZON = 10  # control intervals
@@ -182,7 +183,7 @@ def fit(
     fastest: PerRegion | None = None,
     iterations: int = ITERATIONS,
     seed: int = 0,
-    progress: Callable[[int, int, str], None] | None = None,
+    progress: Show = None,
 ) -> RegionalModel:
     """Return `network` with the parameters that predict `runs` best.
 
@@ -285,7 +286,9 @@ def _network(network: RegionalModel, model: _Model, runs: Sequence[Observed]) ->
     assert p.capacity is not None
     assert p.storage is not None
     rates = p.exit_rates.double().numpy()
-    mean = _mean_exit_rates(rates, runs)
+    weight = sum(run.accumulation.sum(axis=0) for run in runs)
+    weight[weight.sum(axis=1) == 0] = 1.0  # empty in all runs
+    mean = (weight * rates).sum(axis=1) / weight.sum(axis=1)
     curves = [vars(p.mfd)[name].tolist() for name in ("a", "b", "c", "jam")]
     mfds = []
     for a, b, c, jam, factor in zip(*curves, mean, strict=True):
@@ -298,13 +301,6 @@ def _network(network: RegionalModel, model: _Model, runs: Sequence[Observed]) ->
         capacity=p.capacity.double().numpy() * network.u_max * network.adjacency,
         storage=p.storage.double().numpy(),
     )
-
-
-def _mean_exit_rates(rates: Float[np.ndarray, "R R"], runs: Sequence[Observed]) -> PerRegion:
-    """Return the exit rate (R,) [-] of the average vehicle in each region."""
-    weight = sum(run.accumulation.sum(axis=0) for run in runs)
-    weight[weight.sum(axis=1) == 0] = 1.0  # empty in all runs
-    return (weight * rates).sum(axis=1) / weight.sum(axis=1)
 
 
 def prediction_errors(

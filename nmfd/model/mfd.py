@@ -174,9 +174,9 @@ class PiecewiseLinear(Mfd):
         rising = (np.diff(n) > 0).all()
         finite = np.isfinite([*n, *self.outflows]).all()
         if not (alike and rising and finite):
-            wanted = "as many finite outflows as accumulations, which rise from above 0"
             raise InputError(
-                f"PiecewiseLinear: expected {wanted}, got {self.accumulations} and {self.outflows}"
+                "PiecewiseLinear: expected as many finite outflows as accumulations, which rise "
+                f"from above 0, got {self.accumulations} and {self.outflows}"
             )
 
     @property

@@ -57,9 +57,11 @@ def other_model(scenario: Scenario, folder: Path, where: str = "") -> RegionalMo
     """
     model = load_network(folder)
     if not np.array_equal(model.adjacency, scenario.network.adjacency):
-        what = f"network {model.name} has other regions or boundaries than {scenario.network.name}"
-        remedy = "identify one for the same city with 'cosim identify'"
-        raise InputError(f"{where or folder / 'network.toml'}: {what}; {remedy}")
+        raise InputError(
+            f"{where or folder / 'network.toml'}: network {model.name} has other regions or "
+            f"boundaries than {scenario.network.name}; identify one for the same city with 'cosim "
+            "identify'"
+        )
     check_step(model, scenario.step / scenario.substeps, f"{model.folder}")
     return model
 

@@ -205,9 +205,7 @@ class RegionalModel:
         """
         if not self.equal_ways:
             return None
-        free = np.array([mfd.rate_up_to_jam(0.0) for mfd in self.mfds])
-        rates = np.ones(self.adjacency.shape) if self.exit_rates is None else self.exit_rates
-        time = 1.0 / (rates * free[:, None])
+        time = 1.0 / (self.relative_rates * self.free_rates[:, None])
         elsewhere = ~np.eye(self.regions, dtype=bool)
         onward = np.zeros(time.shape)
         for _ in range(self.regions):  # no way has more boundaries
@@ -216,6 +214,18 @@ class RegionalModel:
         least = np.where(used, time.min(axis=1)[:, None, None], time[:, None, :])
         in_region = np.maximum(onward[:, None, :] - onward[None, :, :], least)
         return np.where(self.split_mask, in_region / time[:, None, :] - 1.0, 0.0)
+
+    @property
+    def free_rates(self) -> PerRegion:
+        """Rates g_i(x_i)/x_i of empty regions (1/s, (R,))."""
+        return np.array([mfd.rate_up_to_jam(0.0) for mfd in self.mfds])
+
+    @property
+    def relative_rates(self) -> PerPair:
+        """`exit_rates`, 1 if they are None (R, R) [-]."""
+        if self.exit_rates is None:
+            return np.ones(self.adjacency.shape)
+        return self.exit_rates
 
     @property
     def misleads(self) -> str:
@@ -286,9 +296,8 @@ class PerimeterTable(Settings):
     @model_validator(mode="after")
     def _ordered(self) -> "PerimeterTable":
         if self.min >= self.max:
-            raise Problem(
-                "", f"min must be less than max, got min = {self.min:g} and max = {self.max:g}"
-            )
+            problem = f"min must be less than max, got min = {self.min:g} and max = {self.max:g}"
+            raise Problem("", problem)
         return self
 
 

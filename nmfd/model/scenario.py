@@ -48,6 +48,19 @@ CONTROLLER_FILES = {
     "plan": shipped.SCENARIO,
 }
 KINDS = ("demand", "demand-total", "mfd-scale", "mfd-axis", "trip-lengths")  # of `perturbed`
+# Fields of a scenario with the names of their keys in scenario.toml.
+SETTINGS = (
+    "name",
+    "step",
+    "steps",
+    "integrator",
+    "substeps",
+    "protected",
+    "demand_factor",
+    "measurement_std",
+    "process_std",
+    "faults",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,20 +173,8 @@ class Scenario(Horizon):
     @property
     def settings(self) -> dict[str, Any]:
         """Settings of a run besides network and demand, as in scenario.toml."""
-        content = {
-            "name": self.name,
-            "step": self.step,
-            "steps": self.steps,
-            "integrator": self.integrator,
-            "substeps": self.substeps,
-            "protected": list(self.protected),
-            "demand_factor": self.demand_factor,
-            "measurement_std": self.measurement_std,
-            "process_std": self.process_std,
-            "faults": list(self.faults),
-            "controllers": self.controller_options,
-            "sumo": self.sumo,
-        }
+        content = {name: getattr(self, name) for name in SETTINGS}
+        content |= {"controllers": self.controller_options, "sumo": self.sumo}
         if self.initial is not None:
             content["initial"] = self.initial.tolist()
         return json.loads(json.dumps(content))
@@ -276,11 +277,8 @@ def perturbed(scenario: Scenario, sigma: float, seed: int, kind: str = "demand")
         if kind == "demand-total":
             demand *= scenario.demand.sum(axis=0) / np.maximum(demand.sum(axis=0), 1e-9)
         return replace(scenario, demand=demand)
-    rates = network.exit_rates
-    if rates is None:
-        rates = np.ones(network.adjacency.shape)
-    rates_up_to_jam = np.array([mfd.rate_up_to_jam(0.0) for mfd in network.mfds])
-    highest = scenario.substeps / scenario.step / rates_up_to_jam
+    rates = network.relative_rates
+    highest = scenario.substeps / scenario.step / network.free_rates
     if kind == "trip-lengths":
         factors = np.exp(sigma * random.standard_normal(rates.shape))
         rates = np.minimum(rates * factors, highest[:, None])
@@ -409,20 +407,15 @@ def read_scenario(folder: Path | str, settings: Mapping[str, Any] | None = None)
     if max(table.protected, default=0) >= network.regions:
         allowed = f"a list of distinct whole numbers from 0 to {network.regions - 1}"
         raise config.error(path, "protected", config.got(allowed, list(table.protected)))
-    _check_initial(table.initial, network.regions, path)
+    if table.initial:
+        lengths = {len(table.initial), *map(len, table.initial)}
+        if lengths != {network.regions} or min(map(min, table.initial)) < 0:
+            allowed = f"{network.regions} lists of {network.regions} numbers from 0 up"
+            rows = [list(row) for row in table.initial]
+            raise config.error(path, "initial", config.got(allowed, rows))
     scenario = Scenario(**values)
     _ = scenario.ordered_faults
     return scenario
-
-
-def _check_initial(rows: tuple[Numbers, ...], regions: int, path: Path) -> None:
-    """Raise InputError unless there are no rows, or R of R numbers from 0 up."""
-    if not rows:
-        return
-    lengths = {len(rows), *map(len, rows)}
-    if lengths != {regions} or min(map(min, rows)) < 0:
-        allowed = f"{regions} lists of {regions} numbers from 0 up"
-        raise config.error(path, "initial", config.got(allowed, [list(row) for row in rows]))
 
 
 def read_tables(folder: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:

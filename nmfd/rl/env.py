@@ -113,7 +113,7 @@ class Interface:
         perimeter = self._open.copy()
         perimeter[self._boundaries] = low + (high - low) * opening
         if self._turns is None:
-            return Controls(perimeter=perimeter, splits=None)
+            return Controls(perimeter=perimeter)
         weight = np.zeros_like(self._fixed)
         weight[self._turns] = np.exp(LOGIT_SCALE * action[self._gates :])
         sums = weight.sum(axis=1, keepdims=True)
@@ -240,17 +240,14 @@ class RegionsEnv(ParallelEnv):
         self._guidance = guidance
         loaded = self._env.scenario
         self.agents: list[str] = []
-        self.possible_agents: list[str] = []
         self.interfaces = {}
-        self.observation_spaces = {}
-        self.action_spaces = {}
         for region in range(loaded.network.regions):
-            agent = f"region_{region}"
             interface = Interface(loaded.network, guidance=guidance, regions=[region])
-            self.possible_agents.append(agent)
-            self.interfaces[agent] = interface
-            self.observation_spaces[agent] = interface.observation_space(loaded)
-            self.action_spaces[agent] = interface.action_space
+            self.interfaces[f"region_{region}"] = interface
+        self.possible_agents = list(self.interfaces)
+        agents = self.interfaces.items()
+        self.observation_spaces = {agent: one.observation_space(loaded) for agent, one in agents}
+        self.action_spaces = {agent: one.action_space for agent, one in agents}
 
     def observation_space(self, agent: str) -> Box:
         return self.observation_spaces[agent]

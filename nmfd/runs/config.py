@@ -60,8 +60,9 @@ class Settings(BaseModel):
         for key in values:
             if key not in keys:
                 hint = did_you_mean(str(key), keys)
-                allowed = f"allowed here: {', '.join(keys)}"
-                raise Problem(key, f"unknown key{hint}; {allowed}; remove or correct it")
+                raise Problem(
+                    key, f"unknown key{hint}; allowed here: {', '.join(keys)}; remove or correct it"
+                )
         return values
 
     def changed(self: S, **changes: Any) -> S:

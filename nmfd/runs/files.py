@@ -99,7 +99,7 @@ def write_table(path: Path, frame: "pd.DataFrame", **options: str) -> None:
     write_text(path, frame.to_csv(index=False, **options))
 
 
-def check_file(path: Path, remedy: str = "give a file") -> None:
+def check_file(path: Path | str, remedy: str = "give a file") -> None:
     """Check that a path is a file, or does not exist.
 
     Raises: InputError for a folder, pipe or device, which would be read for ever
@@ -117,8 +117,10 @@ def check_name(path: Path | str) -> None:
     try:
         absolute.encode()
     except UnicodeEncodeError:
-        problem = "the name is not UTF-8, and SUMO and netCDF cannot open it"
-        raise InputError(f"{absolute}: {problem}; rename the file or folder") from None
+        raise InputError(
+            f"{absolute}: the name is not UTF-8, and SUMO and netCDF cannot open it; rename the "
+            "file or folder"
+        ) from None
 
 
 def file_hash(path: Path) -> str:
@@ -162,6 +164,13 @@ def run_name(controller: str, seed: int) -> str:
     The controller may be path/to/file.py:Class.
     """
     return f"{quote(controller, safe='+,-._ ()=')}-{seed}"
+
+
+def folder_of(name: str, command: str, out: Path | str | None) -> Path:
+    """Return the folder `out` or, if it is None, runs/NAME-COMMAND."""
+    if out is None:
+        return Path("runs", f"{file_name(name)}-{command}")
+    return Path(out)
 
 
 def default_folder(scenario: str) -> Path:

@@ -85,14 +85,12 @@ def in_processes(
     jobs: Sequence[Job],
     workers: int,
     limits: Sequence[float | None],
-    folder: str = "",
     modules: Collection[str] = (),
 ) -> Generator[tuple[int, Any]]:
     """Yield the number and the outcome of each job, as they end.
 
     workers: jobs at a time
     limits: time after which a job is ended (s), None for none
-    folder: current folder of the processes
     modules: imported once for all of them, if their server is not running yet
     """
     waiting = list(range(len(jobs)))
@@ -101,8 +99,7 @@ def in_processes(
         while waiting or live:
             while waiting and len(live) < workers:
                 number = waiting.pop(0)
-                future = _start(jobs[number], limits[number], os.path.abspath(folder), modules)
-                live[future] = number
+                live[_start(jobs[number], limits[number], modules)] = number
             done, _ = wait(live, timeout=POLL_S, return_when=FIRST_COMPLETED)
             for future in done:
                 number = live.pop(future)
@@ -152,8 +149,8 @@ def died(status: int) -> str:
     return f"its process died (status {status}{meaning})"
 
 
-def _start(job: Job, limit: float | None, folder: str, modules: Collection[str]) -> Future:
-    """Start the process of a job."""
+def _start(job: Job, limit: float | None, modules: Collection[str]) -> Future:
+    """Start the process of a job, in the current folder."""
     with STARTING, uninterrupted():
         here = _Context()
         if hasattr(os, "fork"):
@@ -163,7 +160,7 @@ def _start(job: Job, limit: float | None, folder: str, modules: Collection[str])
             _start_server()
         # Only as a decorator, and by this name, does pebble take the context.
         decorated = concurrent.process(name=NAME, timeout=limit, context=here)
-        return decorated(work)(cloudpickle.dumps(job), folder, dict(os.environ))
+        return decorated(work)(cloudpickle.dumps(job), os.getcwd(), dict(os.environ))
 
 
 def _start_server() -> None:

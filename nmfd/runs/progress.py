@@ -13,15 +13,14 @@ from contextlib import contextmanager
 with warnings.catch_warnings(action="ignore"):  # a notebook without ipywidgets gets no bar
     from tqdm.auto import tqdm
 
-Progress = Callable[..., None] | bool | None
+Show = Callable[..., None] | None  # takes done, all and perhaps a note
+Progress = Show | bool
 MEASURED_S = 2.0  # of the first steps, from which the time of all others follows
 LONG_S = 30.0  # what takes longer is announced
 
 
 @contextmanager
-def watched(
-    label: str, progress: Progress = None, *, said: bool = False
-) -> Iterator[Callable[..., None] | None]:
+def watched(label: str, progress: Progress = None, *, said: bool = False) -> Iterator[Show]:
     """Yield the function that shows progress.
 
     progress: the user's own function; None for a bar on a terminal or in a notebook, and a line on

@@ -185,7 +185,8 @@ def run_many(
             raise KeyboardInterrupt(left) from None
         finally:
             table = _table([rows[name] for name in keys if name in rows])
-            _write_rows(out, kept)
+            content = {"made_by": _made_by(), "runs": kept}
+            write_text(out / ROWS, json.dumps(content, default=lambda numbers: numbers.tolist()))
             write_if_changed(out / TABLE, table.to_csv(index=False))
     return table
 
@@ -198,7 +199,12 @@ def finished_table(out: Path) -> "pd.DataFrame":
     """
     import pandas as pd  # takes half a second
 
-    kept = _kept_runs(out, _files_in(out / TABLE))
+    names = []
+    with suppress(OSError, KeyError, TypeError, ValueError, csv.Error):
+        for row in csv.DictReader((out / TABLE).read_text(encoding="utf-8").splitlines()):
+            run = run_name(row["controller"], int(row["seed"]))
+            names.append(file_of(row.get("folder", ""), run))
+    kept = _kept_runs(out, names)
     rows = []
     for name, key in _keys(_manifest(out)["folders"], kept).items():
         if not _differing(kept[name].key, key):
@@ -206,22 +212,14 @@ def finished_table(out: Path) -> "pd.DataFrame":
     return pd.read_csv(io.StringIO(_table(rows).to_csv(index=False)))
 
 
-def _files_in(table: Path) -> list[str]:
-    """Return the files of the runs in runs.csv, as far as it can be read."""
-    names = []
-    with suppress(OSError, KeyError, TypeError, ValueError, csv.Error):
-        for row in csv.DictReader(table.read_text(encoding="utf-8").splitlines()):
-            run = run_name(row["controller"], int(row["seed"]))
-            names.append(file_of(row.get("folder", ""), run))
-    return names
-
-
 def check_names(runs: Sequence[Run]) -> None:
     """Raise InputError for a run whose name is too long for a file."""
     for run in runs:
         if len(run.name.encode()) > LONGEST_NAME:
-            problem = f"its name is longer than the {LONGEST_NAME} bytes that a file may have"
-            raise InputError(f"controller {run.place.controller}: {problem}; shorten it")
+            raise InputError(
+                f"controller {run.place.controller}: its name is longer than the {LONGEST_NAME} "
+                "bytes that a file may have; shorten it"
+            )
 
 
 def raise_failures(rows: "Table") -> None:
@@ -303,8 +301,9 @@ def locked(out: Path, mark: str = MANIFEST) -> Iterator[None]:
                 if [path.name for path in out.glob("*")] == [LOCK]:
                     shutil.rmtree(out, ignore_errors=True)
     except Timeout:
-        problem = "another process is writing to it; wait for its end"
-        raise InputError(f"{out}: {problem}, or {remedy}") from None
+        raise InputError(
+            f"{out}: another process is writing to it; wait for its end, or {remedy}"
+        ) from None
 
 
 class FolderOfRuns(BaseModel):
@@ -335,8 +334,9 @@ def read_manifest(folder: Path) -> dict:
     try:
         manifest = Manifest.model_validate_json(file.read_bytes())
     except (OSError, ValueError):
-        remedy = "choose another folder with --out"
-        raise InputError(f"{file}: is no manifest of runs, or damaged; {remedy}") from None
+        raise InputError(
+            f"{file}: is no manifest of runs, or damaged; choose another folder with --out"
+        ) from None
     return manifest.model_dump()
 
 
@@ -412,12 +412,6 @@ class Kept(NamedTuple):
     stamp: Stamp
 
 
-def _write_rows(out: Path, kept: Mapping[str, Kept]) -> None:
-    """Write the rows of finished runs for the next call."""
-    content = {"made_by": _made_by(), "runs": kept}
-    write_text(out / ROWS, json.dumps(content, default=lambda numbers: numbers.tolist()))
-
-
 def _known_rows(out: Path) -> dict[str, Kept]:
     """Return the rows of finished runs from an earlier call by file.
 
@@ -486,9 +480,10 @@ def _check_kept(out: Path, runs: Sequence[Run], kept: Mapping[str, Kept]) -> Non
             continue
         changed = _differing(kept[run.file].key, run.json_key)
         if changed:
-            remedy = "choose another folder with --out, or add --overwrite to do it again"
-            problem = f"is a run with other settings ({changed} changed)"
-            raise InputError(f"{out / run.file}: {problem}; {remedy}")
+            raise InputError(
+                f"{out / run.file}: is a run with other settings ({changed} changed); choose "
+                "another folder with --out, or add --overwrite to do it again"
+            )
 
 
 def _differing(one: Mapping, other: Mapping) -> str:

@@ -63,10 +63,10 @@ def found(name: Path | str, *kinds: str, beside: Path | None = None) -> Path:
     for kind in kinds:
         for place in (root() / f"{kind}s", Path()):
             near += [file.parent.name for file in place.glob(f"*/{kind}.toml")]
-    problem = (
-        f"no such folder here, and no {' or '.join(kinds)} of that name comes with the package"
+    raise InputError(
+        f"{name}: no such folder here, and no {' or '.join(kinds)} of that name comes with the "
+        f"package{did_you_mean(str(name), near)}; `nmfd show` lists them"
     )
-    raise InputError(f"{name}: {problem}{did_you_mean(str(name), near)}; `nmfd show` lists them")
 
 
 def installed(path: Path) -> bool:
@@ -89,8 +89,9 @@ def beside(folder: Path, file: str, option: str, *, scenario: bool = False) -> P
         content = f'name = "..." and base = "{folder.name}"'
         remedy += f", or make a folder of your own whose scenario.toml has {content}"
     if installed(folder):
-        problem = "came with the package, where nothing is written"
-        raise InputError(f"{folder.name}: {problem}; {remedy}")
+        raise InputError(
+            f"{folder.name}: came with the package, where nothing is written; {remedy}"
+        )
     if folder.is_dir() and not os.access(folder, os.W_OK):
         raise InputError(f"{folder}: cannot be written to; {remedy}")
     return folder / file

@@ -1,5 +1,6 @@
 """Tables as text, for the terminal and in markdown."""
 
+import math
 import re
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
@@ -33,6 +34,11 @@ def text_columns(
     # headings as a line: tabulate makes columns wider than their headings
     table = tabulate(cells, tablefmt="plain", disable_numparse=True, colalign=sides)
     return "\n".join([table, *wrapped(caption)])
+
+
+def cell(value: float, form: str) -> str:
+    """Return a number as `form`, such as "{:.1f} %", shows it; "-" for NaN."""
+    return "-" if math.isnan(value) else form.format(value)
 
 
 def markdown_table(headings: Sequence[str], lines: Iterable[Iterable[object]]) -> str:

@@ -24,7 +24,7 @@ from nmfd.metrics import COUNTED, decision_ms, percent_change, summary
 from nmfd.model.scenario import Scenario, perturbed
 from nmfd.runs.files import file_hash, is_newer, run_name
 from nmfd.runs.run_many import TABLE
-from nmfd.runs.tables import text_columns, text_table
+from nmfd.runs.tables import cell, text_columns, text_table
 from nmfd.types import Plant, Result
 
 if TYPE_CHECKING:
@@ -130,8 +130,9 @@ def key_of(
     """
     for fault in scenario.ordered_faults:
         if fault.kind in faults.CITY:
-            problem = f"{fault.kind} is a fault of a city in SUMO; omit it"
-            raise InputError(f"{scenario.name}: faults: {problem}")
+            raise InputError(
+                f"{scenario.name}: faults: {fault.kind} is a fault of a city in SUMO; omit it"
+            )
     own = {}
     for strategy in strategies:
         policy = policies.get(strategy.name)
@@ -247,10 +248,12 @@ def _level_table(done: "pd.DataFrame") -> str:
     for name, group in groups.items():
         spent = group["total_time_spent_veh_s"].tolist()
         mean = group.mean(numeric_only=True).to_dict()
+        spread = interval(spent)
+        half = "" if math.isnan(spread) else f" ± {_scientific(spread, 1)}"
         line = {
             "controller": name,
             "seeds": len(group),
-            "TTS [veh s]": _with_interval(spent),
+            "TTS [veh s]": _scientific(statistics.fmean(spent)) + half,
             "change": "" if name == against else _percent(spent, reference),
         }
         if with_bound:
@@ -277,15 +280,9 @@ def _level_table(done: "pd.DataFrame") -> str:
     return text_table(lines + impossible, caption)
 
 
-def _with_interval(values: Sequence[float]) -> str:
-    mean = _scientific(statistics.fmean(values))
-    spread = interval(values)
-    return mean if math.isnan(spread) else f"{mean} ± {_scientific(spread, 1)}"
-
-
 def _percent(values: Sequence[float], reference: Sequence[float]) -> str:
     change = percent_change(statistics.fmean(values), statistics.fmean(reference))
-    return "-" if math.isnan(change) else f"{change:+.1f} %"
+    return cell(change, "{:+.1f} %")
 
 
 def _scientific(value: float, digits: int = 4) -> str:
@@ -414,7 +411,7 @@ def improvement_table(rows: "pd.DataFrame") -> str:
         cells = [name]
         for sigma in trips.index:
             mean, half = gains.get(sigma, (math.nan, math.nan))
-            cells.append("-" if math.isnan(mean) else f"{mean:.1f} ± {half:.1f}")
+            cells.append(cell(mean, f"{{:.1f}} ± {half:.1f}"))
         lines.append(cells)
     caption = ROBUSTNESS_CAPTION.format(kind=kind, meaning=_meaning(kind))
     return text_columns(["sigma", *(f"{sigma:g}" for sigma in trips.index)], lines, caption)

@@ -31,7 +31,7 @@ it if the nominal splits follow shortest paths.
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -52,6 +52,7 @@ from nmfd.model.mfd import Mfd
 from nmfd.model.plant import NmfdPlant
 from nmfd.model.regional_model import LEAST_LIMIT, RegionalModel
 from nmfd.model.scenario import Scenario
+from nmfd.runs.progress import Show
 from nmfd.tensors import one_thread
 
 ITERATIONS = 1500
@@ -60,7 +61,6 @@ INSIDE = 0.02  # distance of starts from the edge of the admissible set, where t
 # Lines above the MFD of a region, in the relaxation: from its slope at 0 to the critical
 # accumulation.
 LINES = 16
-Note = Callable[[int, int, str], None]  # takes done, all, note
 
 
 class Start(NamedTuple):
@@ -71,7 +71,7 @@ class Start(NamedTuple):
 
 
 def compute(
-    scenario: Scenario, name: str, *, iterations: int = ITERATIONS, progress: Note | None = None
+    scenario: Scenario, name: str, *, iterations: int = ITERATIONS, progress: Show = None
 ) -> Plan:
     """Return the best plan found, with the lower bound.
 
@@ -90,7 +90,11 @@ def compute(
         progress(0, steps, "lower bound")
     lower = lower_bound(scenario, guidance=guidance)
     starts = neutral_starts(scenario.network, steps, guidance=guidance)
-    for controller in _starting_controllers(scenario, guidance=guidance):
+    controllers = ["pi-gating"] if scenario.protected else []
+    for trained in ["dpc-pc", "dpc-pcrg"] if guidance else ["dpc-pc"]:
+        if scenario.folder and (scenario.folder / f"{trained}.pt").is_file():
+            controllers.append(trained)
+    for controller in controllers:
         if progress:
             progress(0, steps, f"closed loop {controller}")
         policy = parse(controller).make(scenario)
@@ -98,18 +102,6 @@ def compute(
         starts[controller] = Start(result["perimeter"], result["splits"])
     plan = solve(scenario, starts, guidance=guidance, iterations=iterations, progress=progress)
     return replace(plan, lower=lower)
-
-
-def _starting_controllers(scenario: Scenario, *, guidance: bool) -> list[str]:
-    """Return the controllers whose closed loops are starts."""
-    names = []
-    if scenario.protected:
-        names.append("pi-gating")
-    policies = ["dpc-pc", "dpc-pcrg"] if guidance else ["dpc-pc"]
-    for policy in policies:
-        if scenario.folder and (scenario.folder / f"{policy}.pt").is_file():
-            names.append(policy)
-    return names
 
 
 def neutral_starts(network: RegionalModel, steps: int, *, guidance: bool) -> dict[str, Start]:
@@ -140,7 +132,7 @@ def solve(
     *,
     guidance: bool,
     iterations: int = ITERATIONS,
-    progress: Note | None = None,
+    progress: Show = None,
 ) -> Plan:
     """Return the best plan by separate descents.
 
@@ -428,9 +420,7 @@ def _limits(
     leaving: (P, E), 1 where a turn leaves a pair
     step, vehicles: those of the Relaxation
     """
-    exit_rates = np.ones(len(pairs))
-    if network.exit_rates is not None:
-        exit_rates = network.exit_rates[*pairs.T]
+    exit_rates = network.relative_rates[*pairs.T]
     blocks = []
     for region in np.unique(pairs[:, 0]):
         there = pairs[:, 0] == region

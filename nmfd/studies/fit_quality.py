@@ -13,7 +13,7 @@ from nmfd.metrics import largest_accumulation
 from nmfd.model import mfd
 from nmfd.model.regional_model import Errors, HeldOut, RegionalModel
 from nmfd.runs import files
-from nmfd.runs.tables import text_table, wrapped
+from nmfd.runs.tables import cell, text_table, wrapped
 
 if TYPE_CHECKING:
     from nmfd.model.identification import Observed
@@ -52,6 +52,7 @@ HELD_OUT = (
     "largest), in runs that the model has not seen: "
 )
 SITUATIONS = ("flowing", "congested")  # no region beyond its critical accumulation, and else
+VEHICLES = "{:.1f}"  # form of an error
 AHEAD_CAPTION = (
     'RMSE in vehicles, and "as now": that of the prediction that nothing changes. Flowing: no '
     "region is beyond its critical accumulation (where that was not seen, the largest one)"
@@ -252,8 +253,8 @@ def fit_table(
             "samples": fit.samples,
             "R2": f"{fit.r2:.2f}",
             "spread": f"{100 * fit.spread:.0f} %",
-            "hysteresis": _percent(fit.hysteresis),
-            "most / critical": "-" if np.isnan(fit.most_share) else f"{fit.most_share:.2f}",
+            "hysteresis": cell(100 * fit.hysteresis, "{:.0f} %"),
+            "most / critical": cell(fit.most_share, "{:.2f}"),
             "WARNINGS": "; ".join(fit.doubts) or "none",
         }
         rows.append(row)
@@ -277,11 +278,11 @@ def short_table(network: RegionalModel, fits: pd.DataFrame, errors: pd.DataFrame
             "critical": _critical(fit),
             "outflow": f"{fit.max_outflow_veh_s:.3f}",
             "R2": f"{fit.r2:.2f}",
-            "hysteresis": _percent(fit.hysteresis),
+            "hysteresis": cell(100 * fit.hysteresis, "{:.0f} %"),
         }
         for name in SITUATIONS:
-            model = _vehicles(error[f"{name}_rmse_veh"])
-            row[name] = f"{model} ({_vehicles(error[f'{name}_persistence_rmse_veh'])})"
+            model = cell(error[f"{name}_rmse_veh"], VEHICLES)
+            row[name] = f"{model} ({cell(error[f'{name}_persistence_rmse_veh'], VEHICLES)})"
         rows.append(row)
     return text_table(rows)
 
@@ -300,11 +301,6 @@ def _critical(fit: Any) -> str:
     if np.isnan(fit.critical_veh):
         return f"above {fit.critical_above_veh:.0f}"
     return f"{fit.critical_veh:.0f}"
-
-
-def _percent(share: float) -> str:
-    """Return a share as text, "-" for NaN."""
-    return "-" if np.isnan(share) else f"{100 * share:.0f} %"
 
 
 def predictions(
@@ -337,7 +333,7 @@ def predictions(
         critical = network.known_critical
     longest = max(len(run.demand) for run in runs)
     ahead = min(max(1, round(AHEAD_S / scheme["step"])), longest)
-    columns: dict[str, object] = {}
+    columns = {}
     for when, intervals in (("next_interval", 1), ("ahead", ahead)):
         errors = identification.prediction_errors(network, runs, intervals, **scheme)
         states = identification.windows(runs, intervals).states.sum(-1).numpy()
@@ -373,15 +369,15 @@ def ahead_table(errors: pd.DataFrame, titles: Sequence[str]) -> str:
     for title, (_, error) in zip(titles, errors.iterrows(), strict=True):
         row = {"region": title}
         for name in SITUATIONS:
-            row[name] = _vehicles(error[f"{name}_rmse_veh"])
-            row[f"{name}, as now"] = _vehicles(error[f"{name}_persistence_rmse_veh"])
+            row[name] = cell(error[f"{name}_rmse_veh"], VEHICLES)
+            row[f"{name}, as now"] = cell(error[f"{name}_persistence_rmse_veh"], VEHICLES)
         rows.append(row)
     everywhere = held_out(errors)
     row = {"region": "all"}
     for name in SITUATIONS:
         model, as_now = getattr(everywhere, name) or (np.nan, np.nan)
-        row[name] = _vehicles(model)
-        row[f"{name}, as now"] = _vehicles(as_now)
+        row[name] = cell(model, VEHICLES)
+        row[f"{name}, as now"] = cell(as_now, VEHICLES)
     table = text_table([*rows, row], f"{everywhere.ahead:g} s ahead. {AHEAD_CAPTION}")
     share = errors["flowing_total_share"].iloc[0]
     if not np.isnan(share):
@@ -389,11 +385,6 @@ def ahead_table(errors: pd.DataFrame, titles: Sequence[str]) -> str:
     if everywhere.problem:
         table += f"\nWARNING: the model does not know: {everywhere.problem}"
     return table
-
-
-def _vehicles(error: float) -> str:
-    """Return an error [veh] as text, "-" for NaN."""
-    return "-" if np.isnan(error) else f"{error:.1f}"
 
 
 def _rmse(errors: np.ndarray) -> PerRegion:

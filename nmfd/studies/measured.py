@@ -78,8 +78,7 @@ UNKNOWN_PARTS = (
 class Measured:
     """Tables of real detectors.
 
-    counts: file of the counts
-    read: numbers of rows, detectors and days in it, as text
+    read: numbers of rows, detectors and days of the counts, as text
     days: number of days
     left: lines about detectors whose counts cannot be right
     odd: region -> detector -> its flow over that of others at the same occupancy, if doubtful
@@ -89,7 +88,6 @@ class Measured:
     intervals: those of Identified
     """
 
-    counts: Path
     read: str
     days: int
     left: list[str]
@@ -167,42 +165,20 @@ def identify(
         raise InputError(f"--trip-length: {config.got('a number from 10 to 100000', trip_length)}")
     if (out / "network.toml").exists():
         raise InputError(f"{out / 'network.toml'}: exists; choose another --out")
-    data = load(
-        Path(counts),
-        detectors=_path(detectors),
-        regions=_path(regions),
-        about=_path(about),
-        city=city,
-        skip_bad=skip_bad,
-        trip_length=trip_length,
-    )
-    identified = fit(data, name=out.absolute().name, adjacency=_path(adjacency))
-    identified.write(out, data.counts.name)
-    return identified
-
-
-def _path(file: Path | str | None) -> Path | None:
-    return None if file is None else Path(file)
-
-
-def load(
-    counts: Path,
-    *,
-    detectors: Path | None = None,
-    regions: Path | None = None,
-    about: Path | None = None,
-    city: str | None = None,
-    skip_bad: bool = False,
-    trip_length: float | None = None,
-) -> Measured:
-    """Read the tables of `identify`, without detectors that cannot be right.
-
-    Raises: InputError
-    """
+    counts = Path(counts)
     rows, omitted = detector_tables.read_counts(counts, city=city, skip_bad=skip_bad)
     stations = detector_tables.read_detectors(detectors, regions, rows, counts, city=city)
-    names = sorted(set(stations["region"]), key=_order)
-    _check_units(rows, counts)
+    # Numbers are sorted by their value.
+    names = sorted(
+        set(stations["region"]), key=lambda name: name.rjust(9) if name.isdecimal() else name
+    )
+    speed = rows["flow"].sum() * VEHICLE_LENGTH_M / 3600.0 / max(rows["occ"].sum(), 1e-9)
+    if not SPEEDS_M_S[0] <= speed <= SPEEDS_M_S[1]:
+        raise InputError(
+            f"{counts}: flow and occ give a mean speed of {speed:.3g} m/s, with "
+            f"{VEHICLE_LENGTH_M:g} m for a vehicle over a loop; expected flow in veh/h per lane, "
+            "not per interval, and occ as a share, not percent"
+        )
     days = rows["day"].nunique()
     read = f"{len(rows):,} rows of {rows['detid'].nunique()} detectors on {days} days; "
     read += f"left out: {detector_tables.omitted(omitted)}"
@@ -216,8 +192,7 @@ def load(
     lane_km, coverage = _lane_km(stations, table, about or counts)
     trip_km, assumed = _trip_lengths(stations, table, trip_length)
     table = table.assign(lane_km=lane_km, coverage=coverage, trip_km=trip_km, assumed=assumed)
-    return Measured(
-        counts=counts,
+    data = Measured(
         read=read,
         days=days,
         left=_left_lines(faulty, used, days),
@@ -226,25 +201,9 @@ def load(
         regions=table,
         intervals=_intervals(rows, used, table),
     )
-
-
-def _order(name: str) -> str:
-    """Return the key by which regions are sorted: numbers by their value."""
-    return name.rjust(9) if name.isdecimal() else name
-
-
-def _check_units(rows: pd.DataFrame, counts: Path) -> None:
-    """Check that flow and occupancy give a plausible mean speed.
-
-    Raises: InputError
-    """
-    speed = rows["flow"].sum() * VEHICLE_LENGTH_M / 3600.0 / max(rows["occ"].sum(), 1e-9)
-    if not SPEEDS_M_S[0] <= speed <= SPEEDS_M_S[1]:
-        raise InputError(
-            f"{counts}: flow and occ give a mean speed of {speed:.3g} m/s, with "
-            f"{VEHICLE_LENGTH_M:g} m for a vehicle over a loop; expected flow in veh/h per lane, "
-            "not per interval, and occ as a share, not percent"
-        )
+    identified = _fitted(data, counts, name=out.absolute().name, adjacency=adjacency)
+    identified.write(out, counts.name)
+    return identified
 
 
 def _left_lines(
@@ -259,15 +218,13 @@ def _left_lines(
     for reason, bad_days in faulty.items():
         names = []
         for name, number in bad_days.items():
-            if name in used.index:
-                name = f"{name} ({number} of {days} days)"
-            names.append(name)
+            names.append(f"{name} ({number} of {days} days)" if name in used.index else name)
         lines.append(f"detectors left out, {reason}: {', '.join(names)}")
     return lines
 
 
 def _lane_km(
-    detectors: pd.DataFrame, about: pd.DataFrame, where: Path
+    detectors: pd.DataFrame, about: pd.DataFrame, where: Path | str
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return lane-kilometres (R,) and their share with detectors (R,).
 
@@ -364,11 +321,11 @@ def _intervals(rows: pd.DataFrame, detectors: pd.DataFrame, regions: pd.DataFram
     return table
 
 
-def fit(data: Measured, *, name: str, adjacency: Path | None = None) -> Identified:
+def _fitted(data: Measured, counts: Path, *, name: str, adjacency: Path | str | None) -> Identified:
     """Return the network with the MFDs that fit the intervals best.
 
     name: of the network
-    adjacency: csv file region,neighbour; None: by the detectors' positions
+    others: see `identify`
 
     Raises: InputError for a region with too few intervals, or that cannot be reached
     """
@@ -377,7 +334,7 @@ def fit(data: Measured, *, name: str, adjacency: Path | None = None) -> Identifi
     for region in fit_quality.nearly_empty(samples):
         left = "".join(f"; {line}" for line in data.left)
         raise InputError(
-            f"{data.counts}: region {names[region]} was measured in fewer than "
+            f"{counts}: region {names[region]} was measured in fewer than "
             f"{fit_quality.SAMPLES} intervals with {100 * LEAST_REPORTING:g} % of its detectors "
             f"reporting; give more data, or join it to another region{left}"
         )
@@ -394,13 +351,12 @@ def fit(data: Measured, *, name: str, adjacency: Path | None = None) -> Identifi
     if (network.hops < 0).any():
         i, j = np.argwhere(network.hops < 0)[0]
         raise InputError(
-            f"{adjacency or data.counts}: region {names[j]} cannot be reached from {names[i]}; "
+            f"{adjacency or counts}: region {names[j]} cannot be reached from {names[i]}; "
             "give all pairs of neighbours, region,neighbour, with --adjacency"
         )
     network = fit_quality.with_guesses(network, samples, lane_km)
     fits = fit_quality.region_fits(network, samples, lane_km=lane_km)
-    own = [_doubts(data, region) for region in names]
-    fits["doubts"] = [(*of_fit, *more) for of_fit, more in zip(fits["doubts"], own, strict=True)]
+    fits["doubts"] += pd.Series([tuple(_doubts(data, region)) for region in names])
     network = replace(network, doubts=tuple(fits["doubts"]))
     text = _report(data, network, fits)
     return Identified(network=network, fits=fits, intervals=data.intervals, text=text)
@@ -439,7 +395,9 @@ def _positions(detectors: pd.DataFrame, regions: pd.DataFrame) -> np.ndarray:
     return 1000.0 * np.stack([np.sin(angle), np.cos(angle)], axis=1)
 
 
-def _adjacency(path: Path | None, detectors: pd.DataFrame, regions: Sequence[str]) -> Adjacency:
+def _adjacency(
+    path: Path | str | None, detectors: pd.DataFrame, regions: Sequence[str]
+) -> Adjacency:
     """Return (R, R) bool: given, or regions with neighbouring detectors.
 
     Neighbours are joined by a side of a triangle (Delaunay) and not far apart.
@@ -465,10 +423,9 @@ def _adjacency(path: Path | None, detectors: pd.DataFrame, regions: Sequence[str
     distance = np.linalg.norm(points[sides[:, 0]] - points[sides[:, 1]], axis=1)
     near = sides[distance <= FAR * np.median(distance)]
     region = pd.Index(regions).get_indexer(placed["region"])
-    for i, h in region[near]:
-        adjacency[i, h] = i != h
-        adjacency[h, i] = i != h
-    return adjacency
+    i, h = region[near].T
+    adjacency[i, h] = i != h
+    return adjacency | adjacency.T
 
 
 def _doubts(data: Measured, name: str) -> list[str]:

@@ -24,13 +24,12 @@ from jaxtyping import Float
 from nmfd import closed_loop
 from nmfd.api import load_scenario
 from nmfd.arrays import StatesOverTime
-from nmfd.controllers.base import from_table
 from nmfd.controllers.dpc.policy import DpcController, Policy
 from nmfd.controllers.dpc.policy_file import load_policy
 from nmfd.controllers.dpc.rollout import Demands, Rollout
 from nmfd.controllers.mpc.controller import EconomicMpc, MpcController
 from nmfd.controllers.mpc.terminal import LATE, OFFSET, WEIGHTS, Terminal, clock
-from nmfd.controllers.rules import NoControl, PiGating
+from nmfd.controllers.rules import NoControl, scenario_gate
 from nmfd.controllers.strategy import parse
 from nmfd.model.planning import PlanningModel
 from nmfd.model.plant import NmfdPlant
@@ -88,7 +87,6 @@ def learn(
         def driven(driver: Controller) -> StatesOverTime:
             return closed_loop.run(NmfdPlant(city), driver, city, seed=seed)["accumulation"][:-1]
 
-        gating = from_table(PiGating, planning, "pi-gating")
         mpc = EconomicMpc(guidance=guidance)
         both = [driven(DpcController(after)), driven(mpc.make(planning))]
         for number in range(rounds):
@@ -103,7 +101,7 @@ def learn(
             else:
                 own = [
                     driven(NoControl().make(planning)),
-                    *([driven(gating.make(planning))] if planning.protected else []),
+                    *([driven(scenario_gate(planning))] if planning.protected else []),
                 ]
             visited = torch.tensor(np.stack(both + own), dtype=rollout.dtype)
             seen = 0

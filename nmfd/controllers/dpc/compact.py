@@ -37,8 +37,7 @@ The regional model answers prices by a logit (nmfd.model.answer). The policy is 
 network.
 """
 
-from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -56,6 +55,9 @@ from nmfd.controllers.dpc.policy import (
 from nmfd.model.planning import PlanningModel
 from nmfd.model.regional_model import RegionalModel
 from nmfd.tensors import PerPair, PerRegion
+
+if TYPE_CHECKING:
+    from nmfd.controllers.dpc.options import ConstantControl, GatingRule
 
 
 class CompactPolicy(Policy):
@@ -84,9 +86,7 @@ class CompactPolicy(Policy):
         else:
             gate = memory[..., 0, :]
             share = (0.5 + (gate.unsqueeze(-2) + relief)).clamp(0.0, 1.0)
-        share = torch.where(self.held, share, torch.ones_like(share))
-        perimeter = self.box.low + (self.box.high - self.box.low) * share
-        return perimeter * self.box.allowed, None
+        return self.box.opened(torch.where(self.held, share, torch.ones_like(share))), None
 
     def remember(self, x: PerPair, memory: Memory | None) -> Memory | None:
         """Return v and e after the states x; None without integral action.
@@ -145,21 +145,18 @@ class CompactPolicy(Policy):
 
 
 def rule(
-    kind: type[CompactPolicy],
-    planning: PlanningModel,
-    numbers: Sequence[float],
-    *,
-    name: str,
-    guidance: bool,
-    metering: bool,
+    kind: type[CompactPolicy], planning: PlanningModel, options: "GatingRule | ConstantControl"
 ) -> DpcController:
-    """Return the controller of a policy with these numbers.
+    """Return the controller of a policy with the numbers of a rule.
 
     kind: of the policy, for the protected regions
     """
-    architecture = Architecture(guidance=guidance, compact=planning.protected, metering=metering)
+    architecture = Architecture(
+        guidance=options.guides, compact=planning.protected, metering=options.metering
+    )
     policy = kind(planning.network, architecture)
-    policy.numbers.data.copy_(torch.tensor(numbers, dtype=DTYPE))
+    given = torch.tensor(options.numbers, dtype=DTYPE)
+    policy.numbers.data[: len(given)] = given
     controller = DpcController(policy)
-    controller.name = name
+    controller.name = options.name
     return controller

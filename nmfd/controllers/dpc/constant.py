@@ -26,9 +26,8 @@ class ConstantPolicy(CompactPolicy):
     def outputs(self, x: PerPair, memory: Memory | None = None) -> tuple[PerPair, None]:
         """Return the perimeter, and None."""
         gate = self._levels().gate
-        opening = torch.where(self.held, gate, torch.ones_like(gate)).expand(x.shape)
-        perimeter = self.box.low + (self.box.high - self.box.low) * opening
-        return perimeter * self.box.allowed, None
+        share = torch.where(self.held, gate, torch.ones_like(gate))
+        return self.box.opened(share.expand(x.shape)), None
 
     def remember(self, x: PerPair, memory: Memory | None) -> None:
         """Return None: nothing is remembered."""

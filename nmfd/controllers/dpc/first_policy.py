@@ -5,14 +5,13 @@ import torch
 from torch import Generator
 from torch.optim import Adam
 
-from nmfd.controllers.base import from_table
 from nmfd.controllers.dpc.compact import CompactPolicy
 from nmfd.controllers.dpc.numbers import Numbers
 from nmfd.controllers.dpc.options import Dpc
 from nmfd.controllers.dpc.policy import Architecture, Policy
 from nmfd.controllers.dpc.policy_file import new_policy
 from nmfd.controllers.dpc.rollout import Rollout
-from nmfd.controllers.rules import PiGating
+from nmfd.controllers.rules import scenario_gate
 from nmfd.model.planning import PlanningModel
 from nmfd.model.regional_model import RegionalModel
 
@@ -79,7 +78,7 @@ def begin_as_gate(policy: Policy, rollout: Rollout, generator: Generator) -> Non
     A gate is half closed at the set point of PI gating. The other boundaries stay open.
     """
     network = rollout.planning.network
-    gate = from_table(PiGating, rollout.planning, "pi-gating").make(rollout.planning)
+    gate = scenario_gate(rollout.planning)
     protected = gate.regions.tolist()
     set_point = torch.tensor(gate.set_point, dtype=rollout.dtype, device=rollout.device)
     boundaries = rollout.parameters.adjacency.expand(GATE_BATCH, -1, -1)

@@ -54,8 +54,10 @@ class FileKeeper:
             raise InputError(f"{file}: {wrong}")
         for key, now in self._configuration.items():
             if before.get(key) != now:
-                was = f"was {before.get(key)!r}, now {now!r}"
-                raise InputError(f"{file}: {key}: {was}; resume with the same settings or {remedy}")
+                raise InputError(
+                    f"{file}: {key}: was {before.get(key)!r}, now {now!r}; resume with the same "
+                    f"settings or {remedy}"
+                )
         try:
             restore(state)
         except Exception:  # whatever torch raises for tensors of another kind

@@ -21,7 +21,7 @@ from nmfd.controllers.dpc.numbers import (
 )
 from nmfd.model.planning import PlanningModel
 from nmfd.model.scenario import Scenario
-from nmfd.runs import config, shipped
+from nmfd.runs import shipped
 from nmfd.runs.config import Flow, Problem, Share, Text, Texts, got, setting, whole
 
 if TYPE_CHECKING:
@@ -227,6 +227,17 @@ class Dpc(Options):
         return Problem(key, "expected a scenario with protected regions; name them, or omit it")
 
 
+def numbers_problem(
+    numbers: tuple[float, ...], planning: PlanningModel, *, possible: bool, allowed: str
+) -> Problem | None:
+    """Return wrong numbers of a rule, or no protected region, as a problem."""
+    if not possible:
+        return Problem("numbers", got(allowed, list(numbers)))
+    if not planning.protected:
+        return Problem("numbers", "expected a scenario with protected regions; name them")
+    return None
+
+
 class GatingRule(Options):
     """Gates by numbers that were tuned in SUMO."""
 
@@ -236,29 +247,15 @@ class GatingRule(Options):
     numbers: NumbersOption = setting(MEANING, Numbers(), unit="-")
     metering: bool = setting("trips wait while regions are full; for +metering", False)
 
-    @property
-    def guides(self) -> bool:
-        return self.guidance
-
     def misfit(self, planning: PlanningModel) -> Problem | None:
-        """Return negative numbers, or no protected region, as a problem."""
-        if min(self.numbers) < 0.0:
-            return Problem("numbers", config.got("8 to 12 numbers >= 0", list(self.numbers)))
-        if not planning.protected:
-            return Problem("numbers", "expected a scenario with protected regions; name them")
-        return None
+        possible = min(self.numbers) >= 0.0
+        allowed = "8 to 12 numbers >= 0"
+        return numbers_problem(self.numbers, planning, possible=possible, allowed=allowed)
 
     def make(self, planning: PlanningModel) -> "DpcController":
         from nmfd.controllers.dpc.compact import CompactPolicy, rule
 
-        return rule(
-            CompactPolicy,
-            planning,
-            Numbers(*self.numbers),
-            name=self.name,
-            guidance=self.guidance,
-            metering=self.metering,
-        )
+        return rule(CompactPolicy, planning, self)
 
 
 class PricingRule(GatingRule):
@@ -276,29 +273,13 @@ class ConstantControl(Options):
     metering: bool = setting("trips wait beyond a rate; for +metering", False)
     name: ClassVar[str] = "constant"
 
-    @property
-    def guides(self) -> bool:
-        return self.guidance
-
     def misfit(self, planning: PlanningModel) -> Problem | None:
-        """Return negative numbers, a gate above 1, or no protected region."""
-        levels = Levels(*self.numbers)
-        if min(levels) < 0.0 or levels.gate > 1.0:
-            expected = "4 numbers >= 0, the first at most 1"
-            return Problem("numbers", got(expected, list(self.numbers)))
-        if not planning.protected:
-            return Problem("numbers", "expected a scenario with protected regions; name them")
-        return None
+        possible = min(self.numbers) >= 0.0 and Levels(*self.numbers).gate <= 1.0
+        allowed = "4 numbers >= 0, the first at most 1"
+        return numbers_problem(self.numbers, planning, possible=possible, allowed=allowed)
 
     def make(self, planning: PlanningModel) -> "DpcController":
         from nmfd.controllers.dpc.compact import rule
         from nmfd.controllers.dpc.constant import ConstantPolicy
 
-        return rule(
-            ConstantPolicy,
-            planning,
-            Levels(*self.numbers),
-            name=self.name,
-            guidance=self.guidance,
-            metering=self.metering,
-        )
+        return rule(ConstantPolicy, planning, self)

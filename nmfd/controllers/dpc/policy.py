@@ -19,10 +19,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import nn
 
-from nmfd.arrays import Adjacency
 from nmfd.model.answer import Answer
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Horizon
@@ -94,7 +93,11 @@ class PerimeterLayer(nn.Module):
         self.register_buffer("allowed", torch.as_tensor(allowed, dtype=DTYPE), persistent=False)
 
     def forward(self, numbers: PerBoundary) -> PerBoundary:
-        return (self.low + (self.high - self.low) * torch.sigmoid(numbers)) * self.allowed
+        return self.opened(torch.sigmoid(numbers))
+
+    def opened(self, share: PerBoundary) -> PerBoundary:
+        """Return u that is u_min for a share of 0 and u_max for 1 (-)."""
+        return (self.low + (self.high - self.low) * share) * self.allowed
 
 
 class SplitsLayer(nn.Module):
@@ -168,7 +171,9 @@ class Policy(nn.Module):
         scale = torch.tensor([[mfd.critical] for mfd in network.mfds], dtype=DTYPE)
         self.register_buffer("scale", scale, persistent=not architecture.local)
         if architecture.only_adjacent:
-            onward = _adjacent(network.adjacency)
+            rows = [np.flatnonzero(row) for row in network.adjacency]
+            most = max(map(len, rows))  # shorter rows repeat their last region
+            onward = np.stack([np.pad(row, (0, most - len(row)), "edge") for row in rows])
         else:
             onward = np.tile(np.arange(regions), (regions, 1))
         here = np.arange(regions)[:, None]
@@ -261,27 +266,21 @@ class Policy(nn.Module):
     def _hidden(self, x: PerPair) -> Float[torch.Tensor, "... H"]:
         """Return the output of the backbone."""
         if self.architecture.local:
-            return self.backbone(self._around(x))
+            # Features of every boundary, of region i and then of region h: accumulation, mean one
+            # of the neighbours, and trips that end there, relative to the critical accumulation.
+            critical = self.scale.squeeze(-1)
+            full = x.sum(-1).to(critical.dtype) / critical
+            ending = torch.diagonal(x, dim1=-2, dim2=-1).to(critical.dtype) / critical
+            allowed = self.box.allowed
+            beside = (full[..., self.onward] * allowed).sum(-1) / allowed.sum(-1).clamp(min=1.0)
+            regions = torch.stack([full, beside, ending], dim=-1)
+            here = regions.unsqueeze(-2).expand(*regions.shape[:-1], self.onward.shape[1], -1)
+            return self.backbone(torch.cat([here, regions[..., self.onward, :]], dim=-1))
         return self.backbone((x / self.scale).flatten(-2))
 
     def _full(self, x: PerPair) -> PerRegion:
         """Return the accumulations relative to the critical ones (-, (..., R))."""
         return x.to(self.scale.dtype).sum(-1) / self.scale.squeeze(-1)
-
-    def _around(self, x: PerPair) -> Float[torch.Tensor, "*#B R D F"]:
-        """Return the features of every boundary.
-
-        They are those of region i, then those of region h: its accumulation, the mean one of its
-        neighbours, and its trips that end there, relative to the critical accumulation.
-        """
-        critical = self.scale.squeeze(-1)
-        full = x.sum(-1).to(critical.dtype) / critical
-        ending = torch.diagonal(x, dim1=-2, dim2=-1).to(critical.dtype) / critical
-        allowed = self.box.allowed
-        beside = (full[..., self.onward] * allowed).sum(-1) / allowed.sum(-1).clamp(min=1.0)
-        regions = torch.stack([full, beside, ending], dim=-1)
-        here = regions.unsqueeze(-2).expand(*regions.shape[:-1], self.onward.shape[1], -1)
-        return torch.cat([here, regions[..., self.onward, :]], dim=-1)
 
 
 def _hidden_layers(architecture: Architecture, inputs: int, count: int) -> list[nn.Module]:
@@ -301,16 +300,6 @@ def _decoder(architecture: Architecture, outputs: int) -> nn.Module:
     if not layers:
         return last
     return nn.Sequential(*layers, last)
-
-
-def _adjacent(adjacency: Adjacency) -> Int[np.ndarray, "R D"]:
-    """Return the regions adjacent to each (R, D).
-
-    Shorter rows repeat their last region.
-    """
-    rows = [np.flatnonzero(row) for row in adjacency]
-    most = max(len(row) for row in rows)
-    return np.stack([np.pad(row, (0, most - len(row)), "edge") for row in rows])
 
 
 class DpcController:

@@ -67,8 +67,9 @@ def load_policy(path: Path, network: RegionalModel) -> tuple[Policy, dict]:
         if trained != network.hash and not architecture.local:
             other = f"network {content['network']!r} ({trained})"
             problem = f"the policy was trained for {other}, not for {network.name!r}"
-            remedy = "train one with 'nmfd train'"
-            raise InputError(f"{path}: network_hash: {problem} ({network.hash}); {remedy}")
+            raise InputError(
+                f"{path}: network_hash: {problem} ({network.hash}); train one with 'nmfd train'"
+            )
         policy = new_policy(network, architecture)
         policy.load_state_dict(content["weights"])
     except (AttributeError, KeyError, TypeError, RuntimeError):

@@ -15,7 +15,7 @@ from nmfd.controllers.dpc.policy import commanded
 from nmfd.model import dynamics
 from nmfd.model.planning import PlanningModel
 from nmfd.model.scenario import pairs_with_demand
-from nmfd.tensors import PerPair, PerRegion, PerTurn
+from nmfd.tensors import PerPair, PerRegion
 
 States = Float[torch.Tensor, "B R R"]
 Demands = Float[torch.Tensor, "T B R R"]  # or states over time
@@ -83,9 +83,8 @@ class Rollout:
         self.demand = self._tensor(planning.forecast)
         self.nominal_splits = self._tensor(network.nominal_splits)
         self.bound = self._tensor(planning.destinations)
-        if planning.initial is None:
-            self.start = torch.zeros_like(self.demand[0])
-        else:
+        self.start = torch.zeros_like(self.demand[0])
+        if planning.initial is not None:
             self.start = self._tensor(planning.initial)
 
     def _tensor(self, values: np.ndarray) -> torch.Tensor:
@@ -271,7 +270,9 @@ class Rollout:
         if self.detour_cost or self.holding_cost:
             perimeter, splits = commanded(policy, seen)
             if self.detour_cost and splits is not None:
-                diverted = self._diverted(exact, splits).sum((0, -2, -1))
+                leaving = dynamics.desired_outflow(self.parameters, exact, splits)
+                share = 0.5 * (splits - self.nominal_splits).abs().sum(-2)  # off the nominal ones
+                diverted = (share * leaving).sum((0, -2, -1))
                 vehicles = vehicles + self.detour_cost * diverted
             if self.holding_cost:
                 held = self._held(exact, perimeter).sum((0, -1))
@@ -289,11 +290,6 @@ class Rollout:
         closed = (network.u_max - perimeter) / (network.u_max - network.u_min) * p.adjacency
         boundaries = p.adjacency.sum(-1).clamp(min=1.0)
         return dynamics.rate(p, vehicles) * vehicles * closed.sum(-1) / boundaries
-
-    def _diverted(self, x: PerPair, splits: PerTurn) -> PerPair:
-        """Return the flow off the nominal splits (veh/s, (..., R, R))."""
-        leaving = dynamics.desired_outflow(self.parameters, x, splits)
-        return 0.5 * (splits - self.nominal_splits).abs().sum(-2) * leaving
 
 
 def can_compile(device: str = "cpu") -> bool:

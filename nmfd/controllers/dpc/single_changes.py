@@ -35,36 +35,23 @@ def changed_policies(
 
     kept: numbers of a compact policy that stay as they are
     """
-    if isinstance(policy, CompactPolicy):
-        for name, changes in _changed_numbers(policy).items():
-            if not set(changes) & set(kept):
-                yield name, _with_numbers(policy, changes)
+    if not isinstance(policy, CompactPolicy):
+        yield from _with_outputs(policy, planning)
         return
-    yield from _with_outputs(policy, planning)
-
-
-def _changed_numbers(policy: CompactPolicy) -> dict[str, dict[str, float]]:
-    """Return the changed numbers of a compact policy."""
     numbers = Numbers(*policy.numbers.tolist())
     changes = {GATE: GATE_NUMBERS, OPEN: OPEN_NUMBERS}
     if policy.architecture.guidance:
         for name, factor in FACTORS.items():
-            changes[name] = {
-                "price": factor * numbers.price,
-                "elsewhere": factor * numbers.elsewhere,
-            }
+            prices = {"price": factor * numbers.price, "elsewhere": factor * numbers.elsewhere}
+            changes[name] = prices
     if policy.architecture.metering:
         changes[UNMETERED] = UNMETERED_NUMBERS
-    return changes
-
-
-def _with_numbers(policy: CompactPolicy, changes: dict[str, float]) -> CompactPolicy:
-    """Return a copy of a compact policy with other numbers."""
-    changed = copy.deepcopy(policy)
-    with torch.no_grad():
-        for name, value in changes.items():
-            changed.numbers[Numbers._fields.index(name)] = value
-    return changed
+    for name, values in changes.items():
+        if not set(values) & set(kept):
+            changed = copy.deepcopy(policy)
+            others = torch.tensor(numbers._replace(**values))
+            changed.numbers.data.copy_(others)
+            yield name, changed
 
 
 def _with_outputs(policy: Policy, planning: PlanningModel) -> Iterator[tuple[str, Policy]]:

@@ -20,7 +20,7 @@ import numpy as np
 from pydantic import model_validator
 
 from nmfd.arrays import PerPair, PerTurn
-from nmfd.controllers.base import FileKind, Options, from_table
+from nmfd.controllers.base import FileKind, Options
 from nmfd.controllers.mpc import edge_model
 from nmfd.controllers.mpc.edge_model import (
     Decision,
@@ -32,7 +32,7 @@ from nmfd.controllers.mpc.edge_model import (
 )
 from nmfd.controllers.mpc.projected_gradient import AT_REST, TIME_LIMIT, Late, Minimum, minimise
 from nmfd.controllers.mpc.terminal import Terminal, read
-from nmfd.controllers.rules import PiGate, PiGating
+from nmfd.controllers.rules import PiGate, scenario_gate
 from nmfd.model.planning import PlanningModel
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
@@ -92,20 +92,16 @@ class EconomicMpc(Options):
         return self
 
     @property
-    def guides(self) -> bool:
-        return self.guidance
-
-    @property
     def reads(self) -> FileKind | None:
         return VALUE if self.terminal else None
 
     def misfit(self, planning: PlanningModel) -> Problem | None:
         """Return a model that is not worth planning with as a problem."""
-        misleads = planning.network.misleads
-        if not misleads or self.anyway:
+        network = planning.network
+        if not network.misleads or self.anyway:
             return None
-        name = planning.network.name
-        return Problem("anyway", f"the model {name}: {misleads}; set anyway = true to plan with it")
+        problem = f"the model {network.name}: {network.misleads}"
+        return Problem("anyway", f"{problem}; set anyway = true to plan with it")
 
     def make(self, planning: PlanningModel) -> "MpcController":
         return MpcController(planning, self)
@@ -232,7 +228,7 @@ class MpcController:
             self.name += "-terminal"
         self.options = options
         network = planning.network
-        horizon = self.options.horizon
+        horizon = options.horizon
         self._terminal = terminal
         self._tolerance = TOLERANCE if terminal is None else TERMINAL_TOLERANCE
         self._planning = planning
@@ -244,8 +240,8 @@ class MpcController:
             # With one Euler step per interval, the last controls move vehicles that do not arrive
             # within the horizon.
             self._moves = horizon - 1
-        if self.options.control_horizon is not None:
-            self._moves = min(self._moves, self.options.control_horizon)
+        if options.control_horizon is not None:
+            self._moves = min(self._moves, options.control_horizon)
         self._model = edge_model.build(network, self._used, guidance=guidance, **planning.scheme)
         rounded = replace(self._model, rounding=JAM_ROUNDING * min(mfd.jam for mfd in network.mfds))
         self.vehicle_steps = partial(edge_model.vehicle_steps, self._model)  # exact
@@ -254,10 +250,10 @@ class MpcController:
         self._open = self.admissible.open(self._moves)
         self._gating: PiGate | None = None
         if planning.protected:
-            self._gating = from_table(PiGating, planning, "pi-gating").make(planning)
+            self._gating = scenario_gate(planning)
         self.deadline = planning.step  # s: a later answer is of no use
         self._ipopt = None
-        if self.options.solver == "ipopt":
+        if options.solver == "ipopt":
             from nmfd.controllers.mpc.ipopt import Ipopt  # with CasADi and torch
 
             limits = {"max_iter": MAX_ITERATIONS, "max_wall_time": DEADLINE_SHARE * self.deadline}

@@ -26,6 +26,7 @@ from nmfd.model.regional_model import LEAST_LIMIT, LEAST_ROOM, SHARPNESS, Region
 PerCell = Float[np.ndarray, " C"]
 PerEdge = Float[np.ndarray, " E"]
 PerTurn = Float[np.ndarray, " V"]
+TurnNumbers = Int[np.ndarray, " V"]
 Demands = Float[np.ndarray, "H C"]
 Plan = Float[np.ndarray, "K D"]  # D = E + V decisions in each interval
 Decision = Float[np.ndarray, " D"]
@@ -60,9 +61,9 @@ class Turns:
     destinations: Int[np.ndarray, " J"]
     edges: Int[np.ndarray, "E 2"]
     turns: Int[np.ndarray, "V 3"]
-    edge: Int[np.ndarray, " V"]
-    source: Int[np.ndarray, " V"]
-    target: Int[np.ndarray, " V"]
+    edge: TurnNumbers
+    source: TurnNumbers
+    target: TurnNumbers
     own: PerTurn
     region: Int[np.ndarray, " C"]
     ends: Bool[np.ndarray, " C"]
@@ -129,9 +130,6 @@ def build(
     number = np.zeros(regions, dtype=int)  # of a destination
     number[destinations] = np.arange(count)
     cells = np.arange(regions * count)
-    rates = network.exit_rates
-    if rates is None:
-        rates = np.ones(network.adjacency.shape)
     detours = network.detours
     if detours is not None:
         detours = detours[here, onward, bound]
@@ -139,7 +137,7 @@ def build(
     if capacity is not None:
         capacity = capacity[tuple(edges.T)]
     return Turns(
-        exit_rates=rates[:, destinations].ravel(),
+        exit_rates=network.relative_rates[:, destinations].ravel(),
         detours=detours,
         storage=network.storage,
         capacity=capacity,

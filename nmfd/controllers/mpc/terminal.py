@@ -108,8 +108,10 @@ def read(path: Path, planning: PlanningModel, controller: str) -> Terminal:
     network = planning.network
     same_destinations = np.array_equal(terminal.used, planning.destinations)
     if terminal.network_hash != network.hash or not same_destinations:
-        other = "was learned for another regional model or other destinations than those of"
-        raise InputError(f"{path}: network_hash: {other} {network.name!r}")
+        raise InputError(
+            f"{path}: network_hash: was learned for another regional model or other destinations "
+            f"than those of {network.name!r}"
+        )
     if terminal.controller != controller:
         raise InputError(
             f"{path}: is the value function of {terminal.controller}, not of {controller}"

@@ -48,8 +48,9 @@ class LinkPlant:
         if scenario.initial is not None:
             raise InputError(f"{scenario.where}: initial: a city of links begins empty; remove it")
         if scenario.step % 1.0:
-            expected = f"expected whole seconds, got {scenario.step:g}"
-            raise InputError(f"{scenario.where}: step: {expected}")
+            raise InputError(
+                f"{scenario.where}: step: expected whole seconds, got {scenario.step:g}"
+            )
         _check_demand(scenario, network, where)
         self.model = LinkModel(
             network,
@@ -130,8 +131,9 @@ def _check_demand(scenario: Scenario, network: LinkNetwork, where: Path) -> None
     regions = network.regions
     remedy = "write it with 'cosim links'"
     if regions != scenario.network.regions:
-        problem = f"has {regions} regions, the scenario {scenario.network.regions}"
-        raise InputError(f"{where}: {problem}; {remedy}")
+        raise InputError(
+            f"{where}: has {regions} regions, the scenario {scenario.network.regions}; {remedy}"
+        )
     pair = network.region[network.entry_link] * regions + network.destination
     begin = np.bincount(pair, network.origin.min(axis=0), regions**2).reshape(regions, regions)
     missing = (scenario.demand.sum(axis=0) > 0.0) & (begin == 0.0)
