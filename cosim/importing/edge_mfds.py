@@ -186,7 +186,7 @@ def _outflow(streets: Streets, rows: pd.DataFrame, labels: EdgeNumbers) -> pd.Se
 
 
 def _critical(cloud: Mapping[str, Points]) -> float:
-    """Return the critical accumulation (veh) of samples of outflow, NaN if not seen."""
+    """Return the critical accumulation (veh) of outflow; NaN: not seen."""
     points = fit_quality.own_points(cloud)
     curve = mfd.fit(*points.T)
     if fit_quality.falls(curve, points[:, 0].max()):

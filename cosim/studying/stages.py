@@ -257,7 +257,7 @@ def measured(runner: Runner, load: Loading, runs: Sequence[Result]) -> RegionalM
 
 
 def train_gates(scenario: Scenario) -> None:
-    """Train a DPC policy for the gates, unless that is done or the model is too bad.
+    """Train a DPC policy for the gates, unless that is done or refused.
 
     It is written into the scenario's folder.
     """

@@ -1,4 +1,4 @@
-"""SUMO's output files: tripinfo while SUMO writes it, emissions and traffic by edge."""
+"""SUMO's output files: tripinfo while it is written, totals by edge."""
 
 import math
 import xml.etree.ElementTree as ElementTree
@@ -130,7 +130,7 @@ def options(trip_file: Path, *, detailed: bool, drawn: bool = False) -> list[str
 
 
 def write_edge_outputs(path: Path, emissions: Path, traffic: Path) -> None:
-    """Write an additional file that makes SUMO write two outputs over the whole run.
+    """Write an additional file for two outputs over the whole run.
 
     emissions, traffic: SUMO's outputs by edge; emissions also of edges on junctions
     """
