@@ -50,10 +50,10 @@ def test_importing_the_packages_imports_nothing_heavy():
     assert json.loads(subprocess.check_output([sys.executable, "-c", code], text=True)) == []
 
 
-@pytest.mark.parametrize("module", ["nmfd.api", "cosim.api", "cosim.evaluation.simulate"])
-def test_runs_without_policies_load_neither_torch_nor_figures(module):
+def test_runs_without_policies_load_neither_torch_nor_figures():
+    modules = "nmfd.api, cosim.api, cosim.evaluation.simulate"
     heavy = ("torch", "casadi", "matplotlib", "bokeh", "optuna", "sklearn", "distributed")
-    code = f"import sys, {module}; print(*(name for name in {heavy} if name in sys.modules))"
+    code = f"import sys, {modules}; print(*(name for name in {heavy} if name in sys.modules))"
     assert subprocess.check_output([sys.executable, "-c", code], text=True) == "\n"
 
 
@@ -85,7 +85,7 @@ def test_run_and_benchmark_agree_with_the_command_line(tmp_path):
 
 
 HALF = tiny.Acting(
-    lambda seen: nmfd.Controls(perimeter=np.full(seen.accumulation.shape, 0.5), splits=None), "half"
+    lambda seen: nmfd.Controls(perimeter=np.full(seen.accumulation.shape, 0.5)), "half"
 )
 
 
