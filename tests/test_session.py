@@ -78,7 +78,7 @@ def test_demand_and_steps_are_arguments(scenario):
     np.testing.assert_allclose(short["accumulation"][1].sum(), 1.2 * plain["accumulation"][1].sum())
 
 
-def test_a_city_is_its_settings(tmp_path):
+def test_a_city_is_its_settings():
     city = cosim.Settings(signals="max-pressure", guided=True)
     run = cosim.run("demo", nmfd.PiGating(), city=city, seed=1, steps=2)
     assert run.controller == "pi-gating+guided+max-pressure"
