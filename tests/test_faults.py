@@ -137,7 +137,7 @@ def test_a_number_that_is_not_finite_is_named(scenario, plant, wrong, at, value)
         "signal:",
     ],
 )
-def test_wrong_faults(tmp_path, text):
+def test_wrong_faults(text):
     with pytest.raises(InputError, match="expected frozen, delayed:INTERVALS"):
         faults.parse(text, "here", 2)
 

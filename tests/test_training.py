@@ -4,6 +4,7 @@ regions."""
 import math
 import shutil
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -271,6 +272,24 @@ def test_the_best_validation_is_kept(tmp_path, scenario, monkeypatch):
     }
     expected["validation_veh_s"] = 5.0
     assert expected.items() <= torch.load(out, weights_only=True)["configuration"].items()
+
+
+def test_a_resumed_training_ends_as_if_it_had_never_stopped(tmp_path, scenario, monkeypatch):
+    monkeypatch.setattr(training, "VALIDATION_PERIOD", 1)
+
+    def stop(done, steps, note):
+        if done == 3:
+            raise KeyboardInterrupt
+
+    train = partial(training.train, scenario, parse("dpc-pc"), seed=0, steps=6)
+    whole = train(out=tmp_path / "whole.pt")
+    out = tmp_path / "stopped.pt"
+    with pytest.raises(KeyboardInterrupt):
+        train(out=out, progress=stop)
+    train(out=out, resume=True)
+    expected = torch.load(whole, weights_only=True)["weights"]
+    for name, weight in torch.load(out, weights_only=True)["weights"].items():
+        assert torch.equal(weight, expected[name]), name
 
 
 def test_a_network_that_misses_a_single_change_says_so(tmp_path, scenario, monkeypatch, capsys):
