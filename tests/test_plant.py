@@ -82,7 +82,7 @@ def test_ledger_and_crossings_balance(scenario, plant_of):
     assert record.arrivals.sum() > 100
 
 
-def test_the_samples_are_those_of_every_edge(scenario, plant_of):
+def test_the_samples_are_those_of_every_edge(plant_of):
     """Both while there are fewer vehicles than edges, and later."""
     plant, asked, crossing = plant_of(), [], []
     plant.reset(1)
@@ -175,7 +175,7 @@ def test_guided_vehicles_are_asked_again(scenario, plant_of):
     assert [m.accumulation.tolist() for m in first] == [m.accumulation.tolist() for m in second]
 
 
-def test_second_session_is_refused(scenario, plant_of):
+def test_second_session_is_refused(plant_of):
     plant_of().reset(1)
     with pytest.raises(RuntimeError, match="already open"):
         Session(Path("a"), Path("b"), seed=0)
