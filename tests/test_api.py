@@ -8,7 +8,6 @@ import re
 import subprocess
 import sys
 from importlib import resources
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -99,19 +98,6 @@ def test_figures_are_drawn_again_if_a_run_is_new(tmp_path):
     first = drawn("no-control")
     assert drawn("no-control") == first
     assert drawn("no-control", "greedy") > first
-
-
-def test_a_controller_and_a_plant_as_objects(tmp_path):
-    scenario = nmfd.load_scenario(tiny.write(tmp_path))
-    inner = nmfd.NmfdPlant(scenario)
-    own = SimpleNamespace(
-        reset=inner.reset, step=inner.step, observe=inner.observe
-    )  # all that the docstring asks for
-    trajectory = nmfd.run(scenario, HALF, steps=5, plant=own)
-    assert (trajectory.controller, trajectory.plant) == ("half", "SimpleNamespace")
-    assert (trajectory["accumulation"] == nmfd.run(scenario, HALF, steps=5)["accumulation"]).all()
-    assert trajectory["perimeter"].shape == (5, 2, 2)
-    assert (trajectory["perimeter"][:, [0, 1], [1, 0]] == 0.5).all()
 
 
 @pytest.mark.parametrize(
