@@ -1,5 +1,4 @@
-"""What every test shares: one thread per process, and no skipped test where `--no-skips` forbids
-it."""
+"""What every test shares: one thread per process, checked annotations, and small scenarios."""
 
 import gc
 import os
@@ -28,23 +27,8 @@ SHAPED = [
     "cosim.sumo.trips",
 ]
 
-# Reasons for which a test may be skipped all the same; benchmarks run when they are asked for.
-ALLOWED = ("no GPU", "no real city", "no neuromancer", "--benchmark-skip active")
-
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption(
-        "--no-skips",
-        action="store_true",
-        help="a skipped test fails, unless a GPU or a real city is missing",
-    )
-    parser.addoption(
-        "--may-skip",
-        action="append",
-        default=[*ALLOWED],
-        metavar="REASON",
-        help="nor does it fail for this reason",
-    )
     parser.addoption(
         "--annotations",
         choices=("on", "off"),
@@ -77,15 +61,6 @@ def pytest_keyboard_interrupt() -> None:
     NodeManager.EXIT_TIMEOUT = (
         0.1  # s, that workers have to end: they are in the middle of a test; usually it is 10 s
     )
-
-
-def _fail_if_skipped(
-    report: pytest.TestReport | pytest.CollectReport, config: pytest.Config
-) -> None:
-    if config.getoption("no_skips") and report.skipped and not hasattr(report, "wasxfail"):
-        reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else str(report.longrepr)
-        if not any(allowed in reason for allowed in config.getoption("may_skip")):
-            report.outcome, report.longrepr = "failed", f"--no-skips: {reason}"
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -135,17 +110,3 @@ def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
     """No check of annotations: for tests of what users are told who give something of a wrong
     type."""
     monkeypatch.setattr(config, "jaxtyping_disable", True)
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_makereport(item: pytest.Item):
-    report = yield
-    _fail_if_skipped(report, item.config)
-    return report
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_make_collect_report(collector: pytest.Collector):
-    report = yield
-    _fail_if_skipped(report, collector.config)
-    return report

@@ -19,7 +19,7 @@ from nmfd.model.scenario import with_demand
 from nmfd.runs import run_many
 from nmfd.types import Result
 
-SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
+SCENARIO = "grid7_peak"
 STEPS = 5
 SHARE = {"no-control": 1.0, "pi-gating": 0.8, "dpc-pcrg": 0.5}  # of the vehicles without control
 

@@ -8,7 +8,6 @@ import re
 import subprocess
 import sys
 from importlib import resources
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -50,10 +49,10 @@ def test_importing_the_packages_imports_nothing_heavy():
     assert json.loads(subprocess.check_output([sys.executable, "-c", code], text=True)) == []
 
 
-@pytest.mark.parametrize("module", ["nmfd.api", "cosim.api", "cosim.evaluation.simulate"])
-def test_runs_without_policies_load_neither_torch_nor_figures(module):
+def test_runs_without_policies_load_neither_torch_nor_figures():
+    modules = "nmfd.api, cosim.api, cosim.evaluation.simulate"
     heavy = ("torch", "casadi", "matplotlib", "bokeh", "optuna", "sklearn", "distributed")
-    code = f"import sys, {module}; print(*(name for name in {heavy} if name in sys.modules))"
+    code = f"import sys, {modules}; print(*(name for name in {heavy} if name in sys.modules))"
     assert subprocess.check_output([sys.executable, "-c", code], text=True) == "\n"
 
 
@@ -85,7 +84,7 @@ def test_run_and_benchmark_agree_with_the_command_line(tmp_path):
 
 
 HALF = tiny.Acting(
-    lambda seen: nmfd.Controls(perimeter=np.full(seen.accumulation.shape, 0.5), splits=None), "half"
+    lambda seen: nmfd.Controls(perimeter=np.full(seen.accumulation.shape, 0.5)), "half"
 )
 
 
@@ -99,19 +98,6 @@ def test_figures_are_drawn_again_if_a_run_is_new(tmp_path):
     first = drawn("no-control")
     assert drawn("no-control") == first
     assert drawn("no-control", "greedy") > first
-
-
-def test_a_controller_and_a_plant_as_objects(tmp_path):
-    scenario = nmfd.load_scenario(tiny.write(tmp_path))
-    inner = nmfd.NmfdPlant(scenario)
-    own = SimpleNamespace(
-        reset=inner.reset, step=inner.step, observe=inner.observe
-    )  # all that the docstring asks for
-    trajectory = nmfd.run(scenario, HALF, steps=5, plant=own)
-    assert (trajectory.controller, trajectory.plant) == ("half", "SimpleNamespace")
-    assert (trajectory["accumulation"] == nmfd.run(scenario, HALF, steps=5)["accumulation"]).all()
-    assert trajectory["perimeter"].shape == (5, 2, 2)
-    assert (trajectory["perimeter"][:, [0, 1], [1, 0]] == 0.5).all()
 
 
 @pytest.mark.parametrize(

@@ -223,9 +223,8 @@ def test_demand_files(tmp_path, content):
 def city(tmp_path_factory):
     """Return the folder of a city, a controller, and the network and scenario imported from it."""
     project = tmp_path_factory.mktemp("project")
-    config = tiny_city.city(project)
+    tiny_city.imported(project)
     good(nmfd("new-controller", project / "mine.py"))
-    good(cosim("import", config, "--regions", 3, "--out", project / "networks" / "tiny"))
     return project
 
 
@@ -240,10 +239,6 @@ def changed(attribute: str, value: str):
 DAMAGES = {
     "networks/tiny/regions.csv": {
         "empty": lambda text: "",
-        "columns": lambda text: "a,b\n",
-        "unknown edge": lambda text: "edge,region\nnowhere,0\n",
-        "twice": lambda text: text + text.splitlines()[1] + "\n",
-        "gap": lambda text: "edge,region\nA0A1,7\n",
         "an edge without a region": lambda text: "\n".join(text.splitlines()[:-1]) + "\n",
     },
     "networks/tiny/city.net.xml.gz": {
@@ -353,7 +348,7 @@ LINES = """
     train {s} --controller dpc-pc --steps 0
     train {s} --controller dpc-pc --device tpu
     train {s} --controller dpc-pc --out {none}/x.pt
-    train {s} --controller dpc-pc --resume
+    train {s} --controller dpc-pc --steps 1 --resume
     show {none}
     show {s} --out /dev/null/x
     robustness {s} --controllers no-control --sigmas a|-1|nan

@@ -2,7 +2,6 @@
 The command."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,7 +19,7 @@ from nmfd.model.plant import NmfdPlant
 from nmfd.model.scenario import with_demand
 from nmfd.studies import bound
 
-ECONOMIC = Path(__file__).parents[1] / "scenarios" / "economic_mpc"
+ECONOMIC = "economic_mpc"
 
 
 def closed(scenario, controller):

@@ -141,28 +141,6 @@ def test_an_interrupted_benchmark_continues(both, tmp_path, monkeypatch, in_proc
     assert same(runs(tmp_path / "out"), runs(tmp_path / "whole"))
 
 
-def test_training_can_be_interrupted_and_resumed(folder, monkeypatch):
-    monkeypatch.setattr(training, "VALIDATION_PERIOD", 1)
-    calls, clip = [], torch.nn.utils.clip_grad_norm_
-
-    def stopped(*args):
-        calls.append(None)
-        if len(calls) == 3:
-            raise KeyboardInterrupt
-        return clip(*args)
-
-    monkeypatch.setattr(torch.nn.utils, "clip_grad_norm_", stopped)
-    command = ["train", folder, "--controller", "dpc-pc", "--steps", 4]
-    result = nmfd(*command)
-    assert result.exit_code == 130
-    assert result.stderr.count("\n") == 1
-    assert result.stderr.endswith(f"is {folder / 'dpc-pc.pt'}; add --resume to continue\n")
-    assert (folder / "dpc-pc.pt").is_file()
-    good(nmfd(*command, "--resume"))
-    assert len(calls) == 5
-    assert {path.name for path in folder.iterdir()} == {"scenario.toml", "dpc-pc.pt"}
-
-
 def test_without_a_compiler_training_is_not_compiled(folder, tmp_path, monkeypatch):
     (tmp_path / "bin").mkdir()
     monkeypatch.setenv("PATH", str(tmp_path / "bin"))

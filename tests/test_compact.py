@@ -270,34 +270,20 @@ def test_constant_control_measures_nothing():
 
 
 @pytest.mark.parametrize(
-    "numbers, protected, problem",
+    "controller, numbers, protected, problem",
     [
-        ([1.2, 0.0, 0.0, 1.0], (3,), "numbers: expected 4 numbers >= 0, the first at most 1"),
-        ([0.5] * 3, (3,), "numbers: should have at least 4"),
-        ([0.5] * 4, (), "numbers: expected a scenario with protected regions"),
+        ("constant", [1.2, 0.0, 0.0, 1.0], (3,), "expected 4 numbers >= 0, the first at most 1"),
+        ("constant", [0.5] * 3, (3,), "should have at least 4"),
+        ("constant", [0.5] * 4, (), "expected a scenario with protected regions"),
+        ("pricing-rule", [-1.0] * 8, (3,), "expected 8 to 12 numbers >= 0"),
+        ("pricing-rule", [1.0] * 7, (3,), "should have at least 8"),
+        ("pricing-rule", [1.0] * 8, (), "expected a scenario with protected regions"),
     ],
 )
-def test_wrong_numbers_of_constant_control(numbers, protected, problem):
-    options = {"constant": {"numbers": numbers}}
+def test_wrong_numbers(controller, numbers, protected, problem):
+    options = {controller: {"numbers": numbers}}
     scenario = replace(
         load_scenario("economic_mpc"), protected=protected, controller_options=options
     )
-    with pytest.raises(InputError, match=f"controllers.constant.{problem}"):
-        parse("constant").make(scenario)
-
-
-@pytest.mark.parametrize(
-    "numbers, protected, problem",
-    [
-        ([-1.0] * 8, (3,), "numbers: expected 8 to 12 numbers >= 0"),
-        ([1.0] * 7, (3,), "numbers: should have at least 8"),
-        ([1.0] * 8, (), "numbers: expected a scenario with protected regions"),
-    ],
-)
-def test_wrong_numbers_of_a_rule(numbers, protected, problem):
-    options = {"pricing-rule": {"numbers": numbers}}
-    scenario = replace(
-        load_scenario("economic_mpc"), protected=protected, controller_options=options
-    )
-    with pytest.raises(InputError, match=f"controllers.pricing-rule.{problem}"):
-        parse("pricing-rule").make(scenario)
+    with pytest.raises(InputError, match=f"controllers.{controller}.numbers: {problem}"):
+        parse(controller).make(scenario)

@@ -3,7 +3,6 @@ itself."""
 
 import re
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,17 +17,13 @@ from cosim.evaluation.model_validation import observed, outflow_samples, predict
 from cosim.plant.strategy import parse
 from nmfd.api import load_scenario
 from nmfd.model import dynamics, mfd
-from nmfd.model.identification import observed_split_ratios
 from nmfd.model.mfd import held_up
-from nmfd.model.regional_model import load_network, network_toml
 from nmfd.studies.fit_quality import fit_table, nearly_empty, predictions, region_fits, with_guesses
-
-ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope="module")
 def scenario():
-    return replace(load_scenario(ROOT / "scenarios" / "economic_mpc"), measurement_std=0.0)
+    return replace(load_scenario("economic_mpc"), measurement_std=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +109,7 @@ def test_errors_where_the_critical_accumulation_was_not_seen(scenario, result):
 
 def test_the_model_of_those_who_drive():
     """A controller's own model, or what the scenario names for a strategy; else the scenario's."""
-    scenario = load_scenario(ROOT / "scenarios" / "grid7_peak")
+    scenario = load_scenario("grid7_peak")
     names = {
         "no-control": "grid7",
         "pi-gating": "grid7",
@@ -144,41 +139,6 @@ def test_outflow_samples_lie_on_the_mfd(scenario, result):
             np.abs(fitted.outflow(seen) - scenario.network.mfds[region].outflow(seen)).max()
             < 0.08 * 6.3
         )
-
-
-def test_own_splits_are_the_crossings_shares_and_the_network_file_comes_back(
-    scenario, result, tmp_path
-):
-    network = scenario.network
-    crossings = result["crossings"].sum(axis=0)
-    assert observed_split_ratios(network, crossings)[0, 6] == {3: 1.0}
-    crossings[0, 1, 6] = crossings[0, 3, 6] / 3.0
-    network = replace(network, observed_split_ratios=observed_split_ratios(network, crossings))
-    assert network.observed_split_ratios[0, 6] == pytest.approx({1: 0.25, 3: 0.75})
-    for kind in (network, tiny.limited(network)):
-        text = network_toml(kind, {"net": "city.net.xml"}, "a test")
-        (tmp_path / "network.toml").write_text(text)
-        again = load_network(tmp_path)
-        np.testing.assert_allclose(again.nominal_splits, kind.nominal_splits)
-        for name in ("exit_rates", "capacity", "storage"):
-            there, here = getattr(kind, name), getattr(again, name)
-            assert (there is None) == (here is None)
-            if there is not None:
-                np.testing.assert_allclose(here, there, rtol=1e-3)
-    assert '[sumo]\nnet = "city.net.xml"' in text
-
-
-@pytest.mark.parametrize("jam", [9000.0, 2500.0])
-def test_fit_is_safe_and_close(jam):
-    truth = load_network(ROOT / "networks" / "hexagon7").mfds[0]
-    random = np.random.default_rng(1)
-    x = random.uniform(0.0, jam, 400)
-    fitted = mfd.fit(x, truth.outflow(x) + random.normal(0.0, 0.2, x.size))
-    grid = np.linspace(0.0, 3.0 * jam, 1000)
-    assert (fitted.outflow(grid)[1:] > 0).all()
-    assert (np.diff(fitted.rate(grid)) <= 1e-12).all()
-    inside = grid[grid <= jam]
-    assert np.abs(fitted.outflow(inside) - truth.outflow(inside)).max() < 0.3
 
 
 def test_held_up_is_who_collapsed_later():

@@ -2,7 +2,6 @@
 refused because they predict worse than that nothing changes."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -27,7 +26,6 @@ from nmfd.model.mfd import RoundedLinear, trapezoid
 from nmfd.model.regional_model import Errors, HeldOut, load_network, network_toml
 from nmfd.runs.config import Problem
 
-ROOT = Path(__file__).parents[1]
 SCHEME = {"step": 30.0, "substeps": 1, "integrator": "euler"}
 STEPS = 160
 LANE_KM = np.full(7, 100.0)  # jam: 8,000 veh
@@ -37,7 +35,7 @@ WORSE = HeldOut(ahead=900.0, flowing=Errors(2.0, 5.0), congested=Errors(7.0, 6.0
 @pytest.fixture(scope="module")
 def truth():
     """Seven regions with trapezoids, other exit rates for every destination, wide boundaries."""
-    network = load_network(ROOT / "networks" / "hexagon7")
+    network = load_network("hexagon7")
     random = np.random.default_rng(0)
     curve = trapezoid(free=0.003, capacity=3.0, wave=0.0005, jam=8000.0)
     rates = random.uniform(0.7, 1.4, network.adjacency.shape)
@@ -101,16 +99,20 @@ def runs(truth):
     return [drive(truth, factor, seed) for seed, factor in enumerate((3.0, 4.5, 6.0))]
 
 
-def test_counting_finds_rates_and_curves(truth, runs):
-    found = count(truth, runs[:2])
+@pytest.fixture(scope="module")
+def found(truth, runs):
+    """The model counted from the runs of least and most demand."""
+    return count(truth, [runs[0], runs[2]])
+
+
+def test_counting_finds_rates_and_curves(truth, runs, found):
     np.testing.assert_allclose(found.exit_rates, truth.exit_rates, rtol=0.15)
-    for curve, model, run in zip(truth.mfds, found.mfds, [runs[1]] * 7, strict=True):
-        seen = np.linspace(50.0, min(1000.0, run.accumulation.sum(axis=2).max()), 20)
+    seen = np.linspace(50.0, min(1000.0, runs[2].accumulation.sum(axis=2).max()), 20)
+    for curve, model in zip(truth.mfds, found.mfds, strict=True):
         np.testing.assert_allclose(model.outflow(seen), curve.outflow(seen), rtol=0.15)
 
 
-def test_counting_predicts_a_run_that_it_has_not_seen(truth, runs):
-    found = count(truth, [runs[0], runs[2]])
+def test_counting_predicts_a_run_that_it_has_not_seen(runs, found):
     off = prediction_errors(found, runs[1:2], 30, **SCHEME)
     state = runs[1].accumulation.sum(axis=2)
     unchanged = state[:-30] - state[30:]
@@ -118,7 +120,7 @@ def test_counting_predicts_a_run_that_it_has_not_seen(truth, runs):
 
 
 def test_no_rate_is_above_the_limit(truth, runs):
-    found = count(truth, runs, fastest=1.0 / 400.0)
+    found = count(truth, runs[:1], fastest=1.0 / 400.0)
     free = np.array([curve.rate(0.0) for curve in found.mfds])
     assert (found.exit_rates * free[:, None]).max() <= (1.0 + 1e-9) / 400.0
 
@@ -151,8 +153,8 @@ def test_a_plateau_ends_only_where_locked_states_were_seen(locks):
         assert flowing.all()
 
 
-def test_a_counted_model_comes_back_from_its_file(truth, runs, tmp_path):
-    found = replace(count(truth, runs[:1]), held_out=WORSE)
+def test_a_counted_model_comes_back_from_its_file(found, tmp_path):
+    found = replace(found, held_out=WORSE)
     (tmp_path / "network.toml").write_text(network_toml(found, {}, "a test"))
     again = load_network(tmp_path)
     assert again.held_out == WORSE
@@ -171,7 +173,7 @@ def test_a_counted_model_comes_back_from_its_file(truth, runs, tmp_path):
 @pytest.mark.slow
 def test_mpc_solves_its_plans_on_a_counted_model(truth, runs):
     """Kinks are rounded: at sharp ones the solver of MPC stops."""
-    scenario = load_scenario(ROOT / "scenarios" / "economic_mpc")
+    scenario = load_scenario("economic_mpc")
     city = replace(scenario, network=count(truth, runs), measurement_std=0.0)
     result = nmfd.run(city, "mpc-pc", steps=40, progress=False)
     assert (result["status"] == 0).all()
@@ -232,6 +234,6 @@ def test_a_fit_is_made_only_if_counting_falls_short(counted_errors, fitted_error
 
 def test_crossing_times_are_those_of_the_streets():
     """The four sides of the demo's ring are alike; its centre is smaller."""
-    times = crossing_times(city_of(load_network(ROOT / "networks" / "demo")))
+    times = crossing_times(city_of(load_network("demo")))
     np.testing.assert_allclose(times[:4], times[0], rtol=0.02)
     assert 10.0 < times[4] < times[0] < 120.0

@@ -3,7 +3,6 @@ estimates."""
 
 from contextlib import closing
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,7 +20,7 @@ from nmfd.api import load_scenario
 from nmfd.model.planning import planning_model
 from nmfd.types import Controls
 
-SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
+SCENARIO = "grid7_peak"
 INTERVALS = 2
 
 
@@ -53,7 +52,7 @@ def run(scenario):
 def test_travel_times_come_from_probes(scenario):
     with closing(SumoPlant(scenario, settings=Settings(measurement="estimate"))) as plant:
         plant.reset(3)
-        plant.step(Controls(perimeter=scenario.network.open_perimeter, splits=None))
+        plant.step(Controls(perimeter=scenario.network.open_perimeter))
         streets = plant._streets
     assert 0.05 < streets.timed.sum() / streets.vehicles.sum() < 0.2
     assert (np.isfinite(streets.speed) == (streets.timed > 0.0)).all()
@@ -140,7 +139,7 @@ def test_the_closed_loop_runs_on_estimates(scenario, run):
 
 def test_estimating_changes_nothing_but_what_is_seen(scenario, run):
     """The same controls give the same city, with detectors or without."""
-    again = tiny.Acting(lambda seen: Controls(perimeter=run.perimeter[seen.step], splits=None))
+    again = tiny.Acting(lambda seen: Controls(perimeter=run.perimeter[seen.step]))
     exact = drive(scenario, again)
     assert not exact.estimated
     assert run.estimated
@@ -153,7 +152,7 @@ def test_states_are_estimated_with_the_model_of_those_who_drive():
     strategies = [
         parse(name) for name in ("route-guidance+estimate", "route-guidance+estimate+max-pressure")
     ]
-    scenario = load_scenario(SCENARIO, {"steps": INTERVALS})
+    scenario = load_scenario(SCENARIO, {"steps": 1})
     models = [strategy.planning(scenario).network for strategy in strategies]
     assert [model.folder.name for model in models] == ["grid7_guided", "grid7_max_pressure"]
     found = simulate(Simulation(scenario, strategies[0], seed=3))

@@ -1,7 +1,6 @@
 """DPC: constraints by construction, policy files, and training."""
 
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -26,7 +25,7 @@ from nmfd.model.regional_model import load_network
 from nmfd.types import Controls, Observation, Status
 
 PRICED = {"guidance": True, "prices": True, "metering": True}
-NETWORK = load_network(Path(__file__).parents[1] / "networks" / "hexagon7")
+NETWORK = load_network("hexagon7")
 
 
 def policy(*, guidance, network=NETWORK, spread=1.0, **outputs):
@@ -180,10 +179,13 @@ def test_resume_needs_something_to_resume_and_the_same_settings(tmp_path, scenar
         training.train(scenario, parse("dpc-pc"), seed=1, out=out, steps=4, resume=True)
 
 
-@pytest.mark.parametrize("content", [{}, {"configuration": 1}, [1.0]], ids=str)
+@pytest.mark.parametrize("content", [{}, {"configuration": 1}, [1.0], b"", b"x"], ids=str)
 def test_what_is_no_state_of_a_training_cannot_be_resumed(tmp_path, scenario, content):
     out = tmp_path / "p.pt"
-    torch.save(content, tmp_path / "p.pt.resume")
+    if isinstance(content, bytes):
+        (tmp_path / "p.pt.resume").write_bytes(content)
+    else:
+        torch.save(content, tmp_path / "p.pt.resume")
     with pytest.raises(InputError, match="is no state of a training; train without") as caught:
         training.train(scenario, parse("dpc-pc"), seed=0, out=out, steps=4, resume=True)
     one_line(caught, tmp_path / "p.pt.resume")
@@ -261,7 +263,6 @@ def test_the_device_is_the_gpu_where_there_is_one(monkeypatch):
     [
         ("dpc-pc", {"widht": 3}, "widht: unknown key"),
         ("dpc-pc", {"steps": 0}, "steps: should be greater"),
-        ("dpc-pc", {"steps": 1.5}, "steps: should be a valid integer"),
         (
             "dpc-pc",
             {"from_gating": True},
@@ -274,7 +275,6 @@ def test_the_device_is_the_gpu_where_there_is_one(monkeypatch):
         ),
         ("dpc-pcrg", {"local": True}, "local: a local policy guides no routes; train dpc-pc"),
         ("dpc-pc", {"numbers": [1.0] * 8}, "numbers: expected 8 to 12 numbers >= 0 of a compact"),
-        ("dpc-pc", {"compact": True, "numbers": [1.0]}, "numbers: should have at least 8"),
         (
             "dpc-pc",
             {"compact": True, "numbers": [-1.0] * 8},
@@ -355,15 +355,10 @@ def test_a_local_policy_looks_around_every_boundary():
 
 
 def test_a_local_policy_drives_another_city(tmp_path):
-    """Its weights are as many as in any other; one with numbers for its own regions is refused."""
-    other = load_network("two_regions")
-    for local in (True, False):
-        made = Policy(NETWORK, Architecture(width=8, local=local))
-        torch.save(checkpoint(made, NETWORK, {}), tmp_path / f"{local}.pt")
-    loaded, _ = load_policy(tmp_path / "True.pt", other)
+    """Its weights are as many as in any other."""
+    made = Policy(NETWORK, Architecture(width=8, local=True))
+    loaded, _ = load_policy(saved(tmp_path / "p.pt", made, NETWORK), load_network("two_regions"))
     assert loaded(torch.full((2, 2), 100.0))[0].shape == (2, 2)
-    with pytest.raises(InputError, match="trained for network 'hexagon7'"):
-        load_policy(tmp_path / "False.pt", other)
 
 
 def test_every_rollout_has_a_model_of_its_own(scenario):
@@ -423,7 +418,7 @@ def test_a_policy_begins_as_a_gate(scenario):
     assert min(share[:, 1, 0].min() for share in shares) > 0.8
 
 
-PEAK = load_scenario(Path(__file__).parents[1] / "scenarios" / "grid7_peak")
+PEAK = load_scenario("grid7_peak")
 PEAK = replace(PEAK, steps=12, demand=PEAK.demand[20:32], measurement_std=0.0)
 
 

@@ -1,7 +1,6 @@
 """The physics of the regional model, and its torch and CasADi twins against each other."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -17,7 +16,7 @@ from nmfd.model.mfd import Cubic
 from nmfd.model.regional_model import LEAST_ROOM, load_network
 
 STEP = 30.0
-NETWORK = load_network(Path(__file__).parents[1] / "networks" / "hexagon7")
+NETWORK = load_network("hexagon7")
 PARAMETERS = dynamics.parameters(NETWORK)
 LIMITED = tiny.limited(NETWORK)
 KINDS = pytest.mark.parametrize(
@@ -148,8 +147,8 @@ def test_torch_and_casadi_agree(integrator, substeps, network):
     x = torch.zeros(7, 7, dtype=torch.float64)
     twin = ca.DM(7, 7)
     most = 0.0
-    for _ in range(120):
-        demand = random.uniform(0.0, 2.0, (7, 7))
+    for _ in range(50):
+        demand = random.uniform(0.0, 5.0, (7, 7))
         perimeter, splits = random_controls(random, NETWORK)
         scheme = {"step": STEP, "integrator": integrator, "substeps": substeps}
         inputs = (torch.from_numpy(array) for array in (demand, perimeter, splits))

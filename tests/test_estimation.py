@@ -3,7 +3,6 @@ regional model says."""
 
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,13 +18,13 @@ from nmfd.types import Controls
 
 # With one curve per region, as published: what is tested here is the filter, not how good a model a
 # city has.
-_PEAK = load_scenario(Path(__file__).parents[1] / "scenarios" / "grid7_peak")
+_PEAK = load_scenario("grid7_peak")
 SCENARIO = replace(
     _PEAK, network=replace(_PEAK.network, exit_rates=None, capacity=None, storage=None)
 )
 NETWORK = SCENARIO.network
 REGIONS = NETWORK.regions
-OPEN = Controls(perimeter=np.where(NETWORK.adjacency, NETWORK.u_max, 0.0), splits=None)
+OPEN = Controls(perimeter=NETWORK.open_perimeter)
 
 
 def equipped(*, detectors=0.3, probes=0.1, error=0.15):

@@ -137,7 +137,7 @@ def test_a_number_that_is_not_finite_is_named(scenario, plant, wrong, at, value)
         "signal:",
     ],
 )
-def test_wrong_faults(tmp_path, text):
+def test_wrong_faults(text):
     with pytest.raises(InputError, match="expected frozen, delayed:INTERVALS"):
         faults.parse(text, "here", 2)
 
@@ -153,11 +153,7 @@ def test_faults_of_a_city_are_refused_on_the_regional_model(tmp_path):
 
 @pytest.fixture(scope="module")
 def city(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("city")
-    out, config = folder / "networks" / "tiny", tiny_city.city(folder)
-    result = call("cosim", "import", config, "--regions", 3, "--out", out)
-    assert result.exit_code == 0, result.output
-    return load_scenario(folder / "scenarios" / "tiny")
+    return load_scenario(tiny_city.imported(tmp_path_factory.mktemp("city")))
 
 
 def in_sumo(city, *ordered, perimeter=None, watch=None, **changed):
@@ -172,7 +168,7 @@ def in_sumo(city, *ordered, perimeter=None, watch=None, **changed):
         states = [plant.reset(0)]
         if watch:
             watch(plant)
-        states += [plant.step(Controls(perimeter=opened, splits=None)) for _ in range(STEPS)]
+        states += [plant.step(Controls(perimeter=opened)) for _ in range(STEPS)]
         return states, SimpleNamespace(**plant.record())
     finally:
         plant.close()

@@ -26,6 +26,9 @@ from nmfd.studies.fit_quality import (
     write_fits,
 )
 
+GROWING = np.zeros((9, 3, 3))  # region 0 gains 10 vehicles in every interval
+GROWING[:, 0, 0] = 10.0 * np.arange(9)
+
 
 @pytest.fixture
 def network(tmp_path):
@@ -91,9 +94,7 @@ def observed(network, states):
 
 def test_persistence_is_what_it_says(network):
     """A region that gains 10 vehicles in every interval: 10 after one, 40 after four."""
-    state = np.zeros((9, 3, 3))
-    state[:, 0, 0] = 10.0 * np.arange(9)
-    run, critical = observed(network, state), network.mfds[0].critical
+    run, critical = observed(network, GROWING), network.mfds[0].critical
     errors = predictions(network, [run, run], {"step": 225.0, "substeps": 8, "integrator": "euler"})
     assert (errors["ahead_s"] == 900.0).all()
     shares = errors[
@@ -130,10 +131,8 @@ def test_every_table_of_predictions_has_persistence():
 
 def test_errors_are_told_apart_by_congestion(network):
     """Region 0 gains 10 vehicles in every interval, beyond its critical accumulation at last."""
-    state = np.zeros((9, 3, 3))
-    state[:, 0, 0] = 10.0 * np.arange(9)
     scheme = {"step": 450.0, "substeps": 16, "integrator": "euler"}  # 900 s are two intervals
-    runs = [observed(network, state)]
+    runs = [observed(network, GROWING)]
     errors = predictions(network, runs, scheme, critical=np.array([55.0, 1.0, 1.0]))
     assert errors["flowing_states"].tolist() == [4] * 3  # up to 50 vehicles after 900 s
     assert errors["congested_states"].tolist() == [3] * 3
@@ -148,10 +147,8 @@ def test_errors_are_told_apart_by_congestion(network):
 
 
 def test_the_short_table_has_fits_and_errors(network):
-    state = np.zeros((9, 3, 3))
-    state[:, 0, 0] = 10.0 * np.arange(9)
     scheme = {"step": 225.0, "substeps": 8, "integrator": "euler"}
-    errors = predictions(network, [observed(network, state)], scheme)
+    errors = predictions(network, [observed(network, GROWING)], scheme)
     network = replace(network, critical_above={2: 7.0})
     fits = region_fits(network, [cloud([1.0], [1.0])] * 3)
     lines = short_table(network, fits, errors).splitlines()
@@ -164,10 +161,8 @@ def test_the_short_table_has_fits_and_errors(network):
 
 
 def test_a_model_worse_than_as_now_is_said_to_know_nothing(network):
-    state = np.zeros((9, 3, 3))
-    state[:, 0, 0] = 10.0 * np.arange(9)
     scheme = {"step": 225.0, "substeps": 8, "integrator": "euler"}
-    errors = predictions(network, [observed(network, state)], scheme)
+    errors = predictions(network, [observed(network, GROWING)], scheme)
     good = errors.assign(flowing_rmse_veh=1.0)
     assert "WARNING" not in ahead_table(good, network.titles)
     bad = errors.assign(flowing_rmse_veh=100.0)

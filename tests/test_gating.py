@@ -1,7 +1,6 @@
 """PI gating of the centre: what it reaches on the benchmark, its anti-windup and its options."""
 
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,7 +17,7 @@ from nmfd.model.plant import NmfdPlant
 from nmfd.model.regional_model import RegionalModel
 from nmfd.types import Observation, Status
 
-SCENARIO = load_scenario(Path(__file__).parents[1] / "scenarios" / "economic_mpc")
+SCENARIO = load_scenario("economic_mpc")
 NETWORK, CENTRE = SCENARIO.network, 3
 CRITICAL = NETWORK.mfds[CENTRE].critical
 

@@ -2,7 +2,6 @@
 and b through 2."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -226,9 +225,9 @@ def test_in_the_mesoscopic_model_another_way_must_save_a_share_of_its_own_time(a
 def test_guided_is_guidance_by_travel_times_wherever_the_controller_says_nothing():
     """The bytes are those of a controller that commands the nominal split ratios; without it no
     driver is guided."""
-    scenario = load_scenario(Path(__file__).parents[1] / "scenarios" / "grid7_peak")
-    scenario = replace(scenario, steps=1, demand=scenario.demand[15:16])
-    half = Controls(perimeter=np.full((7, 7), 0.4), splits=scenario.network.nominal_splits)
+    scenario = load_scenario("demo", {"steps": 2})
+    gates = 0.5 * scenario.network.open_perimeter
+    half = Controls(perimeter=gates, splits=scenario.network.nominal_splits)
     by_hand, option, off = (
         simulate(Simulation(scenario, parse(tiny.Acting(lambda _, told=told: told), city), seed=1))
         for city, told in (

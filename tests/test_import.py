@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import tiny_city
-from commands import cosim, error_line, good, nmfd
+from commands import cosim, error_line, good
 
 from cosim.evaluation.identify import identify
 from cosim.importing.case import read_sumo_input
@@ -27,6 +27,8 @@ from nmfd.errors import InputError
 from nmfd.model.regional_model import load_network
 from nmfd.model.scenario import with_demand
 
+IMPORT = ("import", "--regions", 3, "--seeds", 1)
+
 
 @pytest.fixture(scope="module")
 def config(tmp_path_factory):
@@ -37,7 +39,7 @@ def config(tmp_path_factory):
 def imported(config, tmp_path_factory):
     """(project folder, what the import printed)."""
     project = tmp_path_factory.mktemp("project")
-    text = good(cosim("import", config, "--regions", 3, "--out", project / "networks" / "tiny"))
+    text = good(cosim(*IMPORT, config, "--out", project / "networks" / "tiny"))
     shutil.copytree(
         project, project.with_name("as-imported")
     )  # runs build something in the other one
@@ -72,7 +74,7 @@ def test_traffic_keeps_cars_and_leaves_the_rest_alone(config):
     assert detector.get("file") == "NUL"  # a run writes nothing into the user's folders
 
 
-def test_import_gives_every_edge_one_region_and_connected_regions(imported, config):
+def test_import_gives_every_edge_one_region_and_connected_regions(imported):
     project, _ = imported
     network = project / "networks" / "tiny"
     assert (network / "map.png").stat().st_size > 10_000
@@ -130,16 +132,14 @@ def test_gateways_and_quality_add_up(imported):
 
 def test_import_is_deterministic_and_atomic(imported, config, tmp_path):
     project = imported[0].with_name("as-imported")
-    good(cosim("import", config, "--regions", 3, "--out", tmp_path / "networks" / "tiny"))
+    command = (*IMPORT, config, "--out", tmp_path / "networks" / "tiny")
+    good(cosim(*command))
     for folder in ("networks", "scenarios"):
         here, there = (sorted((root / folder).rglob("*")) for root in (project, tmp_path))
         assert [file.name for file in here] == [file.name for file in there]
         for one, other in zip(here, there, strict=True):
             assert one.is_dir() or one.read_bytes() == other.read_bytes(), one.name
-    line = error_line(
-        cosim("import", config, "--regions", 3, "--out", tmp_path / "networks" / "tiny")
-    )
-    assert "exists; choose another name" in line
+    assert "exists; choose another name" in error_line(cosim(*command))
 
 
 def test_scenario_drives_the_original_vehicles(imported, config):
@@ -173,14 +173,14 @@ def test_own_regions_come_back(imported, config, tmp_path):
 
 
 def test_networks_as_they_are(tmp_path):
-    """Left-hand traffic; two signals; none at all: a working result, with a demand that is
-    generated."""
+    """Left-hand traffic; two signals; none at all: a working result."""
     for name, options, expected in (
         ("left", ("--lefthand", "true", "--tls.set", "B1,C2"), "left-hand traffic; 2 signals"),
         ("none", ("--default-junction-type", "priority"), "no gateway has a signal"),
     ):
-        net = tiny_city.network(tmp_path, *options, name=f"{name}.net.xml")
-        folder = tiny_city.imported(tmp_path / name, 2, net, demand="peak", level=0.1, iterations=1)
+        (tmp_path / name).mkdir()
+        config = tiny_city.city(tmp_path / name, *options)
+        folder = tiny_city.imported(tmp_path / name, 2, config)
         assert expected in (tmp_path / name / "networks" / "tiny" / "import.txt").read_text()
         with tiny_city.played(load_scenario(folder), 3, 0.1) as (_, _, record):
             assert record.departures.sum() > 0
@@ -249,31 +249,15 @@ def test_options_and_includes_of_the_user_count(config, tmp_path):
     assert case.ignored == ("tripinfo-output",)
     assert case.options["max-depart-delay"] == "60"
     assert case.options["meso-junction-control"] == "false"
-    text = good(
-        cosim(
-            "import",
-            tmp_path / "city.sumocfg",
-            "--regions",
-            2,
-            "--out",
-            tmp_path / "networks" / "x",
-        )
-    )
+    text = good(cosim(*IMPORT, tmp_path / "city.sumocfg", "--out", tmp_path / "networks" / "x"))
     assert "150 vehicles in" in text
     assert "that only write files: tripinfo-output" in text
     scenario = load_scenario(tmp_path / "scenarios" / "x")
     assert scenario.demand_factor == 1.0
     assert scenario.demand.sum() * scenario.step == pytest.approx(150.0)
     assert settings(scenario).mesoscopic
-    options = (
-        "--routes",
-        tmp_path / "cars.rou.xml",
-        "--regions",
-        2,
-        "--out",
-        tmp_path / "networks" / "y",
-    )
-    good(cosim("import", tmp_path / "city.net.xml", *options))  # without any sumocfg
+    options = ("--routes", tmp_path / "cars.rou.xml", "--out", tmp_path / "networks" / "y")
+    good(cosim(*IMPORT, tmp_path / "city.net.xml", *options))  # without any sumocfg
     assert load_scenario(
         tmp_path / "scenarios" / "y"
     ).demand.sum() * scenario.step == pytest.approx(60.0)
@@ -329,17 +313,8 @@ def test_signal_plans_know_the_city_s_own_vehicles(imported):
 def test_one_clear_line(config, tmp_path, change, expected):
     shutil.copytree(config.parent, tmp_path, dirs_exist_ok=True)
     change(tmp_path)
-    line = error_line(
-        cosim(
-            "import",
-            tmp_path / "city.sumocfg",
-            "--regions",
-            3,
-            "--out",
-            tmp_path / "networks" / "x",
-        )
-    )
-    assert expected in line
+    command = (*IMPORT, tmp_path / "city.sumocfg", "--out", tmp_path / "networks" / "x")
+    assert expected in error_line(cosim(*command))
     assert not (tmp_path / "networks").exists() or not list((tmp_path / "networks").iterdir())
 
 
@@ -372,17 +347,7 @@ def test_guidance_leaves_roads_that_are_closed_to_cars_alone(config, tmp_path):
         '<configuration><net-file value="city.net.xml"/><route-files value="cars.rou.xml"/>'
         "</configuration>"
     )
-    good(
-        cosim(
-            "import",
-            tmp_path / "city.sumocfg",
-            "--regions",
-            2,
-            "--out",
-            tmp_path / "networks" / "taxis",
-        )
-    )
-    scenario = load_scenario(tmp_path / "scenarios" / "taxis")
+    scenario = load_scenario(tiny_city.imported(tmp_path, 2, tmp_path / "city.sumocfg"))
     with tiny_city.played(scenario, 6, 0.9, scenario.network.nominal_splits) as (_, _, record):
         assert record.guided.sum() > 10
 
@@ -404,6 +369,8 @@ def test_identification_gives_both_models_and_the_import_takes_the_second_away(
     assert guided.hash != loaded.network.hash
     assert "PLACEHOLDERS" not in (network / "network.toml").read_text()
     assert not loaded.network.placeholder
+    assert loaded.network.observed_split_ratios
+    assert all(mfd.problem() is None for mfd in loaded.network.mfds)
     assert all("one seed" in doubts for doubts in loaded.network.doubts)
     assert text.count("Can perimeter control help?") == 2
     assert (tmp_path / "loading" / "fit.csv").is_file()
@@ -413,24 +380,3 @@ def test_identification_gives_both_models_and_the_import_takes_the_second_away(
     shutil.rmtree(scenario)
     tiny_city.imported(tmp_path, 2, config)
     assert parse("dpc-pcrg").own_planning(load_scenario(scenario)).network.regions == 2
-
-
-@pytest.mark.slow
-def test_the_chain_in_a_city_without_signals(tmp_path):
-    """Perimeter control cannot act, and training says so."""
-    net = tiny_city.network(tmp_path, "--default-junction-type", "priority", name="none.net.xml")
-    scenario = tiny_city.imported(tmp_path, 2, net, demand="peak", level=0.1, iterations=1)
-    good(
-        cosim(
-            "run",
-            scenario,
-            "--controller",
-            "pi-gating",
-            "--set",
-            "steps=4",
-            "--out",
-            tmp_path / "out",
-        )
-    )
-    said = error_line(nmfd("train", scenario, "--controller", "dpc-pc"), "nmfd")
-    assert "no gateway has a signal" in said

@@ -14,6 +14,7 @@ from test_responsive import CARS, CONFIG
 
 from cosim.api import run_controllers
 from cosim.evaluation.simulate import leaking_share
+from cosim.importing.importer import import_city
 from cosim.reporting.city import City
 from cosim.sumo.signals import free_light
 from cosim.sumo.xml_files import read_xml
@@ -36,84 +37,64 @@ def programme(net, signal, change, about='programID="more"'):
     return f'<tlLogic id="{signal}" type="static" {about} offset="0">{rows}</tlLogic>'
 
 
-def everywhere(light):
-    """A function of a net file: programmes whose lights are all the same."""
-    return lambda net: "".join(
-        programme(net, signal, lambda state: light * len(state)) for signal in SIGNALS
-    )
+def same_light(light):
+    """A function of a net file and a signal: a programme whose lights are all the same."""
+    return lambda net, signal: programme(net, signal, lambda state: light * len(state))
 
 
-blinking, switched_off = everywhere("o"), everywhere("O")
+def arrows(net, signal):
+    """A programme with turns on red instead of red."""
+    return programme(net, signal, lambda state: state.replace("r", "s"))
 
 
-def arrows(net):
-    """Programmes with turns on red instead of red."""
-    return "".join(
-        programme(net, signal, lambda state: state.replace("r", "s")) for signal in SIGNALS
-    )
+def one_phase(net, signal):
+    return re.sub(r"(<phase [^>]*>)+", r"\1", same_light("G")(net, signal))
 
 
-def one_phase(net):
-    return re.sub(r"(<phase [^>]*>)+", r"\1", everywhere("G")(net))
+def red_and_yellow(net, signal):
+    return programme(net, signal, lambda state: state.replace("y", "u"))
 
 
-def red_and_yellow(net):
-    return "".join(
-        programme(net, signal, lambda state: state.replace("y", "u")) for signal in SIGNALS
-    )
+def off(net, signal):
+    return f'<tlLogic id="{signal}" type="static" programID="off"/>'
 
 
-def off(net):
-    return "".join(f'<tlLogic id="{name}" type="static" programID="off"/>' for name in SIGNALS)
-
-
-def timetable(net):
-    switches = "".join(f'<wautJunction wautID="w" junctionID="{name}"/>' for name in SIGNALS)
+def timetable(net, signal):
     table = '<WAUT refTime="0" id="w" startProg="0"><wautSwitch time="99" to="more"/></WAUT>'
-    return everywhere("G")(net) + table + switches
+    switch = f'<wautJunction wautID="w" junctionID="{signal}"/>'
+    return same_light("G")(net, signal) + table + switch
 
 
-def ordinary_at_last(net):
+def ordinary_at_last(net, signal):
     """Turns on red, and the ordinary programme after them."""
-    last = (programme(net, name, str, 'programID="last"') for name in SIGNALS)
-    return arrows(net) + "".join(last)
-
-
-def nothing(net):
-    return ""
+    return arrows(net, signal) + programme(net, signal, str, 'programID="last"')
 
 
 def one_lane_free(text):
-    """A network in which one of the two lanes of every movement straight on has no signal."""
-    return re.sub(r'(<connection [^>]*fromLane="1"[^>]*) tl="\w+" linkIndex="\d+"', r"\1", text)
+    """A network in which one of the two lanes of every movement straight on at C1 has no signal."""
+    return re.sub(r'(<connection [^>]*fromLane="1"[^>]*) tl="C1" linkIndex="\d+"', r"\1", text)
 
 
 def plain(text):
     return text
 
 
-def imported(folder, contents=nothing, network=plain, options="", signals=USUAL):
-    """The scenario of a city of two regions, left and right, with other signals."""
+def imported(folder, programmes=(), network=plain, options="", signals=USUAL):
+    """The scenario of a city of two regions, left and right.
+
+    programmes: signals and functions of net file and signal, for the additional file
+    """
     net = tiny_city.network(folder, *signals)
     net.write_text(network(net.read_text()))
     (folder / "cars.rou.xml").write_text(CARS)
-    (folder / "more.add.xml").write_text(f"<additional>{contents(net)}</additional>")
+    contents = "".join(made(net, signal) for signal, made in programmes)
+    (folder / "more.add.xml").write_text(f"<additional>{contents}</additional>")
     more = f'<additional-files value="more.add.xml"/>{options}'
     (folder / "city.sumocfg").write_text(CONFIG.replace("</input>", f"{more}</input>"))
     own = "\n".join(f"{edge},{int(edge[0] in 'CD')}" for edge in edges_of(net))
     (folder / "own.csv").write_text(f"edge,region\n{own}\n")
     out = folder / "networks" / "x"
-    done = cosim(
-        "import",
-        folder / "city.sumocfg",
-        "--regions",
-        folder / "own.csv",
-        "--out",
-        out,
-        "--seeds",
-        1,
-    )
-    assert done.exit_code == 0, done.output + str(done.exception)
+    import_city(folder / "city.sumocfg", out, regions=folder / "own.csv", seeds=1)
     return folder / "scenarios" / "x"
 
 
@@ -151,45 +132,57 @@ def told(folder):
         )
 
 
+LIGHTS = (
+    ("B1", arrows),
+    ("B2", same_light("o")),
+    ("C1", same_light("O")),
+    ("C2", timetable),
+)
 CASES = {
-    "all alike": (nothing, plain, "", {"controlled"}),
-    "turn on red": (arrows, plain, "", {"turn on red"}),
-    "blinking": (blinking, plain, "", {"blinking"}),
-    "switched off": (switched_off, plain, "", {"switched off"}),
-    "off programme": (off, plain, "", {"switched off"}),
-    "off option": (nothing, plain, '<tls.all-off value="true"/>', {"switched off"}),
-    "timetable": (timetable, plain, "", {"programme follows a timetable"}),
-    "last programme": (ordinary_at_last, plain, "", {"controlled"}),
-    "one lane free": (nothing, one_lane_free, "", {"controlled", "no signal on some lanes"}),
+    "lights": (
+        (LIGHTS,),
+        {
+            ("B1", "turn on red"),
+            ("B2", "blinking"),
+            ("C1", "switched off"),
+            ("C2", "programme follows a timetable"),
+        },
+    ),
+    "programmes": (
+        ((("B1", off), ("B2", ordinary_at_last)), one_lane_free),
+        {
+            ("B1", "switched off"),
+            ("B2", "controlled"),
+            ("C1", "controlled"),
+            ("", "no signal on some lanes"),
+            ("C2", "controlled"),
+        },
+    ),
+    "off option": (
+        ((), plain, '<tls.all-off value="true"/>'),
+        {(signal, "switched off") for signal in SIGNALS},
+    ),
     "queue model": (
-        nothing,
-        plain,
-        '<mesosim value="true"/>',
-        {"mesoscopic model without junction control"},
+        ((), plain, '<mesosim value="true"/>'),
+        {(signal, "mesoscopic model without junction control") for signal in SIGNALS},
     ),
 }
 
 
-LIKE_OTHERS = ("blinking", "switched off", "off option")  # "off programme" is one of their kind
-
-
-@pytest.mark.parametrize(
-    "case",
-    [pytest.param(case, marks=pytest.mark.slow) if case in LIKE_OTHERS else case for case in CASES],
-)
+@pytest.mark.parametrize("case", CASES)
 def test_one_word_for_every_gateway(made, case):
     """Table, verdict, map and run agree on which gateways a command can hold."""
-    contents, network, options, expected = CASES[case]
-    seen = told(made(contents, network, options))
-    at_signals = seen.table["control"] != "no signal"
-    assert set(seen.table["control"][at_signals]) == expected
+    given, expected = CASES[case]
+    seen = told(made(*given))
+    table = seen.table[seen.table["control"] != "no signal"]
+    assert set(zip(table["signal"], table["control"], strict=True)) == expected
     assert (seen.loaded == seen.controlled).all()
     assert (seen.commanded == seen.controlled).all()
     assert (np.array(seen.leaks) == ~seen.controlled).all()
     assert any(seen.drawn) == seen.controlled.any() == seen.verdict.any()
     free = seen.flow[~seen.controlled].sum() / seen.flow.sum()
     assert seen.share == pytest.approx(free)
-    assert (seen.share > 0.5) == (case not in ("all alike", "last programme"))
+    assert (seen.share < 0.9) == (case == "programmes")
 
 
 def test_turns_on_red_leak_and_the_other_gates_hold(made):
@@ -204,14 +197,10 @@ def test_turns_on_red_leak_and_the_other_gates_hold(made):
     assert seen.flow[seen.controlled].sum() < 0.5 * free[seen.controlled].sum()
 
 
-@pytest.mark.parametrize(
-    "contents",
-    [arrows, timetable, *(pytest.param(one, marks=pytest.mark.slow) for one in (off, blinking))],
-)
-def test_a_whole_run(made, tmp_path, contents):
+def test_a_whole_run(made, tmp_path):
     """Without words about broken rules; a timetable may cut the green of a programme short."""
-    scenario, out = made(contents, plain, ""), tmp_path / "out"
-    text = run_controllers(scenario, ["no-control"], steps=3, out=out)
+    out = tmp_path / "out"
+    text = run_controllers(made(LIGHTS), ["no-control"], steps=3, out=out)
     assert "break their rules" not in text
     row = pd.read_csv(out / "runs.csv").iloc[0]
     assert row.signal_violations == 0
@@ -225,22 +214,21 @@ def test_max_pressure_runs_signals_with_turns_on_red(made):
         assert record.gateway_flow.sum() > 0.0
 
 
-@pytest.mark.parametrize(
-    "contents, reason",
-    [
-        pytest.param(blinking, "(blinking: 4)", marks=pytest.mark.slow),
-        (off, "(switched off: 4)"),
-        (one_phase, "(fewer than two green phases: 4)"),
-        (red_and_yellow, "(light u: 4)"),
-    ],
-)
-def test_max_pressure_says_why_it_cannot_run(made, tmp_path, contents, reason):
+def test_max_pressure_says_why_it_cannot_run(made, tmp_path):
+    unfit = (
+        ("B1", same_light("o")),
+        ("B2", off),
+        ("C1", one_phase),
+        ("C2", red_and_yellow),
+    )
     done = cosim(
-        *("run", made(contents, plain, ""), "--controller", "max-pressure", "--steps", 1),
+        *("run", made(unfit), "--controller", "max-pressure", "--steps", 1),
         *("--out", tmp_path / "out"),
     )
     assert done.exit_code != 0
-    assert f"none of the 4 signals here is one {reason}; choose fixed" in done.stderr
+    assert "none of the 4 signals here is one (" in done.stderr
+    for reason in ("blinking", "switched off", "fewer than two green phases", "light u"):
+        assert f"{reason}: 1" in done.stderr
 
 
 @pytest.mark.parametrize(

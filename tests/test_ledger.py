@@ -7,12 +7,10 @@ import numpy as np
 import pandas as pd
 import pytest
 import tiny
-import torch
-from click.testing import CliRunner
+from commands import good, nmfd
 
 from nmfd import ledger
 from nmfd.api import load_scenario
-from nmfd.cli import main
 from nmfd.model import acyclic, dynamics
 from nmfd.model.plant import AcyclicPlant, NmfdPlant
 from nmfd.types import Controls
@@ -29,7 +27,7 @@ def scenario(tmp_path_factory):
 
 
 def opened(scenario, u=0.9):
-    return Controls(perimeter=np.where(scenario.network.adjacency, u, 0.0), splits=None)
+    return Controls(perimeter=np.where(scenario.network.adjacency, u, 0.0))
 
 
 @PLANTS
@@ -48,28 +46,16 @@ def test_it_holds_with_every_scheme(scenario, make, integrator, substeps):
 
 
 @pytest.mark.parametrize("integrator, substeps", [("euler", 2), ("rk4", 2)])
-def test_counting_changes_nothing(scenario, integrator, substeps):
+def test_what_is_counted_is_missing(scenario, integrator, substeps):
+    """In the acyclic model; test_dynamics.py has the same of the other one."""
     random = np.random.default_rng(0)
-    p = dynamics.parameters(scenario.network)
-    x = torch.from_numpy(random.uniform(0.0, 300.0, (5, 3, 3)))
-    demand, perimeter = (torch.from_numpy(random.uniform(0.0, 1.0, (5, 3, 3))) for _ in range(2))
-    splits = torch.from_numpy(scenario.network.nominal_splits)
-    options = {"integrator": integrator, "substeps": substeps}
-    plain = dynamics.advance(p, x, demand, perimeter, splits, 30.0, **options)
-    counted, ended = dynamics.advance_counted(p, x, demand, perimeter, splits, 30.0, **options)
-    torch.testing.assert_close(counted, plain, rtol=1e-13, atol=1e-10)
-    single, _ = dynamics.advance_counted(p, x[0], demand[0], perimeter[0], splits, 30.0, **options)
-    torch.testing.assert_close(single, plain[0], rtol=1e-13, atol=1e-10)
-    lost = (x + 30.0 * demand - counted).sum((-2, -1))
-    torch.testing.assert_close(ended, lost, rtol=1e-12, atol=1e-9)
+    demand, perimeter = random.uniform(0.0, 1.0, (2, 3, 3))
     model = acyclic.build(scenario.network)
     theta, _ = acyclic.shares(model, scenario.network.nominal_splits)
     state = random.uniform(0.0, 50.0, len(model.region))
-    arguments = model, state, demand[0].numpy(), perimeter[0].numpy(), theta, 30.0
-    after, ended = acyclic.advance_counted(*arguments, **options)
-    assert ended == pytest.approx(
-        state.sum() + 30.0 * demand[0].sum().item() - after.sum(), abs=1e-9
-    )
+    options = {"integrator": integrator, "substeps": substeps}
+    after, ended = acyclic.advance_counted(model, state, demand, perimeter, theta, 30.0, **options)
+    assert ended == pytest.approx(state.sum() + 30.0 * demand.sum() - after.sum(), abs=1e-9)
 
 
 @PLANTS
@@ -95,30 +81,18 @@ def test_controls_that_move_more_than_there_is_stop_the_run(scenario, make):
             plant.step(opened(scenario, u=20.0))
 
 
-@pytest.mark.parametrize("plant", ["nmfd", pytest.param("acyclic", marks=pytest.mark.slow)])
-def test_the_command_says_it_in_one_line_and_keeps_what_was_finished(tmp_path, monkeypatch, plant):
-    scenario, out = tiny.write(tmp_path), tmp_path / "out"
-    command = [
-        "benchmark",
-        scenario,
-        "--controllers",
-        "no-control",
-        "--plant",
-        plant,
-        "--out",
-        out,
-        "--seeds",
-    ]
-    assert CliRunner().invoke(main, [str(a) for a in [*command, 1]]).exit_code == 0
-    module = {"nmfd": dynamics, "acyclic": acyclic}[plant]
-    honest = module.advance_counted
+def test_the_command_says_it_in_one_line_and_keeps_what_was_finished(tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    command = ("benchmark", tiny.write(tmp_path), "--controllers", "no-control", "--out", out)
+    good(nmfd(*command, "--seeds", 1))
+    honest = dynamics.advance_counted
 
     def leaking(*arguments, **options):
         x, ended = honest(*arguments, **options)
         return 0.999 * x, ended
 
-    monkeypatch.setattr(module, "advance_counted", leaking)
-    result = CliRunner().invoke(main, [str(a) for a in [*command, 2]])
+    monkeypatch.setattr(dynamics, "advance_counted", leaking)
+    result = nmfd(*command, "--seeds", 2)
     assert result.exit_code == 1
     assert result.stderr.count("\n") == 1
     assert "no-control, seed 1: LedgerError: vehicle ledger broken at control step" in result.stderr

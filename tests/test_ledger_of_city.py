@@ -381,14 +381,13 @@ def test_a_vehicle_that_sumo_tells_nothing_of_is_an_error(city, tmp_path):
 
 MEDDLER = """
 import libsumo
-import numpy as np
 from nmfd import Controls
 
 class Meddler:
     name = "meddler"
 
     def __init__(self, scenario):
-        self._open = np.where(scenario.network.adjacency, scenario.network.u_max, 0.0)
+        self._open = scenario.network.open_perimeter
 
     def reset(self, seed=0):
         pass

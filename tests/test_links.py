@@ -14,9 +14,8 @@ from nmfd.errors import InputError
 from nmfd.model.links.flows import REACTION_S, VEHICLE_M
 from nmfd.model.links.model import Choices, Commands, LinkModel
 from nmfd.model.links.network import LinkNetwork, read_links
-from nmfd.model.links.plant import LinkPlant, links_file
+from nmfd.model.links.plant import LinkPlant
 
-SCENARIO = api.load_scenario("grid7_peak")
 CYCLE_S = 60
 GREEN_S = 30
 ONE_LANE = {"lane_link": np.arange(3), "server": np.array([0, 0, 2])}
@@ -261,36 +260,6 @@ def test_gradients_are_those_of_central_differences():
     assert bool((gradient != 0.0).all())
 
 
-@pytest.mark.slow
-def test_gradients_of_grid7_are_those_of_central_differences():
-    """Metering of each region, a gate around the centre, a price of it: 9 numbers."""
-    scenario = api.loaded("grid7_peak", demand=0.8)
-    network = read_links(links_file(scenario))
-    choices = Choices(chain_limit=0.0)
-    model = LinkModel(network, STEP_S, choices=choices, dtype=torch.float64)
-    demand = torch.as_tensor(scenario.demand)
-
-    def spent(numbers):
-        gates = torch.ones(len(numbers), 7, 7, dtype=torch.float64)
-        gates = gates.index_fill(2, torch.tensor([3]), 0.0)
-        gates = gates + torch.eye(7)[3].double() * numbers[:, 7, None, None]
-        prices = torch.eye(7)[3].double() * numbers[:, 8:9]
-        state = model.start(len(numbers))
-        for k in range(20):
-            due = demand[k].expand(len(numbers), 7, 7)
-            state = model.advance(state, due, Commands(gates, numbers[:, :7], None, prices))
-        return state.spent
-
-    numbers = torch.tensor([[0.3, 0.3, 0.25, 0.3, 0.25, 0.3, 0.3, 0.5, 0.5]]).double()
-    numbers.requires_grad_()
-    (gradient,) = torch.autograd.grad(spent(numbers).sum(), numbers)
-    change = 1e-5 * torch.eye(9, dtype=torch.float64)
-    with torch.no_grad():
-        up, down = spent(torch.cat([numbers + change, numbers - change])).chunk(2)
-    differences = (up - down) / 2e-5
-    torch.testing.assert_close(gradient[0], differences, rtol=1e-3, atol=0.0)
-
-
 def test_a_batch_gives_what_single_rollouts_give():
     model = model_of()
     rates = torch.tensor([0.2, 0.9], dtype=torch.float64)
@@ -328,7 +297,7 @@ def test_what_streets_have_not_is_refused(key, value):
         LinkPlant(scenario)
 
 
-def test_a_missing_file_names_the_command(tmp_path):
+def test_a_missing_file_names_the_command():
     failed = nmfd_command(
         "benchmark", "economic_mpc", "--plant", "links", "--controllers", "greedy"
     )

@@ -90,7 +90,7 @@ def test_without_a_command_regions_are_held_at_their_level():
 def test_in_the_regional_model_who_may_not_enter_waits_and_enters_later(kind):
     scenario = with_demand(load_scenario("economic_mpc"), steps=12)
     network, plant = scenario.network, kind(scenario)
-    opened = Controls(perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=None)
+    opened = Controls(perimeter=network.open_perimeter)
     due = scenario.demand.sum(axis=(1, 2)) * scenario.step
     state = plant.reset(0)
     for k in range(12):
@@ -107,9 +107,7 @@ def ran(scenario, seed=5, **changes):
     """States and trips of a city with nothing held back at its gateways."""
     network = scenario.network
     rate = changes.pop("rate", None)
-    opened = Controls(
-        perimeter=np.where(network.adjacency, network.u_max, 0.0), splits=None, metering=rate
-    )
+    opened = Controls(perimeter=network.open_perimeter, metering=rate)
     plant = SumoPlant(scenario, settings=settings(scenario).changed(**changes))
     plant.reset(seed)
     states, trips = [plant.step(opened) for _ in range(scenario.steps)], plant.meter.trips()

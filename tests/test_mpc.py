@@ -3,7 +3,6 @@ rows."""
 
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,7 +24,7 @@ from nmfd.model.plant import NmfdPlant
 from nmfd.model.scenario import with_demand
 from nmfd.types import Controls, Observation, Status
 
-SCENARIO = load_scenario(Path(__file__).parents[1] / "scenarios" / "economic_mpc")
+SCENARIO = load_scenario("economic_mpc")
 NETWORK = SCENARIO.network
 BOTH = pytest.mark.parametrize("guidance", [False, True], ids=["pc", "pcrg"])
 

@@ -141,7 +141,7 @@ def test_a_policy_cost_constraint_and_days():
         policy = Linear(scenario.network)
         before = nmfd.run(scenario, nmfd.ModuleController(policy, scenario), progress=False)
         own = {"cost": burnt, "sample": days, "constraints": [(crowded, weight)]}
-        trained = nmfd.train(scenario, policy=policy, **own, steps=25, progress=False)
+        trained = nmfd.train(scenario, policy=policy, **own, steps=15, progress=False)
         after = nmfd.run(scenario, nmfd.ModuleController(trained, scenario), progress=False)
         most[weight] = after["accumulation"][:, 1].sum(-1).max()
         assert trained is policy

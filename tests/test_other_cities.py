@@ -176,7 +176,7 @@ PERSONS = "".join(
 )
 
 
-def test_private_trips_are_those_of_the_demand(city, tmp_path):
+def test_private_trips_are_those_of_the_demand(city):
     """Vehicles that calibrators and persons make are none, whether they drive or not."""
     bus = '<vehicle id="b" line="1" depart="1"><route edges="A1B1 B1C1"/></vehicle>'
     text, scenario = imported(city(FLOW + bus + PERSONS, MADE, '<end value="600"/>'))
@@ -336,24 +336,25 @@ def test_phases_that_do_not_follow_in_order(net, city):
         assert len(plant.actuation.leaks()) == len(plant.city.gateways) > 0
 
 
-def test_cycles_shorter_than_half_a_second(net, tmp_path):
+def test_cycles_shorter_than_half_a_second(net, city, tmp_path):
     """Of a network that somebody made for something else: control intervals are the usual 90 s."""
     (tmp_path / "fast.net.xml").write_text(
         re.sub(r'(<phase duration=")\d+', r"\g<1>0.05", net.read_text())
     )
-    _, scenario = imported(
-        tmp_path / "fast.net.xml", demand="peak", level=0.1, iterations=1, mesoscopic=True
-    )
+    _, scenario = imported(city(net_file="fast.net.xml"), mesoscopic=True)
     assert scenario.step == 90.0
 
 
-def along_roads(folder, nodes, edges):
-    """Import a network of these elements with a thin peak; return the report and the scenario."""
+def along_roads(folder, nodes, edges, first, last):
+    """Import a network of these elements with trips from the first to the last; return the report
+    and the scenario."""
     (folder / "n.nod.xml").write_text(f"<nodes>{nodes}</nodes>")
     (folder / "e.edg.xml").write_text(f"<edges>{edges}</edges>")
     net = folder / "road.net.xml"
     tiny_city.run("netconvert", "-n", folder / "n.nod.xml", "-e", folder / "e.edg.xml", "-o", net)
-    return imported(net, demand="peak", level=0.2, iterations=1, mesoscopic=True)
+    flow = FLOW.replace("A1B1", first).replace("C1D1", last)
+    (folder / "r.rou.xml").write_text(f"<routes>{flow}</routes>")
+    return imported(net, routes=[folder / "r.rou.xml"])
 
 
 def test_a_city_along_a_straight_road(tmp_path):
@@ -363,7 +364,7 @@ def test_a_city_along_a_straight_road(tmp_path):
         f'<edge id="f{n}" from="{n}" to="{n + 1}"/><edge id="b{n}" from="{n + 1}" to="{n}"/>'
         for n in range(8)
     )
-    text, scenario = along_roads(tmp_path, nodes, edges)
+    text, scenario = along_roads(tmp_path, nodes, edges, "f0", "f7")
     assert "regions instead of" not in text
     assert scenario.network.adjacency.sum() == 2
     sizes = np.bincount(
@@ -388,7 +389,7 @@ def test_parts_without_a_connection_and_small_regions_are_told(tmp_path):
             one, other = f"{part}.{n}", f"{part}.{n + 1}"
             edges.append(f'<edge id="f{one}" from="{one}" to="{other}"/>')
             edges.append(f'<edge id="b{one}" from="{other}" to="{one}"/>')
-    text, scenario = along_roads(tmp_path, "".join(nodes), "".join(edges))
+    text, scenario = along_roads(tmp_path, "".join(nodes), "".join(edges), "f0.0", "f0.7")
     assert "the streets fall into 2 parts without a connection; 27" in text
     assert scenario.network.regions == 2
     for region in range(2):
@@ -444,7 +445,7 @@ def test_speeds_and_coordinates(city):
     assert traffic.notes == {"fixed speeds at the departure, made the highest safe ones": 1}
 
 
-def test_a_generated_peak_beside_types_of_the_city(net, city):
+def test_a_generated_peak_beside_types_of_the_city(city):
     config = city("", '<vType id="car" vClass="passenger" sigma="0.9"/>')
     text, _ = imported(config, demand="peak", level=0.1, iterations=1, mesoscopic=True)
     assert "trips of a generated morning peak" in text

@@ -2,7 +2,6 @@
 and line."""
 
 import re
-from pathlib import Path
 
 import commands
 import copies
@@ -18,7 +17,6 @@ from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
 from nmfd.types import Observation
 
-ROOT = Path(__file__).parents[1]
 GOOD = tiny.CONTROLLER
 
 
@@ -49,7 +47,7 @@ def test_the_template_is_copied_runs_and_counts_in_the_fingerprint(place):
 
 
 def test_the_template_holds_regions_at_their_set_points():
-    scenario = nmfd.load_scenario(ROOT / "scenarios" / "economic_mpc")
+    scenario = nmfd.load_scenario("economic_mpc")
     controller = nmfd.controller(f"{template.__file__}:MyController", scenario)
     accumulation = np.zeros((7, 7))
     accumulation[3, 0] = 2 * scenario.network.mfds[3].critical
@@ -123,18 +121,6 @@ def test_sumo_takes_it(place):
             "act: interval 0: perimeter: expected numbers of shape",
         ),
         (
-            GOOD.replace("0.5", "np.nan"),
-            "act: interval 0: perimeter[0, 0]: expected a finite number, got nan instead",
-        ),
-        (
-            GOOD.replace("0.5", "1.5"),
-            "act: interval 0: perimeter[0, 1]: expected 0.1 to 0.9, got 1.5 instead",
-        ),
-        (
-            GOOD.replace("splits=None", "splits=np.zeros((2, 2))"),
-            "splits: expected numbers of shape (2, 2, 2)",
-        ),
-        (
             GOOD.replace("splits=None", "splits=np.zeros((2, 2, 2))"),
             "splits: expected a sum of 1 over h",
         ),
@@ -145,14 +131,6 @@ def test_sumo_takes_it(place):
         (
             GOOD.replace("splits=None", "splits=None, prices=np.array([0.0, -1.0])"),
             "prices[1]: expected 0 to 100",
-        ),
-        (
-            GOOD.replace("splits=None", "splits=None, metering='all'"),
-            "metering: expected numbers of shape (2,)",
-        ),
-        (
-            GOOD.replace("return Controls(", "return dict("),
-            "act: interval 0: expected nmfd.Controls, got dict instead",
         ),
     ],
 )

@@ -1,7 +1,6 @@
 """Figures: colours, units on the axes, and the data in them."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from nmfd.api import load_scenario
 from nmfd.controllers.strategy import CONTROLLERS
 from nmfd.studies import benchmark, plots
 
-SCENARIO = Path(__file__).parents[1] / "scenarios" / "economic_mpc"
+SCENARIO = "economic_mpc"
 DOLLARS = "ü <b>$x^$</b> & $$y"  # no mathematics: a syntax error
 
 

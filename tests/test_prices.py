@@ -88,18 +88,6 @@ def test_mpc_of_grid7_has_the_outputs_of_the_policy():
     np.testing.assert_allclose(controls.metering, (1.2 * critical - x.sum(1)) / 90.0, rtol=1e-4)
 
 
-def test_a_price_everywhere_diverts_nobody_from_ways_that_take_the_same_time():
-    """Prices of all regions are proportional to times, so that only unequal times divert."""
-    network = tiny.limited(load_scenario("economic_mpc").network)
-    network = replace(network, exit_rates=np.ones((7, 7)))
-    x = torch.zeros(7, 7)
-    nominal = torch.tensor(network.nominal_splits, dtype=torch.float32)
-    alike = Answer(network)(x, torch.full((7,), 1.4))
-    other = Answer(network)(x, torch.tensor([0.0, 0.0, 0.0, 1.4, 0.0, 0.0, 0.0]))
-    torch.testing.assert_close(alike, nominal, atol=1e-4, rtol=0.0)
-    assert (other - nominal).abs().max() > 0.1
-
-
 class AnsweringPlant(NmfdPlant):
     guides_by_prices = True
 

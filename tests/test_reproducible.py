@@ -67,13 +67,7 @@ def test_trainings(tmp_path):
 
 @pytest.fixture(scope="module")
 def city(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("city")
-    good(
-        cosim(
-            "import", tiny_city.city(folder), "--regions", 3, "--out", folder / "networks" / "tiny"
-        )
-    )
-    return folder / "scenarios" / "tiny"
+    return tiny_city.imported(tmp_path_factory.mktemp("city"))
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ import tiny_city
 from commands import cosim
 from signal_rules import MIN_GREEN, watched
 
+from cosim.importing.importer import import_city
 from cosim.plant.gates import DEFAULT_YELLOW_S
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
@@ -32,22 +33,14 @@ CARS = """<routes>
 </routes>"""
 
 
-def imported(folder, name, *options, signals):
+def imported(folder, name, *, signals, **options):
     """The scenario of a city of two regions, left and right."""
     folder.mkdir()
     tiny_city.network(folder, *signals)
     (folder / "cars.rou.xml").write_text(CARS)
     (folder / "city.sumocfg").write_text(CONFIG)
-    done = cosim(
-        "import",
-        folder / "city.sumocfg",
-        "--regions",
-        2,
-        "--out",
-        folder / "networks" / name,
-        *options,
-    )
-    assert done.exit_code == 0, done.output + str(done.exception)
+    out = folder / "networks" / name
+    import_city(folder / "city.sumocfg", out, regions=2, seeds=1, **options)
     return folder / "scenarios" / name
 
 
@@ -80,9 +73,7 @@ def drive(folder, gates, faults=(), **overrides):
         plant.reset(1)
         shown = watched(plant)
         for gate in gates:
-            plant.step(
-                Controls(perimeter=np.where(scenario.network.adjacency, gate, 0.0), splits=None)
-            )
+            plant.step(Controls(perimeter=np.where(scenario.network.adjacency, gate, 0.0)))
         return SimpleNamespace(
             shown=shown,
             record=SimpleNamespace(**plant.record()),
@@ -176,10 +167,10 @@ def places(tmp_path_factory):
     """Scenarios: a city in SUMO's queue model, and one without any signal."""
     folder, made = tmp_path_factory.mktemp("places"), {}
     for name, signals, options in (
-        ("queues", ("--tls.set", "B1,B2"), ("--mesoscopic",)),
-        ("bare", ("--default-junction-type", "priority"), ()),
+        ("queues", ("--tls.set", "B1,B2"), {"mesoscopic": True}),
+        ("bare", ("--default-junction-type", "priority"), {}),
     ):
-        made[name] = imported(folder / name, name, *options, signals=signals)
+        made[name] = imported(folder / name, name, signals=signals, **options)
     return made
 
 

@@ -114,7 +114,7 @@ def test_no_command_fills_the_street_before_a_gateway(town, limit, held):
     ) as plant:
         plant.reset(1)
         closed = Controls(
-            perimeter=np.where(scenario.network.adjacency, scenario.network.u_min, 0.0), splits=None
+            perimeter=np.where(scenario.network.adjacency, scenario.network.u_min, 0.0)
         )
         realised = [plant.step(closed) for _ in range(4)][-1].realised
         record, streets = plant.record(), plant.city.edges
@@ -136,7 +136,7 @@ def test_the_integral_goes_on_from_what_was_realised():
     accumulation = np.zeros((7, 7))
     accumulation[3, 0] = controller.set_point[0]
     entries = network.adjacency[:, 3]
-    realised = np.where(network.adjacency, network.u_max, 0.0)
+    realised = network.open_perimeter
     realised[entries, 3] = np.linspace(0.3, 0.7, entries.sum())
     seen = Observation(
         step=1, time=30.0, accumulation=accumulation, backlog=accumulation, realised=realised

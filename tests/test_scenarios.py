@@ -239,8 +239,6 @@ mfd_spread = 0.2
         assert make_controller(name, scenario).name == "dpc-pc"
     with pytest.raises(InputError, match="network"):  # each was trained on its own model
         make_controller("dpc-pc", scenario, policy=folder / "dpc-pc+max-pressure.pt")
-    with pytest.raises(InputError, match="'dpc-pc\\+webster' needs a table"):
-        training.settings(scenario, parse("dpc-pc+webster"))
 
 
 def test_a_model_of_another_city_is_refused(base, tmp_path):

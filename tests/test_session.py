@@ -61,13 +61,13 @@ def test_a_result_has_labelled_arrays_and_lists_them(result, scenario):
 
 def test_a_benchmark_takes_names_options_and_objects(scenario, tmp_path):
     table = nmfd.benchmark(
-        scenario, ["no-control", nmfd.PiGating(kp=2.0), Half()], seeds=2, out=tmp_path / "out"
+        scenario, ["no-control", nmfd.PiGating(kp=2.0), Half()], seeds=1, out=tmp_path / "out"
     )
     assert isinstance(table, pd.DataFrame)
     means = table.groupby("controller")["total_time_spent_veh_s"].mean()
     assert set(means.index) == {"no-control", "pi-gating(kp=2.0)", "Half"}
     assert means["pi-gating(kp=2.0)"] < means["no-control"]
-    again = nmfd.benchmark(scenario, [Half()], seeds=2, out=tmp_path / "out")
+    again = nmfd.benchmark(scenario, [Half()], seeds=1, out=tmp_path / "out")
     assert set(again["failure"]) == {""}
 
 
@@ -78,7 +78,7 @@ def test_demand_and_steps_are_arguments(scenario):
     np.testing.assert_allclose(short["accumulation"][1].sum(), 1.2 * plain["accumulation"][1].sum())
 
 
-def test_a_city_is_its_settings(tmp_path):
+def test_a_city_is_its_settings():
     city = cosim.Settings(signals="max-pressure", guided=True)
     run = cosim.run("demo", nmfd.PiGating(), city=city, seed=1, steps=2)
     assert run.controller == "pi-gating+guided+max-pressure"
@@ -88,9 +88,9 @@ def test_a_city_is_its_settings(tmp_path):
 
 def test_an_evaluation_is_a_table_and_its_runs_are_found(tmp_path):
     controllers = ["no-control", "pi-gating+max-pressure", nmfd.PiGating(kp=0.4)]
-    table = cosim.evaluate("demo", controllers, seeds=2, steps=1, out=tmp_path / "ev")
+    table = cosim.evaluate("demo", controllers, seeds=1, steps=1, out=tmp_path / "ev")
     assert isinstance(table, pd.DataFrame)
-    assert len(table) == 6
+    assert len(table) == 3
     seed = table["seed"].iloc[0]
     again = cosim.read_run(str(tmp_path / "ev"), "pi-gating+max-pressure", seed=seed)
     assert again.seed == seed

@@ -3,25 +3,19 @@ by second in SUMO."""
 
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
-from functools import cache
-from pathlib import Path
-from types import SimpleNamespace
 
 import libsumo
 import numpy as np
 import pytest
-from signal_rules import MIN_GREEN, watched
+from signal_rules import watched
 
-from cosim.plant.plant import SumoPlant
-from cosim.plant.pressure import Roads
-from cosim.plant.settings import Settings
 from cosim.sumo.net import city_of
 from cosim.sumo.signals import read_signals
-from cosim.sumo.trips import make_trips, turning_flows
+from cosim.sumo.trips import make_trips
 from nmfd.api import load_scenario
 from nmfd.types import Controls
 
-SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
+SCENARIO = "grid7_peak"
 
 
 @pytest.fixture(scope="module")
@@ -34,32 +28,6 @@ def scenario():
 @pytest.fixture(scope="module")
 def city(scenario):
     return city_of(scenario.network)
-
-
-@pytest.fixture(scope="module")
-def driven(scenario):
-    """The first three intervals at u with these overrides, for all tests that ask for the same:
-    `drive`, and leaks."""
-
-    @cache
-    def run(u, **overrides):
-        plant = SumoPlant(scenario, settings=Settings(**overrides))
-        try:
-            return *drive(plant, scenario, 3, u=u), plant.actuation.leaks()
-        finally:
-            plant.close()
-
-    return run
-
-
-def drive(plant, scenario, intervals, seed=1, u=0.9):
-    """States of every signal, second by second, under u at all gateways; the network's own
-    programmes; the record."""
-    plant.reset(seed)
-    shown, network = watched(plant), scenario.network
-    for _ in range(intervals):
-        plant.step(Controls(perimeter=np.where(network.adjacency, u, 0.0), splits=None))
-    return shown, {s.id: s for s in plant.steered}, SimpleNamespace(**plant.record())
 
 
 def test_signals_of_the_city(city):
@@ -91,66 +59,22 @@ def test_signals_that_are_not_simple_are_left_alone(city, tmp_path):
     assert [s.offset for s in simple if s.id == "c12"] == ["7"]
 
 
-def test_pressure_is_upstream_minus_downstream(city, scenario):
-    """A queue gives its stage the pressure; the same queue behind the junction takes it away;
-    shares add up."""
-    simple, _ = read_signals(city)
-    roads = Roads(city, simple, turning_flows(city, scenario.demand, scenario.step))
-    n = next(n for n, s in enumerate(simple) if s.id == "o11")
-    chosen = simple[n]
-    straight = next(k for k in chosen.links if chosen.phases[0].state[k.index] == "G")
-
-    def pressures(counts):
-        present = np.array([counts.get(lane.rpartition("_")[0], 0.0) for lane in roads.lanes])
-        begin = roads.begins[n]
-        return (roads.gain @ np.maximum(roads.weights @ present, 0.0))[
-            begin : begin + len(chosen.stages)
-        ]
-
-    queue = pressures({straight.from_edge: 5.0})
-    assert int(np.argmax(queue)) == 0
-    assert queue[0] > 5.0
-    targets = {k.to_edge: 25.0 for k in chosen.links if k.from_edge == straight.from_edge}
-    assert pressures({straight.from_edge: 5.0, **targets})[0] < 0.2 * queue[0]
-    held = (
-        roads.weights.toarray().clip(min=0.0).sum(axis=0)
-    )  # a vehicle before a signal is counted once
-    before = [lane for lane, total in zip(roads.lanes, held, strict=True) if total > 0]
-    assert len(before) > 300
-    assert held[held > 0] == pytest.approx(1.0)
-
-
-@pytest.mark.slow
-def test_perimeter_control_over_max_pressure(driven):
-    """Open gateways leave max-pressure as it is; closed ones let less through and keep to their
-    ration."""
-    seen = {}
-    for name, u, overrides in (
-        ("alone", 0.9, {"gateways_fixed": False}),
-        ("open", 0.9, {}),
-        ("closed", 0.1, {}),
-    ):
-        shown, _, record, _ = driven(u, signals="max-pressure", **overrides)
-        seen[name] = shown, record
-    assert seen["alone"][0] == seen["open"][0] != seen["closed"][0]
-    green = seen["closed"][1].gateway_green
-    assert np.nanmax(green[1:]) <= MIN_GREEN + 1.0
-    assert np.nanmean(green) < 0.3 * np.nanmean(seen["open"][1].gateway_green)
-    flows = [seen[name][1].gateway_flow.sum() for name in ("open", "closed")]
-    assert flows[1] < 0.6 * flows[0]
-
-
-def test_max_pressure_runs_all_signals(city, driven):
-    shown, original, record, leaks = driven(0.9, signals="max-pressure")
+def test_max_pressure_runs_all_signals(city, scenario, plant_of):
+    plant = plant_of(signals="max-pressure")
+    plant.reset(1)
+    shown = watched(plant)
+    for _ in range(2):
+        plant.step(Controls(perimeter=scenario.network.open_perimeter))
     gateways, changed = {g.signal for g in city.gateways}, set()
-    for name, states in shown.items():
-        cycle = [phase.state for phase in original[name].phases for _ in range(int(phase.duration))]
+    for signal in plant.steered:
+        cycle = [phase.state for phase in signal.phases for _ in range(int(phase.duration))]
+        states = shown[signal.id]
         if states != [cycle[n % 90] for n in range(len(states))]:
-            changed.add(name)
+            changed.add(signal.id)
     assert len(changed) > 30
     assert len(changed & gateways) > 10
-    assert not np.isnan(record.gateway_green).any()
-    assert not leaks
+    assert not np.isnan(plant.record()["gateway_green"]).any()
+    assert not plant.actuation.leaks()
 
 
 @pytest.mark.parametrize("gateways_fixed", [True, False])
@@ -172,7 +96,8 @@ def test_webster_in_sumo(scenario, plant_of):
     for logic in ElementTree.parse(offsets).getroot():  # a later offset is a later beginning
         programme = plans[logic.get("id")]
         assert programme.position == pytest.approx(-float(logic.get("offset")) % programme.cycle)
-    shown, _, _ = drive(plant, scenario, 1)
+    shown = watched(plant)
+    plant.step(Controls(perimeter=scenario.network.open_perimeter))
     assert len({p.cycle for p in plans.values()}) == 1
     assert len({p.position for p in plans.values()}) > 5
     for name, states in shown.items():
@@ -202,7 +127,7 @@ def test_the_same_drivers_reroute(scenario, plant_of):
                 )
 
         plant.session.step = watch
-        plant.step(Controls(perimeter=np.full((7, 7), 0.9), splits=None))
+        plant.step(Controls(perimeter=np.full((7, 7), 0.9)))
         equipped[share, signals] = {v for v, (reroutes, _) in seen.items() if reroutes}
         assert all(own for reroutes, own in seen.values() if not reroutes)
         assert (

@@ -2,7 +2,6 @@
 
 import xml.etree.ElementTree as ElementTree
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from cosim.sumo.recorded_trips import as_recorded, draw, write_recorded_trips
 from cosim.sumo.trips import make_trips
 from nmfd.api import load_scenario
 
-SCENARIO = Path(__file__).parents[1] / "scenarios" / "grid7_peak"
+SCENARIO = "grid7_peak"
 
 
 @pytest.fixture(scope="module")
@@ -63,16 +62,13 @@ def test_no_trip_starts_or_ends_on_a_radial_or_in_a_pocket(trips, city):
     assert not any(edge.endswith(".p") for route in trips.routes for edge in (route[0], route[-1]))
 
 
-def test_seeds(city, scenario, tmp_path):
-    written = []
-    for seed in (1, 1, 2):
-        made = as_recorded(make_trips(city, scenario.demand, scenario.step, seed))
-        write_recorded_trips(
-            made,
-            draw(made, seed=seed, factor=1.0, jitter=0.0, begin=0.0),
-            tmp_path / "trips.rou.xml",
-        )
-        written.append((tmp_path / "trips.rou.xml").read_bytes())
+def test_seeds(city, scenario, trips, tmp_path):
+    written, file = [], tmp_path / "trips.rou.xml"
+    again, other = (make_trips(city, scenario.demand, scenario.step, seed) for seed in (1, 2))
+    for drawn in (trips, again, other):
+        made = as_recorded(drawn)
+        write_recorded_trips(made, draw(made, seed=1, factor=1.0, jitter=0.0, begin=0.0), file)
+        written.append(file.read_bytes())
     first, again, other = written
     assert first == again != other
     vehicles = list(ElementTree.fromstring(first).iter("vehicle"))

@@ -1,7 +1,6 @@
 """cosim tune: what is searched, what is kept and resumed; SUMO is not started."""
 
 import math
-from pathlib import Path
 
 import copies
 import made_up
@@ -16,8 +15,6 @@ from cosim.plant.strategy import parse
 from nmfd.api import load_scenario
 from nmfd.errors import InputError, RunFailed
 from nmfd.runs import config
-
-ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope="module")

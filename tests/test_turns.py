@@ -3,7 +3,6 @@ projected gradients."""
 
 import time
 from dataclasses import replace
-from pathlib import Path
 from unittest.mock import Mock
 
 import numpy as np
@@ -17,7 +16,7 @@ from nmfd.controllers.mpc.projected_gradient import minimise
 from nmfd.model import dynamics
 from nmfd.model.regional_model import load_network
 
-NETWORK = load_network(Path(__file__).parents[1] / "networks" / "hexagon7")
+NETWORK = load_network("hexagon7")
 LIMITED = tiny.limited(NETWORK)
 BOTH = pytest.mark.parametrize("guidance", [False, True], ids=["pc", "pcrg"])
 EVERY, SOME = np.arange(7), np.array([1, 2, 6])

@@ -196,10 +196,10 @@ def test_finished_runs_on_one_page_with_a_slider(drawn, plain):
 
 
 def test_runs_in_processes_of_their_own(scenario, strategy, tmp_path, monkeypatch):
-    """One run ends, one is wrong, and pausing holds a run; from the server of processes, since each
-    would import everything again."""
-    server = multiprocessing.get_context("forkserver")
-    monkeypatch.setattr(multiprocessing, "get_context", lambda _: server)
+    """One run ends, one is wrong, and pausing holds a run; forked, since a new process imports
+    everything again."""
+    forked = multiprocessing.get_context("fork")
+    monkeypatch.setattr(multiprocessing, "get_context", lambda _: forked)
     (tmp_path / "wrong.py").write_text("class Wrong:\n    pass\n")
     wrong = parse(f"{tmp_path / 'wrong.py'}:Wrong")
     show = live.Show([Simulation(scenario, strategy, seed=3), Simulation(scenario, wrong, seed=3)])

@@ -2,12 +2,14 @@
 files."""
 
 import gzip
+import shutil
 import subprocess
+from atexit import register
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, mkdtemp
 from types import SimpleNamespace
 
 import numpy as np
@@ -114,9 +116,24 @@ def city(folder: Path, *options: str) -> Path:
 
 def imported(folder: Path, regions: int = 3, source: Path | None = None, **options) -> Path:
     """Import a city, by default the one with demand, into `folder`; return its scenario."""
-    out, scenario = folder / "networks" / "tiny", folder / "scenarios" / "tiny"
-    import_city(source or city(folder), out, scenario, regions=regions, seeds=1, **options)
-    return scenario
+    if source is None:
+        shutil.copytree(_with_demand(), folder, dirs_exist_ok=True)
+    else:
+        out = folder / "networks" / "tiny"
+        import_city(source, out, _scenario(folder), regions=regions, seeds=1, **options)
+    return _scenario(folder)
+
+
+def _scenario(folder: Path) -> Path:
+    return folder / "scenarios" / "tiny"
+
+
+@cache
+def _with_demand() -> Path:
+    """The folder of the city with demand, and of what it is imported to, once in a process."""
+    folder = Path(mkdtemp())
+    register(shutil.rmtree, folder)
+    return imported(folder, source=city(folder)).parents[1]
 
 
 class Record(SimpleNamespace):
