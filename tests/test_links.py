@@ -14,7 +14,7 @@ from nmfd.errors import InputError
 from nmfd.model.links.flows import REACTION_S, VEHICLE_M
 from nmfd.model.links.model import Choices, Commands, LinkModel
 from nmfd.model.links.network import LinkNetwork, read_links
-from nmfd.model.links.plant import LinkPlant
+from nmfd.model.links.plant import LinkPlant, links_file
 
 CYCLE_S = 60
 GREEN_S = 30
@@ -258,6 +258,36 @@ def test_gradients_are_those_of_central_differences():
     cosine = torch.nn.functional.cosine_similarity(gradient, torch.tensor(differences).double(), 0)
     assert float(cosine) > 0.99
     assert bool((gradient != 0.0).all())
+
+
+@pytest.mark.slow
+def test_gradients_of_grid7_are_those_of_central_differences():
+    """Metering of each region, a gate around the centre, a price of it: 9 numbers."""
+    scenario = api.loaded("grid7_peak", demand=0.8)
+    network = read_links(links_file(scenario))
+    choices = Choices(chain_limit=0.0)
+    model = LinkModel(network, STEP_S, choices=choices, dtype=torch.float64)
+    demand = torch.as_tensor(scenario.demand)
+
+    def spent(numbers):
+        gates = torch.ones(len(numbers), 7, 7, dtype=torch.float64)
+        gates = gates.index_fill(2, torch.tensor([3]), 0.0)
+        gates = gates + torch.eye(7)[3].double() * numbers[:, 7, None, None]
+        prices = torch.eye(7)[3].double() * numbers[:, 8:9]
+        state = model.start(len(numbers))
+        for k in range(20):
+            due = demand[k].expand(len(numbers), 7, 7)
+            state = model.advance(state, due, Commands(gates, numbers[:, :7], None, prices))
+        return state.spent
+
+    numbers = torch.tensor([[0.3, 0.3, 0.25, 0.3, 0.25, 0.3, 0.3, 0.5, 0.5]]).double()
+    numbers.requires_grad_()
+    (gradient,) = torch.autograd.grad(spent(numbers).sum(), numbers)
+    change = 1e-5 * torch.eye(9, dtype=torch.float64)
+    with torch.no_grad():
+        up, down = spent(torch.cat([numbers + change, numbers - change])).chunk(2)
+    differences = (up - down) / 2e-5
+    torch.testing.assert_close(gradient[0], differences, rtol=1e-3, atol=0.0)
 
 
 def test_a_batch_gives_what_single_rollouts_give():

@@ -13,6 +13,7 @@ from cosim.importing.baseline import INTERVAL_S, Baseline
 from cosim.importing.boundaries import Turns, with_room
 from cosim.importing.choice import choose, densest_region
 from cosim.importing.partition import finish, make_blocks, names, own_regions, partition
+from cosim.importing.quality import doubts
 from cosim.importing.streets import read_streets
 from nmfd.errors import InputError
 
@@ -100,6 +101,18 @@ def test_finish_repairs_what_is_torn(streets):
     assert all(pieces(streets, found == region) == 1 for region in range(2))
     assert found[streets.number["A0B0"]] == found[streets.number["B0A0"]]
     assert found[streets.number["I8H8"]] == found[streets.number["H8I8"]]
+
+
+def test_own_regions_may_be_in_pieces(streets):
+    """They stay as they are, and the import says so."""
+    labels = (streets.centre[:, 0] > 600.0).astype(int)
+    labels[streets.number["A0B0"]] = 1
+    labels[streets.number["I8H8"]] = -1
+    found = finish(streets, labels, own=True)
+    assert (found != labels).nonzero()[0] == [streets.number["I8H8"]]
+    assert found[streets.number["I8H8"]] == 1
+    sentences = doubts(streets, found, ("west", "east"))
+    assert ["region 1 east is in 2 pieces" in sentence for sentence in sentences] == [True]
 
 
 def test_a_region_without_return_goes_to_its_neighbour(tmp_path):

@@ -92,6 +92,18 @@ class AnsweringPlant(NmfdPlant):
     guides_by_prices = True
 
 
+def test_a_price_everywhere_diverts_nobody_from_ways_that_take_the_same_time():
+    """Prices of all regions are proportional to times, so that only unequal times divert."""
+    network = tiny.limited(load_scenario("economic_mpc").network)
+    network = replace(network, exit_rates=np.ones((7, 7)))
+    x = torch.zeros(7, 7)
+    nominal = torch.tensor(network.nominal_splits, dtype=torch.float32)
+    alike = Answer(network)(x, torch.full((7,), 1.4))
+    other = Answer(network)(x, torch.tensor([0.0, 0.0, 0.0, 1.4, 0.0, 0.0, 0.0]))
+    torch.testing.assert_close(alike, nominal, atol=1e-4, rtol=0.0)
+    assert (other - nominal).abs().max() > 0.1
+
+
 def test_expected_splits_are_written_as_commanded_only_where_they_are_obeyed():
     scenario = load_scenario("grid7_peak")
     scenario = replace(scenario, steps=3, demand=scenario.demand[:3])

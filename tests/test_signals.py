@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from signal_rules import watched
 
+from cosim.plant.pressure import Roads
 from cosim.sumo.net import city_of
 from cosim.sumo.signals import read_signals
-from cosim.sumo.trips import make_trips
+from cosim.sumo.trips import make_trips, turning_flows
 from nmfd.api import load_scenario
 from nmfd.types import Controls
 
@@ -57,6 +58,35 @@ def test_signals_that_are_not_simple_are_left_alone(city, tmp_path):
     simple, others = read_signals(changed, [tmp_path / "more.add.xml"])
     assert others == {"c11": "actuated signal"}
     assert [s.offset for s in simple if s.id == "c12"] == ["7"]
+
+
+def test_pressure_is_upstream_minus_downstream(city, scenario):
+    """A queue gives its stage the pressure; the same queue behind the junction takes it away;
+    shares add up."""
+    simple, _ = read_signals(city)
+    roads = Roads(city, simple, turning_flows(city, scenario.demand, scenario.step))
+    n = next(n for n, s in enumerate(simple) if s.id == "o11")
+    chosen = simple[n]
+    straight = next(k for k in chosen.links if chosen.phases[0].state[k.index] == "G")
+
+    def pressures(counts):
+        present = np.array([counts.get(lane.rpartition("_")[0], 0.0) for lane in roads.lanes])
+        begin = roads.begins[n]
+        return (roads.gain @ np.maximum(roads.weights @ present, 0.0))[
+            begin : begin + len(chosen.stages)
+        ]
+
+    queue = pressures({straight.from_edge: 5.0})
+    assert int(np.argmax(queue)) == 0
+    assert queue[0] > 5.0
+    targets = {k.to_edge: 25.0 for k in chosen.links if k.from_edge == straight.from_edge}
+    assert pressures({straight.from_edge: 5.0, **targets})[0] < 0.2 * queue[0]
+    held = (
+        roads.weights.toarray().clip(min=0.0).sum(axis=0)
+    )  # a vehicle before a signal is counted once
+    before = [lane for lane, total in zip(roads.lanes, held, strict=True) if total > 0]
+    assert len(before) > 300
+    assert held[held > 0] == pytest.approx(1.0)
 
 
 def test_max_pressure_runs_all_signals(city, scenario, plant_of):
