@@ -168,7 +168,8 @@ def edge_traffic(path: Path) -> dict[str, tuple[float, float]]:
     traffic = {}
     for edge in _edges(path):
         passed = float(edge["left"]) + float(edge["arrived"])
-        traffic[edge["id"]] = (float(edge["timeLoss"]), passed)
+        time_loss = float(edge.get("timeLoss", 0.0))  # not there if nobody drove on the edge
+        traffic[edge["id"]] = (time_loss, passed)
     return traffic
 
 

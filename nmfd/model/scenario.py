@@ -455,7 +455,7 @@ def _relocate(own: dict, folder: Path, here: Path) -> None:
             own[key] = seen(own[key], *kinds)
     sumo = own.get("sumo")
     if isinstance(sumo, dict):
-        for key in ("routes", "background", "additional"):
+        for key in ("routes", "background", "additional", "planned"):
             if isinstance(sumo.get(key), list) and all(isinstance(name, str) for name in sumo[key]):
                 sumo[key] = [seen(name) for name in sumo[key]]
     controllers = own.get("controllers")
