@@ -74,6 +74,7 @@ def test_only_drivers_with_a_plan_and_without_stops_are_planned():
     stopping = vehicle("stops")
     ElementTree.SubElement(stopping, "stop", lane="b_0")
     trip = ElementTree.Element("trip", {"id": "trip", "from": "a", "to": "z", "type": "car"})
+    ElementTree.SubElement(trip, "param", key="of", value="trip")
     elements = [
         stopping,
         vehicle("elsewhere", "b z"),
@@ -89,6 +90,7 @@ def test_only_drivers_with_a_plan_and_without_stops_are_planned():
     assert routes_of(found) == ["a b z", "b z", "a c z", "a b z", "a c z", "a b a"]
     made = found.originals.elements[2]
     assert (made.tag, made.attrib) == ("vehicle", {"id": "trip", "type": "car"})
+    assert [part.tag for part in made] == ["route", "param"]
 
 
 def test_some_drivers_keep_their_route_if_not_all_comply():

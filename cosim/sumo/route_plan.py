@@ -162,13 +162,7 @@ def planned_trips(
     for place, (_, n, _) in enumerate(drawn):
         element = originals.elements[n]
         if place in routes and follows[place]:
-            kept = {}
-            for key, value in element.attrib.items():
-                if key not in ("route", "from", "to"):
-                    kept[key] = value
-            element = ElementTree.Element("vehicle", kept)
-            ElementTree.SubElement(element, "route", edges=" ".join(routes[place]))
-            element.extend(part for part in element if part.tag != "route")
+            element = _on_route(element, routes[place])
         elements.append(element)
     departures: PerTrip = np.array([row[0] for row in drawn])
     return PlannedTrips(
@@ -176,3 +170,15 @@ def planned_trips(
         drawn=[(row[0], place, row[2]) for place, row in enumerate(drawn)],
         planned=frozenset(drawn[place][2] for place in routes),
     )
+
+
+def _on_route(element: ElementTree.Element, route: Route) -> ElementTree.Element:
+    """Return a vehicle with another route."""
+    kept = {}
+    for key, value in element.attrib.items():
+        if key not in ("route", "from", "to"):
+            kept[key] = value
+    vehicle = ElementTree.Element("vehicle", kept)
+    ElementTree.SubElement(vehicle, "route", edges=" ".join(route))
+    vehicle.extend(part for part in element if part.tag != "route")
+    return vehicle
