@@ -106,6 +106,7 @@ class LinkModel:
         choices: Choices | None = None,
         dt: float = 3.0,
         dtype: torch.dtype = torch.float32,
+        device: str = "cpu",
     ):
         """step: control interval (s), a multiple of dt
         dt: time step, a whole number (s)
@@ -114,7 +115,7 @@ class LinkModel:
         self.network = network
         self.step = step
         self._choices = choices or Choices()
-        self.flows = Flows(network, numbers or Numbers(), dt=dt, dtype=dtype)
+        self.flows = Flows(network, numbers or Numbers(), dt=dt, dtype=dtype, device=device)
         self._steps = round(step / dt)
         by_pressure = self._choices.signals == MAX_PRESSURE
         self._gates = Gates(self.flows, by_cycle=by_pressure)
