@@ -30,9 +30,12 @@ def run_sumo(program: str, options: Mapping[str, object], *flags: str, where: st
 
 
 def last_words(said: object) -> str:
-    """Return the last line of what a program or an error says."""
-    words = getattr(said, "stderr", "") or str(said)
-    return " ".join(words.strip().splitlines()[-1:])
+    """Return the last line of what a finished program or an error says."""
+    words = getattr(said, "stderr", "")
+    if not words and isinstance(said, Exception):
+        words = str(said)
+    lines = (words or "").strip().splitlines()
+    return lines[-1] if lines else "no message"
 
 
 def run_tool(
