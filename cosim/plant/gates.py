@@ -378,9 +378,10 @@ class ResponsiveSignal:
 
     def play(self, now: float) -> None:
         """Set the state from `now` [s] on, or leave the signal to SUMO."""
-        base = self._session.signal_state(self._signal)
         if self._held:
             base = self._session.state_underneath(self._signal, self._programme)
+        else:
+            base = self._session.signal_state(self._signal)
         if base == self._base and now < self._next - 1e-6:
             return
         before = self._base

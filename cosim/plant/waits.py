@@ -63,17 +63,11 @@ class Waits:
                 standing = session.standing_time(vehicle)
                 if standing == 0.0:
                     continue
-                route = self._session.route(vehicle)
-                place = self._session.route_index(vehicle)
-                ahead = targets.get(route[place + 1] if place + 1 < len(route) else "")
+                ahead = targets.get(self._next_edge(vehicle))
                 if ahead is None:  # the vehicle is on the wrong lane
                     continue
                 signal, link = ahead
-                red_since = None
-                for time, state in reversed(self._states[signal]):
-                    if state[link] not in CLOSED:
-                        break
-                    red_since = time
+                red_since = self._red_since(signal, link)
                 if red_since is not None:
                     self._waiting[signal][link] = max(session.time - standing, red_since)
 
@@ -84,5 +78,20 @@ class Waits:
                 self._end(signal, self._session.time - begin)
         return self._longest
 
+    def _red_since(self, signal: str, link: int) -> float | None:
+        """Return the time at which a light became red [s], None if it is not."""
+        since = None
+        for time, state in reversed(self._states[signal]):
+            if state[link] not in CLOSED:
+                break
+            since = time
+        return since
+
     def _end(self, signal: str, seconds: float) -> None:
         self._longest[signal] = max(seconds, self._longest.get(signal, 0.0))
+
+    def _next_edge(self, vehicle: str) -> str:
+        """Return the next edge of a vehicle's route, "" at its end."""
+        route = self._session.route(vehicle)
+        place = self._session.route_index(vehicle)
+        return route[place + 1] if place + 1 < len(route) else ""
