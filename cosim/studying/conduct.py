@@ -48,11 +48,14 @@ def conducted(
             load = stages.loading(runner)
             found = stages.gates(runner, load, own=own)
             runner = replace(runner, scenario=found.scenario)
+            demands = sorted({1.0, load.under})
             if own and not found.reason:
-                stages.train_gates(found.scenario)
+                far = [stages.far_from_critical(runner, level) for level in demands]
+                if not all(far):
+                    stages.train_gates(found.scenario)
             skipped = runner.impossible()
             levels = []
-            for level in dict.fromkeys((1.0, load.under)):
+            for level in demands:
                 levels.append(_level(runner, level, found.reason, skipped, most_seeds))
             place = str(source)
             if own:

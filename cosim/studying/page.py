@@ -1,6 +1,7 @@
 """Answer of a study: sentences, table of the terminal, HTML page."""
 
 import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,12 +13,14 @@ from cosim.importing.importer import COMPARISONS, reported
 from cosim.reporting import html
 from cosim.studying.stages import LABELS, Level, Loading, Outcome, compared
 from cosim.studying.verdict import FEWEST_SEEDS, NOTHING_PERCENT, Answer, Verdict
-from cosim.sumo.net import edge_shapes, network_folder
+from cosim.sumo.arrays import Points
+from cosim.sumo.net import City, edge_shapes, network_folder
 from nmfd.model.scenario import Scenario
 from nmfd.runs import files
 from nmfd.runs.run_many import TABLE
 from nmfd.runs.tables import NARROW, text_table, wrapped
 from nmfd.studies.benchmark import REFERENCE
+from nmfd.types import Result
 
 PAGE = "study.html"
 MOST_PLACES = 10  # streets and signals in a table
@@ -311,6 +314,12 @@ def write(study: Study) -> Path:
         demand = level.demand
     finished = results.read(study.runs)
     shown = html.map_of(finished, demand=demand, names=names)
+    city = finished.map()
+    shapes = edge_shapes(city)
+    runs = []  # of every strategy, on their common seeds
+    for of_strategy in statistics.common_runs(finished.level(demand), names):
+        if of_strategy:
+            runs.append(of_strategy)
     text = html.rendered(
         "cosim.studying",
         "study.html.j2",
@@ -321,8 +330,8 @@ def write(study: Study) -> Path:
         trust=trust(study),
         map=shown,
         map_demand=f"{demand:g}",
-        queues=queues(finished, demand, names),
-        delays=delays(finished, demand, names),
+        queues=queues(city, finished.scenario.network.titles, shapes, runs),
+        delays=delays(city, shapes, runs),
         place_names=[LABELS[name] for name in names],
         map_names=" and ".join(LABELS[name] for name in names),
         manifest=html.made_by(finished),
@@ -333,19 +342,19 @@ def write(study: Study) -> Path:
     return study.page
 
 
-def queues(finished: results.Finished, demand: float, names: Sequence[str]) -> list[dict]:
+def queues(
+    city: City, titles: Sequence[str], shapes: Sequence[Points], runs: Sequence[Sequence[Result]]
+) -> list[dict]:
     """Return the streets with the longest queues of the first strategy.
 
     A row has the street, its region, the signal at its end, where it ends (x, y) [m], and the
-    longest queue [veh] of every strategy, mean over their common seeds.
+    longest queue [veh] of every strategy, mean over its seeds.
+
+    titles: of the regions; shapes: of the edges; runs: of every strategy
     """
-    city = finished.map()
-    titles = finished.scenario.network.titles
-    runs = statistics.common_runs(finished.level(demand), names)
-    means = [np.mean([run["queue_max"] for run in of], axis=0) for of in runs if of]
+    means = [np.mean([run["queue_max"] for run in of], axis=0) for of in runs]
     if not means:
         return []
-    shapes = edge_shapes(city)
     rows = []
     for edge in np.argsort(-means[0], kind="stable")[:MOST_PLACES]:
         name = city.edges[edge]
@@ -363,24 +372,22 @@ def queues(finished: results.Finished, demand: float, names: Sequence[str]) -> l
     return rows
 
 
-def delays(finished: results.Finished, demand: float, names: Sequence[str]) -> list[dict]:
+def delays(city: City, shapes: Sequence[Points], runs: Sequence[Sequence[Result]]) -> list[dict]:
     """Return the signals at which most time is lost under the first strategy.
 
     A row has the signal, where it is (x, y) [m], vehicles [veh] that passed it in a run, and the
     mean delay [s] and level of service under every strategy. The delay is the time that all
-    vehicles lost on the streets before the signal, over their number, of their common seeds.
+    vehicles lost on the streets before the signal, over their number.
+
+    shapes: of the edges; runs: of every strategy
     """
-    city = finished.map()
-    runs = statistics.common_runs(finished.level(demand), names)
-    runs = [of for of in runs if of]
     if not runs or any("time_loss" not in run for of in runs for run in of):
         return []
-    before: dict[str, list[int]] = {}  # signal -> numbers of the edges that end there
+    before = defaultdict[str, list[int]](list)  # signal -> numbers of the edges that end there
     for edge, signal in city.signals.items():
-        before.setdefault(signal, []).append(city.number[edge])
+        before[signal].append(city.number[edge])
     lost = [np.sum([run["time_loss"] for run in of], axis=0) for of in runs]
     passed = [np.sum([run["passed"] for run in of], axis=0) for of in runs]
-    shapes = edge_shapes(city)
     worst = sorted(before, key=lambda signal: -lost[0][before[signal]].sum())
     rows = []
     for signal in worst[:MOST_PLACES]:
