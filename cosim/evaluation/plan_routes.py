@@ -3,8 +3,8 @@
 The first plan has the routes in which guidance every minute ends. Then, in every iteration, a share
 of the drivers, those who gain most by it, change to the route of least cost
 (cosim.evaluation.move_times) at the mean travel times of the last runs, and SUMO runs with the
-plan. The routes of the run with the least total time spent are the ones that are changed: after an
-iteration without a gain fewer drivers change. The plan of that run is kept.
+plan. It is always the run with the least total time spent whose routes are changed, and whose plan
+is kept. After an iteration without a gain fewer drivers change.
 
     <out>/plan-<n>.csv.gz     plan of iteration n
     <out>/iteration-<n>/      its run
@@ -48,7 +48,7 @@ from nmfd.runs.run_many import Run, locked, raise_failures, run_many
 
 FIRST = "guided+guidance-period-60"  # words of the run whose routes the first plan has
 CHANGED_SHARE = 0.04  # drivers who change to another route in one iteration
-SMALLER = 0.7  # share of these who change after an iteration without a gain
+SMALLER = 0.7  # factor of that share after an iteration without a gain
 AVERAGED_RUNS = 3  # the last ones, whose travel times are averaged
 TABLE = "plan.csv"
 GAP = "relative_gap"
@@ -109,15 +109,16 @@ class Driver(NamedTuple):
 class Base(NamedTuple):
     """The best run with a plan so far, whose routes the next plan changes.
 
-    number: iteration; spent: total time spent (veh s); share: of the drivers, who change
+    number: iteration, 0 before the first plan; spent: total time spent (veh s)
+    share: of the drivers who change
     """
 
-    number: int
-    spent: float
-    drivers: list[Driver]
+    number: int = 0
+    spent: float = math.inf
+    drivers: Sequence[Driver] = ()
     share: float = CHANGED_SHARE
 
-    def after(self, number: int, spent: float, drivers: list[Driver]) -> "Base":
+    def after(self, number: int, spent: float, drivers: Sequence[Driver]) -> "Base":
         """Return the base after another iteration.
 
         A run with a plan takes the place of the one with guidance in any case.
@@ -167,7 +168,7 @@ def plan_routes(
     end = chosen.begin + scenario.steps * scenario.step
     rows: list[dict] = []
     runs = []
-    best: Base | None = None
+    base = Base()
     total = order.iterations + 1
     with locked(order.out), watched("plan", progress, said=True) as show:
         for number in range(total):
@@ -180,20 +181,18 @@ def plan_routes(
             drivers = drivers_of(driven, due, city)
             runs.append(visits(city, [driven[name] for name in drivers], chosen.begin, end))
             costs = Costs(city, runs[-AVERAGED_RUNS:], chosen.begin)
-            own = list(drivers.values())
-            best = Base(number, spent, own) if best is None else best.after(number, spent, own)
-            found = assess(city, costs, best.drivers, chosen.begin)
-            changes = found.changes[: round(best.share * len(best.drivers))]
-            changed_plan(best.drivers, changes).write(order.plan(number + 1))
+            base = base.after(number, spent, list(drivers.values()))
+            found = assess(city, costs, base.drivers, chosen.begin)
+            changes = found.changes[: round(base.share * len(base.drivers))]
+            changed_plan(base.drivers, changes).write(order.plan(number + 1))
             rows.append({"iteration": number, TTS: spent, GAP: found.gap})
             files.write_table(order.out / TABLE, Table(rows))
             text = f"total time spent {spent:.4g} veh s, relative gap {found.gap:.3f}"
             _say(f"iteration {number}: {text}", progress)
             if show:
                 show(number + 1, total)
-    assert best is not None
     with files.atomic(file) as temporary:
-        shutil.copyfile(order.plan(best.number), temporary)
+        shutil.copyfile(order.plan(base.number), temporary)
     return Table(rows)
 
 
