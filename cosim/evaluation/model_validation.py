@@ -179,7 +179,10 @@ def prediction_table(rows: pd.DataFrame) -> str:
         for name in SITUATIONS:
             errors = group[[f"{name}_rmse_veh", f"{name}_persistence_rmse_veh"]]
             model, as_now = np.sqrt((errors**2).mean())
-            line[f"{name} (as now)"] = cell(model, f"{{:.0f}} ({as_now:.0f}) veh")
+            error = "-"
+            if not np.isnan(model):
+                error = f"{model:.0f} ({as_now:.0f}) veh"
+            line[f"{name} (as now)"] = error
         lines.append(line)
     return text_table(lines, CAPTION)
 

@@ -31,7 +31,7 @@ from nmfd.errors import InputError
 from nmfd.model import mfd
 from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import files
-from nmfd.runs.tables import NARROW, text_table, wrapped
+from nmfd.runs.tables import NARROW, cell, text_table, wrapped
 from nmfd.studies import fit_quality, plots
 from nmfd.studies.measured import U_MAX, U_MIN, samples_of
 
@@ -273,12 +273,6 @@ def _row(fit: pd.Series) -> dict[str, object]:
         critical = f"above {fit['critical_above_veh']:,.0f}"
         density = "-"
         speed = "-"
-    by_outflow = "-"
-    if not np.isnan(fit["outflow_critical_veh"]):
-        by_outflow = f"{fit['outflow_critical_veh']:,.0f}"
-    loop = "-"
-    if not np.isnan(fit["hysteresis"]):
-        loop = f"{fit['hysteresis']:+.0%}"
     return {
         "region": f"{fit['region']} {fit['name']}",
         "lane-km": f"{fit['lane_km']:.1f}",
@@ -287,7 +281,7 @@ def _row(fit: pd.Series) -> dict[str, object]:
         "veh/lane-km": density,
         "production": f"{fit['max_outflow_veh_s']:,.0f}",
         "speed": speed,
-        "by outflow": by_outflow,
-        "hysteresis": loop,
+        "by outflow": cell(fit["outflow_critical_veh"], "{:,.0f}"),
+        "hysteresis": cell(fit["hysteresis"], "{:+.0%}"),
         "R2": f"{fit['r2']:.2f}",
     }

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from xml.etree.ElementTree import Element
 from xml.sax.saxutils import quoteattr
 
-from cosim.sumo.xml_files import BROKEN, attribute
+from cosim.sumo.xml_files import BROKEN, attribute, elements_of
 from nmfd.errors import RunFailed
 
 KG_PER_MG = 1e-6
@@ -134,13 +134,14 @@ def write_edge_outputs(path: Path, emissions: Path, traffic: Path) -> None:
 
     emissions, traffic: SUMO's outputs by edge; emissions also of edges on junctions
     """
-    common = 'excludeEmpty="true" file='
-    polluted = f'id="emissions" type="emissions" withInternal="true" {common}'
-    texts = [
-        f"<edgeData {polluted}{quoteattr(str(emissions))}/>",
-        f'<edgeData id="traffic" {common}{quoteattr(str(traffic))}/>',
-    ]
-    path.write_text("\n".join(["<additional>", *texts, "</additional>\n"]), encoding="utf-8")
+    polluted = quoteattr(str(emissions))
+    driven = quoteattr(str(traffic))
+    text = f"""<additional>
+<edgeData id="emissions" type="emissions" withInternal="true" excludeEmpty="true" file={polluted}/>
+<edgeData id="traffic" excludeEmpty="true" file={driven}/>
+</additional>
+"""
+    path.write_text(text, encoding="utf-8")
 
 
 def edge_emissions(path: Path) -> dict[str, tuple[float, float]]:
@@ -176,7 +177,7 @@ def edge_traffic(path: Path) -> dict[str, tuple[float, float]]:
 def _edges(path: Path) -> Iterator[Mapping[str, str]]:
     """Yield the attributes of every edge in an output of SUMO."""
     try:
-        for edge in ElementTree.parse(path).iter("edge"):
+        for edge in elements_of(path, "edge"):
             yield edge.attrib
     except BROKEN as error:
         raise unfinished(path, error) from None

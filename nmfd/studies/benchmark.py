@@ -411,7 +411,7 @@ def improvement_table(rows: "pd.DataFrame") -> str:
         cells = [name]
         for sigma in trips.index:
             mean, half = gains.get(sigma, (math.nan, math.nan))
-            cells.append(cell(mean, f"{{:.1f}} ± {half:.1f}"))
+            cells.append("-" if math.isnan(mean) else f"{mean:.1f} ± {half:.1f}")
         lines.append(cells)
     caption = ROBUSTNESS_CAPTION.format(kind=kind, meaning=_meaning(kind))
     return text_columns(["sigma", *(f"{sigma:g}" for sigma in trips.index)], lines, caption)
