@@ -181,8 +181,9 @@ def details(level: Level) -> list[str]:
             more = one.more_left * one.means["trips"]
             lines.append(f"{one.label}: leaves {more:,.0f} trips more unserved; not recommended")
     skipped: dict[str, list[str]] = {}
-    for name, reason in level.skipped.items():
-        skipped.setdefault(reason, []).append(LABELS[name])
+    for name, label in LABELS.items():
+        if name in level.skipped:
+            skipped.setdefault(level.skipped[name], []).append(label)
     for reason, labels in skipped.items():
         lines.append(f"{', '.join(labels)}: not judged; {reason}")
     return lines
