@@ -105,8 +105,7 @@ def in_processes(
                 number = live.pop(future)
                 yield number, _outcome(future, limits[number])
     finally:  # after Ctrl-C there are some
-        for future in live:  # first, as pebble raises errors of its own for processes that died
-            future.cancel()
+        # Jobs are not cancelled: pebble raises an error if a process ends at that moment.
         for process in multiprocessing.active_children():
             if live and process.name == NAME:
                 process.kill()
