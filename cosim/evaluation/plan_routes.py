@@ -33,9 +33,9 @@ from cosim.evaluation.move_times import (
 )
 from cosim.evaluation.runs import runs_of
 from cosim.evaluation.statistics import TTS
-from cosim.plant.launch import drawn_vehicles, own_vehicles
+from cosim.plant.launch import drawn_vehicles, vehicles_of
 from cosim.plant.programmes import scenario_city
-from cosim.plant.settings import Settings, check_plannable, own_files, settings
+from cosim.plant.settings import Settings, own_files, settings
 from cosim.plant.strategy import Strategy, parse
 from cosim.sumo import recorded_trips as recorded
 from cosim.sumo.net import City
@@ -162,7 +162,6 @@ def plan_routes(
     """
     scenario = with_demand(order.scenario, factor=order.demand)
     chosen = settings(scenario)
-    check_plannable(scenario, chosen)
     city = scenario_city(scenario, chosen)
     due = _due(scenario, chosen, city, order.seed)
     end = chosen.begin + scenario.steps * scenario.step
@@ -198,7 +197,7 @@ def plan_routes(
 
 def _due(scenario: Scenario, chosen: Settings, city: City, seed: int) -> dict[str, float]:
     """Return when each vehicle is due (s) that may get another route."""
-    originals = own_vehicles(scenario, chosen, city)
+    originals = vehicles_of(scenario, chosen, city, seed)
     shared = recorded.read_routes(own_files(scenario, chosen.additional))
     due = {}
     for depart, n, name in drawn_vehicles(scenario, chosen, originals, seed):

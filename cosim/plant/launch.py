@@ -12,7 +12,7 @@ from cosim.sumo import outputs
 from cosim.sumo import recorded_trips as recorded
 from cosim.sumo.net import City
 from cosim.sumo.recorded_trips import DrawnTrip, HeldTrips, RecordedTrips, as_recorded
-from cosim.sumo.route_plan import PlannedTrips, planned_trips, read_plan
+from cosim.sumo.route_plan import PlannedTrips, ends_of, planned_trips, read_plan
 from cosim.sumo.session import Session
 from cosim.sumo.signals import Signal
 from cosim.sumo.trips import PLANNING_SEEDS, make_trips, turning_flows
@@ -33,8 +33,13 @@ REROUTING = {
 GIVEN = ("step-length", "time-to-teleport", "collision.action")  # arguments of Session
 
 
-def own_vehicles(scenario: Scenario, settings: Settings, city: City) -> RecordedTrips:
-    """Return the recorded trips of the city. Raises InputError."""
+def vehicles_of(scenario: Scenario, settings: Settings, city: City, seed: int) -> RecordedTrips:
+    """Return the recorded trips of the city, or trips made from the demand by `seed`.
+
+    Raises: InputError
+    """
+    if not settings.routes:
+        return as_recorded(make_trips(city, scenario.demand, scenario.step, seed))
     originals = recorded.read_recorded_trips(own_files(scenario, settings.routes))
     recorded.check_edges(originals, city, f"{scenario.where}: sumo.routes")
     return originals
@@ -208,6 +213,8 @@ class Launch:
         settings = self._settings
         where = f"{self._scenario.where}: sumo.planned"
         plan = read_plan(own_files(self._scenario, settings.planned), self._city)
+        if not settings.routes:
+            plan.add_parts(ends_of(element, self._shared_routes) for element in originals.elements)
         trips = planned_trips(
             plan,
             originals,
@@ -218,16 +225,16 @@ class Launch:
         )
         if not trips.planned:
             raise InputError(
-                f"{where}: no trip begins and ends on the same edges as a route of the plan; make "
+                f"{where}: no trip begins and ends on edges of a route of the plan; make "
                 "the plan with cosim plan, or omit it"
             )
         return trips
 
     def _vehicles_of(self, seed: int) -> RecordedTrips:
-        """Return the recorded trips, or trips made from the demand by `seed`."""
+        """Return the trips of one run; those of the city itself are read once."""
         if self._settings.routes:
             return self._recorded
-        return as_recorded(make_trips(self._city, self._scenario.demand, self._scenario.step, seed))
+        return vehicles_of(self._scenario, self._settings, self._city, seed)
 
     @cached_property
     def beside(self) -> frozenset[str]:
@@ -238,7 +245,7 @@ class Launch:
 
     @cached_property
     def _recorded(self) -> RecordedTrips:
-        return own_vehicles(self._scenario, self._settings, self._city)
+        return vehicles_of(self._scenario, self._settings, self._city, 0)
 
     @cached_property
     def _shared_routes(self) -> Mapping[str, tuple[str, ...]]:

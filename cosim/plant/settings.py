@@ -191,8 +191,6 @@ def settings(scenario: "Scenario") -> Settings:
 
 def check_files(scenario: "Scenario", settings: Settings) -> None:
     """Check that the files of the city exist. Raise InputError."""
-    if settings.planned:
-        check_plannable(scenario, settings)
     for key in FILES:
         for file in own_files(scenario, getattr(settings, key)):
             if not file.is_file():
@@ -201,20 +199,6 @@ def check_files(scenario: "Scenario", settings: Settings) -> None:
                     remedy += ", or make it with cosim plan"
                 problem = f"no such file: {file}; {remedy}"
                 raise config.error(scenario.where, f"sumo.{key}", problem)
-
-
-def check_plannable(scenario: "Scenario", settings: Settings) -> None:
-    """Check that the city has its own vehicles, whose routes a plan may know.
-
-    Raises: InputError
-    """
-    if not settings.routes:
-        raise config.error(
-            scenario.where,
-            "sumo.planned",
-            "every seed draws other trips from the demand, which no plan knows; plan routes in a "
-            "city that is imported with its vehicles",
-        )
 
 
 def own_files(scenario: "Scenario", names: Texts) -> list[Path]:

@@ -2,12 +2,13 @@
 
 A plan is a table of begin of the quarter [s], number of drivers, and route (edges with a space
 between them). The vehicles of a run need not be those that the plan was made for: they take the
-routes between their own first and last edges in the shares of the plan.
+routes between their own first and last edges in the shares of the plan. Where every run draws other
+trips from a demand between regions, those whose ends no route has take parts of routes.
 """
 
 import xml.etree.ElementTree as ElementTree
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
@@ -46,6 +47,21 @@ class RoutePlan:
         quarters = self._drivers.setdefault(Ends(route[0], route[-1]), {})
         routes = quarters.setdefault(int(depart // QUARTER_S), Counter())
         routes[route] += drivers
+
+    def add_parts(self, trips: Iterable[Ends | None]) -> None:
+        """Give the trips for which there is no plan the parts of routes between their ends.
+
+        A part of a route of least cost has least cost, too (Bellman's principle of optimality).
+        """
+        wanted: dict[str, set[str]] = defaultdict(set)
+        for ends in trips:
+            if ends is not None and ends not in self._drivers:
+                wanted[ends.first].add(ends.last)
+        for quarters in list(self._drivers.values()):
+            for quarter, routes in quarters.items():
+                for route, drivers in routes.items():
+                    for part in _parts(route, wanted):
+                        self.add(quarter * QUARTER_S, part, drivers)
 
     def quarter(self, ends: Ends, depart: float) -> int | None:
         """Return the nearest planned quarter of an hour; None without a plan.
@@ -102,6 +118,15 @@ def read_plan(paths: Iterable[Path], city: City) -> RoutePlan:
                 )
             plan.add(row.begin, route, row.drivers)
     return plan
+
+
+def _parts(route: Route, wanted: Mapping[str, Container[str]]) -> Iterator[Route]:
+    """Yield the parts of a route from an edge to one of those that are wanted from there."""
+    for start, first in enumerate(route):
+        lasts = wanted.get(first, ())
+        for end in range(start + 1, len(route)):
+            if route[end] in lasts:
+                yield route[start : end + 1]
 
 
 def ends_of(element: ElementTree.Element, shared: Mapping[str, Sequence[str]]) -> Ends | None:
