@@ -96,15 +96,6 @@ class _Visits:
             self._present[visit.event.vehicle] = visit
             self._due[self._step + steps].append(visit)
 
-    def targets(self, number: dict[str, int]) -> dict[tuple[int, int, bool], list[int]]:
-        """Return last edges of the drivers for `RegionRoutes.command`."""
-        targets = defaultdict(list)
-        for visit in self._present.values():
-            event = visit.event
-            key = (event.region, visit.driver_class, event.region == event.destination)
-            targets[key].append(number[event.edge])
-        return targets
-
     def due(self) -> list[_Visit]:
         """Return the drivers to guide again in this step."""
         visits = self._due.pop(self._step, [])
@@ -183,7 +174,7 @@ class Guide:
             return
         if seen is not None:
             self._times.learn(seen)
-        self._routes.command(prices, self._visits.targets(self._city.number))
+        self._routes.command(prices)
         self._shares.command(splits)
 
     def apply(self, events: list[Event]) -> None:
@@ -338,9 +329,7 @@ class Guide:
             time = self._time(trip, within[n].route(), all_free)
         return self._change(present, time, within[n], ways.exits.neighbours[n])
 
-    def _shortened(
-        self, trip: _Trip, choice: Choice, shortest: Choice, limit: float
-    ) -> list[int]:
+    def _shortened(self, trip: _Trip, choice: Choice, shortest: Choice, limit: float) -> list[int]:
         """Return a route within the limit; [] if there is none.
 
         choice: the fastest route with prices; shortest: without prices

@@ -8,7 +8,7 @@ interval counts half.
 
 import math
 from bisect import bisect_right
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache, cached_property, partial
 from operator import add
 from typing import Any, NamedTuple
@@ -19,7 +19,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from cosim.plant.sampling import STANDING_M_S, StreetMeans
-from cosim.sumo.arrays import EdgeMask, GatewayMask, MoveEnds, PerEdge, PerGateway, PerMove
+from cosim.sumo.arrays import EdgeMask, MoveEnds, PerEdge, PerGateway, PerMove
 from cosim.sumo.net import City
 from nmfd.arrays import PerRegion
 
@@ -245,6 +245,7 @@ class Trees:
     They are searched on demand and no further than needed.
 
     node: edge -> its node, as in `Moves`
+    asked: nodes from which searches were needed
     """
 
     def __init__(
@@ -261,7 +262,7 @@ class Trees:
     ):
         """time: of edges (s, (E,)); turns: of moves (s, (M,))
         ahead: see `Moves.costing` (s, (nodes,))
-        together: nodes to search from in one call, when the first of them is needed
+        together: different nodes to search from in one call, when the first of them is needed
         aims: nodes that `times` are for; beyond: time from each aim on (s)
         """
         self.node = moves.node
@@ -274,8 +275,9 @@ class Trees:
         self._ahead = ahead
         self._aims = np.array(aims, dtype=int)
         self._beyond = beyond
-        self._together = frozenset(together)
-        self._found: dict[int, _Tree] = {}  # searches done together
+        self._row = {node: row for row, node in enumerate(together)}
+        self._found: dict[int, _Tree] = {}  # of the searches done together
+        self.asked: set[int] = set()
 
     def costs(self, begin: int, most: float) -> PerNode:
         """Return the times from edge `begin` (s, (nodes,)).
@@ -299,31 +301,32 @@ class Trees:
 
     def _tree(self, node: int, most: float) -> _Tree:
         """Return the search from a node, at least up to `most` (s)."""
-        if node not in self._together:
+        self.asked.add(node)
+        row = self._row.get(node)
+        if row is None:
             return self._searches.tree(self._owner, node, most, self._search)
-        if not self._found:
-            self._search_together()
+        if node not in self._found:
+            costs, before = self._searched_together
+            self._found[node] = self._as_tree(node, math.inf, costs[row], before[row])
         return self._found[node]
 
     def _search(self, node: int, most: float) -> _Tree:
         """Return a new search from a node up to `most` (s)."""
         found = dijkstra(self._costs, indices=node, return_predecessors=True, limit=most)
-        costs, before = found
-        return _Tree(most, costs, before, self._to_aims(node, costs).tolist())
+        return self._as_tree(node, most, *found)
 
-    def _search_together(self) -> None:
-        """Search from all nodes of `together`."""
-        nodes = sorted(self._together)
-        found = dijkstra(self._costs, indices=nodes, return_predecessors=True)
-        for node, costs, before in zip(nodes, *found, strict=True):
-            self._found[node] = _Tree(math.inf, costs, before, self._to_aims(node, costs).tolist())
+    @cached_property
+    def _searched_together(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return costs and predecessors of the searches from all nodes of `together`."""
+        return dijkstra(self._costs, indices=[*self._row], return_predecessors=True)
 
-    def _to_aims(self, node: int, costs: PerNode) -> PerGateway:
-        """Return the times from a node to each aim and beyond (s, (G,))."""
+    def _as_tree(self, node: int, most: float, costs: PerNode, before: Nodes) -> _Tree:
+        """Return a search from a node up to `most` (s) with the times to the aims."""
         times = costs[self._aims]
         if self._ahead is not None:
             times = times + self._ahead[node]
-        return times + self._beyond
+        times = times + self._beyond
+        return _Tree(most, costs, before, times.tolist())
 
 
 class Choice(NamedTuple):
@@ -362,19 +365,28 @@ class Exits:
         self.first_nodes = inside.number[self.first]
         self.second_nodes = outside.number[self.second]
 
-    def leading(self, here: int, target: int) -> GatewayMask:
-        """Return the gateways that lead from edge `here` to `target` (bool, (G,))."""
-        return self._leading[self.inside.node[here]] & self._reached[self.outside.node[target]]
+    def leads(self, here: int, target: int, n: int) -> bool:
+        """Return True if a way from edge `here` to `target` leads by region neighbours[n]."""
+        both = self._leading[self.inside.node[here]] & self._reached[self.outside.node[target]]
+        return both & self._into[n] != 0
 
     @cached_property
-    def _leading(self) -> Bool[np.ndarray, "inside G"]:
-        """Return which edges inside lead to each gateway."""
-        return self.inside.leading_to(self.first_nodes)
+    def _leading(self) -> list[int]:
+        """Return the gateways that each edge inside leads to, as bits."""
+        return _bits(self.inside.leading_to(self.first_nodes))
 
     @cached_property
-    def _reached(self) -> Bool[np.ndarray, "outside G"]:
-        """Return which edges outside each gateway leads to."""
-        return self.outside.leading_to(self.second_nodes)
+    def _reached(self) -> list[int]:
+        """Return the gateways that lead to each edge outside, as bits."""
+        return _bits(self.outside.leading_to(self.second_nodes))
+
+    @cached_property
+    def _into(self) -> list[int]:
+        """Return the gateways into each of `neighbours`, as bits."""
+        numbers = np.arange(len(self.first))
+        begins = np.array(self.begins, dtype=int)[:, None]
+        ends = np.array(self.ends, dtype=int)[:, None]
+        return _bits((numbers >= begins) & (numbers < ends))
 
 
 class Returning(NamedTuple):
@@ -383,12 +395,20 @@ class Returning(NamedTuple):
     nodes: of first[g] (G,)
     entering: time from the end of first[g] to that of second[g] (s)
     back: no more than the time from behind the nearest gateway back to first[g] (s)
+    nearest: the least of these, infinite without a gateway
     """
 
     trees: Trees
     nodes: GatewayNumbers
     entering: Sequence[float]
     back: Sequence[float]
+    nearest: float
+
+
+def _bits(mask: Bool[np.ndarray, "N G"]) -> list[int]:
+    """Return the rows of a mask as whole numbers, a bit for each column."""
+    packed = np.packbits(mask, axis=1, bitorder="little")
+    return [int.from_bytes(row.tobytes(), "little") for row in packed]
 
 
 class Ways:
@@ -408,7 +428,7 @@ class Ways:
         ahead: PerNode,
         everywhere: Returning | None = None,
     ):
-        """there: routes by moves `inside`, whose aims are first[g], with the time beyond to the end of
+        """there: routes by moves `inside`, whose aims are first[g], and from there to the end of
             second[g]
         onward: routes by reversed moves `outside`, with `ahead`, whose aims are second[g]
         ahead: time from the nearest second[g] to nodes of `outside`, not above their times (s)
@@ -428,10 +448,10 @@ class Ways:
         """
         cost = self.cost(here, target, detour + longest)
         choices = []
-        for begin, end in zip(self.exits.begins, self.exits.ends, strict=True):
-            costs = cost[begin:end]
+        for n, begin in enumerate(self.exits.begins):
+            costs = cost[begin : self.exits.ends[n]]
             time = min(costs)
-            exists = time < math.inf or bool(self.exits.leading(here, target)[begin:end].any())
+            exists = time < math.inf or self.exits.leads(here, target, n)
             route = partial(self.route, here, begin + costs.index(time), target)
             choices.append(Choice(time, exists, route))
         fastest = min(cost, default=math.inf)
@@ -464,14 +484,15 @@ class Ways:
         if self._everywhere is None:
             return math.inf, 0
         everywhere = self._everywhere
-        onward = self._onward.times(target, 0.0)
-        # By then it has left, and come back, which alone takes too long for most gateways.
+        ends = [*map(add, everywhere.entering, self._onward.times(target, 0.0))]
+        # By then it has left, and come back, which alone takes too long for most drivers.
         left = min(self._there.times(here, 0.0), default=math.inf)
-        ends = []
-        for back, entering, time in zip(everywhere.back, everywhere.entering, onward, strict=True):
-            end = entering + time
-            ends.append(end if left + back + end < most else math.inf)
-        nearest = min(ends, default=math.inf)
+        if left + everywhere.nearest + min(ends, default=math.inf) >= most:
+            return math.inf, 0
+        for gateway, back in enumerate(everywhere.back):
+            if left + back + ends[gateway] >= most:
+                ends[gateway] = math.inf
+        nearest = min(ends)
         if nearest == math.inf:
             return math.inf, 0
         costs = everywhere.trees.costs(here, most - nearest)[everywhere.nodes] + ends
@@ -544,19 +565,19 @@ class RegionRoutes:
         self.time = cache(self._time)
         self.home = cache(self._home)
         self.ways = cache(self._ways)
-        self.command(None, {})
+        # Moves and class of drivers -> searches without prices.
+        self._unpriced: dict[tuple[Moves, int], Trees] = {}
+        self.command(None)
 
-    def command(
-        self, prices: PerRegion | None, targets: Mapping[tuple[int, int, bool], list[int]]
-    ) -> None:
+    def command(self, prices: PerRegion | None) -> None:
         """Begin a control interval with new travel times.
 
         prices: of the regions (-, (R,)); None: no prices
-        targets: last edges of drivers who will probably be guided, by region and class, and whether
-            it is their last region
         """
         self._prices = np.zeros(len(self.regions)) if prices is None else prices
-        self._targets = targets
+        # Many drivers are where others were, or go where others went.
+        self._asked = {key: sorted(trees.asked) for key, trees in self._unpriced.items()}
+        self._unpriced.clear()
         self._searches = Searches()
         self._free = [self._free_regions(destination) for destination in self.regions]
         self._trees.cache_clear()
@@ -588,8 +609,7 @@ class RegionRoutes:
 
         They stay inside it, unless routes may return.
         """
-        targets = self._targets.get((region, driver_class, True), [])
-        return self._trees_of(self._homeward[region], driver_class, free, targets)
+        return self._trees(self._homeward[region], driver_class, free)
 
     def _ways(self, region: int, driver_class: int, free: tuple[int, ...]) -> Ways:
         """Return routes out of a region to edges of others."""
@@ -597,13 +617,13 @@ class RegionRoutes:
         second = self._seen(driver_class, free)[exits.second]
         over = self._times.turns[exits.move] + second
         ahead = self._ahead(exits.outside, region, driver_class)
-        targets = self._targets.get((region, driver_class, False), [])
         everywhere = None
         if self._everywhere:
             trees = self._trees(self._everywhere, driver_class, free)
             back = self._ahead(self._homeward[region], region, driver_class)[exits.first]
             nodes = self._everywhere.number[exits.first]
-            everywhere = Returning(trees, nodes, over.tolist(), back.tolist())
+            nearest = float(back.min(initial=math.inf))
+            everywhere = Returning(trees, nodes, over.tolist(), back.tolist(), nearest)
         there = self._trees_of(
             exits.inside,
             driver_class,
@@ -612,7 +632,7 @@ class RegionRoutes:
             beyond=over if self._lanes else second,
         )
         onward = self._trees_of(
-            exits.outside, driver_class, free, targets, ahead=ahead, aims=exits.second_nodes
+            exits.outside, driver_class, free, ahead=ahead, aims=exits.second_nodes
         )
         return Ways(
             exits,
@@ -627,23 +647,26 @@ class RegionRoutes:
         moves: Moves,
         driver_class: int,
         free: tuple[int, ...],
-        targets: Sequence[int] = (),
         **others: Any,
     ) -> Trees:
         """Return routes at the times that a class of drivers sees.
 
-        targets: edges from which searches will probably be needed; others: arguments of `Trees`
+        others: arguments of `Trees`
         """
         seen = self._seen(driver_class, free)
+        turns = self._times.turns
+        # With prices, results depend on how far searches go.
+        if free != self.regions:
+            return Trees(moves, seen, turns, self._searches, **others)
+        key = (moves, driver_class)
         together: Iterable[int] = ()
         nodes = len(moves.edges)
-        # With prices, results depend on how far searches go.
-        if free == self.regions and nodes <= MOST_WHOLE:
+        if nodes <= MOST_WHOLE:
             together = range(nodes)
-        elif free == self.regions and nodes <= MOST_TOGETHER:
-            together = moves.number[list(targets)].tolist()
-        turns = self._times.turns
-        return Trees(moves, seen, turns, self._searches, together=together, **others)
+        elif nodes <= MOST_TOGETHER:
+            together = self._asked.get(key, ())
+        self._unpriced[key] = Trees(moves, seen, turns, self._searches, together=together, **others)
+        return self._unpriced[key]
 
     def _ahead_of(self, back: Moves, region: int, driver_class: int) -> np.ndarray:
         """Return the time from behind the nearest gateway (s, (nodes,)).
