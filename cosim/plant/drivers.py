@@ -7,7 +7,7 @@ for others.
 import math
 from collections.abc import Iterable, Sequence
 from itertools import groupby, pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from cosim.plant.routes import TravelTimes
 from cosim.sumo.net import City
@@ -15,6 +15,7 @@ from cosim.sumo.net import City
 # Drivers keep their route if another one saves less than this share of its delay, times the delay's
 # share of its time.
 SWITCHING_THRESHOLD = 0.6
+UNKNOWN = -1  # number of an edge closed to cars, or of a move that the city does not have
 MESO_THRESHOLD = 0.3  # in the mesoscopic model: less than this share of the other's own time
 
 
@@ -51,7 +52,7 @@ class Drivers:
         self._region = city.edge_region.tolist()
         self._times = times
         self._free = times.free.tolist()
-        self._free_turn = times.by_move(times.free_turns)
+        self._free_turns = times.free_turns.tolist()
         self._ways_return = ways_return
         self._lanes = lanes
 
@@ -60,17 +61,18 @@ class Drivers:
 
         edges: names, from the present one on; time: of every edge (s)
         """
-        route = [self._number[edge] for edge in edges if edge in self._number]
-        if len(route) < len(edges):
+        route = [self._number.get(edge, UNKNOWN) for edge in edges]
+        if UNKNOWN in route:
             return Present(None)
         if route[0] != here:
             return Present(route)
-        turn_of = self._times.turn_of
-        moves = [move for move in pairwise(route) if move in turn_of]
+        times = self._times
         ahead = route[1:]
-        takes = _total(time, ahead) + _total(turn_of, moves)
-        free = _total(self._free, ahead) + _total(self._free_turn, moves)
-        found = len(moves) == len(ahead)
+        moves = [times.move.get(pair, UNKNOWN) for pair in pairwise(route)]
+        found = UNKNOWN not in moves
+        known = moves if found else [move for move in moves if move != UNKNOWN]
+        takes = _total(time, ahead) + _total(times.turn_list, known)
+        free = _total(self._free, ahead) + _total(self._free_turns, known)
         if found and not self._ways_return:
             regions = self._regions(route)
             found = regions.count(regions[0]) == 1
@@ -81,7 +83,8 @@ class Drivers:
 
         time: of every edge (s)
         """
-        return _total(time, route[1:]) + _total(self._times.turn_of, pairwise(route))
+        moves = map(self._times.move.__getitem__, pairwise(route))
+        return _total(time, route[1:]) + _total(self._times.turn_list, moves)
 
     def keeps(self, present: Present, time: float, following: int | None = None) -> bool:
         """Return True if a driver keeps the present route.
@@ -119,9 +122,6 @@ class Drivers:
         return [region for region, _ in groupby(map(self._region.__getitem__, route))]
 
 
-def _total(times: Any, keys: Iterable) -> float:
-    """Return the sum of some times (s).
-
-    times: list, or a dictionary
-    """
-    return sum(map(times.__getitem__, keys))
+def _total(times: Sequence[float], numbers: Iterable[int]) -> float:
+    """Return the sum of the times with these numbers (s)."""
+    return sum(map(times.__getitem__, numbers))

@@ -42,8 +42,7 @@ class TravelTimes:
 
     first, second: numbers of the edges that each move joins (M,); move: these two -> its number
     free, free_turns: in free flow, along edges (s, (E,)) and of moves over junctions (s, (M,))
-    edges, turns: the same at present
-    turn_of: the two edges of a move -> its time at present (s)
+    edges, turns: the same at present; turn_list: `turns` as a list
     """
 
     def __init__(self, city: City, *, lanes: bool = True):
@@ -58,7 +57,7 @@ class TravelTimes:
         self.free_turns = city.move_time
         self.edges = self.free.copy()
         self.turns = self.free_turns.copy()
-        self.turn_of = self.by_move(self.turns)
+        self.turn_list = self.turns.tolist()
         self._longest = np.array(list(city.inside.values())) / STANDING_M_S
         # Pairs of moves and internal edges that they lead over, which several moves may share.
         inside = {edge: n for n, edge in enumerate(city.inside)}
@@ -72,10 +71,6 @@ class TravelTimes:
         # The same on internal edges: time [veh s] and vehicles that got over them [veh].
         self._crossing = np.zeros(len(inside))
         self._crossed = np.zeros(len(inside))
-
-    def by_move(self, values: PerMove) -> dict[tuple[int, int], float]:
-        """Return the two edges of a move -> its value."""
-        return dict(zip(self.move, values.tolist(), strict=True))
 
     def learn(self, seen: StreetMeans) -> None:
         """Update the times from the means of a control interval."""
@@ -114,7 +109,7 @@ class TravelTimes:
         takes = np.divide(self._crossing, self._crossed, out=standing, where=self._crossed > 0.0)
         over = np.minimum(takes, self._longest)[self._via]
         self.turns = np.maximum(np.bincount(self._move, over, len(self.turns)), self.free_turns)
-        self.turn_of = self.by_move(self.turns)
+        self.turn_list = self.turns.tolist()
 
 
 class Moves:

@@ -64,8 +64,10 @@ class Shares:
         times = [choice.time if choice.time <= limit else math.inf for choice in choices]
         fastest = neighbours[times.index(min(times))]
         self._wished[region][destination][fastest] += 1.0
-        rows = (self._wished, self._own, self._theta, self._given)
-        wish, own, theta, given = (_picked(row[region][destination], neighbours) for row in rows)
+        wish = _picked(self._wished[region][destination], neighbours)
+        own = _picked(self._own[region][destination], neighbours)
+        theta = _picked(self._theta[region][destination], neighbours)
+        given = _picked(self._given[region][destination], neighbours)
         wishes = sum(wish)
         shares = shifted([w / wishes for w in wish], own, theta)
         for n, choice in enumerate(choices):
