@@ -1,6 +1,5 @@
 """One closed-loop run in SUMO, and the facts in its result."""
 
-import gc
 import json
 import math
 import time
@@ -91,9 +90,6 @@ def simulate(
         stack.callback(plant.close)
         # Without a command, drivers do what the controller's model takes them to do.
         believed = replace(scenario, network=planning.network)
-        # What has been loaded stays: the garbage collector need not look through it during the run.
-        gc.freeze()
-        stack.callback(gc.unfreeze)
         result = closed_loop.run(plant, controller, believed, seed=job.seed, progress=progress)
         used = scenario.settings | {"sumo": chosen.model_dump(mode="json", exclude_defaults=True)}
         about = {"controller": strategy.name, "plant": "sumo", "settings": json.dumps(used)}

@@ -5,7 +5,7 @@ for others.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from itertools import groupby, pairwise
 from typing import NamedTuple
 
@@ -15,8 +15,8 @@ from cosim.sumo.net import City
 # Drivers keep their route if another one saves less than this share of its delay, times the delay's
 # share of its time.
 SWITCHING_THRESHOLD = 0.6
-UNKNOWN = -1  # number of an edge closed to cars, or of a move that the city does not have
 MESO_THRESHOLD = 0.3  # in the mesoscopic model: less than this share of the other's own time
+UNKNOWN = -1  # number of an edge closed to cars, or of a move that the city does not have
 
 
 class Present(NamedTuple):
@@ -83,7 +83,7 @@ class Drivers:
 
         time: of every edge (s)
         """
-        moves = map(self._times.move.__getitem__, pairwise(route))
+        moves = [self._times.move[pair] for pair in pairwise(route)]
         return _total(time, route[1:]) + _total(self._times.turn_list, moves)
 
     def keeps(self, present: Present, time: float, following: int | None = None) -> bool:
@@ -122,6 +122,6 @@ class Drivers:
         return [region for region, _ in groupby(map(self._region.__getitem__, route))]
 
 
-def _total(times: Sequence[float], numbers: Iterable[int]) -> float:
+def _total(times: Sequence[float], numbers: Sequence[int]) -> float:
     """Return the sum of the times with these numbers (s)."""
-    return sum(map(times.__getitem__, numbers))
+    return sum([times[number] for number in numbers])

@@ -344,12 +344,18 @@ class Guide:
         return []
 
     def _present(self, trip: _Trip, free: tuple[int, ...]) -> Present:
-        """Return the present route of a driver. free: regions without a price"""
+        """Return the present route of a driver.
+
+        free: regions without a price
+        """
         time = self._routes.time(trip.driver_class, free)
         return self._drivers.present(trip.edges, trip.here, time)
 
     def _time(self, trip: _Trip, route: list[int], free: tuple[int, ...]) -> float:
-        """Return the time of a route for a driver (s). free: regions without a price"""
+        """Return the time of a route for a driver (s).
+
+        free: regions without a price
+        """
         return self._drivers.time(route, self._routes.time(trip.driver_class, free))
 
     def _next_region(

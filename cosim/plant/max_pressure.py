@@ -128,7 +128,7 @@ class MaxPressure:
     def _decide(self, now: float) -> None:
         """Switch the junctions whose next stage is another one."""
         present = np.zeros(len(self._roads.lanes))
-        present[self._counted] = [*map(self._session.lane_vehicles, self._names)]
+        present[self._counted] = [self._session.lane_vehicles(lane) for lane in self._names]
         closed = [gate for gate in self._gates if gate.ration.exhausted]
         pressure = self._pressure(present, closed)
         approaches = self._approaches

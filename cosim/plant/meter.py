@@ -223,12 +223,12 @@ class Meter:
     def _entered(self) -> list[Event]:
         """Return the entries since the last poll of the edges behind boundaries."""
         events = []
-        seen = self._seen
-        for edge, present in zip(seen, map(self._session.vehicles_on, seen), strict=True):
-            if present != seen[edge]:
-                for vehicle in set(present).difference(seen[edge]):
-                    events += self._enter(vehicle, edge, self._entries[edge])
-                seen[edge] = present
+        for edge, region in self._entries.items():
+            present = self._session.vehicles_on(edge)
+            if present != self._seen[edge]:
+                for vehicle in set(present).difference(self._seen[edge]):
+                    events += self._enter(vehicle, edge, region)
+                self._seen[edge] = present
         return events
 
     def accumulation(self, step: int = 0) -> PerPair:
