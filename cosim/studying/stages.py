@@ -49,6 +49,7 @@ AT_CRITICAL = {
     DPC: "DPC gates",
     "mpc-pc": "MPC gates",
     "metering": "metering",
+    "pricing-rule+max-pressure+guidance-period-60": "prices over max-pressure",
 }
 LABELS = {REFERENCE: "no control"} | EVERYWHERE | AT_CRITICAL
 FAILED = f"a run failed, for the reason in {TABLE}"
