@@ -70,7 +70,7 @@ def test_elements_are_written_as_by_the_library():
 
 
 MIXED = """<routes>
-  <vehicle id="own" type="car" depart="1" departLane="best" arrivalPos="-1" color="red">
+  <vehicle id="own" type="car" depart="1" departLane="best" arrivalPos="-1" color="red" arrival="90">
     <route edges="a b"/></vehicle>
   <vehicle id="shared" depart="2" route="morning"/>
   <vehicle id="unknown" depart="3" route="evening"/>

@@ -317,7 +317,7 @@ class Outcome:
     @property
     def left(self) -> float:
         """Mean number of trips left at the end."""
-        return unfinished(self.means)
+        return round(unfinished(self.means), 6) + 0.0  # no -0
 
 
 @dataclass(frozen=True, kw_only=True)
