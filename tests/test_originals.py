@@ -70,8 +70,8 @@ def test_elements_are_written_as_by_the_library():
 
 
 MIXED = """<routes>
-  <vehicle id="own" type="car" depart="1" departLane="best" arrivalPos="-1" color="red">
-    <route edges="a b"/></vehicle>
+  <vehicle id="own" type="car" depart="1" departLane="best" arrivalPos="-1" color="red"
+    arrival="90"><route edges="a b"/></vehicle>
   <vehicle id="shared" depart="2" route="morning"/>
   <vehicle id="unknown" depart="3" route="evening"/>
   <vehicle id="stops" depart="4"><route edges="a b"/><stop lane="a_0" duration="5"/></vehicle>

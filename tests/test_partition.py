@@ -182,6 +182,14 @@ def test_the_chosen_partition_is_the_one_whose_gates_hold_most(tmp_path):
         assert all(pieces(streets, choice.labels == n) == 1 for n in set(choice.labels))
 
 
+def test_two_regions_are_chosen_even_if_gates_hold_nobody(tmp_path):
+    streets = read_streets(tiny_city.network(tmp_path))
+    routes = {(int(a), int(b)): 1 for a, b in streets.links}
+    signals = {signal for signal in streets.link_signals if signal}
+    run = baseline(streets, np.full(len(streets.edges), 0.01))
+    assert choose(streets, run, routes, uncontrollable=signals).labels.max() == 1
+
+
 def test_a_vehicle_counts_once_where_it_first_enters_from_elsewhere(streets):
     """Along a row of streets, of which every other one is inside."""
     row = [streets.number[f"{a}0{b}0"] for a, b in pairwise("ABCDEF")]

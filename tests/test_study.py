@@ -144,6 +144,18 @@ def test_the_answer_says_that_the_best_is_not_told_apart():
     )
 
 
+def test_the_answer_says_what_helps_only_today():
+    only_today = [outcome(PRESSURE, *GAIN), outcome(GUIDED, 0.0, 0.1, 0.0)]
+    harming = outcome(PRESSURE, 9.0, 10.0, 11.0)
+    said = page.answer(studied(only_today, [harming]))
+    assert said.startswith("Today max-pressure signals would save 10.0")
+    assert said.endswith("with more traffic harm, or leave more trips unserved.")
+    said = page.answer(studied(only_today, [harming, outcome(GUIDED, *GAIN)]))
+    assert said.startswith("Today max-pressure signals would save 10.0")
+    assert " With more traffic guidance would save 10.0" in said
+    assert page.answer(studied([outcome(PRESSURE, *GAIN)])).startswith("Yes: max-pressure")
+
+
 def test_the_next_line_follows_from_the_verdict():
     nothing = [outcome(PRESSURE, 0.0, 0.1, 0.0)]
     assert page.next_line(studied(nothing)).endswith("keep the signals as they are.")

@@ -140,7 +140,9 @@ def choose(
     for labels in (*by_density, *search.results(by_density, turns, even)):
         number = int(labels.max()) + 1
         smallest = np.bincount(labels, streets.lane_metres).min() / 1000.0
-        if smallest < SMALLEST_LANE_KM or regions not in (None, number):
+        if smallest < SMALLEST_LANE_KM or number < FEWEST_REGIONS:
+            continue
+        if regions not in (None, number):
             continue
         one = judged(labels)
         if number not in best or one.net > best[number].net:

@@ -279,7 +279,8 @@ def _imported(
     choice = labelled(streets, baseline, traffic.routes, wanted, uncontrollable=left)
     if choice.labels.max() < 1:
         raise InputError(
-            f"{streets.path}: no two regions can be made that can be reached from each other"
+            f"{streets.path}: no two regions can be made that can be reached from each other; "
+            "give a larger city, or your own regions with --regions FILE"
         )
     return City(
         request=request,

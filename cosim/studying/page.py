@@ -98,6 +98,16 @@ class Study:
         return True
 
     @property
+    def only_today(self) -> Outcome | None:
+        """The strategy that saves most today, of those that harm or leave trips at other demand."""
+        gaining = []
+        for one in self.levels[0].outcomes:
+            gains = one.verdict is not None and one.verdict.answer is Answer.GAINS
+            if gains and one.serves and not self._sound(one):
+                gaining.append(one)
+        return min(gaining, key=_percent, default=None)
+
+    @property
     def undecided(self) -> list[tuple[Level, Outcome]]:
         """Strategies whose verdict is open, at their demand."""
         found = []
@@ -127,20 +137,39 @@ def _percent(one: Outcome) -> float:
 def answer(study: Study) -> str:
     """Return the answer to the engineer's question in one sentence."""
     found = study.recommended
+    today = _only_today(study)
     if found is not None:
         level, one = found
         assert one.verdict is not None
         saved = one.verdict.change.removeprefix("-")
         chance = f"the odds are {_chance(one.verdict.odds.gains)} that it is more than"
-        begins = "Yes" if level is study.levels[0] else "Not today, but with more traffic"
+        begins = "Yes:"
+        if level is not study.levels[0]:
+            begins = "Not today, but with more traffic:"
+            if today:
+                begins = f"{today} With more traffic"
         return (
-            f"{begins}: {one.label} would save {saved} of the time spent {_at(level)}; "
+            f"{begins} {one.label} would save {saved} of the time spent {_at(level)}; "
             f"{chance} {NOTHING_PERCENT:g} %.{_not_told_apart(study, one)}"
         )
+    if today:
+        return today
     if study.undecided:
         labels = dict.fromkeys(one.label for _, one in study.undecided)
         return f"Cannot say yet: {', '.join(labels)} may help or not; nothing else does."
     return "No: nothing that was tried saves time without leaving more trips unserved."
+
+
+def _only_today(study: Study) -> str:
+    """Return a sentence on a strategy that helps only today, "" if there is none."""
+    one = study.only_today
+    if one is None or one.verdict is None:
+        return ""
+    saved = one.verdict.change.removeprefix("-")
+    return (
+        f"Today {one.label} would save {saved} of the time spent, but with more traffic harm, or "
+        "leave more trips unserved."
+    )
 
 
 def _not_told_apart(study: Study, simpler: Outcome) -> str:

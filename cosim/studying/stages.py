@@ -49,6 +49,7 @@ AT_CRITICAL = {
     DPC: "DPC gates",
     "mpc-pc": "MPC gates",
     "metering": "metering",
+    "pricing-rule+max-pressure+guidance-period-60": "prices over max-pressure",
 }
 LABELS = {REFERENCE: "no control"} | EVERYWHERE | AT_CRITICAL
 FAILED = f"a run failed, for the reason in {TABLE}"
@@ -316,7 +317,7 @@ class Outcome:
     @property
     def left(self) -> float:
         """Mean number of trips left at the end."""
-        return unfinished(self.means)
+        return round(unfinished(self.means), 6) + 0.0  # no -0
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -56,6 +56,8 @@ ALIKE = (
     "speedFactor",
 )
 ORDERED = {"type": "typeID"} | {name: name for name in ALIKE}
+# What vehicles under metering may have. SUMO writes `arrival`, and does not read it.
+METERABLE = frozenset(["id", "depart", "route", "from", "to", "color", "arrival", *ORDERED])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -387,7 +389,7 @@ def _meterable_route(
 
     SUMO connects the two edges of a trip.
     """
-    if not {"id", "depart", "route", "from", "to", "color", *ORDERED}.issuperset(element.attrib):
+    if not METERABLE.issuperset(element.attrib):
         return ()
     has_own_route = element.tag == "vehicle" and "route" not in element.attrib
     if len(element) > int(has_own_route):

@@ -69,7 +69,7 @@ def main(folder: Path) -> None:
     table = "dpc-pcrg+max-pressure+guidance-period-60+metering"
     answer = Answer(parse(table).own_planning(scenario).network)
     strategy = f"{__file__}:RandomPrices+{CITY}"
-    cosim.evaluate("grid7_peak", [strategy], seeds=SEEDS, levels=LEVELS, workers=1, out=folder)
+    cosim.evaluate("grid7_peak", [strategy], seeds=SEEDS, demand=LEVELS, workers=1, out=folder)
     runs = [Result.read(file) for file in sorted(folder.glob("**/*.nc"))]
     nominal, constant = likelihood(runs, answer, 1e6)
     for dispersion in (30, 60, 100, 150, 200, 300, 400, 500, 700, 1000):
