@@ -10,7 +10,6 @@ import math
 from bisect import bisect_right
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache, cached_property, partial
-from operator import add
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -312,7 +311,7 @@ class Trees:
 
     @cached_property
     def _searched_together(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return costs and predecessors of the searches from all nodes of `together`."""
+        """Return costs and predecessors from all nodes of `together`."""
         return dijkstra(self._costs, indices=[*self._row], return_predecessors=True)
 
     def _as_tree(self, node: int, most: float, costs: PerNode, before: Nodes) -> _Tree:
@@ -360,28 +359,20 @@ class Exits:
         self.first_nodes = inside.number[self.first]
         self.second_nodes = outside.number[self.second]
 
-    def leads(self, here: int, target: int, n: int) -> bool:
-        """Return True if a way from edge `here` to `target` leads by region neighbours[n]."""
-        both = self._leading[self.inside.node[here]] & self._reached[self.outside.node[target]]
-        return both & self._into[n] != 0
+    def exist(self, here: int, target: int) -> list[bool]:
+        """Return by which `neighbours` a way from `here` to `target` exists."""
+        through = self._leading[self.inside.node[here]] & self._reached[self.outside.node[target]]
+        return np.logical_or.reduceat(through, self.begins).tolist()
 
     @cached_property
-    def _leading(self) -> list[int]:
-        """Return the gateways that each edge inside leads to, as bits."""
-        return _bits(self.inside.leading_to(self.first_nodes))
+    def _leading(self) -> Bool[np.ndarray, "inside G"]:
+        """Return which edges inside lead to each gateway."""
+        return self.inside.leading_to(self.first_nodes)
 
     @cached_property
-    def _reached(self) -> list[int]:
-        """Return the gateways that lead to each edge outside, as bits."""
-        return _bits(self.outside.leading_to(self.second_nodes))
-
-    @cached_property
-    def _into(self) -> list[int]:
-        """Return the gateways into each of `neighbours`, as bits."""
-        numbers = np.arange(len(self.first))
-        begins = np.array(self.begins, dtype=int)[:, None]
-        ends = np.array(self.ends, dtype=int)[:, None]
-        return _bits((numbers >= begins) & (numbers < ends))
+    def _reached(self) -> Bool[np.ndarray, "outside G"]:
+        """Return which edges outside each gateway leads to."""
+        return self.outside.leading_to(self.second_nodes)
 
 
 class Returning(NamedTuple):
@@ -390,20 +381,12 @@ class Returning(NamedTuple):
     nodes: of first[g] (G,)
     entering: time from the end of first[g] to that of second[g] (s)
     back: no more than the time from behind the nearest gateway back to first[g] (s)
-    nearest: the least of these, infinite without a gateway
     """
 
     trees: Trees
     nodes: GatewayNumbers
     entering: Sequence[float]
     back: Sequence[float]
-    nearest: float
-
-
-def _bits(mask: Bool[np.ndarray, "N G"]) -> list[int]:
-    """Return the rows of a mask as whole numbers, a bit for each column."""
-    packed = np.packbits(mask, axis=1, bitorder="little")
-    return [int.from_bytes(row.tobytes(), "little") for row in packed]
 
 
 class Ways:
@@ -423,9 +406,8 @@ class Ways:
         ahead: PerNode,
         everywhere: Returning | None = None,
     ):
-        """there: routes by moves `inside`, whose aims are first[g], and from there to the end of
-            second[g]
-        onward: routes by reversed moves `outside`, with `ahead`, whose aims are second[g]
+        """there: routes by moves `inside` to first[g], and on to second[g]
+        onward: routes by reversed moves `outside` to second[g], with `ahead`
         ahead: time from the nearest second[g] to nodes of `outside`, not above their times (s)
         everywhere: for routes that come back; None if none may
         """
@@ -442,14 +424,16 @@ class Ways:
         detour: beyond this, routes that take longer are left out (s)
         """
         cost = self.cost(here, target, detour + longest)
+        fastest = min(cost, default=math.inf)
+        exist: list[bool] = []
         choices = []
         for n, begin in enumerate(self.exits.begins):
             costs = cost[begin : self.exits.ends[n]]
             time = min(costs)
-            exists = time < math.inf or self.exits.leads(here, target, n)
+            if time == math.inf and not exist:
+                exist = self.exits.exist(here, target)
             route = partial(self.route, here, begin + costs.index(time), target)
-            choices.append(Choice(time, exists, route))
-        fastest = min(cost, default=math.inf)
+            choices.append(Choice(time, time < math.inf or exist[n], route))
         time, gateway = self.returning(here, target, min(fastest, longest))
         if time < fastest:
             n = bisect_right(self.exits.begins, gateway) - 1
@@ -468,7 +452,7 @@ class Ways:
         if nearest == math.inf:
             return there
         left = max(most - min(nearest, most) - ahead, 0.0)
-        return [*map(add, there, self._onward.times(target, left))]
+        return _sums(there, self._onward.times(target, left))
 
     def returning(self, here: int, target: int, most: float) -> tuple[float, int]:
         """Return the time of the fastest route of all (s), and its last gateway.
@@ -479,10 +463,11 @@ class Ways:
         if self._everywhere is None:
             return math.inf, 0
         everywhere = self._everywhere
-        ends = [*map(add, everywhere.entering, self._onward.times(target, 0.0))]
+        ends = _sums(everywhere.entering, self._onward.times(target, 0.0))
         # By then it has left, and come back, which alone takes too long for most drivers.
         left = min(self._there.times(here, 0.0), default=math.inf)
-        if left + everywhere.nearest + min(ends, default=math.inf) >= most:
+        back_soonest = min(everywhere.back, default=math.inf)
+        if left + back_soonest + min(ends, default=math.inf) >= most:
             return math.inf, 0
         for gateway, back in enumerate(everywhere.back):
             if left + back + ends[gateway] >= most:
@@ -504,6 +489,10 @@ class Ways:
             trees = self._everywhere.trees
         inside = trees.back(here, int(self.exits.first[gateway]))
         return inside[::-1] + self._onward.back(target, int(self.exits.second[gateway]))
+
+
+def _sums(first: Sequence[float], second: Sequence[float]) -> list[float]:
+    return [a + b for a, b in zip(first, second, strict=True)]
 
 
 class RegionRoutes:
@@ -617,8 +606,7 @@ class RegionRoutes:
             trees = self._trees(self._everywhere, driver_class, free)
             back = self._ahead(self._homeward[region], region, driver_class)[exits.first]
             nodes = self._everywhere.number[exits.first]
-            nearest = float(back.min(initial=math.inf))
-            everywhere = Returning(trees, nodes, over.tolist(), back.tolist(), nearest)
+            everywhere = Returning(trees, nodes, over.tolist(), back.tolist())
         there = self._trees_of(
             exits.inside,
             driver_class,
