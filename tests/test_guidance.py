@@ -14,7 +14,7 @@ from streets import seen
 from cosim.plant import guidance
 from cosim.plant.guidance import Guide
 from cosim.plant.meter import Event
-from cosim.plant.routes import MOST_NODES, Exits, Moves, Searches, Trees, Ways
+from cosim.plant.routes import MOST_NODES, Exits, Moves, Returning, Searches, Trees, Ways
 
 EDGES, REGION = 40, np.repeat([0, 1, 2, 3], 10)
 
@@ -30,12 +30,12 @@ def city():
     return first, second, random.uniform(0.0, 3.0, len(pairs)), random.uniform(5.0, 60.0, EDGES)
 
 
-@pytest.fixture(params=[(MOST_NODES, ()), (1, ()), (1, (0, 2, 2, 5))])
+@pytest.fixture(params=[(MOST_NODES, ()), (1, ()), (1, (0, 2, 5))])
 def ways(city, request):
     """Out of region 0, with all trees kept or hardly any, or some searched together."""
     kept, together = request.param
     first, second, turn, time = city
-    inside, back = (
+    inside, outside = (
         Moves(first, second, allowed=(REGION == 0) ^ outside, reverse=outside)
         for outside in (False, True)
     )
@@ -48,22 +48,19 @@ def ways(city, request):
     )
     following, gate, entry, move = np.array(gates).T
     searches = Searches(kept)
-    ahead = back.ahead(back.number[entry], 0.8 * time, 0.7 * turn)
+    ahead = outside.ahead(outside.number[entry], 0.8 * time, 0.7 * turn)
     everywhere = Trees(
         Moves(first, second, allowed=np.full(EDGES, True), reverse=False), time, turn, searches
     )
-    return (
-        Ways(
-            Exits(np.array([gate, entry, move, following]).T, inside=inside, outside=back),
-            there=Trees(inside, time, turn, searches, together=together),
-            onward=Trees(back, time, turn, searches, ahead, together),
-            crossing=turn[move],
-            ahead=ahead,
-            everywhere=(everywhere, turn[move], back_to(gate, entry, city)),
-        ),
-        gate,
-        entry,
-    )
+    exits = Exits(np.array([gate, entry, move, following]).T, inside=inside, outside=outside)
+    over = turn[move] + time[entry]
+    to_gates = {"aims": exits.first_nodes, "beyond": over}
+    there = Trees(inside, time, turn, searches, together=together, **to_gates)
+    onward = Trees(outside, time, turn, searches, ahead, together, aims=exits.second_nodes)
+    back = back_to(gate, entry, city)
+    returning = Returning(everywhere, gate, over.tolist(), back.tolist())
+    found = Ways(exits, there=there, onward=onward, ahead=ahead, everywhere=returning)
+    return found, gate, entry
 
 
 def least(city, allowed):
@@ -99,8 +96,9 @@ def test_the_searches_find_the_least_times_up_to_a_limit(city, ways):
         for here in range(10):
             for target in range(10, EDGES):
                 exact = inside[here, gate] + over + outside[entry, target]
-                cost, reached = found.cost(here, target, most)
-                np.testing.assert_array_equal(reached, np.isfinite(exact))
+                cost = np.array(found.cost(here, target, most))
+                by_region = np.logical_or.reduceat(np.isfinite(exact), found.exits.begins)
+                assert found.exits.exist(here, target) == by_region.tolist()
                 np.testing.assert_allclose(cost[exact <= most], exact[exact <= most])
                 assert (cost[exact > most] >= exact[exact > most] - 1e-9).all()
                 cut += int((np.isinf(cost) & np.isfinite(exact)).sum())
@@ -121,7 +119,7 @@ def test_ways_that_come_back_are_found_where_they_are_the_fastest_of_all(city, w
     for most in (60.0, np.inf, 150.0):
         for here in range(10):
             for target in range(10, EDGES):
-                cost, _ = found.cost(here, target, most)
+                cost = np.array(found.cost(here, target, most))
                 returning, gateway = found.returning(here, target, most)
                 if exact[here, target] < most:
                     assert min(returning, cost.min()) == pytest.approx(exact[here, target])
@@ -298,7 +296,7 @@ def test_drivers_are_asked_again_where_they_are():
             assert guide.realised.sum() == guide.realised[0, 2, 2] == 1
         # Of the region that he was told before nothing is left, although a control interval has
         # passed.
-        assert guide._shares._given[0, 2, 2] == pytest.approx(1.0 if asked < 9 else 0.9)
+        assert guide._shares._given[0][2][2] == pytest.approx(1.0 if asked < 9 else 0.9)
 
 
 def test_on_a_junction_it_is_too_late_and_who_arrived_is_not_asked():

@@ -2,6 +2,7 @@
 instead."""
 
 import math
+import sys
 
 import libsumo
 import numpy as np
@@ -12,7 +13,7 @@ import tiny_city
 from cosim.plant.guidance import Guide
 from cosim.plant.meter import Event
 from cosim.plant.stuck import LEADER_M, LEADER_PATIENCE_S, QUEUE_END_M, Lanes
-from cosim.sumo.session import Session
+from cosim.sumo.session import Session, _compiled
 
 NODES = """<nodes><node id="a" x="0" y="0"/><node id="b" x="300" y="0"/>
 <node id="l" x="600" y="200"/>
@@ -173,3 +174,9 @@ def test_guided_drivers_are_led_on(session):
         guide.apply([])
     assert guide.led_on >= 2
     assert not session.running()
+
+
+def test_functions_of_sumo_are_called_without_python_between():
+    compiled = sys.modules["libsumo._libsumo"].vehicle_getRoadID
+    assert _compiled(libsumo.vehicle.getRoadID) is compiled
+    assert _compiled(compiled) is compiled

@@ -50,19 +50,23 @@ def test_the_cheapest_next_region_is_assigned(times, shares, given, expected):
     assert assigned(times, shares, given) == expected
 
 
+def splits_of(shares):
+    """Return split ratios from region 0 to 3 by 1 and 2."""
+    splits = np.zeros((4, 4, 4))
+    splits[0, 1:3, 3] = shares
+    return splits
+
+
 def shares_of(theta):
     """Return shares of drivers from region 0 to 3, half of whom go by 1 without guidance."""
-    own, splits = np.zeros((2, 4, 4, 4))
-    own[0, 1:3, 3] = HALF
-    splits[0, 1:3, 3] = theta
-    shares = Shares(own)
-    shares.command(splits)
+    shares = Shares(splits_of(HALF))
+    shares.command(splits_of(theta))
     return shares
 
 
 def next_region(shares, *times, exists=(True, True), limit=math.inf):
     choices = [Choice(time, there, list) for time, there in zip(times, exists, strict=True)]
-    return shares.next_region(0, np.array([1, 2]), 3, choices, limit)
+    return shares.next_region(0, [1, 2], 3, choices, limit)
 
 
 def test_a_region_without_a_route_leaves_its_share_to_others():
@@ -76,13 +80,14 @@ def test_a_region_beyond_the_limit_gets_nobody_although_theta_says_so():
 
 
 def test_a_driver_who_is_assigned_anew_counts_no_more_for_the_region_before():
-    shares = shares_of((0.25, 0.75))  # all wish to go by 1, half of them shall
+    theta = (0.25, 0.75)
+    shares = shares_of(theta)  # all wish to go by 1, half of them shall
     shares.assign((0, 1, 3))
     interval = shares.interval
     assert next_region(shares, 100.0, 101.0) == 1
-    shares.command(shares._theta)
-    assert shares._given[0, 1, 3] == MEMORY
+    shares.command(splits_of(theta))
+    assert shares._given[0][3][1] == MEMORY
     shares.withdraw((0, 1, 3), interval)
-    assert shares._given[0, 1, 3] == pytest.approx(0.0)
+    assert shares._given[0][3][1] == pytest.approx(0.0)
     assert shares.realised.sum() == 0
     assert next_region(shares, 100.0, 101.0) == 0

@@ -6,23 +6,20 @@ for others.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import groupby, pairwise
-
-import numpy as np
+from typing import NamedTuple
 
 from cosim.plant.routes import TravelTimes
-from cosim.sumo.arrays import PerEdge
 from cosim.sumo.net import City
 
 # Drivers keep their route if another one saves less than this share of its delay, times the delay's
 # share of its time.
 SWITCHING_THRESHOLD = 0.6
 MESO_THRESHOLD = 0.3  # in the mesoscopic model: less than this share of the other's own time
+UNKNOWN = -1  # number of an edge closed to cars, or of a move that the city does not have
 
 
-@dataclass(frozen=True)
-class Present:
+class Present(NamedTuple):
     """The present route of a driver.
 
     route: edges by number; None on roads closed to cars
@@ -42,7 +39,10 @@ class Present:
 
 
 class Drivers:
-    """Judgement of drivers in one city."""
+    """Judgement of drivers in one city.
+
+    Routes are short, so lists of times take less time than arrays.
+    """
 
     def __init__(self, city: City, times: TravelTimes, *, ways_return: bool, lanes: bool):
         """ways_return: routes may come back into a region
@@ -51,38 +51,40 @@ class Drivers:
         self._number = city.number
         self._region = city.edge_region.tolist()
         self._times = times
+        self._free = times.free.tolist()
+        self._free_turns = times.free_turns.tolist()
         self._ways_return = ways_return
         self._lanes = lanes
 
-    def present(self, edges: Sequence[str], here: int, time: PerEdge) -> Present:
+    def present(self, edges: Sequence[str], here: int, time: Sequence[float]) -> Present:
         """Return the present route of a driver on edge `here`.
 
-        edges: names, from the present one on; time: of every edge (s, (E,))
+        edges: names, from the present one on; time: of every edge (s)
         """
-        route = [self._number[edge] for edge in edges if edge in self._number]
-        if len(route) < len(edges):
+        route = [self._number.get(edge, UNKNOWN) for edge in edges]
+        if UNKNOWN in route:
             return Present(None)
         if route[0] != here:
             return Present(route)
         times = self._times
-        ahead = np.array(route[1:], dtype=int)
-        moves = [times.move[pair] for pair in pairwise(route) if pair in times.move]
-        known = np.array(moves, dtype=int)
-        takes = time.take(ahead).sum() + times.turns.take(known).sum()
-        free = times.free.take(ahead).sum() + times.free_turns.take(known).sum()
-        found = len(moves) == len(ahead)
+        ahead = route[1:]
+        moves = [times.move.get(pair, UNKNOWN) for pair in pairwise(route)]
+        found = UNKNOWN not in moves
+        known = moves if found else [move for move in moves if move != UNKNOWN]
+        takes = _total(time, ahead) + _total(times.turn_list, known)
+        free = _total(self._free, ahead) + _total(self._free_turns, known)
         if found and not self._ways_return:
             regions = self._regions(route)
             found = regions.count(regions[0]) == 1
         return Present(route, takes, max(takes - free, 0.0), found)
 
-    def time(self, route: list[int], time: PerEdge) -> float:
+    def time(self, route: list[int], time: Sequence[float]) -> float:
         """Return the time of a route from the end of its first edge (s).
 
-        time: of every edge (s, (E,))
+        time: of every edge (s)
         """
         moves = [self._times.move[pair] for pair in pairwise(route)]
-        return float(time[route[1:]].sum() + self._times.turns[moves].sum())
+        return _total(time, route[1:]) + _total(self._times.turn_list, moves)
 
     def keeps(self, present: Present, time: float, following: int | None = None) -> bool:
         """Return True if a driver keeps the present route.
@@ -118,3 +120,8 @@ class Drivers:
 
     def _regions(self, route: list[int]) -> list[int]:
         return [region for region, _ in groupby(map(self._region.__getitem__, route))]
+
+
+def _total(times: Sequence[float], numbers: Sequence[int]) -> float:
+    """Return the sum of the times with these numbers (s)."""
+    return sum([times[number] for number in numbers])

@@ -26,7 +26,6 @@ from cosim.plant.routes import Choice, RegionRoutes, TravelTimes, Ways
 from cosim.plant.sampling import StreetMeans
 from cosim.plant.shares import Shares
 from cosim.plant.stuck import QUEUE_END_M, Lanes
-from cosim.sumo.arrays import PerEdge
 from cosim.sumo.net import City
 from cosim.sumo.session import REFUSALS, Session
 from nmfd.arrays import PerRegion, PerTurn
@@ -65,8 +64,7 @@ class _Trip(NamedTuple):
     edges: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class _Plan:
+class _Plan(NamedTuple):
     """A route for a driver, and the next region that it counts for.
 
     route: edges by number; None: the present route
@@ -97,15 +95,6 @@ class _Visits:
         if steps:
             self._present[visit.event.vehicle] = visit
             self._due[self._step + steps].append(visit)
-
-    def targets(self, number: dict[str, int]) -> dict[tuple[int, int, bool], list[int]]:
-        """Return last edges of the drivers for `RegionRoutes.command`."""
-        targets = defaultdict(list)
-        for visit in self._present.values():
-            event = visit.event
-            key = (event.region, visit.driver_class, event.region == event.destination)
-            targets[key].append(number[event.edge])
-        return targets
 
     def due(self) -> list[_Visit]:
         """Return the drivers to guide again in this step."""
@@ -185,7 +174,7 @@ class Guide:
             return
         if seen is not None:
             self._times.learn(seen)
-        self._routes.command(prices, self._visits.targets(self._city.number))
+        self._routes.command(prices)
         self._shares.command(splits)
 
     def apply(self, events: list[Event]) -> None:
@@ -280,16 +269,16 @@ class Guide:
         target = trip.target
         free = self._routes.free(trip.destination)
         seen = self._routes.home(trip.region, trip.driver_class, free)
-        present = self._drivers.present(trip.edges, here, seen.time)
+        present = self._present(trip, free)
         longest = self._drivers.worth(present) + 1.0
-        time = seen.costs(target, longest)[seen.number[here]]
-        if here == target or not np.isfinite(time) or self._drivers.keeps(present, time):
+        time = float(seen.costs(target, longest)[seen.node[here]])
+        if here == target or math.isinf(time) or self._drivers.keeps(present, time):
             return None
         route = seen.back(target, here)
         if free != self._routes.regions:  # prices may have made the route a long detour
             unpriced = self._routes.home(trip.region, trip.driver_class, self._routes.regions)
-            takes = self._drivers.time(route, unpriced.time)
-            fastest = unpriced.costs(target, takes)[unpriced.number[here]]
+            takes = self._time(trip, route, self._routes.regions)
+            fastest = unpriced.costs(target, takes)[unpriced.node[here]]
             if fastest < takes - self._most_detour:
                 route = unpriced.back(target, here)
         return _Plan(route)
@@ -298,7 +287,7 @@ class Guide:
         """Return the next region of a driver, and the fastest route by it."""
         free = self._routes.free(trip.destination)
         ways = self._routes.ways(trip.region, trip.driver_class, free)
-        present = self._drivers.present(trip.edges, trip.here, ways.time)
+        present = self._present(trip, free)
         choices = ways.choices(trip.here, trip.target, present.longest, self._most_detour)
         fastest = min((choice.time for choice in choices), default=math.inf)
         if fastest == math.inf:
@@ -318,15 +307,17 @@ class Guide:
 
         choices: the fastest routes with prices
         """
-        unpriced = self._routes.ways(trip.region, trip.driver_class, self._routes.regions)
-        present_unpriced = self._drivers.present(trip.edges, trip.here, unpriced.time)
+        free = self._routes.free(trip.destination)
+        all_free = self._routes.regions
+        unpriced = self._routes.ways(trip.region, trip.driver_class, all_free)
+        present_unpriced = self._present(trip, all_free)
         longest = present_unpriced.longest
         shortest = unpriced.choices(trip.here, trip.target, longest, self._most_detour)
         limit = min(choice.time for choice in shortest) + self._most_detour
         within = []
         for choice, short in zip(choices, shortest, strict=True):
-            route = self._shortened(choice, short, limit, unpriced.time)
-            time = self._drivers.time(route, ways.time) if route else math.inf
+            route = self._shortened(trip, choice, short, limit)
+            time = self._time(trip, route, free) if route else math.inf
             within.append(Choice(time, choice.exists or short.exists, route.copy))
         n = self._next_region(trip, ways, within, math.inf)
         if n is None:
@@ -335,24 +326,37 @@ class Guide:
         if present_unpriced.time > limit:
             # Prices do not justify so long a detour: the present route is judged without them.
             present = present_unpriced
-            time = self._drivers.time(within[n].route(), unpriced.time)
+            time = self._time(trip, within[n].route(), all_free)
         return self._change(present, time, within[n], ways.exits.neighbours[n])
 
-    def _shortened(
-        self, choice: Choice, shortest: Choice, limit: float, time: PerEdge
-    ) -> list[int]:
+    def _shortened(self, trip: _Trip, choice: Choice, shortest: Choice, limit: float) -> list[int]:
         """Return a route within the limit; [] if there is none.
 
         choice: the fastest route with prices; shortest: without prices
-        limit: of the time without prices (s); time: without prices (s, (E,))
+        limit: of the time without prices (s)
         """
         if choice.time < math.inf:
             route = choice.route()
-            if self._drivers.time(route, time) <= limit:
+            if self._time(trip, route, self._routes.regions) <= limit:
                 return route
         if shortest.time <= limit < math.inf:
             return shortest.route()
         return []
+
+    def _present(self, trip: _Trip, free: tuple[int, ...]) -> Present:
+        """Return the present route of a driver.
+
+        free: regions without a price
+        """
+        time = self._routes.time(trip.driver_class, free)
+        return self._drivers.present(trip.edges, trip.here, time)
+
+    def _time(self, trip: _Trip, route: list[int], free: tuple[int, ...]) -> float:
+        """Return the time of a route for a driver (s).
+
+        free: regions without a price
+        """
+        return self._drivers.time(route, self._routes.time(trip.driver_class, free))
 
     def _next_region(
         self, trip: _Trip, ways: Ways, choices: list[Choice], limit: float

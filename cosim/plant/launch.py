@@ -34,7 +34,7 @@ GIVEN = ("step-length", "time-to-teleport", "collision.action")  # arguments of 
 
 
 def vehicles_of(scenario: Scenario, settings: Settings, city: City, seed: int) -> RecordedTrips:
-    """Return the recorded trips of the city, or trips made from the demand by `seed`.
+    """Return the recorded trips, or trips made from the demand by `seed`.
 
     Raises: InputError
     """

@@ -90,6 +90,7 @@ class MaxPressure:
                 self._gates.append(Gate(ration, first + link, movement[link]))
             show(junction.signal, junction.state)
         self._counted = self._roads.counted(self._approaches.lanes)
+        self._names = [self._roads.lanes[n] for n in self._counted]
         self._programmed = float(np.mean([intergreen_share(signal.phases) for signal in signals]))
         self._start = now
         self._next = now  # time of the next decision [s]
@@ -127,8 +128,7 @@ class MaxPressure:
     def _decide(self, now: float) -> None:
         """Switch the junctions whose next stage is another one."""
         present = np.zeros(len(self._roads.lanes))
-        for n, lane in self._counted:
-            present[n] = self._session.lane_vehicles(lane)
+        present[self._counted] = [self._session.lane_vehicles(lane) for lane in self._names]
         closed = [gate for gate in self._gates if gate.ration.exhausted]
         pressure = self._pressure(present, closed)
         approaches = self._approaches

@@ -60,13 +60,12 @@ class Roads:
         self.weights = _sparse(rows, len(self.lanes))
         self._add_stages(signals)
 
-    def counted(self, others: np.ndarray) -> list[tuple[int, str]]:
-        """Return number and name of the lanes whose vehicles count.
+    def counted(self, others: np.ndarray) -> np.ndarray:
+        """Return the numbers of the lanes whose vehicles count.
 
         others: numbers of further lanes
         """
-        numbers = np.unique(np.concatenate([self.weights.indices, self.apart.indices, others]))
-        return [(n, self.lanes[n]) for n in numbers.tolist()]
+        return np.unique(np.concatenate([self.weights.indices, self.apart.indices, others]))
 
     def watched(self, link: Link) -> set[int]:
         """Return the lanes (numbers) whose vehicles may wait for a link.

@@ -7,9 +7,10 @@ interval counts half.
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from bisect import bisect_right
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache, cached_property, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -17,7 +18,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from cosim.plant.sampling import STANDING_M_S, StreetMeans
-from cosim.sumo.arrays import EdgeMask, GatewayMask, MoveEnds, PerEdge, PerGateway, PerMove
+from cosim.sumo.arrays import EdgeMask, MoveEnds, PerEdge, PerGateway, PerMove
 from cosim.sumo.net import City
 from nmfd.arrays import PerRegion
 
@@ -40,7 +41,7 @@ class TravelTimes:
 
     first, second: numbers of the edges that each move joins (M,); move: these two -> its number
     free, free_turns: in free flow, along edges (s, (E,)) and of moves over junctions (s, (M,))
-    edges, turns: the same at present
+    edges, turns: the same at present; turn_list: `turns` as a list
     """
 
     def __init__(self, city: City, *, lanes: bool = True):
@@ -55,6 +56,7 @@ class TravelTimes:
         self.free_turns = city.move_time
         self.edges = self.free.copy()
         self.turns = self.free_turns.copy()
+        self.turn_list = self.turns.tolist()
         self._longest = np.array(list(city.inside.values())) / STANDING_M_S
         # Pairs of moves and internal edges that they lead over, which several moves may share.
         inside = {edge: n for n, edge in enumerate(city.inside)}
@@ -106,12 +108,13 @@ class TravelTimes:
         takes = np.divide(self._crossing, self._crossed, out=standing, where=self._crossed > 0.0)
         over = np.minimum(takes, self._longest)[self._via]
         self.turns = np.maximum(np.bincount(self._move, over, len(self.turns)), self.free_turns)
+        self.turn_list = self.turns.tolist()
 
 
 class Moves:
     """Moves between allowed edges as a graph whose nodes are these edges.
 
-    number: edge -> its node, -1 for edges that are not allowed (E,)
+    number, node: edge -> its node, -1 for edges that are not allowed, as an array (E,) and a list
     """
 
     def __init__(self, first: MoveEnds, second: MoveEnds, *, allowed: EdgeMask, reverse: bool):
@@ -122,6 +125,7 @@ class Moves:
         self.edges = np.flatnonzero(allowed)
         self.number = np.full(len(allowed), -1)
         self.number[self.edges] = np.arange(len(self.edges))
+        self.node = self.number.tolist()
         rows = self.number[second if reverse else first]
         columns = self.number[first if reverse else second]
         kept = np.flatnonzero(allowed[first] & allowed[second])
@@ -188,11 +192,13 @@ class _Tree(NamedTuple):
     """One search.
 
     most: its limit (s); costs: of every node (s, (nodes,)); before: predecessors (nodes,)
+    times: to each aim (s)
     """
 
     most: float
     costs: PerNode
     before: Nodes
+    times: list[float]
 
 
 class Searches:
@@ -207,17 +213,19 @@ class Searches:
         self._nodes = 0
         self._trees: dict[tuple[object, int], _Tree] = {}
 
-    def tree(self, owner: object, begin: int, costs: csr_array, most: float) -> _Tree:
+    def tree(
+        self, owner: object, begin: int, most: float, search: Callable[[int, float], _Tree]
+    ) -> _Tree:
         """Return the search of `owner` from a node.
 
-        most: limit that the search has at least (s)
+        most: limit that the search has at least (s); search: does it
         """
         tree = self._trees.pop((owner, begin), None)
         if tree is None:
-            self._nodes += costs.shape[0]
-        if tree is None or tree.most < most:
-            found = dijkstra(costs, indices=begin, return_predecessors=True, limit=most)
-            tree = _Tree(most, *found)
+            tree = search(begin, most)
+            self._nodes += len(tree.costs)
+        elif tree.most < most:
+            tree = search(begin, most)
         while self._nodes > self._most and len(self._trees) >= FEWEST_TREES:
             oldest = next(iter(self._trees))
             self._nodes -= len(self._trees.pop(oldest).costs)
@@ -230,7 +238,8 @@ class Trees:
 
     They are searched on demand and no further than needed.
 
-    time: of every edge (s, (E,)); number: edge -> its node, as in `Moves`
+    node: edge -> its node, as in `Moves`
+    asked: nodes from which searches were needed
     """
 
     def __init__(
@@ -241,44 +250,77 @@ class Trees:
         searches: Searches,
         ahead: PerNode | None = None,
         together: Iterable[int] = (),
+        *,
+        aims: Nodes | Sequence[int] = (),
+        beyond: PerGateway | float = 0.0,
     ):
         """time: of edges (s, (E,)); turns: of moves (s, (M,))
         ahead: see `Moves.costing` (s, (nodes,))
-        together: nodes to search from in one call, when the first of them is needed
+        together: different nodes to search from in one call, when the first of them is needed
+        aims: nodes that `times` are for; beyond: time from each aim on (s)
         """
-        self.time = time
-        self.number = moves.number
+        self.node = moves.node
         self._moves = moves
         self._costs = moves.costing(time, turns, ahead)
         self._searches = searches
         # Not this object itself: `searches` would hold it, and both would stay until the garbage is
         # collected.
         self._owner = object()
-        self._row = {node: row for row, node in enumerate(dict.fromkeys(together))}
-        self._together: tuple[np.ndarray, np.ndarray] | None = None
+        self._ahead = ahead
+        self._aims = np.array(aims, dtype=int)
+        self._beyond = beyond
+        self._row = {node: row for row, node in enumerate(together)}
+        self._found: dict[int, _Tree] = {}  # of the searches done together
+        self.asked: set[int] = set()
 
     def costs(self, begin: int, most: float) -> PerNode:
         """Return the times from edge `begin` (s, (nodes,)).
 
+        Times above `most` may be infinite. They are less by the drop of `ahead`.
+        """
+        return self._tree(self.node[begin], most).costs
+
+    def times(self, begin: int, most: float) -> list[float]:
+        """Return the times from edge `begin` to each aim and beyond (s).
+
         Times above `most` may be infinite.
         """
-        return self._tree(int(self.number[begin]), most).costs
+        return self._tree(self.node[begin], most).times
 
     def back(self, begin: int, end: int) -> list[int]:
         """Return the edges from `end` back to `begin`, after `costs` of `begin`."""
-        first = int(self.number[end])
-        last = int(self.number[begin])
+        first = self.node[end]
+        last = self.node[begin]
         return self._moves.path(self._tree(last, 0.0).before, first, last)
 
     def _tree(self, node: int, most: float) -> _Tree:
         """Return the search from a node, at least up to `most` (s)."""
+        self.asked.add(node)
         row = self._row.get(node)
         if row is None:
-            return self._searches.tree(self._owner, node, self._costs, most)
-        if self._together is None:
-            self._together = dijkstra(self._costs, indices=[*self._row], return_predecessors=True)
-        costs, before = self._together
-        return _Tree(math.inf, costs[row], before[row])
+            return self._searches.tree(self._owner, node, most, self._search)
+        if node not in self._found:
+            costs, before = self._searched_together
+            self._found[node] = self._as_tree(node, math.inf, costs[row], before[row])
+        return self._found[node]
+
+    def _search(self, node: int, most: float) -> _Tree:
+        """Return a new search from a node up to `most` (s)."""
+        found = dijkstra(self._costs, indices=node, return_predecessors=True, limit=most)
+        return self._as_tree(node, most, *found)
+
+    @cached_property
+    def _searched_together(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return costs and predecessors from all nodes of `together`."""
+        return dijkstra(self._costs, indices=[*self._row], return_predecessors=True)
+
+    def _as_tree(self, node: int, most: float, costs: PerNode, before: Nodes) -> _Tree:
+        """Return a search from a node up to `most` (s) with the times to the aims."""
+        times = costs[self._aims]
+        if self._ahead is not None:
+            times = times + self._ahead[node]
+        times = times + self._beyond
+        return _Tree(most, costs, before, times.tolist())
 
 
 class Choice(NamedTuple):
@@ -297,8 +339,8 @@ class Choice(NamedTuple):
 class Exits:
     """Gateways out of one region, with the moves that lead there and on.
 
-    Gateway g leads from edge first[g] to second[g]. Gateways begins[n] to
-    ends[n] - 1 lead into region neighbours[n].
+    Gateway g leads from edge first[g] to second[g]. Gateways begins[n] to ends[n] - 1 lead into
+    region neighbours[n].
 
     first, second, move: edges of each gateway, and move from one to the other (G,)
     inside: moves in the region; outside: reversed moves elsewhere
@@ -308,22 +350,43 @@ class Exits:
     def __init__(self, gateways: Int[np.ndarray, "G 4"], *, inside: Moves, outside: Moves):
         """gateways: first, second, move and next region, which rises"""
         self.first, self.second, self.move, next_region = gateways.T.copy()
-        self.neighbours, self.begins = np.unique(next_region, return_index=True)
-        self.ends = np.append(self.begins[1:], len(next_region))
+        neighbours, begins = np.unique(next_region, return_index=True)
+        self.neighbours: list[int] = neighbours.tolist()
+        self.begins: list[int] = begins.tolist()
+        self.ends = [*self.begins[1:], len(next_region)]
         self.inside = inside
         self.outside = outside
         self.first_nodes = inside.number[self.first]
         self.second_nodes = outside.number[self.second]
 
+    def exist(self, here: int, target: int) -> list[bool]:
+        """Return by which `neighbours` a way from `here` to `target` exists."""
+        through = self._leading[self.inside.node[here]] & self._reached[self.outside.node[target]]
+        return np.logical_or.reduceat(through, self.begins).tolist()
+
     @cached_property
-    def leading(self) -> Bool[np.ndarray, "inside G"]:
+    def _leading(self) -> Bool[np.ndarray, "inside G"]:
         """Return which edges inside lead to each gateway."""
         return self.inside.leading_to(self.first_nodes)
 
     @cached_property
-    def reached(self) -> Bool[np.ndarray, "outside G"]:
+    def _reached(self) -> Bool[np.ndarray, "outside G"]:
         """Return which edges outside each gateway leads to."""
         return self.outside.leading_to(self.second_nodes)
+
+
+class Returning(NamedTuple):
+    """Fastest routes by all moves, for those that come back into a region.
+
+    nodes: of first[g] (G,)
+    entering: time from the end of first[g] to that of second[g] (s)
+    back: no more than the time from behind the nearest gateway back to first[g] (s)
+    """
+
+    trees: Trees
+    nodes: GatewayNumbers
+    entering: Sequence[float]
+    back: Sequence[float]
 
 
 class Ways:
@@ -340,25 +403,19 @@ class Ways:
         *,
         there: Trees,
         onward: Trees,
-        crossing: PerGateway,
         ahead: PerNode,
-        everywhere: tuple[Trees, PerGateway, PerGateway] | None = None,
+        everywhere: Returning | None = None,
     ):
-        """there: routes by moves `inside`
-
-        onward: routes by reversed moves `outside`, with `ahead`
-        crossing: time over each gateway (s, (G,))
+        """there: routes by moves `inside` to first[g], and on to second[g]
+        onward: routes by reversed moves `outside` to second[g], with `ahead`
         ahead: time from the nearest second[g] to nodes of `outside`, not above their times (s)
-        everywhere: routes by all moves; time over each gateway on these; and, not above it, the
-            time from behind the nearest gateway back to first[g]; None if no route may come back
+        everywhere: for routes that come back; None if none may
         """
         self.exits = exits
-        self.time = onward.time
         self._there = there
         self._onward = onward
-        self._ahead = ahead
+        self._ahead = ahead.tolist()
         self._everywhere = everywhere
-        self._entering = crossing + self.time[exits.second]
 
     def choices(self, here: int, target: int, longest: float, detour: float) -> list[Choice]:
         """Return the fastest routes from `here` to `target` by each next region.
@@ -366,36 +423,36 @@ class Ways:
         longest: no less than the fastest of all takes (s), infinite if unknown
         detour: beyond this, routes that take longer are left out (s)
         """
-        begins = self.exits.begins
-        cost, reached = self.cost(here, target, detour + longest)
-        times = np.minimum.reduceat(cost, begins).tolist()
-        exists = np.logical_or.reduceat(reached, begins).tolist()
+        cost = self.cost(here, target, detour + longest)
+        fastest = min(cost, default=math.inf)
+        exist: list[bool] = []
         choices = []
-        for n, begin in enumerate(begins.tolist()):
-            gateway = begin + int(cost[begin : self.exits.ends[n]].argmin())
-            route = partial(self.route, here, gateway, target)
-            choices.append(Choice(times[n], exists[n], route))
-        fastest = min(times, default=math.inf)
+        for n, begin in enumerate(self.exits.begins):
+            costs = cost[begin : self.exits.ends[n]]
+            time = min(costs)
+            if time == math.inf and not exist:
+                exist = self.exits.exist(here, target)
+            route = partial(self.route, here, begin + costs.index(time), target)
+            choices.append(Choice(time, time < math.inf or exist[n], route))
         time, gateway = self.returning(here, target, min(fastest, longest))
         if time < fastest:
-            n = int(np.searchsorted(begins, gateway, side="right")) - 1
+            n = bisect_right(self.exits.begins, gateway) - 1
             route = partial(self.route, here, gateway, target, returning=True)
             choices[n] = Choice(time, True, route)
         return choices
 
-    def cost(self, here: int, target: int, most: float) -> tuple[PerGateway, GatewayMask]:
-        """Return times by gateway, and through which gateways a route exists.
+    def cost(self, here: int, target: int, most: float) -> list[float]:
+        """Return times from the end of `here` to that of `target` by gateway (s).
 
-        The times (s, (G,)) are from the end of `here` to that of `target`, infinite above `most`.
+        They are infinite above `most`.
         """
-        last = int(self._onward.number[target])
-        open_ways = self.exits.leading[self._there.number[here]] & self.exits.reached[last]
-        there = self._to_entries(here, max(most - self._ahead[last], 0.0))
-        nearest = float(there.min(initial=np.inf))
-        if nearest == np.inf:
-            return there, open_ways
-        left = max(most - min(nearest, most) - self._ahead[last], 0.0)
-        return there + self._from_entries(target, left), open_ways
+        ahead = self._ahead[self._onward.node[target]]
+        there = self._there.times(here, max(most - ahead, 0.0))
+        nearest = min(there, default=math.inf)
+        if nearest == math.inf:
+            return there
+        left = max(most - min(nearest, most) - ahead, 0.0)
+        return _sums(there, self._onward.times(target, left))
 
     def returning(self, here: int, target: int, most: float) -> tuple[float, int]:
         """Return the time of the fastest route of all (s), and its last gateway.
@@ -404,18 +461,23 @@ class Ways:
         region. Call it after `cost`.
         """
         if self._everywhere is None:
-            return np.inf, 0
-        trees, over, back = self._everywhere
-        end = over + self.time[self.exits.second] + self._from_entries(target, 0.0)
-        # By then it has left, and come back, which alone takes too long for most gateways.
-        left = self._to_entries(here, 0.0).min(initial=np.inf)
-        end[left + back + end >= most] = np.inf
-        nearest = float(end.min(initial=np.inf))
-        if nearest == np.inf:
-            return np.inf, 0
-        cost = trees.costs(here, most - nearest)[trees.number[self.exits.first]] + end
-        gateway = int(cost.argmin())
-        return float(cost[gateway]), gateway
+            return math.inf, 0
+        everywhere = self._everywhere
+        ends = _sums(everywhere.entering, self._onward.times(target, 0.0))
+        # By then it has left, and come back, which alone takes too long for most drivers.
+        left = min(self._there.times(here, 0.0), default=math.inf)
+        back_soonest = min(everywhere.back, default=math.inf)
+        if left + back_soonest + min(ends, default=math.inf) >= most:
+            return math.inf, 0
+        for gateway, back in enumerate(everywhere.back):
+            if left + back + ends[gateway] >= most:
+                ends[gateway] = math.inf
+        nearest = min(ends)
+        if nearest == math.inf:
+            return math.inf, 0
+        costs = everywhere.trees.costs(here, most - nearest)[everywhere.nodes] + ends
+        gateway = int(costs.argmin())
+        return float(costs[gateway]), gateway
 
     def route(self, here: int, gateway: int, target: int, *, returning: bool = False) -> list[int]:
         """Return the edges from `here` to `target` through a gateway.
@@ -424,18 +486,13 @@ class Ways:
         """
         trees = self._there
         if returning and self._everywhere:
-            trees = self._everywhere[0]
+            trees = self._everywhere.trees
         inside = trees.back(here, int(self.exits.first[gateway]))
         return inside[::-1] + self._onward.back(target, int(self.exits.second[gateway]))
 
-    def _to_entries(self, here: int, most: float) -> PerGateway:
-        """Return times from the end of `here` to that of second[g] (s, (G,))."""
-        return self._there.costs(here, most)[self.exits.first_nodes] + self._entering
 
-    def _from_entries(self, target: int, most: float) -> PerGateway:
-        """Return times from the end of second[g] to that of `target` (s, (G,))."""
-        cost = self._onward.costs(target, most)[self.exits.second_nodes]
-        return cost + self._ahead[self._onward.number[target]]
+def _sums(first: Sequence[float], second: Sequence[float]) -> list[float]:
+    return [a + b for a, b in zip(first, second, strict=True)]
 
 
 class RegionRoutes:
@@ -488,55 +545,82 @@ class RegionRoutes:
         self._ahead = cache(self._ahead_of)
         # Results of one control interval.
         self._trees = cache(self._trees_of)
+        self._seen = cache(self._seen_by)
+        self.time = cache(self._time)
         self.home = cache(self._home)
         self.ways = cache(self._ways)
-        self.command(None, {})
+        # Moves and class of drivers -> searches without prices.
+        self._unpriced: dict[tuple[Moves, int], Trees] = {}
+        self.command(None)
 
-    def command(
-        self, prices: PerRegion | None, targets: Mapping[tuple[int, int, bool], list[int]]
-    ) -> None:
+    def command(self, prices: PerRegion | None) -> None:
         """Begin a control interval with new travel times.
 
         prices: of the regions (-, (R,)); None: no prices
-        targets: last edges of drivers who will probably be guided, by region and class, and whether
-            it is their last region
         """
         self._prices = np.zeros(len(self.regions)) if prices is None else prices
-        self._targets = targets
+        # Many drivers are where others were, or go where others went.
+        self._asked = {key: sorted(trees.asked) for key, trees in self._unpriced.items()}
+        self._unpriced.clear()
         self._searches = Searches()
+        self._free = [self._free_regions(destination) for destination in self.regions]
         self._trees.cache_clear()
+        self._seen.cache_clear()
+        self.time.cache_clear()
         self.home.cache_clear()
         self.ways.cache_clear()
 
     def free(self, destination: int) -> tuple[int, ...]:
         """Return the regions without a price for drivers to `destination`."""
+        return self._free[destination]
+
+    def _free_regions(self, destination: int) -> tuple[int, ...]:
         free = [r for r in self.regions if r == destination or not self._prices[r]]
         return tuple(free)
+
+    def _seen_by(self, driver_class: int, free: tuple[int, ...]) -> PerEdge:
+        """Return the times of edges that a class of drivers sees (s, (E,))."""
+        prices = self._prices.copy()
+        prices[list(free)] = 0.0
+        return self._times.edges * (1.0 + prices)[self._edge_region] * self._taste[driver_class]
+
+    def _time(self, driver_class: int, free: tuple[int, ...]) -> list[float]:
+        """Return the times of `_seen_by` as a list, for single edges."""
+        return self._seen(driver_class, free).tolist()
 
     def _home(self, region: int, driver_class: int, free: tuple[int, ...]) -> Trees:
         """Return routes to edges of a region.
 
         They stay inside it, unless routes may return.
         """
-        targets = self._targets.get((region, driver_class, True), [])
-        return self._trees_of(self._homeward[region], driver_class, free, targets)
+        return self._trees(self._homeward[region], driver_class, free)
 
     def _ways(self, region: int, driver_class: int, free: tuple[int, ...]) -> Ways:
         """Return routes out of a region to edges of others."""
         exits = self._exits[region]
-        over = self._times.turns[exits.move]
+        second = self._seen(driver_class, free)[exits.second]
+        over = self._times.turns[exits.move] + second
         ahead = self._ahead(exits.outside, region, driver_class)
-        targets = self._targets.get((region, driver_class, False), [])
         everywhere = None
         if self._everywhere:
             trees = self._trees(self._everywhere, driver_class, free)
             back = self._ahead(self._homeward[region], region, driver_class)[exits.first]
-            everywhere = (trees, over, back)
+            nodes = self._everywhere.number[exits.first]
+            everywhere = Returning(trees, nodes, over.tolist(), back.tolist())
+        there = self._trees_of(
+            exits.inside,
+            driver_class,
+            free,
+            aims=exits.first_nodes,
+            beyond=over if self._lanes else second,
+        )
+        onward = self._trees_of(
+            exits.outside, driver_class, free, ahead=ahead, aims=exits.second_nodes
+        )
         return Ways(
             exits,
-            there=self._trees_of(exits.inside, driver_class, free),
-            onward=self._trees_of(exits.outside, driver_class, free, targets, ahead),
-            crossing=over if self._lanes else np.zeros(len(over)),
+            there=there,
+            onward=onward,
             ahead=ahead,
             everywhere=everywhere,
         )
@@ -546,24 +630,26 @@ class RegionRoutes:
         moves: Moves,
         driver_class: int,
         free: tuple[int, ...],
-        targets: Sequence[int] = (),
-        ahead: PerNode | None = None,
+        **others: Any,
     ) -> Trees:
         """Return routes at the times that a class of drivers sees.
 
-        targets: edges from which searches will probably be needed; ahead: see `Moves.costing`
+        others: arguments of `Trees`
         """
-        prices = self._prices.copy()
-        prices[list(free)] = 0.0
-        seen = self._times.edges * (1.0 + prices)[self._edge_region] * self._taste[driver_class]
+        seen = self._seen(driver_class, free)
+        turns = self._times.turns
+        # With prices, results depend on how far searches go.
+        if free != self.regions:
+            return Trees(moves, seen, turns, self._searches, **others)
+        key = (moves, driver_class)
         together: Iterable[int] = ()
         nodes = len(moves.edges)
-        # With prices, results depend on how far searches go.
-        if free == self.regions and nodes <= MOST_WHOLE:
+        if nodes <= MOST_WHOLE:
             together = range(nodes)
-        elif free == self.regions and nodes <= MOST_TOGETHER:
-            together = moves.number[list(targets)].tolist()
-        return Trees(moves, seen, self._times.turns, self._searches, ahead, together)
+        elif nodes <= MOST_TOGETHER:
+            together = self._asked.get(key, ())
+        self._unpriced[key] = Trees(moves, seen, turns, self._searches, together=together, **others)
+        return self._unpriced[key]
 
     def _ahead_of(self, back: Moves, region: int, driver_class: int) -> np.ndarray:
         """Return the time from behind the nearest gateway (s, (nodes,)).

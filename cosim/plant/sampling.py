@@ -82,8 +82,10 @@ class StreetSampler:
         edges = self._city.edges
         counts, speeds, routing = np.zeros((3, len(edges)))
         counts[streets] = [session.vehicle_count(edges[n]) for n in streets]
-        for n in np.flatnonzero(counts):
-            speeds[n], routing[n] = session.speeds(edges[n])
+        used = np.flatnonzero(counts).tolist()
+        if used:
+            means = [session.speeds(edges[n]) for n in used]
+            speeds[used], routing[used] = zip(*means, strict=True)
         self.last = counts, speeds
         for n in np.flatnonzero(counts > self.longest_queue):  # only these can have a longer queue
             self.longest_queue[n] = max(self.longest_queue[n], session.halting(edges[n]))

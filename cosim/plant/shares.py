@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from typing import TypeAlias
 
 import numpy as np
-from jaxtyping import Int
 
 from cosim.plant.routes import Choice
 from nmfd.arrays import PerTurn
@@ -33,24 +32,25 @@ class Shares:
 
     def __init__(self, own: PerTurn):
         """own: split ratios without guidance (-, (R, R, R))"""
-        self._own = own
-        self._theta = own
-        self._wished = np.zeros(own.shape)
-        self._given = np.zeros(own.shape)
+        # Lists by region, destination and next region: a driver needs one row of each.
+        self._own = _rows(own)
+        self._theta = self._own
+        self._wished = _rows(np.zeros(own.shape))
+        self._given = _rows(np.zeros(own.shape))
         self.interval = 0
         self.realised = np.zeros(own.shape, dtype=int)
 
     def command(self, theta: PerTurn) -> None:
         """Begin a control interval with split ratios theta (-, (R, R, R))."""
-        self._theta = theta
-        self._wished *= MEMORY
-        self._given *= MEMORY
+        self._theta = _rows(theta)
+        self._wished = (MEMORY * np.array(self._wished)).tolist()
+        self._given = (MEMORY * np.array(self._given)).tolist()
         self.interval += 1
 
     def next_region(
         self,
         region: int,
-        neighbours: Int[np.ndarray, " N"],
+        neighbours: Sequence[int],
         destination: int,
         choices: Sequence[Choice],
         limit: float,
@@ -63,11 +63,11 @@ class Shares:
         """
         times = [choice.time if choice.time <= limit else math.inf for choice in choices]
         fastest = neighbours[times.index(min(times))]
-        self._wished[region, fastest, destination] += 1.0
-        wish = self._wished[region, neighbours, destination].tolist()
-        own = self._own[region, neighbours, destination].tolist()
-        theta = self._theta[region, neighbours, destination].tolist()
-        given = self._given[region, neighbours, destination].tolist()
+        self._wished[region][destination][fastest] += 1.0
+        wish = _picked(self._wished[region][destination], neighbours)
+        own = _picked(self._own[region][destination], neighbours)
+        theta = _picked(self._theta[region][destination], neighbours)
+        given = _picked(self._given[region][destination], neighbours)
         wishes = sum(wish)
         shares = shifted([w / wishes for w in wish], own, theta)
         for n, choice in enumerate(choices):
@@ -81,12 +81,14 @@ class Shares:
     def assign(self, turn: Turn) -> None:
         """Count a driver for a next region."""
         self.realised[turn] += 1
-        self._given[turn] += 1.0
+        region, following, destination = turn
+        self._given[region][destination][following] += 1.0
 
     def withdraw(self, turn: Turn, interval: int) -> None:
         """Uncount a driver who was assigned in `interval`."""
         self.realised[turn] -= 1
-        self._given[turn] -= MEMORY ** (self.interval - interval)
+        region, following, destination = turn
+        self._given[region][destination][following] -= MEMORY ** (self.interval - interval)
 
 
 def shifted(wish: Sequence[float], own: Sequence[float], theta: Sequence[float]) -> list[float]:
@@ -95,6 +97,8 @@ def shifted(wish: Sequence[float], own: Sequence[float], theta: Sequence[float])
     A next region that theta lowers loses the same part of its wishes. The regions that theta raises
     get these in proportion to how much it raises them.
     """
+    if own == theta:
+        return list(wish)
     kept = []
     raised = []
     for w, o, t in zip(wish, own, theta, strict=True):
@@ -124,3 +128,12 @@ def assigned(times: Sequence[float], shares: Sequence[float], given: Sequence[fl
         behind = shares[n] * count - given[n]
         costs[n] = times[n] - SHARE_PENALTY_S * behind
     return min(costs, key=costs.__getitem__)
+
+
+def _rows(values: PerTurn) -> list[list[list[float]]]:
+    """Return values by region, destination and next region."""
+    return np.swapaxes(values, 1, 2).tolist()
+
+
+def _picked(row: Sequence[float], regions: Sequence[int]) -> list[float]:
+    return [row[region] for region in regions]

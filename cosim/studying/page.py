@@ -99,7 +99,10 @@ class Study:
 
     @property
     def only_today(self) -> Outcome | None:
-        """The strategy that saves most today, of those that harm or leave trips at other demand."""
+        """The strategy that saves most today, but not at other demand.
+
+        There it harms, or leaves trips unserved.
+        """
         gaining = []
         for one in self.levels[0].outcomes:
             gains = one.verdict is not None and one.verdict.answer is Answer.GAINS
@@ -161,7 +164,7 @@ def answer(study: Study) -> str:
 
 
 def _only_today(study: Study) -> str:
-    """Return a sentence on a strategy that helps only today, "" if there is none."""
+    """Return a sentence on what helps only today, "" if nothing does."""
     one = study.only_today
     if one is None or one.verdict is None:
         return ""

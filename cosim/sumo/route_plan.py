@@ -49,7 +49,7 @@ class RoutePlan:
         routes[route] += drivers
 
     def add_parts(self, trips: Iterable[Ends | None]) -> None:
-        """Give the trips for which there is no plan the parts of routes between their ends.
+        """Give trips without a plan the parts of routes between their ends.
 
         A part of a route of least cost has least cost, too (Bellman's principle of optimality).
         """
@@ -121,7 +121,10 @@ def read_plan(paths: Iterable[Path], city: City) -> RoutePlan:
 
 
 def _parts(route: Route, wanted: Mapping[str, Container[str]]) -> Iterator[Route]:
-    """Yield the parts of a route from an edge to one of those that are wanted from there."""
+    """Yield the parts of a route between wanted ends.
+
+    wanted: first edge -> last edges
+    """
     for start, first in enumerate(route):
         lasts = wanted.get(first, ())
         for end in range(start + 1, len(route)):

@@ -143,42 +143,46 @@ class Session:
         simulation = libsumo.simulation
         vehicle = libsumo.vehicle
         edge = libsumo.edge
+        lane = libsumo.lane
         light = libsumo.trafficlight
         # Vehicles in the last step: read from files; inserted; ended as SUMO says, which tripinfo
         # may deny, without those that a program removed; taken off the road to be moved on; back on
         # the road, or gone for good.
-        self.loaded = simulation.getLoadedIDList
-        self.departed = simulation.getDepartedIDList
-        self.arrived = simulation.getArrivedIDList
-        self.started_teleport = simulation.getStartingTeleportIDList
-        self.ended_teleport = simulation.getEndingTeleportIDList
+        self.loaded = _compiled(simulation.getLoadedIDList)
+        self.departed = _compiled(simulation.getDepartedIDList)
+        self.arrived = _compiled(simulation.getArrivedIDList)
+        self.started_teleport = _compiled(simulation.getStartingTeleportIDList)
+        self.ended_teleport = _compiled(simulation.getEndingTeleportIDList)
         # Vehicles now: on the road, without teleporting ones; all that are loaded and have not
         # arrived; due to depart.
-        self.running = vehicle.getIDList
-        self.known = vehicle.getLoadedIDList
-        self.pending = simulation.getPendingVehicles
+        self.running = _compiled(vehicle.getIDList)
+        self.known = _compiled(vehicle.getLoadedIDList)
+        self.pending = _compiled(simulation.getPendingVehicles)
         # One vehicle: edge, normal or internal; route; place on it; speed (m/s); time since it
         # stopped (s); length (m).
-        self.road = vehicle.getRoadID
-        self.route = vehicle.getRoute
-        self.route_index = vehicle.getRouteIndex
-        self.vehicle_speed = vehicle.getSpeed
-        self.standing_time = vehicle.getWaitingTime
-        self.vehicle_length = vehicle.getLength
-        # One edge: its vehicles, their number, and of these under 0.1 m/s. One lane: the number of
-        # its vehicles.
-        self.vehicles_on = edge.getLastStepVehicleIDs
-        self.vehicle_count = edge.getLastStepVehicleNumber
-        self.halting = edge.getLastStepHaltingNumber
-        self.lane_vehicles = libsumo.lane.getLastStepVehicleNumber
+        self.road = _compiled(vehicle.getRoadID)
+        self.route = _compiled(vehicle.getRoute)
+        self.route_index = _compiled(vehicle.getRouteIndex)
+        self.vehicle_speed = _compiled(vehicle.getSpeed)
+        self.standing_time = _compiled(vehicle.getWaitingTime)
+        self.vehicle_length = _compiled(vehicle.getLength)
+        # One edge: its vehicles, their number, and of these under 0.1 m/s; mean speed (m/s). The
+        # same of one lane.
+        self.vehicles_on = _compiled(edge.getLastStepVehicleIDs)
+        self.vehicle_count = _compiled(edge.getLastStepVehicleNumber)
+        self.halting = _compiled(edge.getLastStepHaltingNumber)
+        self._edge_speed = _compiled(edge.getLastStepMeanSpeed)
+        self._on_lane = _compiled(lane.getLastStepVehicleIDs)
+        self.lane_vehicles = _compiled(lane.getLastStepVehicleNumber)
+        self._lane_speed = _compiled(lane.getLastStepMeanSpeed)
         # One loop detector: share of the last step in which a vehicle was on it (%).
-        self.loop_occupancy = libsumo.inductionloop.getLastStepOccupancy
+        self.loop_occupancy = _compiled(libsumo.inductionloop.getLastStepOccupancy)
         # Signals: all of the network; state of one, a character per link; id of its programme; run
         # one of its own.
-        self.signals = light.getIDList
-        self.signal_state = light.getRedYellowGreenState
-        self.programme_id = light.getProgram
-        self.restart_programme = light.setProgram
+        self.signals = _compiled(light.getIDList)
+        self.signal_state = _compiled(light.getRedYellowGreenState)
+        self.programme_id = _compiled(light.getProgram)
+        self.restart_programme = _compiled(light.setProgram)
 
     def close(self) -> None:
         """End the simulation, which completes SUMO's own outputs.
@@ -211,17 +215,17 @@ class Session:
         counts as one vehicle at the limit. So a queue for one turn does not deter drivers with
         another lane.
         """
-        routing = libsumo.edge.getLastStepMeanSpeed(edge)
+        routing = self._edge_speed(edge)
         lanes = self._lanes(edge)
         if len(lanes) == 1:
             return routing, routing
         vehicles = 0
         metres_per_second = 0.0
         for lane in lanes:
-            count = libsumo.lane.getLastStepVehicleNumber(lane)
+            count = self.lane_vehicles(lane)
             if count:
                 vehicles += count
-                metres_per_second += count * libsumo.lane.getLastStepMeanSpeed(lane)
+                metres_per_second += count * self._lane_speed(lane)
         if not vehicles:  # always in the mesoscopic model, which has no lanes
             return routing, routing
         return metres_per_second / vehicles, routing
@@ -278,7 +282,7 @@ class Session:
 
     def first_on(self, lane: str) -> str | None:
         """Return the vehicle nearest to the end of a lane, None without one."""
-        vehicles = libsumo.lane.getLastStepVehicleIDs(lane)
+        vehicles = self._on_lane(lane)
         return vehicles[-1] if vehicles else None
 
     def room(self, lane: str) -> float:
@@ -363,6 +367,12 @@ class Session:
         """Return a programme of a signal as SUMO's own object."""
         logics = libsumo.trafficlight.getAllProgramLogics(signal)
         return next(logic for logic in logics if logic.programID == programme)
+
+
+def _compiled(function: Callable) -> Callable:
+    """Return the compiled function that one of libsumo's only calls."""
+    name = function.__qualname__.replace(".", "_")
+    return getattr(sys.modules["libsumo._libsumo"], name, function)
 
 
 def _lanes_of(edge: str) -> tuple[str, ...]:
