@@ -9,7 +9,7 @@ import numpy as np
 
 from cosim.evaluation.simulate import Simulation
 from cosim.plant import incidents
-from cosim.plant.launch import vehicles_of
+from cosim.plant.launch import own_vehicles
 from cosim.plant.programmes import check_strategy, scenario_city
 from cosim.plant.settings import FILES, own_files, settings
 from cosim.plant.strategy import Strategy, check_tables
@@ -77,7 +77,7 @@ def city_key(scenario: Scenario, strategies: Sequence[Strategy]) -> dict[str, ob
     files = city_files(scenario.network)
     city = scenario_city(scenario, chosen)
     check_adjacency(city, scenario.network)
-    vehicles_of(scenario, chosen, city, 0)
+    own_vehicles(scenario, chosen, city)
     simple, _ = read_signals(city, own_files(scenario, chosen.additional), HELD)
     driven = []
     if any(one.settings(scenario).signals_from_outside for one in strategies):

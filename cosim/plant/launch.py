@@ -38,8 +38,13 @@ def vehicles_of(scenario: Scenario, settings: Settings, city: City, seed: int) -
 
     Raises: InputError
     """
-    if not settings.routes:
-        return as_recorded(make_trips(city, scenario.demand, scenario.step, seed))
+    if settings.routes:
+        return own_vehicles(scenario, settings, city)
+    return as_recorded(make_trips(city, scenario.demand, scenario.step, seed))
+
+
+def own_vehicles(scenario: Scenario, settings: Settings, city: City) -> RecordedTrips:
+    """Return the recorded trips of the city. Raises InputError."""
     originals = recorded.read_recorded_trips(own_files(scenario, settings.routes))
     recorded.check_edges(originals, city, f"{scenario.where}: sumo.routes")
     return originals
@@ -245,7 +250,7 @@ class Launch:
 
     @cached_property
     def _recorded(self) -> RecordedTrips:
-        return vehicles_of(self._scenario, self._settings, self._city, 0)
+        return own_vehicles(self._scenario, self._settings, self._city)
 
     @cached_property
     def _shared_routes(self) -> Mapping[str, tuple[str, ...]]:
