@@ -11,7 +11,7 @@ from tiny_city import pieces
 
 from cosim.importing.baseline import INTERVAL_S, Baseline
 from cosim.importing.boundaries import Turns, with_room
-from cosim.importing.choice import choose, densest_region
+from cosim.importing.choice import _Search, choose, densest_region
 from cosim.importing.partition import finish, make_blocks, names, own_regions, partition
 from cosim.importing.quality import doubts
 from cosim.importing.streets import read_streets
@@ -182,11 +182,13 @@ def test_the_chosen_partition_is_the_one_whose_gates_hold_most(tmp_path):
         assert all(pieces(streets, choice.labels == n) == 1 for n in set(choice.labels))
 
 
-def test_two_regions_are_chosen_even_if_gates_hold_nobody(tmp_path):
+def test_two_regions_are_chosen_even_if_one_would_leak_less(tmp_path, monkeypatch):
     streets = read_streets(tiny_city.network(tmp_path))
     routes = {(int(a), int(b)): 1 for a, b in streets.links}
     signals = {signal for signal in streets.link_signals if signal}
     run = baseline(streets, np.full(len(streets.edges), 0.01))
+    everywhere = np.zeros(len(streets.edges), dtype=int)
+    monkeypatch.setattr(_Search, "results", lambda *_: [everywhere])
     assert choose(streets, run, routes, uncontrollable=signals).labels.max() == 1
 
 
