@@ -69,8 +69,8 @@ class Drivers:
         times = self._times
         ahead = route[1:]
         moves = [times.move.get(pair, UNKNOWN) for pair in pairwise(route)]
-        found = UNKNOWN not in moves
-        known = moves if found else [move for move in moves if move != UNKNOWN]
+        known = [move for move in moves if move != UNKNOWN]
+        found = len(known) == len(moves)
         takes = _total(time, ahead) + _total(times.turn_list, known)
         free = _total(self._free, ahead) + _total(self._free_turns, known)
         if found and not self._ways_return:

@@ -317,7 +317,8 @@ class Outcome:
     @property
     def left(self) -> float:
         """Mean number of trips left at the end."""
-        return round(unfinished(self.means), 6) + 0.0  # no -0
+        # Means of whole numbers may add up to a little less than 0.
+        return max(0.0, unfinished(self.means))
 
 
 @dataclass(frozen=True, kw_only=True)
