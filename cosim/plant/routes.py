@@ -288,7 +288,7 @@ class Trees:
         return self._tree(self.node[begin], most).times
 
     def back(self, begin: int, end: int) -> list[int]:
-        """Return the edges from `end` back to `begin`, after `costs` of `begin`."""
+        """Return the edges from `end` back to `begin`, after its search."""
         first = self.node[end]
         last = self.node[begin]
         return self._moves.path(self._tree(last, 0.0).before, first, last)

@@ -138,7 +138,7 @@ def _percent(one: Outcome) -> float:
 
 
 def answer(study: Study) -> str:
-    """Return the answer to the engineer's question in one sentence."""
+    """Return the answer to the engineer's question in a sentence or two."""
     found = study.recommended
     today = _only_today(study)
     if found is not None:

@@ -370,7 +370,7 @@ class Session:
 
 
 def _compiled(function: Callable) -> Callable:
-    """Return the compiled function that one of libsumo's only calls."""
+    """Return the compiled function that a function of libsumo calls."""
     name = function.__qualname__.replace(".", "_")
     return getattr(sys.modules["libsumo._libsumo"], name, function)
 
