@@ -9,8 +9,10 @@ P / n is the mean speed, and P over the lane-kilometres the mean flow per lane. 
 trips that ended in the region and vehicles that left it. edgeData has no turns: those that leave an
 edge are divided as the next edges are entered.
 
-Edges on junctions do not count. `cosim identify` counts outflow, too, but divides transfers by what
-the gates let pass. `nmfd identify` does the same as here for tables of detectors.
+A vehicle on a junction counts where it comes from, if edgeData has internal edges (withInternal).
+So it is in `cosim identify`, which counts outflow, too, but divides transfers by what the gates let
+pass, and takes accumulations at the ends of intervals. `nmfd identify` does the same as here for
+tables of detectors.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,7 +27,7 @@ from cosim.importing.choice import AUTO, Choice, labelled, number_of
 from cosim.importing.partition import digraph, names, own_regions, partition, positions
 from cosim.importing.streets import Streets, numbers_of, read_streets
 from cosim.sumo.arrays import EdgeNumbers, Points
-from cosim.sumo.edge_data import read_edge_data
+from cosim.sumo.edge_data import ON_JUNCTION, read_edge_data
 from nmfd.arrays import PerRegion
 from nmfd.errors import InputError
 from nmfd.model import mfd
@@ -104,10 +106,8 @@ def edge_mfds(net: Path, edge_data: Sequence[Path], regions: str, out: Path) -> 
         wanted = own_regions(streets, Path(regions))
     days = []
     for day, path in enumerate(edge_data):
-        rows = read_edge_data(path)
-        numbers = numbers_of(rows["edge"], streets, path)
-        vehicles = rows["density"] * streets.length[numbers] / 1000.0
-        days.append(rows.assign(day=day, number=numbers, vehicles=vehicles))
+        rows = _placed(read_edge_data(path, junctions=True), streets, path)
+        days.append(rows.assign(day=day))
     rows = pd.concat(days, ignore_index=True)
     baseline = _baseline(streets, rows, len(days))
     if isinstance(wanted, int):
@@ -136,6 +136,25 @@ def edge_mfds(net: Path, edge_data: Sequence[Path], regions: str, out: Path) -> 
     )
     found.write()
     return found
+
+
+def _placed(rows: pd.DataFrame, streets: Streets, path: Path) -> pd.DataFrame:
+    """Return rows with number and vehicles, too.
+
+    An internal edge gets the number of the edge before it; what it counts of those that enter and
+    leave is left out. Other edges of junctions, such as pedestrian crossings, are left out.
+
+    Raises: InputError for an unknown edge of the file at `path`
+    """
+    inside = rows["edge"].isin(streets.inside)
+    rows = rows[inside | ~rows["edge"].str.startswith(ON_JUNCTION)].copy()
+    rows.loc[inside, ["entered", "left"]] = 0.0
+    before = {edge: place.before for edge, place in streets.inside.items()}
+    rows["number"] = numbers_of(rows["edge"].replace(before), streets, path)
+    length = pd.Series(streets.length[rows["number"]], rows.index)
+    lengths = {edge: place.length for edge, place in streets.inside.items()}
+    length = rows["edge"].map(lengths).fillna(length)
+    return rows.assign(vehicles=rows["density"] * length / 1000.0)
 
 
 def _baseline(streets: Streets, rows: pd.DataFrame, days: int) -> Baseline:

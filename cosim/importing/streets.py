@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from cosim.importing.case import seconds
 from cosim.sumo import signals
 from cosim.sumo.arrays import EdgeMask, EdgeNumbers, PerEdge, Points
-from cosim.sumo.net import NORMAL, for_cars, points_along, points_of, size
+from cosim.sumo.net import NORMAL, for_cars, points_along, points_of, size, stem
 from cosim.sumo.xml_files import attribute, network_root, read_xml
 from nmfd.errors import InputError
 
@@ -34,6 +34,17 @@ class Logic(signals.Logic):
     cycle: float
 
 
+class Inside(NamedTuple):
+    """An internal edge of a junction.
+
+    before: edge that it comes from
+    length: (m)
+    """
+
+    before: str
+    length: float
+
+
 @dataclass(frozen=True, kw_only=True)
 class Streets:
     """Road graph of E normal edges, sorted by id.
@@ -43,6 +54,7 @@ class Streets:
     length [m], lanes (those for cars), speed [m/s]: (E,)
     shapes: E arrays (n, 2) [m]; centre: (E, 2) [m], half way along
     junctions: (E, 2), numbers of the junctions where the edge begins and ends
+    inside: internal edge -> what it comes from
     links: (L, 2) edges that a connection joins, both drivable, by lanes for cars
     all_links: the same for any vehicle
     link_signals: L signals, of each of the links, None without one
@@ -60,6 +72,7 @@ class Streets:
     shapes: tuple[Points, ...]
     centre: Float[np.ndarray, "E 2"]
     junctions: Int[np.ndarray, "E 2"]
+    inside: Mapping[str, Inside]
     links: Int[np.ndarray, "L 2"]
     all_links: Pairs
     link_signals: tuple[str | None, ...]
@@ -151,6 +164,7 @@ def read_streets(net: Path, additional: Iterable[Path] = ()) -> Streets:
     Raises: InputError
     """
     rows = {}
+    internal = {}
     links: list[Mapping[str, str]] = []
     roundabouts: list[list[str]] = []
     logics = {}
@@ -158,7 +172,9 @@ def read_streets(net: Path, additional: Iterable[Path] = ()) -> Streets:
         for element in root:
             if element.tag == "edge" and element.get("function", "normal") in NORMAL:
                 rows[attribute(element, "id")] = _edge(element)
-            elif element.tag == "connection" and not attribute(element, "from").startswith(":"):
+            elif element.tag == "edge" and element.get("function") == "internal":
+                internal[attribute(element, "id")] = size(element[0], "length")
+            elif element.tag == "connection":
                 links.append(element.attrib)
             elif element.tag == "roundabout":
                 roundabouts.append(element.get("edges", "").split())
@@ -169,9 +185,8 @@ def read_streets(net: Path, additional: Iterable[Path] = ()) -> Streets:
             logics[attribute(element, "id")] = _logic(element, path)
     if not any(row.cars for row in rows.values()):
         raise InputError(f"{net}: has no edge that cars may use; give a road network")
-    return _from_rows(
-        net, rows, links, roundabouts, logics, left_hand=root.get("lefthand") == "true"
-    )
+    left_hand = root.get("lefthand") == "true"
+    return _from_rows(net, rows, internal, links, roundabouts, logics, left_hand=left_hand)
 
 
 def numbers_of(edges: pd.Series, streets: Streets, path: Path) -> pd.Series:
@@ -188,6 +203,7 @@ def numbers_of(edges: pd.Series, streets: Streets, path: Path) -> pd.Series:
 def _from_rows(
     path: Path,
     rows: Mapping[str, _Edge],
+    internal: Mapping[str, float],
     links: Iterable[Mapping[str, str]],
     roundabouts: Iterable[Sequence[str]],
     logics: Mapping[str, Logic],
@@ -196,16 +212,23 @@ def _from_rows(
 ) -> Streets:
     """Return the streets of a network.
 
-    rows: id -> edge; links: attributes of connections; roundabouts: their edges
+    rows: id -> edge; internal: id -> length (m); links: attributes of connections; roundabouts:
+        their edges
     """
     edges = tuple(sorted(rows))
     number = {edge: n for n, edge in enumerate(edges)}
     own = [rows[edge] for edge in edges]
     pairs: set[tuple[int, int]] = set()
+    inside: dict[str, Inside] = {}
     signal_of: dict[tuple[int, int], str | None] = {}  # pair of edges, for cars -> signal
     for link in links:
         source = link["from"]
         target = link["to"]
+        way = stem(link.get("via", ""))
+        if way in internal and source in number:
+            inside[way] = Inside(source, internal[way])
+        elif way in internal and source in inside:  # after a halt on the junction
+            inside[way] = Inside(inside[source].before, internal[way])
         if source not in number or target not in number:
             continue
         pair = number[source], number[target]
@@ -228,6 +251,7 @@ def _from_rows(
         shapes=tuple(row.shape for row in own),
         centre=np.array([points_along(row.shape, lambda length: length / 2) for row in own]),
         junctions=junctions.reshape(-1, 2),
+        inside=inside,
         links=np.array(car_links, dtype=int).reshape(-1, 2),
         all_links=np.array(sorted(pairs), dtype=int).reshape(-1, 2),
         link_signals=tuple(signal_of[pair] for pair in car_links),

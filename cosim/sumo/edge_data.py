@@ -37,13 +37,16 @@ class EdgeRow(NamedTuple):
     arrived: float
 
 
-def read_edge_data(path: Path, needed: str = "sampledSeconds") -> pd.DataFrame:
-    """Return the edges outside junctions as rows with the columns of EdgeRow.
+def read_edge_data(
+    path: Path, needed: str = "sampledSeconds", *, junctions: bool = False
+) -> pd.DataFrame:
+    """Return edges as rows with the columns of EdgeRow.
 
     density and distance count a vehicle where its front is; sampledSeconds counts it on every edge
     that it covers.
 
     needed: attribute that every edge must have
+    junctions: with internal edges
 
     Raises: InputError for another file, or overlapping intervals
     """
@@ -63,7 +66,7 @@ def read_edge_data(path: Path, needed: str = "sampledSeconds") -> pd.DataFrame:
                 raise ValueError(f"interval of {begin:g} s to {end:g} s begins before {last:g} s")
             last = end
             for edge in element.iter("edge"):
-                if not attribute(edge, "id").startswith(ON_JUNCTION):
+                if junctions or not attribute(edge, "id").startswith(ON_JUNCTION):
                     attribute(edge, needed)
                     rows.append(_row(edge, begin, end))
             element.clear()

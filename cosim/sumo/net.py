@@ -279,7 +279,7 @@ def _derived(
         successors[source].append(target)
     turn_time = {}
     for link in links:
-        time = net.internal[_stem(link.via)].time if link.via else 0.0
+        time = net.internal[stem(link.via)].time if link.via else 0.0
         turn_time[link.source, link.target] = time
     over = _turns_over_junctions(links, net.connections)
     inside = {}
@@ -385,7 +385,7 @@ def _read_net(path: Path) -> _Net:
         for element in root.iterfind("connection"):
             source = attribute(element, "from")
             via = element.get("via")
-            if via and _stem(via) not in internal:
+            if via and stem(via) not in internal:
                 raise LookupError(f"connection from {source} by way of {via}: no such edge")
             connection = Connection(
                 source=source,
@@ -403,7 +403,7 @@ def _read_net(path: Path) -> _Net:
     return _Net(lanes_of, internal, connections)
 
 
-def _stem(name: str) -> str:
+def stem(name: str) -> str:
     """Return the edge of a lane, or the junction of an internal edge."""
     return name.rpartition("_")[0]
 
@@ -497,13 +497,13 @@ def _internal_regions(net: _Net, region_of: Mapping[str, int]) -> dict[str, int]
         if target is None:
             continue
         if connection.via:
-            regions[_stem(connection.via)] = target
+            regions[stem(connection.via)] = target
         if connection.source.startswith(":"):
             regions[connection.source] = target
     of_junction: dict[str, int] = {}
     for edge, region in regions.items():
-        of_junction.setdefault(_stem(edge), region)
-    return {edge: regions.get(edge, of_junction.get(_stem(edge), 0)) for edge in net.internal}
+        of_junction.setdefault(stem(edge), region)
+    return {edge: regions.get(edge, of_junction.get(stem(edge), 0)) for edge in net.internal}
 
 
 def _turns_over_junctions(
@@ -522,7 +522,7 @@ def _turns_over_junctions(
         way = []
         via = link.via
         while via:
-            way.append(_stem(via))
+            way.append(stem(via))
             via = onward.get(via)
         if way:
             over[link.source, link.target] = tuple(way)
