@@ -7,20 +7,21 @@ from typing import TypeAlias
 
 import numpy as np
 
+from cosim.evaluation.link_vehicles import Drive, Route
 from cosim.sumo.net import City, Connection, connections_for_cars
 from nmfd.arrays import Arrays
 from nmfd.errors import InputError
 
-Route: TypeAlias = tuple[str, ...]
 Movement: TypeAlias = tuple[str, str]  # street, next street
 Turn: TypeAlias = tuple[Movement, int]  # and the link entered
 Lanes: TypeAlias = frozenset[int]
+LONG_M = 100.0  # of a street on which all vehicles find their lane
 
 
 def connections_of(city: City) -> dict[Movement, list[Connection]]:
     """Return the connections of each movement between lanes for cars."""
     connections = defaultdict[Movement, list[Connection]](list)
-    for connection in connections_for_cars(city.net_file):
+    for connection in connections_for_cars(city.net_file, city.number.keys()):
         connections[connection.source, connection.target].append(connection)
     return dict(connections)
 
@@ -88,11 +89,14 @@ class Streets:
     def lanes(self, turn: Turn) -> list[int]:
         """Return the lanes of a movement that lead to a link.
 
-        They are all its lanes if none leads there: vehicles change lanes behind the junction.
+        They are all its lanes if none leads there, or the next street is long: vehicles change
+        lanes behind the junction.
         """
         movement, link = turn
         connections = self.connections[movement]
-        lanes = {one.lane for one in connections if one.to_lane in self.links[link][1]}
+        lanes: set[int] = set()
+        if self.city.length[movement[1]] < LONG_M:
+            lanes = {one.lane for one in connections if one.to_lane in self.links[link][1]}
         return sorted(lanes or {one.lane for one in connections})
 
 
@@ -108,23 +112,27 @@ class Counts:
     entering, ending: by (link, destination), those that do not begin there, and that end there
     beginning: by (link, destination), trips that begin there
     trips: by (region, destination)
+    first, last: sums of Drive by link
     """
 
-    def __init__(self, streets: Streets, routes: Iterable[Route]):
+    def __init__(self, streets: Streets, drives: Iterable[Drive]):
         self.cells = defaultdict[tuple[Turn, int], float](float)
         self.flows = Counter[Movement]()
         self.entering = defaultdict[tuple[int, int], float](float)
         self.ending = defaultdict[tuple[int, int], float](float)
         self.beginning = Counter[tuple[int, int]]()
         self.trips = Counter[tuple[int, int]]()
+        self.first = defaultdict[int, float](float)
+        self.last = defaultdict[int, float](float)
         region_of = streets.city.region_of
-        for route in routes:
+        for route, first, last in drives:
             destination = region_of[route[-1]]
             movements = list(itertools.pairwise(route))
             links = [streets.link_of[movement] for movement in movements]
             self.flows.update(movements)
             self.trips[region_of[route[0]], destination] += 1
             self.beginning[links[0], destination] += 1
+            self.first[links[0]] += first
             for movement, link in zip(movements, links[1:], strict=False):
                 self.cells[(movement, link), destination] += 1
                 self.entering[link, destination] += 1
@@ -132,6 +140,7 @@ class Counts:
                 self.cells[(movements[-1], link), destination] += share
                 self.entering[link, destination] += share
                 self.ending[link, destination] += share
+                self.last[link] += share * last
 
 
 def link_arrays(streets: Streets) -> Arrays:
@@ -188,12 +197,20 @@ def vehicle_arrays(
     trips = np.array([[one.trips[pair] for pair in pairs] for one in every], dtype=float)
     vehicles = np.array([[one.cells[cell] for cell in cells] for one in every])
     leaving = np.array([np.bincount(source, some, len(entries)) for some in vehicles])
+    entered = np.array([link for link, _ in entries])
+    links = range(len(streets.links))
+    first = [counts.first[link] for link in links]
+    last = [counts.last[link] for link in links]
+    begun = np.bincount(entered, beginning[0], len(links))
+    ended = np.bincount(entered, ending[0], len(links))
     return {
         "turn_movement": np.array([number_of[movement] for movement, _ in turns]),
         "turn_link": np.array([link for _, link in turns]),
         "served": served,
         "server": server,
-        "entry_link": np.array([link for link, _ in entries]),
+        "entry_link": entered,
+        "first": np.divide(first, begun, where=begun > 0, out=np.ones(len(links))),
+        "last": np.divide(last, ended, where=ended > 0, out=np.ones(len(links))),
         "destination": np.array([destination for _, destination in entries]),
         "ending": _shares(ending, entering),
         "origin": _shares(beginning, trips),

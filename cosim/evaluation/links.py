@@ -13,20 +13,20 @@ import numpy as np
 from cosim.evaluation.link_streets import (
     Counts,
     Movement,
-    Route,
     Streets,
     connections_of,
     link_arrays,
     vehicle_arrays,
 )
+from cosim.evaluation.link_vehicles import draws_of, drives_of, means_of
 from cosim.plant.gates import MIN_GREEN_S, least_times
 from cosim.plant.pressure import Roads
-from cosim.plant.settings import Settings, own_files, settings
+from cosim.plant.settings import own_files, settings
 from cosim.plant.stages import stages_of, transition
 from cosim.sumo import recorded_trips as recorded
 from cosim.sumo.net import City, Connection, city_of
 from cosim.sumo.signals import HELD, Cycle, Signal, read_cycles, read_signals
-from cosim.sumo.trips import PLANNING_SEEDS, make_trips
+from cosim.sumo.trips import PLANNING_SEEDS
 from cosim.sumo.xml_files import attribute, network_root
 from nmfd.arrays import Arrays
 from nmfd.model.links.network import FILE, LinkNetwork
@@ -69,12 +69,22 @@ def link_network(scenario: Scenario, seeds: Sequence[int] = PLANNING_SEEDS) -> L
     Raises: InputError if a route leads where no connection is
     """
     chosen = settings(scenario)
-    city = city_of(scenario.network)
-    draws = _draws(scenario, chosen, city, seeds)
-    together = [route for routes in draws for route in routes]
-    streets = Streets(city, connections_of(city), together, scenario.where)
-    counts = Counts(streets, together)
     files = own_files(scenario, chosen.additional)
+    city = city_of(scenario.network)
+    draws = draws_of(scenario, chosen, city, seeds)
+    shared = recorded.read_routes(files)
+    # Some vehicles drive where cars may not.
+    driven: set[str] = set()
+    for draw in draws:
+        for element in draw.elements:
+            driven.update(recorded.edges_of(element, shared)[0])
+    city = city_of(scenario.network, opened=driven & city.region_of.keys())
+    by_draw = [drives_of(draw, shared, city.length) for draw in draws]
+    together = [drive for drives in by_draw for drive in drives]
+    routes = [drive.route for drive in together]
+    streets = Streets(city, connections_of(city), routes, scenario.where)
+    counts = Counts(streets, together)
+    means = means_of(scenario, chosen, draws[0])
     steered, _ = read_signals(city, files, HELD)
     obeying = {signal.id for signal in steered}.difference(chosen.leave_signals)
     gated = set()
@@ -84,29 +94,17 @@ def link_network(scenario: Scenario, seeds: Sequence[int] = PLANNING_SEEDS) -> L
     links = link_arrays(streets)
     return LinkNetwork(
         regions=city.regions,
+        spacing=means["length"] + means["minGap"],
+        headway=means["tau"],
+        dawdling=0.5 * means["sigma"] * means["accel"],
+        acceleration=means["accel"],
         **links,
         **_movement_arrays(streets, read_cycles(city.net_file, files), chosen.begin, gated),
         **vehicle_arrays(
-            streets, links["free_time"], counts, [Counts(streets, routes) for routes in draws]
+            streets, links["free_time"], counts, [Counts(streets, drives) for drives in by_draw]
         ),
         **_stage_arrays(streets, counts, steered),
     )
-
-
-def _draws(
-    scenario: Scenario, chosen: Settings, city: City, seeds: Sequence[int]
-) -> list[list[Route]]:
-    """Return the routes of each draw; one draw of recorded trips."""
-    if not chosen.routes:
-        made = [make_trips(city, scenario.demand, scenario.step, seed) for seed in seeds]
-        return [[route for route in trips.routes if len(route) > 1] for trips in made]
-    shared = recorded.read_routes(own_files(scenario, chosen.additional))
-    routes = []
-    for element in recorded.read_recorded_trips(own_files(scenario, chosen.routes)).elements:
-        edges, driven = recorded.edges_of(element, shared)
-        if driven and len(edges) > 1 and city.number.keys() >= set(edges):
-            routes.append(tuple(edges))
-    return [routes]
 
 
 def _foes(city: City) -> set[tuple[Movement, Movement]]:

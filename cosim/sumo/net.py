@@ -3,7 +3,7 @@
 import csv
 import math
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -227,18 +227,25 @@ def city_files(network: RegionalModel) -> CityFiles:
     return files
 
 
-def city_of(network: RegionalModel) -> City:
-    """Return the city of `network`. Raises InputError."""
-    return load_city(*city_files(network), network.regions)
+def city_of(network: RegionalModel, opened: Collection[str] = ()) -> City:
+    """Return the city of `network`; opened: as of `load_city`.
+
+    Raises: InputError
+    """
+    return load_city(*city_files(network), network.regions, opened)
 
 
-def load_city(net_file: Path, regions_csv: Path, regions: int) -> City:
+def load_city(
+    net_file: Path, regions_csv: Path, regions: int, opened: Collection[str] = ()
+) -> City:
     """Read a net.xml (or net.xml.gz) and the region of each of its edges.
+
+    opened: edges that count as open to cars on all lanes, besides those that are
 
     Raises: InputError for a broken file, an unknown edge, an edge without a region, or a region
         without edges
     """
-    net = _read_net(Path(net_file))
+    net = _read_net(Path(net_file), opened)
     given = read_regions(Path(regions_csv), regions)
     edges = tuple(sorted(edge for edge, lanes in net.lanes_of.items() if lanes))
     for edge in given:
@@ -364,18 +371,20 @@ def points_along(shape: Points, marks: Callable[[float], ArrayLike]) -> Float[np
     return np.stack([np.interp(at, along, axis) for axis in shape.T], axis=-1)
 
 
-def _read_net(path: Path) -> _Net:
-    """Read a SUMO network. Raises InputError."""
+def _read_net(path: Path, opened: Collection[str] = ()) -> _Net:
+    """Read a SUMO network; opened: as of `load_city`. Raises InputError."""
     lanes_of: dict[str, list[_Lane]] = {}
     internal: dict[str, _Crossing] = {}
     connections = []
     with network_root(path) as root:
         for element in root.iterfind("edge"):
             edge = attribute(element, "id")
+            rows = [lane for lane in element.iter("lane") if for_cars(lane)]
+            if not rows and edge in opened:
+                rows = list(element.iter("lane"))
             lanes = [
                 _Lane(size(lane, "length"), size(lane, "speed"), attribute(lane, "id"))
-                for lane in element.iter("lane")
-                if for_cars(lane)
+                for lane in rows
             ]
             if element.get("function", "normal") in NORMAL:
                 lanes_of[edge] = lanes
@@ -464,12 +473,13 @@ def read_regions(path: Path, regions: int = 10**6) -> dict[str, int]:
     return region_of
 
 
-def connections_for_cars(net_file: Path) -> list[Connection]:
+def connections_for_cars(net_file: Path, opened: Collection[str] = ()) -> list[Connection]:
     """Return the connections from a lane for cars to a lane for cars.
 
+    opened: as of `load_city`
     Raises: InputError
     """
-    return _links_for_cars(_read_net(net_file))
+    return _links_for_cars(_read_net(net_file, opened))
 
 
 def _links_for_cars(net: _Net) -> list[Connection]:

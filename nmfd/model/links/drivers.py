@@ -66,7 +66,7 @@ class Drivers:
         self._region_of_link = flows.places(region)
         self._at_home = torch.as_tensor(here == target, device=flows.device)
         self._enters_home = torch.as_tensor(onward == target, device=flows.device)
-        self._free = flows.values(flows.numbers.time_factor * network.free_time)
+        self._free = flows.values(flows.free_time)
         home = region[network.entry_link] == network.destination
         self._home = torch.as_tensor(home, device=flows.device).unsqueeze(0)
         self._to_destination = self._ways(onward == target)

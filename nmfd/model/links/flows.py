@@ -22,8 +22,9 @@ shares, if green lasts long enough: first in, first out, and no flow could be la
 lead to some turns only, vehicles that all want one turn still move up in all lanes, and leave too
 fast.
 A movement that gives way to a flow f has exp(-gap f) of its green, which is the chance that no
-vehicle comes within the critical gap. A trip ends halfway along a street, or moves up in the queue
-there twice as fast as it reaches the front.
+vehicle comes within the critical gap. A vehicle that stood at the stop line takes longer along the
+next link: 1.6 s until it drives, and v / 2a as it accelerates. Trips begin and end where they do on
+average along a street; one that ends in the queue moves up there.
 
 Every vehicle that leaves one count enters another one: mass and its derivative are conserved.
 """
@@ -36,13 +37,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nmfd.model.links.chance import Chance, Choice
 from nmfd.model.links.network import LinkNetwork
 
 EPSILON = 1e-3  # veh
 LEAST = 0.1  # veh: smaller counts do not divide a room, which bounds the gradient
 INFLOW = 0.6  # veh/s in each lane, the most that can enter a link
-REACTION_S = 0.9  # headway of SUMO's cars in a queue: REACTION_S + VEHICLE_M / v
-VEHICLE_M = 12.3
+# SUMO's cars leave a queue with a headway of REACTION * tau + (spacing + BETWEEN_M) / v.
+REACTION = 0.9
+BETWEEN_M = 4.8
+START_S = 1.6  # after which the first vehicle of a queue drives
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,14 +54,14 @@ class Numbers:
     """Calibration of the model to a city; the defaults are not fitted.
 
     time_factor: of the free-flow times (-)
-    spacing: length of lane that a standing vehicle takes (m)
-    saturation: flow of a lane at green, as a share of 1 / (0.9 s + 12.3 m / v) with the speed v on
-        the junction (-)
+    spacing: of the length of lane that a standing vehicle takes (-)
+    saturation: of the flow of a lane at green, which is 1 / (0.9 tau + (spacing + 4.8 m) / v) with
+        the speed v on the junction (-)
     gap: critical gap of vehicles that give way (s)
     """
 
     time_factor: float = 1.0
-    spacing: float = 7.5
+    spacing: float = 1.0
     saturation: float = 1.0
     gap: float = 4.7
 
@@ -76,6 +80,8 @@ class Traffic(NamedTuple):
     passed: vehicles that made each movement in the last step (B, M)
     completed: completed trips, by link (B, L)
     entered: vehicles that entered in each of the last steps, the newest last, by entry (B, E)
+    started: the same for vehicles that had stood at the stop line before
+    moved: vehicles that moved up to the stop line so far, by entry (B, E)
     ending: those that entered to end their trip there, by link (B, L)
     left: vehicles that had left each link before each of the last steps, the newest last (B, L)
     """
@@ -91,6 +97,8 @@ class Traffic(NamedTuple):
     passed: Tensor
     completed: Tensor
     entered: tuple[Tensor, ...]
+    started: tuple[Tensor, ...]
+    moved: Tensor
     ending: tuple[Tensor, ...]
     left: tuple[Tensor, ...]
 
@@ -101,11 +109,13 @@ class Ways(NamedTuple):
     cells: of each cell among those of its entry (B, C)
     goes_on: of the vehicles that enter, those whose trip does not end there, by entry (B, E)
     ends: one less that, for the entries at home, where trips end (B, H)
+    choice: how single vehicles draw their cells, None: they are divided
     """
 
     cells: Tensor
     goes_on: Tensor
     ends: Tensor
+    choice: Choice | None = None
 
 
 class Delay:
@@ -177,37 +187,56 @@ class Flows:
         self._home = self.places(at_home)
         self._home_link = self.places(network.entry_link[at_home])
         self._ending = self.values(network.ending)
+        self._ahead = self.values(1.0 - network.first[network.entry_link])
+        # A share of a street's queue begins behind the ends of trips.
+        self._met = self.values(0.5 / np.maximum(1.0 - network.last, 0.01))
+        self._pace_to_end = self.values(1.0 / np.maximum(network.last, 0.1))
 
     def _delay(self) -> None:
         """Set the times that vehicles and holes take, in steps."""
         network = self.network
         numbers = self.numbers
-        free_steps = numbers.time_factor * network.free_time / self.dt
-        along = np.maximum(np.round(free_steps), 1).astype(int)
-        halfway = np.maximum(np.round(free_steps / 2), 1).astype(int)
+        self._spacing = numbers.spacing * network.spacing
         speed = (network.length + network.behind) / network.free_time
-        flow = numbers.saturation / (REACTION_S + VEHICLE_M / speed)
-        wave = flow / (1.0 / numbers.spacing - flow / speed)
+        driven = np.maximum(speed - network.dawdling, 0.5 * speed)
+        self.free_time = numbers.time_factor * network.free_time * speed / driven
+        free_steps = self.free_time / self.dt
+        along = np.maximum(np.floor(free_steps), 1).astype(int)
+        to_end = np.maximum(np.round(network.last * free_steps), 1).astype(int)
+        flow = self._saturation(speed)
+        wave = flow / (1.0 / self._spacing - flow / speed)
         # The newest count is that of now. Between two steps counts change evenly.
-        wave_steps = network.length / wave / self.dt + 1.0
+        # A queue discharges at its flow, although its first vehicle is late on the next link.
+        late = np.minimum(START_S + speed / (2.0 * network.acceleration), network.length / wave)
+        wave_steps = (network.length / wave - late) / self.dt + 1.0
         backwards = np.floor(wave_steps).astype(int)
         self._earlier = self.values(wave_steps - backwards)
         self._along = Delay(along[network.entry_link], self.device)
-        self._halfway = Delay(halfway, self.device)
+        part = np.maximum(free_steps - along, 0.0)
+        self._part = self.values(part[network.entry_link])
+        self._later = Delay(along[network.entry_link] + 1, self.device)
+        started = np.maximum(np.round(free_steps + late / self.dt), 1).astype(int)
+        self._started = Delay(started[network.entry_link], self.device)
+        self._to_end = Delay(to_end, self.device)
         self._backwards = Delay(backwards, self.device)
         self._before = Delay(backwards + 1, self.device)
+
+    def _saturation(self, speed: np.ndarray) -> np.ndarray:
+        """Return the flow of a lane at green (veh/s); speed: of cars (m/s)."""
+        network = self.network
+        headway = REACTION * network.headway + (network.spacing + BETWEEN_M) / speed
+        return self.numbers.saturation / headway
 
     def _limit(self) -> None:
         """Set the storage of links, and the most vehicles that move in a step."""
         network = self.network
-        numbers = self.numbers
         lanes = np.bincount(network.lane_link, minlength=self.links)
         most_in = INFLOW * self.dt * lanes
         # A shorter link would hold up the flow that its lanes can take within a step.
-        storage = np.maximum(lanes * network.length / numbers.spacing, 2.0 * most_in)
+        storage = np.maximum(lanes * network.length / self._spacing, 2.0 * most_in)
         self.storage = self.values(storage)
         self._most_in = self.values(most_in)
-        saturation = numbers.saturation * self.dt / (REACTION_S + VEHICLE_M / network.speed)
+        saturation = self._saturation(network.speed) * self.dt
         movement = network.turn_movement[network.served]
         fastest = np.zeros(len(network.lane_link))
         np.maximum.at(fastest, network.server, saturation[movement])
@@ -216,6 +245,7 @@ class Flows:
         of_movement = np.zeros(self.movements)
         np.maximum.at(of_movement, movement, fastest[network.server])
         lanes_of_turn = np.bincount(network.served)
+        self._lanes_of_turn = self.values(lanes_of_turn)
         self._lane_share = self.values(1.0 / lanes_of_turn[network.served])
         self._pace = self.values(saturation / of_movement)
         self._per_step = self.values(saturation)
@@ -254,18 +284,24 @@ class Flows:
             inside=empty(self.links),
             passed=empty(self.movements),
             completed=empty(self.links),
-            entered=tuple(empty(self.entries) for _ in range(self._along.longest)),
-            ending=tuple(empty(self.links) for _ in range(self._halfway.longest)),
+            entered=tuple(empty(self.entries) for _ in range(self._later.longest)),
+            started=tuple(empty(self.entries) for _ in range(self._started.longest)),
+            moved=empty(self.entries),
+            ending=tuple(empty(self.links) for _ in range(self._to_end.longest)),
             left=tuple(empty(self.links) for _ in range(self._before.longest)),
         )
 
-    def ways(self, cells: Tensor, draw: Tensor) -> Ways:
+    def ways(self, cells: Tensor, draw: Tensor, chance: Chance | None = None) -> Ways:
         """Return the ways with these cells (-, (B, C)).
 
         draw: number of the draw of trips of each rollout (B,)
+        chance: with which vehicles draw their cells; they are divided if None
         """
         ending = self._ending.index_select(0, draw)
-        return Ways(cells, 1.0 - ending, ending.index_select(1, self._home))
+        choice = None
+        if chance is not None:
+            choice = chance.choice(cells)
+        return Ways(cells, 1.0 - ending, ending.index_select(1, self._home), choice)
 
     def step(
         self, traffic: Traffic, begin: Tensor, light: Tensor, yields: Tensor, ways: Ways
@@ -278,9 +314,11 @@ class Flows:
         ways: of the vehicles
         """
         # Vehicles arrive at the queue; trips end before it or in it.
-        queue = traffic.queue + self._along.read(traffic.entered)
-        ends = self._halfway.read(traffic.ending)
-        in_queue = ends * (traffic.inside / self.storage).clamp(max=1.0)
+        soon = self._along.read(traffic.entered)
+        arriving = soon + self._part * (self._later.read(traffic.entered) - soon)
+        queue = traffic.queue + arriving + self._started.read(traffic.started)
+        ends = self._to_end.read(traffic.ending)
+        in_queue = ends * (self._met * traffic.inside / self.storage).clamp(max=1.0)
         stopping = traffic.stopping + in_queue
 
         # 1. The first vehicles.
@@ -289,13 +327,17 @@ class Flows:
         room = self._first_of_lane * (1.0 - in_lane).clamp(min=0.0)
         room = self.sums(room, self._link_of_lane, self.links)
         moving_up = (room / self.by_link(queue).clamp(min=LEAST)).clamp(max=1.0)
-        ahead = queue * moving_up.index_select(1, self.link_of_entry)
-        stopped = stopping * (2.0 * moving_up).clamp(max=1.0)
-        first = traffic.first + ahead.index_select(1, self.entry_of_cell) * ways.cells
+        moved = queue * moving_up.index_select(1, self.link_of_entry)
+        stopped = stopping * (self._pace_to_end * moving_up).clamp(max=1.0)
+        cells = ways.cells
+        if ways.choice is not None:
+            cells = ways.choice.cells(traffic.moved)
+        first = traffic.first + moved.index_select(1, self.entry_of_cell) * cells
         by_turn = self.sums(first, self._turn_of_cell, len(self._link_entered))
 
         # 2. Those that can go, and the trips that can begin.
-        green = self._green(traffic, by_turn, light, yields)
+        stood = traffic.standing / by_turn.clamp(min=EPSILON)
+        green = self._green(traffic, stood, light, yields)
         due = traffic.due + begin
         waiting = self.by_link(due)
         put = (self._most_in / waiting.clamp(min=LEAST)).clamp(max=1.0)
@@ -307,44 +349,53 @@ class Flows:
         leaving = first * going.index_select(1, self._turn_of_cell)
         flow = by_turn * going
         entered = self.sums(leaving, self.onward, self.entries)
+        stopped_here = self.sums(
+            leaving * stood.index_select(1, self._turn_of_cell), self.onward, self.entries
+        )
         passed = self.sums(flow, self._movement_of_turn, self.movements)
         left = self.sums(passed, self._link_left, self.links)
         put = put * rho
         begun = due * put.index_select(1, self.link_of_entry)
         completed = ends - in_queue + stopped
         coming = self.sums(flow, self._link_entered, self.links) + waiting * put
-        # Trips begin anywhere along the street: half of them here at its end.
-        half = 0.5 * begun
+        # Trips that begin along the street drive a share of it: they begin at its ends.
+        ahead = begun * self._ahead
         ending = entered.index_select(1, self._home) * ways.ends
+        starting = stopped_here * ways.goes_on
+        passing = entered * ways.goes_on - starting + begun - ahead
         return Traffic(
             held=traffic.held,
             due=due - begun,
             outside=waiting - waiting * put,
-            queue=queue - ahead + half,
+            queue=queue - moved + ahead,
             first=first - leaving,
             standing=by_turn - flow,
             stopping=stopping - stopped,
             inside=traffic.inside + coming - left - completed,
             passed=passed,
             completed=traffic.completed + completed,
-            entered=(*traffic.entered[1:], entered * ways.goes_on + half),
+            entered=(*traffic.entered[1:], passing),
+            started=(*traffic.started[1:], starting),
+            moved=traffic.moved + moved,
             ending=(*traffic.ending[1:], self.sums(ending, self._home_link, self.links)),
             left=(*traffic.left[1:], traffic.left[-1] + left),
         )
 
-    def _green(self, traffic: Traffic, by_turn: Tensor, light: Tensor, yields: Tensor) -> Tensor:
+    def _green(self, traffic: Traffic, stood: Tensor, light: Tensor, yields: Tensor) -> Tensor:
         """Return the share phi of first vehicles that can go (-, (B, T)).
 
         A vehicle that stood in front goes first, at the headway of its movement; those that arrive
         go at the pace of their lane.
+
+        stood: share of the first vehicles that stood in front (-, (B, T))
         """
         foes = traffic.passed.index_select(1, self._foe) / self.dt
         gap = torch.exp(-self.numbers.gap * self.sums(foes, self._yielding, self.movements))
         open_share = light * (1.0 - yields * (1.0 - gap))
         arriving = (self._pace * open_share).index_select(1, self._movement_of_turn)
-        leader = (self._per_step * open_share).clamp(max=1.0)
-        leader = leader.index_select(1, self._movement_of_turn)
-        stood = traffic.standing / by_turn.clamp(min=EPSILON)
+        most = (self._per_step * open_share).index_select(1, self._movement_of_turn)
+        most = most * self._lanes_of_turn
+        leader = (most / traffic.standing.clamp(min=LEAST)).clamp(max=1.0)
         return arriving + (leader - arriving) * stood
 
     def _room(self, traffic: Traffic) -> Tensor:
@@ -366,8 +417,10 @@ class Flows:
 
         first = self.sums(traffic.first, self.entry_of_cell, self.entries)
         entries = traffic.queue + first + driving(traffic.entered, self._along.steps)
+        entries = entries + driving(traffic.started, self._started.steps)
+        entries = entries + self._part * self._later.read(traffic.entered)
         place = self.network.entry_link * regions + self.network.destination
         total = self.sums(entries, self.places(place), self.links * regions)
-        ends = traffic.stopping + driving(traffic.ending, self._halfway.steps)
+        ends = traffic.stopping + driving(traffic.ending, self._to_end.steps)
         place = np.arange(self.links) * regions + self.network.region
         return total.index_add(1, self.places(place), ends).view(-1, self.links, regions)

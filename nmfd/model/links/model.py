@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from nmfd.arrays import PerTurn
+from nmfd.model.links.chance import Chance
 from nmfd.model.links.drivers import Drivers
 from nmfd.model.links.flows import LEAST, Flows, Numbers, Traffic, Ways
 from nmfd.model.links.network import LinkNetwork
@@ -76,6 +77,9 @@ class LinkState(NamedTuple):
     interval: its number
     draw: number of the draw of trips of each rollout (B,)
     used: of the gates' windows; stages: of max-pressure
+    chance: of single vehicles, None without
+    asked: trips that were due so far on average, by entry (B, E)
+    begun: trips that were due so far (veh, (B,))
     spent: time spent so far (veh s, (B,))
     present: vehicles on each link, summed over the last interval (veh s, (B, L))
     gone: vehicles that left each link in it (veh, (B, L))
@@ -87,6 +91,9 @@ class LinkState(NamedTuple):
     traffic: Traffic
     used: Tensor
     stages: Stages | None
+    chance: Chance | None
+    asked: Tensor
+    begun: Tensor
     spent: Tensor
     present: Tensor
     gone: Tensor
@@ -104,7 +111,7 @@ class LinkModel:
         nominal: PerTurn | None = None,
         numbers: Numbers | None = None,
         choices: Choices | None = None,
-        dt: float = 3.0,
+        dt: float = 2.0,
         dtype: torch.dtype = torch.float32,
         device: str = "cpu",
     ):
@@ -149,20 +156,29 @@ class LinkModel:
         total = np.bincount(boundary, lanes, regions**2)[boundary]
         self._weight_of_gate = flows.values(lanes / total)
 
-    def start(self, batch: int, draws: Sequence[int] = (0,)) -> LinkState:
+    def start(self, batch: int, draws: Sequence[int] = (0,), *, chance: bool = False) -> LinkState:
         """Return the empty city at the beginning of interval 0.
 
         draws: numbers of the draws of trips; the rollouts take them in turn
+        chance: single vehicles draw their turns, with the draws as seeds
         """
         regions = self.network.regions
-        draw = np.resize(np.array(draws) % len(self.network.origin), batch)
+        seeds = np.resize(np.array(draws), batch)
+        draw = seeds % len(self.network.origin)
         traffic = self.flows.start(batch)
+        flows = self.flows
+        by_chance = None
+        if chance:
+            by_chance = Chance(seeds.tolist(), flows.entries, flows.entry_of_cell)
         return LinkState(
             interval=0,
             draw=self.flows.places(draw),
             traffic=traffic,
             used=self._gates.start(batch),
             stages=None if self._pressure is None else self._pressure.start(batch),
+            chance=by_chance,
+            asked=torch.zeros_like(traffic.due),
+            begun=traffic.inside.new_zeros(batch),
             spent=traffic.inside.new_zeros(batch),
             present=torch.zeros_like(traffic.inside),
             gone=torch.zeros_like(traffic.inside),
@@ -194,11 +210,18 @@ class LinkModel:
         present = torch.zeros_like(traffic.inside)
         outside = torch.zeros_like(traffic.inside)
         held = torch.zeros_like(traffic.held)
+        asked = state.asked
+        begun = state.begun
         for n in range(self._steps):
-            released = due
+            whole = due
+            if state.chance is not None:
+                whole = state.chance.trips(asked, due)
+            asked = asked + due
+            begun = begun + whole.sum(1)
+            released = whole
             # Without metering, trips that were held begin in the first step.
             if commands.metering is not None or n == 0:
-                traffic, released = self._metered(traffic, due, commands.metering)
+                traffic, released = self._metered(traffic, whole, commands.metering)
             lights = Lights(light[n : n + 1], yields[n : n + 1])
             if self._pressure is not None and stages is not None:
                 number = state.interval * self._steps + n
@@ -225,6 +248,9 @@ class LinkModel:
             traffic=traffic,
             used=used,
             stages=stages,
+            chance=state.chance,
+            asked=asked,
+            begun=begun,
             spent=state.spent + dt * (present.sum(1) + outside.sum(1) + held.sum(1)),
             present=dt * present,
             gone=gone,
@@ -246,7 +272,7 @@ class LinkModel:
         elif compliance > 0.0:
             cells = drivers.by_times(static, state.present, state.gone, commands.prices)
         cells = static + compliance * (cells - static)
-        return self.flows.ways(cells.to(self.flows.dtype), state.draw)
+        return self.flows.ways(cells.to(self.flows.dtype), state.draw, state.chance)
 
     def _metered(
         self, traffic: Traffic, due: Tensor, metering: PerRegion | None

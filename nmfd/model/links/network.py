@@ -22,6 +22,8 @@ class LinkNetwork:
     Shares are those of D draws of trips: each locks at another demand, and their mean later.
 
     regions: number of regions
+    spacing, headway: of the average vehicle in a queue (m), and the least time it keeps (s)
+    dawdling, acceleration: what it drives below the limit (m/s), and as it starts (m/s2)
     street: names of the links' streets (L,)
     length, behind: of each link, and of the ways over the junction behind it (m, (L,))
     free_time: in free flow over both (s, (L,))
@@ -31,6 +33,7 @@ class LinkNetwork:
     speed: on the junction (m/s, (M,))
     turn_movement, turn_link: movement of each turn, and the link that it enters (T,)
     served, server: pairs of a turn and a lane that leads there (P,)
+    first, last: mean share of each link that trips drive which begin, and end there (-, (L,))
     entry_link, destination: of each entry (E,), sorted by free_time
     ending: share of the vehicles of each entry whose trip ends in the link (D, E)
     origin: share of the trips from the link's region to the destination that begin here (D, E)
@@ -57,6 +60,10 @@ class LinkNetwork:
     """
 
     regions: int
+    spacing: float
+    headway: float
+    dawdling: float
+    acceleration: float
     street: np.ndarray
     length: np.ndarray
     behind: np.ndarray
@@ -69,6 +76,8 @@ class LinkNetwork:
     server: np.ndarray
     turn_movement: np.ndarray
     turn_link: np.ndarray
+    first: np.ndarray
+    last: np.ndarray
     entry_link: np.ndarray
     destination: np.ndarray
     ending: np.ndarray
@@ -117,5 +126,6 @@ def read_links(path: Path) -> LinkNetwork:
         raise InputError(f"{path}: no such file; {remedy}") from None
     except (OSError, KeyError, ValueError, BadZipFile) as error:
         raise InputError(f"{path}: is no network of links ({error}); {remedy}") from None
-    arrays["regions"] = int(arrays["regions"])
+    for name in ("regions", "spacing", "headway", "dawdling", "acceleration"):
+        arrays[name] = arrays[name].item()
     return LinkNetwork(**arrays)

@@ -13,7 +13,7 @@ from nmfd.model.links.network import FILE, LinkNetwork, read_links
 from nmfd.model.scenario import Scenario
 from nmfd.types import Controls, Observation, State
 
-DT_S = 3.0  # time step; a second if it does not divide the control interval
+DT_S = 2.0  # time step; a second if it does not divide the control interval
 
 
 class LinkPlant:
@@ -21,8 +21,7 @@ class LinkPlant:
 
     `cosim links` writes its file.
 
-    A seed chooses a draw of trips of the file: their routes, not their departures. It begins empty
-    and has no process noise.
+    A seed chooses a draw of trips of the file, and where each vehicle turns. The city begins empty.
 
     >>> plant = nmfd.LinkPlant(nmfd.load_scenario("grid7_peak"))
     >>> plant.reset(0).time
@@ -37,13 +36,16 @@ class LinkPlant:
         *,
         network: LinkNetwork | None = None,
         numbers: Numbers | None = None,
+        chance: bool = True,
     ):
         """network: that of the scenario's file if None
+        chance: single vehicles draw their turns; without, streams divide
 
         Raises: InputError if the file is missing or does not fit the scenario
         """
         where = links_file(scenario)
         self._scenario = scenario
+        self._chance = chance
         network = network or read_links(where)
         if scenario.initial is not None:
             raise InputError(f"{scenario.where}: initial: a city of links begins empty; remove it")
@@ -65,8 +67,7 @@ class LinkPlant:
 
     def reset(self, seed: int) -> State:
         """Return the empty city."""
-        self.state = self.model.start(1, [seed])
-        self._entered = 0.0
+        self.state = self.model.start(1, [seed], chance=self._chance)
         self._realised: np.ndarray | None = None
         return self._state()
 
@@ -86,7 +87,6 @@ class LinkPlant:
         demand = self._demand[self.state.interval]
         with torch.inference_mode():
             self.state = self.model.advance(self.state, demand, commands)
-        self._entered += float(demand.sum()) * self._scenario.step
         if gates is not None:
             share = self.state.realised[0].numpy()
         self._realised = network.u_min + share * width
@@ -94,7 +94,7 @@ class LinkPlant:
         ledger.check(
             state.step,
             state.time,
-            entered=self._entered,
+            entered=float(self.state.begun),
             ended=state.completed,
             inside=float(state.unfinished.sum()),
             least=float(state.accumulation.min()),

@@ -1,0 +1,101 @@
+"""Vehicles of the link model: routes, and the average vehicle."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple, TypeAlias
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from cosim.plant.settings import Settings, own_files
+from cosim.sumo import recorded_trips as recorded
+from cosim.sumo.net import City
+from cosim.sumo.recorded_trips import RecordedTrips
+from cosim.sumo.trips import make_trips
+from cosim.sumo.xml_files import attribute, read_xml
+from nmfd.model.scenario import Scenario
+
+Route: TypeAlias = tuple[str, ...]
+# Attributes of a vType, and what SUMO's cars have without them.
+CAR = {"length": 5.0, "minGap": 2.5, "tau": 1.0, "sigma": 0.5, "accel": 2.6}
+# Word for a position -> share of the length of the street; others mean its beginning.
+PLACES = {"random": 0.5, "random_free": 0.5, "center": 0.5, "max": 1.0}
+
+
+class Drive(NamedTuple):
+    """A trip on its way.
+
+    first, last: shares of its first and last streets that it drives (-)
+    """
+
+    route: Route
+    first: float
+    last: float
+
+
+def draws_of(
+    scenario: Scenario, settings: Settings, city: City, seeds: Sequence[int]
+) -> list[RecordedTrips]:
+    """Return the trips of each seed; one draw of recorded trips."""
+    if settings.routes:
+        return [recorded.read_recorded_trips(own_files(scenario, settings.routes))]
+    made = [make_trips(city, scenario.demand, scenario.step, seed) for seed in seeds]
+    return [recorded.as_recorded(trips) for trips in made]
+
+
+def drives_of(
+    trips: RecordedTrips, shared: Mapping[str, Sequence[str]], known: Mapping[str, float]
+) -> list[Drive]:
+    """Return the trips that have a route over known edges, two or more.
+
+    shared: routes of several vehicles
+    known: edge -> length (m)
+    """
+    drives = []
+    for element in trips.elements:
+        edges, driven = recorded.edges_of(element, shared)
+        if driven and len(edges) > 1 and known.keys() >= set(edges):
+            begin = _place(element.get("departPos", "base"), known[edges[0]])
+            end = _place(element.get("arrivalPos", "max"), known[edges[-1]])
+            drives.append(Drive(tuple(edges), 1.0 - begin, end))
+    return drives
+
+
+def means_of(scenario: Scenario, settings: Settings, trips: RecordedTrips) -> dict[str, float]:
+    """Return the attributes CAR of the average vehicle."""
+    roots = [read_xml(path) for path in own_files(scenario, settings.additional)]
+    known = {}
+    for part in [*trips.types, *roots]:
+        for one in part.iter("vType"):
+            known[attribute(one, "id")] = _values([one])
+        for several in part.iter("vTypeDistribution"):
+            known[attribute(several, "id")] = _values(several.iter("vType"))
+    usual = _values([])
+    own = [known.get(element.get("type", ""), usual) for element in trips.elements]
+    return dict(zip(CAR, np.mean(own, axis=0).tolist(), strict=True))
+
+
+def _values(types: Iterable[Element]) -> np.ndarray:
+    """Return the attributes CAR, the mean of some vTypes by their probability."""
+    rows = []
+    weights = []
+    for one in types:
+        rows.append([float(one.get(name, usual)) for name, usual in CAR.items()])
+        weights.append(float(one.get("probability", 1.0)))
+    if not rows:
+        return np.array(list(CAR.values()))
+    return np.average(rows, axis=0, weights=weights)
+
+
+def _place(text: str, length: float) -> float:
+    """Return a position on a street as a share of its length (-).
+
+    text: SUMO's departPos or arrivalPos
+    length: (m)
+    """
+    try:
+        place = float(text)
+    except ValueError:
+        return PLACES.get(text, 0.0)
+    if place < 0.0:
+        place += length
+    return min(max(place / length, 0.0), 1.0)

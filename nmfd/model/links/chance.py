@@ -1,0 +1,79 @@
+"""Chance in the link model: vehicles begin and turn one by one.
+
+Without chance, a junction at 95 % of its capacity has no queue left over at the end of green; with
+it, trips take longer where traffic is dense. The trips of an entry begin as whole vehicles, one
+after the other, the first at a random time. Each vehicle that moves up draws its cell by the shares
+p_c; the draw stays until a whole vehicle has passed. Derivatives are those of the shares.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+DRAWS = 128  # of an entry; then they come again
+
+
+class Choice(NamedTuple):
+    """How the vehicles of B rollouts draw their cells in a control interval.
+
+    shares: of the cells (-, (B, C))
+    low, high: a draw from low to high takes the cell (-, (B, C))
+    draws: of the vehicles of each entry, one after the other (-, (B, DRAWS, E))
+    entry: entry that each cell leaves (C,)
+    """
+
+    shares: Tensor
+    low: Tensor
+    high: Tensor
+    draws: Tensor
+    entry: Tensor
+
+    def cells(self, moved: Tensor) -> Tensor:
+        """Return 1 for the cells that the next vehicles take, else 0 (B, C).
+
+        moved: vehicles that moved up so far, by entry (veh, (B, E))
+        """
+        number = moved.detach().long() % DRAWS
+        draw = self.draws.gather(1, number.unsqueeze(1)).squeeze(1).index_select(1, self.entry)
+        taken = ((draw >= self.low) & (draw < self.high)).to(self.shares.dtype)
+        return taken + (self.shares - self.shares.detach())
+
+
+class Chance:
+    """Draws of B rollouts."""
+
+    def __init__(self, seeds: Sequence[int], entries: int, entry: Tensor):
+        """seeds: of the rollouts; entries: E; entry: that each cell leaves (C,)"""
+        uniform = []
+        for seed in seeds:
+            generator = torch.Generator().manual_seed(seed)
+            uniform.append(torch.rand(DRAWS, entries, generator=generator))
+        self._draws = torch.stack(uniform).to(entry.device)
+        self._entry = entry
+        self._order = torch.argsort(entry, stable=True)
+        self._place = torch.argsort(self._order)
+        sizes = torch.bincount(entry, minlength=entries)
+        self._first = (torch.cumsum(sizes, 0) - sizes)[entry]
+
+    def choice(self, shares: Tensor) -> Choice:
+        """Return how cells with these shares (-, (B, C)) are drawn."""
+        ordered = shares.detach().double().index_select(1, self._order)
+        total = torch.cumsum(ordered, 1)
+        before = total - ordered
+        begin = before.index_select(1, self._first)
+        low = before.index_select(1, self._place) - begin
+        high = total.index_select(1, self._place) - begin
+        dtype = self._draws.dtype
+        return Choice(shares, low.to(dtype), high.to(dtype), self._draws, self._entry)
+
+    def trips(self, before: Tensor, due: Tensor) -> Tensor:
+        """Return the whole trips that begin in a step, by entry (veh, (B, E)).
+
+        before: trips that were due before, on average
+        due: those of the step
+        """
+        start = before.detach() + self._draws[:, 0]
+        whole = (start + due.detach()).floor() - start.floor()
+        return whole + (due - due.detach())
