@@ -235,7 +235,7 @@ def test_a_queue_discharges_at_the_saturation_flow():
     network = replace(triangle(), cell_share=np.array([[1.0, 0.0, 1.0]]), **ONE_LANE)
     model = model_of(network)
     states = rollout(model, 1.0, intervals=16)
-    flow = (states[-1].traffic.left[-1] - states[7].traffic.left[-1])[0, 0] / (9 * STEP_S)
+    flow = (states[-1].traffic.left - states[7].traffic.left)[0, 0] / (9 * STEP_S)
     assert float(flow) == pytest.approx(SATURATION * GREEN_S / CYCLE_S, rel=0.05)
 
 
@@ -246,7 +246,7 @@ def test_a_blocked_turn_blocks_its_link_and_the_trips_that_begin():
     network = replace(network, light=light, **ONE_LANE)
     model = model_of(network)
     last = rollout(model, 0.5, intervals=12)[-1]
-    assert float(last.traffic.left[-1][0, 0]) < 10.0
+    assert float(last.traffic.left[0, 0]) < 10.0
     assert float(last.traffic.inside[0, 0]) <= float(model.flows.storage[0]) + 1e-9
     assert float(model.backlog(last).sum()) > 400.0
 
@@ -255,7 +255,7 @@ def test_a_gate_leaves_its_share_of_green():
     network = replace(triangle(), cell_share=np.array([[1.0, 0.0, 1.0]]), **ONE_LANE)
     model = model_of(network, chain_limit=0.0)
     states = rollout(model, 1.0, all_commands(gate=0.2, metering=9.0, share=1.0), intervals=16)
-    passed = float((states[-1].traffic.left[-1] - states[7].traffic.left[-1])[0, 0])
+    passed = float((states[-1].traffic.left - states[7].traffic.left)[0, 0])
     green = GREEN_S - 0.8 * (GREEN_S - 5.0)
     assert passed / (9 * STEP_S) == pytest.approx(SATURATION * green / CYCLE_S, rel=0.05)
     assert float(states[-1].realised[0, 0, 1]) == pytest.approx(0.2)

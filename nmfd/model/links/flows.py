@@ -29,9 +29,8 @@ average along a street; one that ends in the queue moves up there.
 Every vehicle that leaves one count enters another one: mass and its derivative are conserved.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import torch
@@ -66,6 +65,9 @@ class Numbers:
     gap: float = 4.7
 
 
+History: TypeAlias = tuple[Tensor, ...]
+
+
 class Traffic(NamedTuple):
     """State of B rollouts between two steps (veh).
 
@@ -83,7 +85,8 @@ class Traffic(NamedTuple):
     started: the same for vehicles that had stood at the stop line before
     moved: vehicles that moved up to the stop line so far, by entry (B, E)
     ending: those that entered to end their trip there, by link (B, L)
-    left: vehicles that had left each link before each of the last steps, the newest last (B, L)
+    left: vehicles that left each link so far (B, L)
+    had_left: the same at the ends of the last steps, the newest last
     """
 
     held: Tensor
@@ -96,11 +99,12 @@ class Traffic(NamedTuple):
     inside: Tensor
     passed: Tensor
     completed: Tensor
-    entered: tuple[Tensor, ...]
-    started: tuple[Tensor, ...]
+    entered: History
+    started: History
     moved: Tensor
-    ending: tuple[Tensor, ...]
-    left: tuple[Tensor, ...]
+    ending: History
+    left: Tensor
+    had_left: History
 
 
 class Ways(NamedTuple):
@@ -119,29 +123,44 @@ class Ways(NamedTuple):
 
 
 class Delay:
-    """Reader of histories, with an age of its own for each column."""
+    """Histories of columns that are read at an age of their own.
+
+    A history is a tuple, the newest last, with the columns in the order of their ages.
+    """
 
     def __init__(self, steps: np.ndarray, device: torch.device):
         """steps: age of each column, 1 for the newest (n,)"""
-        self.steps = steps
-        self.longest = int(steps.max(initial=1))
         order = np.argsort(steps, kind="stable")
         ages, begins = np.unique(steps[order], return_index=True)
         ends = [*begins[1:], len(steps)]
+        self.longest = int(steps.max(initial=1))
         self._ages = ages.tolist()
         self._slices = [slice(*ends) for ends in zip(begins.tolist(), ends, strict=True)]
-        self._columns = [torch.as_tensor(order[part], device=device) for part in self._slices]
         self._sorted = bool((np.diff(steps) >= 0).all())
+        self._order = torch.as_tensor(order, device=device)
         self._back = torch.as_tensor(np.argsort(order), device=device)
+        self._steps = torch.as_tensor(steps[order], device=device)
 
-    def read(self, history: Sequence[Tensor]) -> Tensor:
-        """Return the values (B, n) of a history (B, n), the newest last."""
+    def with_new(self, history: History, values: Tensor) -> History:
+        """Return the history with new values (B, n), without its oldest ones."""
+        if not self._sorted:
+            values = values.index_select(1, self._order)
+        return (*history[1:], values)
+
+    def read(self, history: History) -> Tensor:
+        """Return the values that have the age of their column (B, n)."""
+        pairs = zip(self._ages, self._slices, strict=True)
+        return self._natural(torch.cat([history[-age][:, part] for age, part in pairs], dim=1))
+
+    def younger(self, history: History) -> Tensor:
+        """Return the sums of values that have not come to this age (B, n)."""
+        age = torch.arange(len(history), 0, -1, device=self._steps.device)[:, None, None]
+        return self._natural((torch.stack(history) * (age <= self._steps)).sum(0))
+
+    def _natural(self, values: Tensor) -> Tensor:
         if self._sorted:
-            pairs = zip(self._ages, self._slices, strict=True)
-            return torch.cat([history[-age][:, part] for age, part in pairs], dim=1)
-        columns = zip(self._ages, self._columns, strict=True)
-        parts = [history[-age].index_select(1, some) for age, some in columns]
-        return torch.cat(parts, dim=1).index_select(1, self._back)
+            return values
+        return values.index_select(1, self._back)
 
 
 class Flows:
@@ -288,7 +307,8 @@ class Flows:
             started=tuple(empty(self.entries) for _ in range(self._started.longest)),
             moved=empty(self.entries),
             ending=tuple(empty(self.links) for _ in range(self._to_end.longest)),
-            left=tuple(empty(self.links) for _ in range(self._before.longest)),
+            left=empty(self.links),
+            had_left=tuple(empty(self.links) for _ in range(self._before.longest)),
         )
 
     def ways(self, cells: Tensor, draw: Tensor, chance: Chance | None = None) -> Ways:
@@ -374,11 +394,14 @@ class Flows:
             inside=traffic.inside + coming - left - completed,
             passed=passed,
             completed=traffic.completed + completed,
-            entered=(*traffic.entered[1:], passing),
-            started=(*traffic.started[1:], starting),
+            entered=self._along.with_new(traffic.entered, passing),
+            started=self._started.with_new(traffic.started, starting),
             moved=traffic.moved + moved,
-            ending=(*traffic.ending[1:], self.sums(ending, self._home_link, self.links)),
-            left=(*traffic.left[1:], traffic.left[-1] + left),
+            ending=self._to_end.with_new(
+                traffic.ending, self.sums(ending, self._home_link, self.links)
+            ),
+            left=traffic.left + left,
+            had_left=self._backwards.with_new(traffic.had_left, traffic.left + left),
         )
 
     def _green(self, traffic: Traffic, stood: Tensor, light: Tensor, yields: Tensor) -> Tensor:
@@ -400,27 +423,22 @@ class Flows:
 
     def _room(self, traffic: Traffic) -> Tensor:
         """Return the vehicles R that each link can receive (veh, (B, L))."""
-        later = self._backwards.read(traffic.left)
-        before = self._before.read(traffic.left)
+        later = self._backwards.read(traffic.had_left)
+        before = self._before.read(traffic.had_left)
         reached = later + self._earlier * (before - later)
-        free = self.storage - traffic.inside - (traffic.left[-1] - reached)
+        free = self.storage - traffic.inside - (traffic.left - reached)
         return free.clamp(min=0.0).minimum(self._most_in)
 
     def under_way(self, traffic: Traffic) -> Tensor:
         """Return all vehicles by link and destination (veh, (B, L, R))."""
         regions = self.network.regions
 
-        def driving(history: tuple[Tensor, ...], steps: np.ndarray) -> Tensor:
-            age = torch.arange(len(history), 0, -1, device=self.device)[:, None, None]
-            behind = age <= self.places(steps)
-            return (torch.stack(history) * behind).sum(0)
-
         first = self.sums(traffic.first, self.entry_of_cell, self.entries)
-        entries = traffic.queue + first + driving(traffic.entered, self._along.steps)
-        entries = entries + driving(traffic.started, self._started.steps)
+        entries = traffic.queue + first + self._along.younger(traffic.entered)
         entries = entries + self._part * self._later.read(traffic.entered)
+        entries = entries + self._started.younger(traffic.started)
         place = self.network.entry_link * regions + self.network.destination
         total = self.sums(entries, self.places(place), self.links * regions)
-        ends = traffic.stopping + driving(traffic.ending, self._to_end.steps)
+        ends = traffic.stopping + self._to_end.younger(traffic.ending)
         place = np.arange(self.links) * regions + self.network.region
         return total.index_add(1, self.places(place), ends).view(-1, self.links, regions)

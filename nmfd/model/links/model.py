@@ -241,7 +241,7 @@ class LinkModel:
         if commands.gates is not None:
             realised = self._realised(commands.gates, mean_share)
         before = state.traffic
-        gone = traffic.left[-1] - before.left[-1] + traffic.completed - before.completed
+        gone = traffic.left - before.left + traffic.completed - before.completed
         return LinkState(
             interval=state.interval + 1,
             draw=state.draw,
