@@ -9,10 +9,10 @@ import pytest
 from cosim.evaluation.link_vehicles import CAR, drives_of, means_of
 from cosim.evaluation.links import link_network
 from cosim.plant.settings import settings
+from cosim.sumo.net import city_of
 from cosim.sumo.recorded_trips import RecordedTrips
 from nmfd import api
 
-LENGTHS = {"a": 100.0, "b": 200.0}
 TYPES = """
 <additional>
   <vType id="van" length="8"/>
@@ -32,28 +32,38 @@ def trips(*elements):
     "places, first, last",
     [
         ("", 1.0, 1.0),
-        ('departPos="25" arrivalPos="50"', 0.75, 0.25),
-        ('departPos="-25" arrivalPos="-50"', 0.25, 0.75),
+        ('departPos="25" arrivalPos="25"', 0.75, 0.25),
+        ('departPos="-25" arrivalPos="-25"', 0.25, 0.75),
         ('departPos="random_free" arrivalPos="random"', 0.5, 0.5),
         ('departPos="last" arrivalPos="max"', 1.0, 1.0),
         ('departPos="500" arrivalPos="-500"', 0.0, 0.0),
     ],
 )
 def test_trips_begin_and_end_along_their_streets(places, first, last):
-    given = trips(f'<vehicle id="v" depart="0" {places}><route edges="a b"/></vehicle>')
-    (drive,) = drives_of(given, {}, LENGTHS)
-    assert drive == (("a", "b"), pytest.approx(first), pytest.approx(last))
+    city = city_of(api.load_scenario("demo").network)
+    move = city.moves[0]
+    city = replace(city, length={**city.length, **dict.fromkeys(move, 100.0)})
+    route = f'<route edges="{" ".join(move)}"/>'
+    given = trips(f'<vehicle id="v" depart="0" {places}>{route}</vehicle>')
+    (drive,) = drives_of(given, [], city)
+    assert drive == (move, pytest.approx(first), pytest.approx(last))
 
 
-def test_trips_without_a_way_are_left_out():
+def test_trips_without_a_route_take_the_fastest_one(tmp_path):
+    """Those that have no way, or drive on one street only, are left out."""
+    city = city_of(api.load_scenario("demo").network)
+    first, second = city.moves[0]
+    routes = tmp_path / "routes.xml"
+    routes.write_text(f'<additional><route id="r" edges="{first} {second}"/></additional>')
     given = trips(
-        '<vehicle id="v" depart="0"><route edges="a"/></vehicle>',
-        '<vehicle id="w" depart="0"><route edges="a c"/></vehicle>',
+        f'<vehicle id="v" depart="0"><route edges="{first}"/></vehicle>',
+        f'<vehicle id="w" depart="0"><route edges="{first} unknown"/></vehicle>',
         '<vehicle id="x" depart="0" route="r"/>',
-        '<trip id="y" depart="0" from="a" to="b"/>',
+        f'<trip id="y" depart="0" from="{first}" to="{second}"/>',
+        f'<trip id="z" depart="0" from="{first}" to="unknown"/>',
     )
-    drives = drives_of(given, {"r": ("b", "a")}, LENGTHS)
-    assert [drive.route for drive in drives] == [("b", "a")]
+    drives = drives_of(given, [routes], city)
+    assert [drive.route for drive in drives] == 2 * [(first, second)]
 
 
 def test_the_average_vehicle(tmp_path):

@@ -1,6 +1,7 @@
 """Vehicles of the link model: routes, and the average vehicle."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import NamedTuple, TypeAlias
 from xml.etree.ElementTree import Element
 
@@ -9,10 +10,12 @@ import numpy as np
 from cosim.plant.settings import Settings, own_files
 from cosim.sumo import recorded_trips as recorded
 from cosim.sumo.net import City
+from cosim.sumo.programs import run_sumo
 from cosim.sumo.recorded_trips import RecordedTrips
 from cosim.sumo.trips import make_trips
-from cosim.sumo.xml_files import attribute, read_xml
+from cosim.sumo.xml_files import attribute, child, read_xml
 from nmfd.model.scenario import Scenario
+from nmfd.runs.files import temporary_folder
 
 Route: TypeAlias = tuple[str, ...]
 # Attributes of a vType, and what SUMO's cars have without them.
@@ -42,22 +45,50 @@ def draws_of(
     return [recorded.as_recorded(trips) for trips in made]
 
 
-def drives_of(
-    trips: RecordedTrips, shared: Mapping[str, Sequence[str]], known: Mapping[str, float]
-) -> list[Drive]:
-    """Return the trips that have a route over known edges, two or more.
+def drives_of(trips: RecordedTrips, files: Sequence[Path], city: City) -> list[Drive]:
+    """Return the trips over two or more edges of the city.
 
-    shared: routes of several vehicles
-    known: edge -> length (m)
+    Those without a route take the fastest one in free flow.
+    files: with shared routes and vehicle types
+    Raises: InputError
     """
+    shared = recorded.read_routes(files)
+    found = [recorded.edges_of(element, shared) for element in trips.elements]
+    ways: dict[str, Route] = {}
+    if not all(driven for _, driven in found):
+        ways = _fastest(trips, files, city)
     drives = []
-    for element in trips.elements:
-        edges, driven = recorded.edges_of(element, shared)
-        if driven and len(edges) > 1 and known.keys() >= set(edges):
-            begin = _place(element.get("departPos", "base"), known[edges[0]])
-            end = _place(element.get("arrivalPos", "max"), known[edges[-1]])
-            drives.append(Drive(tuple(edges), 1.0 - begin, end))
+    for element, (edges, driven) in zip(trips.elements, found, strict=True):
+        route = tuple(edges)
+        if not driven:
+            route = ways.get(attribute(element, "id"), ())
+        if len(route) > 1 and city.number.keys() >= set(route):
+            begin = _place(element.get("departPos", "base"), city.length[route[0]])
+            end = _place(element.get("arrivalPos", "max"), city.length[route[-1]])
+            drives.append(Drive(route, 1.0 - begin, end))
     return drives
+
+
+def _fastest(trips: RecordedTrips, files: Sequence[Path], city: City) -> dict[str, Route]:
+    """Return vehicle -> its fastest route in free flow; without those that have none."""
+    with temporary_folder() as folder:
+        given = folder / "given.rou.xml"
+        found = folder / "found.rou.xml"
+        departures = enumerate(trips.depart.tolist())
+        drawn = [(depart, n, attribute(trips.elements[n], "id")) for n, depart in departures]
+        recorded.write_recorded_trips(trips, drawn, given)
+        options = {
+            "net-file": city.net_file,
+            "route-files": given,
+            "additional-files": ",".join(map(str, files)),
+            "output-file": found,
+        }
+        run_sumo("duarouter", options, "--ignore-errors", "--no-warnings", where=str(given))
+        routes = {}
+        for vehicle in read_xml(found).iter("vehicle"):
+            edges = attribute(child(vehicle, "route"), "edges")
+            routes[attribute(vehicle, "id")] = tuple(edges.split())
+        return routes
 
 
 def means_of(scenario: Scenario, settings: Settings, trips: RecordedTrips) -> dict[str, float]:

@@ -29,6 +29,7 @@ from cosim.sumo.signals import HELD, Cycle, Signal, read_cycles, read_signals
 from cosim.sumo.trips import PLANNING_SEEDS
 from cosim.sumo.xml_files import attribute, network_root
 from nmfd.arrays import Arrays
+from nmfd.errors import InputError
 from nmfd.model.links.network import FILE, LinkNetwork
 from nmfd.model.scenario import Scenario
 from nmfd.runs import shipped
@@ -66,7 +67,7 @@ def link_network(scenario: Scenario, seeds: Sequence[int] = PLANNING_SEEDS) -> L
     """Return the link network of `scenario`.
 
     seeds: of the draws of trips, if they are not recorded
-    Raises: InputError if a route leads where no connection is
+    Raises: InputError if a route leads where no connection is, or no trip has one
     """
     chosen = settings(scenario)
     files = own_files(scenario, chosen.additional)
@@ -79,9 +80,11 @@ def link_network(scenario: Scenario, seeds: Sequence[int] = PLANNING_SEEDS) -> L
         for element in draw.elements:
             driven.update(recorded.edges_of(element, shared)[0])
     city = city_of(scenario.network, opened=driven & city.region_of.keys())
-    by_draw = [drives_of(draw, shared, city.length) for draw in draws]
+    by_draw = [drives_of(draw, files, city) for draw in draws]
     together = [drive for drives in by_draw for drive in drives]
     routes = [drive.route for drive in together]
+    if not routes:
+        raise InputError(f"{scenario.where}: sumo.routes: no trip leads over two streets for cars")
     streets = Streets(city, connections_of(city), routes, scenario.where)
     counts = Counts(streets, together)
     means = means_of(scenario, chosen, draws[0])

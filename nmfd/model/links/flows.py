@@ -79,7 +79,7 @@ class Traffic(NamedTuple):
     standing: the same by turn (B, T)
     stopping: vehicles in the queue whose trip ends in the link (B, L)
     inside: all vehicles, by link (B, L)
-    passed: vehicles that made each movement in the last step (B, M)
+    recent: flow of each movement, smoothed over the critical gap (veh/s, (B, M))
     completed: completed trips, by link (B, L)
     entered: vehicles that entered in each of the last steps, the newest last, by entry (B, E)
     started: the same for vehicles that had stood at the stop line before
@@ -97,7 +97,7 @@ class Traffic(NamedTuple):
     standing: Tensor
     stopping: Tensor
     inside: Tensor
-    passed: Tensor
+    recent: Tensor
     completed: Tensor
     entered: History
     started: History
@@ -268,6 +268,7 @@ class Flows:
         self._lane_share = self.values(1.0 / lanes_of_turn[network.served])
         self._pace = self.values(saturation / of_movement)
         self._per_step = self.values(saturation)
+        self._weight = min(self.dt / self.numbers.gap, 1.0)
 
     def values(self, numbers: np.ndarray) -> Tensor:
         """Return an array of numbers as a tensor of this model."""
@@ -301,7 +302,7 @@ class Flows:
             standing=empty(len(self._link_entered)),
             stopping=empty(self.links),
             inside=empty(self.links),
-            passed=empty(self.movements),
+            recent=empty(self.movements),
             completed=empty(self.links),
             entered=tuple(empty(self.entries) for _ in range(self._later.longest)),
             started=tuple(empty(self.entries) for _ in range(self._started.longest)),
@@ -392,7 +393,7 @@ class Flows:
             standing=by_turn - flow,
             stopping=stopping - stopped,
             inside=traffic.inside + coming - left - completed,
-            passed=passed,
+            recent=traffic.recent + self._weight * (passed / self.dt - traffic.recent),
             completed=traffic.completed + completed,
             entered=self._along.with_new(traffic.entered, passing),
             started=self._started.with_new(traffic.started, starting),
@@ -412,7 +413,7 @@ class Flows:
 
         stood: share of the first vehicles that stood in front (-, (B, T))
         """
-        foes = traffic.passed.index_select(1, self._foe) / self.dt
+        foes = traffic.recent.index_select(1, self._foe)
         gap = torch.exp(-self.numbers.gap * self.sums(foes, self._yielding, self.movements))
         open_share = light * (1.0 - yields * (1.0 - gap))
         arriving = (self._pace * open_share).index_select(1, self._movement_of_turn)
