@@ -45,9 +45,11 @@ from nmfd.studies.benchmark import REFERENCE, draw_accumulations
 from nmfd.types import Result
 
 if TYPE_CHECKING:
+    from cosim.evaluation.link_fit import Fit
     from cosim.importing.edge_mfds import EdgeMfds
     from cosim.studying.page import Study
     from nmfd.controllers.base import Options
+    from nmfd.model.links.flows import Numbers
 
 DEMO = "demo"  # a shipped scenario
 FIRST_SEED = 2000  # of evaluations; those below are for development
@@ -540,15 +542,29 @@ def links(
     out: Path | str | None = None,
     *,
     seeds: Sequence[int] = PLANNING_SEEDS,
+    numbers: "Numbers | None" = None,
 ) -> Path:
     """Write the streets of a city for nmfd.LinkPlant; return the file.
 
     out: file, SCENARIO/links.npz if None
     seeds: of the draws of trips, if these are not recorded
+    numbers: calibration, such as those of `fit_links`
     """
     from cosim.evaluation.links import write_links
 
-    return write_links(loaded(scenario), None if out is None else Path(out), seeds)
+    return write_links(loaded(scenario), None if out is None else Path(out), seeds, numbers)
+
+
+def fit_links(runs: Path | str, *, progress: Progress = None) -> "Fit":
+    """Fit the numbers of the link model to finished runs in SUMO.
+
+    runs: folder of `cosim run` or `cosim evaluate`
+    Raises: InputError if the model can repeat none of them
+    """
+    from cosim.evaluation.link_fit import fit
+    from cosim.evaluation.results import read
+
+    return fit(read(Path(runs)), progress)
 
 
 def catalogue() -> dict[str, dict[str, str]]:

@@ -541,15 +541,25 @@ def mfd(net: Path, edge_data: tuple[Path, ...], explain: bool, **options: Any) -
 @main.command()
 @SCENARIO
 @file_option("--out", "File. [default: SCENARIO/links.npz]")
-def links(scenario: Path, settings: dict, out: Path | None) -> None:
+@click.option("--runs", type=FOLDER, help="Finished runs to which four numbers are fitted.")
+def links(scenario: Path, settings: dict, out: Path | None, runs: Path | None) -> None:
     """Write the streets of a SUMO city as a plant without SUMO.
 
     Reads the network, static routes and signal programmes. `nmfd benchmark SCENARIO --plant links`
     then simulates queues on every street in seconds.
 
+    With --runs, four numbers are fitted to the runs of the first seed in SUMO, and the errors of
+    all runs are printed.
+
     \b
     Example:
       cosim links grid7_peak --out links.npz
+      cosim links scenarios/mycity --runs runs/mycity-evaluate
     """
     loaded = nmfd.load_scenario(scenario, settings)
-    click.echo(f"Written to {cosim.api.links(loaded, out)}")
+    numbers = None
+    if runs is not None:
+        found = cosim.api.fit_links(runs)
+        click.echo(found.text())
+        numbers = found.numbers
+    click.echo(f"Written to {cosim.api.links(loaded, out, numbers=numbers)}")

@@ -40,6 +40,7 @@ def triangle(length: float = 300.0) -> LinkNetwork:
     light = np.concatenate([green, np.ones(2)]).astype(float)
     return LinkNetwork(
         regions=3,
+        numbers=np.array([1.0, 1.0, 1.0, 4.7]),
         spacing=SPACING,
         headway=1.0,
         dawdling=0.0,

@@ -5,6 +5,7 @@ are counted on the static routes. Lights follow the signal programmes.
 """
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -30,6 +31,7 @@ from cosim.sumo.trips import PLANNING_SEEDS
 from cosim.sumo.xml_files import attribute, network_root
 from nmfd.arrays import Arrays
 from nmfd.errors import InputError
+from nmfd.model.links.flows import Numbers
 from nmfd.model.links.network import FILE, LinkNetwork
 from nmfd.model.scenario import Scenario
 from nmfd.runs import shipped
@@ -48,18 +50,25 @@ class Lights(NamedTuple):
 
 
 def write_links(
-    scenario: Scenario, path: Path | None = None, seeds: Sequence[int] = PLANNING_SEEDS
+    scenario: Scenario,
+    path: Path | None = None,
+    seeds: Sequence[int] = PLANNING_SEEDS,
+    numbers: Numbers | None = None,
 ) -> Path:
     """Write the link network of `scenario`; return its file.
 
     path: file, that of the scenario if None
     seeds: of the draws of trips, if they are not recorded
+    numbers: calibration, the defaults if None
     Raises: InputError if a route leads where no connection is
     """
     if path is None:
         folder = scenario.folder or Path()
         path = shipped.beside(folder, FILE, "--out FILE", scenario=True)
-    link_network(scenario, seeds).write(path)
+    network = link_network(scenario, seeds)
+    if numbers is not None:
+        network = replace(network, numbers=np.array(list(vars(numbers).values())))
+    network.write(path)
     return path
 
 
@@ -97,6 +106,7 @@ def link_network(scenario: Scenario, seeds: Sequence[int] = PLANNING_SEEDS) -> L
     links = link_arrays(streets)
     return LinkNetwork(
         regions=city.regions,
+        numbers=np.array(list(vars(Numbers()).values())),
         spacing=means["length"] + means["minGap"],
         headway=means["tau"],
         dawdling=0.5 * means["sigma"] * means["accel"],

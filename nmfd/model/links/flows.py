@@ -48,7 +48,7 @@ BETWEEN_M = 4.8
 START_S = 1.6  # after which the first vehicle of a queue drives
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Numbers:
     """Calibration of the model to a city; the defaults are not fitted.
 

@@ -22,6 +22,7 @@ class LinkNetwork:
     Shares are those of D draws of trips: each locks at another demand, and their mean later.
 
     regions: number of regions
+    numbers: calibration (flows.Numbers, in their order)
     spacing, headway: of the average vehicle in a queue (m), and the least time it keeps (s)
     dawdling, acceleration: what it drives below the limit (m/s), and as it starts (m/s2)
     street: names of the links' streets (L,)
@@ -60,6 +61,7 @@ class LinkNetwork:
     """
 
     regions: int
+    numbers: np.ndarray
     spacing: float
     headway: float
     dawdling: float

@@ -39,6 +39,7 @@ class LinkPlant:
         chance: bool = True,
     ):
         """network: that of the scenario's file if None
+        numbers: those of the network if None
         chance: single vehicles draw their turns; without, streams divide
 
         Raises: InputError if the file is missing or does not fit the scenario
@@ -58,7 +59,7 @@ class LinkPlant:
             network,
             scenario.step,
             nominal=scenario.network.nominal_splits,
-            numbers=numbers,
+            numbers=numbers or Numbers(*network.numbers.tolist()),
             choices=choices_of(scenario),
             dt=1.0 if scenario.step % DT_S else DT_S,
             dtype=torch.float64,
