@@ -1,4 +1,4 @@
-"""The link model against finished runs in SUMO, and its numbers fitted to them.
+"""Numbers of the link model, fitted to finished runs in SUMO.
 
 The numbers are fitted to the accumulations of the runs of the first seed, those in which traffic
 flows if there are any. Other runs show the error that is left. The model repeats each run with the
@@ -111,7 +111,7 @@ class Fit(NamedTuple):
 
 
 def cases_of(found: Finished) -> tuple[list[Case], list[str]]:
-    """Return the runs that the link model can repeat, and why others are left out."""
+    """Return the runs that the model can repeat, and why not the others."""
     cases = []
     left_out = []
     for level in found.levels:

@@ -70,7 +70,10 @@ def drives_of(trips: RecordedTrips, files: Sequence[Path], city: City) -> list[D
 
 
 def _fastest(trips: RecordedTrips, files: Sequence[Path], city: City) -> dict[str, Route]:
-    """Return vehicle -> its fastest route in free flow; without those that have none."""
+    """Return vehicle -> its fastest route in free flow.
+
+    Vehicles that have none are left out.
+    """
     with temporary_folder() as folder:
         given = folder / "given.rou.xml"
         found = folder / "found.rou.xml"
