@@ -12,8 +12,16 @@ from nmfd.types import Result as Run
 MAINS = {"nmfd": nmfd.cli.main, "cosim": cosim.cli.main}
 
 
+def words(*arguments) -> list[str]:
+    """Return the words of a command line: those of texts; a path or number is one word."""
+    found = []
+    for argument in arguments:
+        found += argument.split() if isinstance(argument, str) else [str(argument)]
+    return found
+
+
 def call(program: str, *arguments) -> Result:
-    return CliRunner().invoke(MAINS[program], [str(argument) for argument in arguments])
+    return CliRunner().invoke(MAINS[program], words(*arguments))
 
 
 nmfd, cosim = (partial(call, program) for program in MAINS)

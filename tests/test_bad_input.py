@@ -99,11 +99,11 @@ def test_files_that_do_not_fit_together(tmp_path, case, command):
     scenario, network, expected = FILES[case]
     folder, out = tiny.write(tmp_path, scenario=scenario, network=network), tmp_path / "out"
     options = {
-        "benchmark": ["--controllers", "no-control"],
-        "train": ["--controller", "dpc-pc"],
-        "show": [],
+        "benchmark": "--controllers no-control",
+        "train": "--controller dpc-pc",
+        "show": "",
     }
-    assert expected in error_line(nmfd(command, folder, *options[command], "--out", out), "nmfd")
+    assert expected in error_line(nmfd(command, folder, options[command], "--out", out), "nmfd")
     assert not out.exists()
 
 
@@ -167,17 +167,8 @@ def test_policies(tmp_path, policy, monkeypatch, name):
     scenario = tiny.write(tmp_path)
     if (content := POLICIES[name](*policy)) is not None:
         Path("p.pt").write_bytes(content)
-    command = (
-        "benchmark",
-        scenario,
-        "--controllers",
-        "dpc-pc",
-        "--out",
-        "out",
-        "--policy",
-        "dpc-pc=p.pt",
-    )
-    assert "p.pt: " in error_line(nmfd(*command), "nmfd")
+    done = nmfd("benchmark", scenario, "--controllers dpc-pc --out out --policy dpc-pc=p.pt")
+    assert "p.pt: " in error_line(done, "nmfd")
     assert not Path("executed").exists()
     assert not Path("out").exists()
 
@@ -196,8 +187,8 @@ def test_policies(tmp_path, policy, monkeypatch, name):
 def test_plans(tmp_path, content):
     scenario = tiny.write(tmp_path)
     (scenario / "bound-pc.npz").write_bytes(content)
-    command = ("benchmark", scenario, "--controllers", "bound-pc", "--out", tmp_path / "out")
-    assert "bound-pc.npz: " in error_line(nmfd(*command), "nmfd")
+    done = nmfd("benchmark", scenario, "--controllers bound-pc --out", tmp_path / "out")
+    assert "bound-pc.npz: " in error_line(done, "nmfd")
     assert not (tmp_path / "out").exists()
 
 
@@ -270,15 +261,8 @@ def test_files_of_a_city(city, tmp_path, file, name):
         gzip.decompress(path.read_bytes()).decode() if packed else path.read_text()
     )
     path.write_bytes(gzip.compress(text.encode()) if packed else text.encode())
-    command = (
-        "run",
-        tmp_path / "project" / "scenarios" / "tiny",
-        "--controller",
-        "no-control",
-        "--set",
-        "steps=1",
-    )
-    line = error_line(cosim(*command, "--out", out))
+    scenario = tmp_path / "project" / "scenarios" / "tiny"
+    line = error_line(cosim("run", scenario, "--controller no-control --set steps=1 --out", out))
     assert path.name in line or "nowhere" in line or "has no region" in line
     assert not out.exists()
 

@@ -83,9 +83,7 @@ def test_a_plan_that_benchmark_replays(folder, tmp_path):
     assert "from pi-gating:" in text
     assert "the best plan is at most" in text
     text = good(
-        nmfd(
-            "benchmark", folder, "--controllers", "no-control,bound-pcrg", "--out", tmp_path / "out"
-        )
+        nmfd("benchmark", folder, "--controllers no-control,bound-pcrg --out", tmp_path / "out")
     )
     assert "above the optimum" in text
     assert "≤ " in text

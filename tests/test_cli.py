@@ -21,16 +21,8 @@ HEAVY = ("pydantic", "torch", "casadi", "libsumo", "numpy", "pandas", "matplotli
 
 @pytest.fixture
 def both(folder, tmp_path):
-    return [
-        "benchmark",
-        folder,
-        "--controllers",
-        "no-control,pi-gating",
-        "--seeds",
-        2,
-        "--out",
-        tmp_path / "out",
-    ]
+    options = "--controllers no-control,pi-gating --seeds 2 --out"
+    return ["benchmark", folder, options, tmp_path / "out"]
 
 
 @pytest.fixture
@@ -89,16 +81,8 @@ def test_benchmark_writes_a_run_folder(both, tmp_path):
 
 def test_settings(folder, tmp_path):
     """--set changes a key, in a nested table too, and mistakes name the key."""
-    command = (
-        "benchmark",
-        folder,
-        "--controllers",
-        "pi-gating",
-        "--out",
-        tmp_path / "out",
-        "--set",
-    )
-    good(nmfd(*command, "steps=3", "--set", "controllers.pi-gating.kp=2.5"))
+    command = ("benchmark", folder, "--controllers pi-gating --out", tmp_path / "out", "--set")
+    good(nmfd(*command, "steps=3 --set controllers.pi-gating.kp=2.5"))
     assert Result.read(tmp_path / "out" / "pi-gating-0.nc").accumulation.shape[0] == 4
     for text, problem in (
         ("stepz=3", "scenario.toml: stepz: unknown key; did you mean step?"),
@@ -146,14 +130,14 @@ def test_without_a_compiler_training_is_not_compiled(folder, tmp_path, monkeypat
     monkeypatch.setenv("PATH", str(tmp_path / "bin"))
     monkeypatch.delenv("CXX", raising=False)
     monkeypatch.setattr(training, "WORTH_COMPILING", 2)
-    good(nmfd("train", folder, "--controller", "dpc-pc", "--steps", 2))
+    good(nmfd("train", folder, "--controller dpc-pc --steps 2"))
     content = torch.load(folder / "dpc-pc.pt", weights_only=True)
     assert content["configuration"]["compiled"] is False
 
 
 def test_a_gpu_that_is_not_there_is_one_line(folder, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    result = nmfd("train", folder, "--controller", "dpc-pc", "--steps", 1, "--device", "cuda")
+    result = nmfd("train", folder, "--controller dpc-pc --steps 1 --device cuda")
     assert "finds no GPU here" in error_line(result, "nmfd")
 
 
@@ -170,19 +154,8 @@ def test_show_draws_the_scenario(folder, tmp_path):
 
 def test_a_new_controller_runs(folder, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert "nmfd benchmark economic_mpc" in good(nmfd("new-controller", "mine.py"))
-    good(
-        nmfd(
-            "benchmark",
-            folder,
-            "--controllers",
-            "mine.py:MyController",
-            "--set",
-            "steps=2",
-            "--out",
-            "out",
-        )
-    )
+    assert "nmfd benchmark economic_mpc" in good(nmfd("new-controller mine.py"))
+    good(nmfd("benchmark", folder, "--controllers mine.py:MyController --set steps=2 --out out"))
     for name, problem in (
         ("mine.py", "exists; choose another"),
         ("mine.txt", "ends in .py"),

@@ -195,7 +195,7 @@ def test_every_number_has_a_gradient_and_perimeter_control_alone_has_no_prices(n
 def test_it_is_trained_and_kept_in_a_file(tmp_path):
     scenario = tiny.write(tmp_path)
     (scenario / "scenario.toml").write_text((scenario / "scenario.toml").read_text() + TABLE)
-    good(nmfd("train", scenario, "--controller", "dpc-pcrg"))
+    good(nmfd("train", scenario, "--controller dpc-pcrg"))
     loaded = load_scenario(scenario)
     trained, content = load_policy(scenario / "dpc-pcrg.pt", loaded.network)
     rule = parse("gating-rule").make(loaded)
@@ -210,16 +210,7 @@ def test_it_is_trained_and_kept_in_a_file(tmp_path):
         rule.policy, Rollout(parse("dpc-pcrg").own_planning(loaded)), 0, setup
     )
     assert content["configuration"]["validation_veh_s"] < untrained
-    good(
-        nmfd(
-            "benchmark",
-            scenario,
-            "--controllers",
-            "dpc-pcrg,gating-rule",
-            "--out",
-            tmp_path / "out",
-        )
-    )
+    good(nmfd("benchmark", scenario, "--controllers dpc-pcrg,gating-rule --out", tmp_path / "out"))
 
 
 def test_descent_from_a_saturated_gate_takes_the_single_change_that_gains(tmp_path):

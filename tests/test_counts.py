@@ -62,23 +62,23 @@ def test_geh():
 @pytest.mark.parametrize(
     "content, options, expected",
     [
-        ("<net/>", (), "expected <meandata>, got a file of <net>"),
-        (meandata({"none": 3}), (), "edge none is not in"),
-        (meandata({"A1B1": 0}), (), "all counts (entered) are 0"),
-        (meandata(COUNTS).replace("entered", "flow"), (), "edge A1B1: entered: missing"),
-        (meandata(COUNTS), ("--demand", "peak"), "has vehicles of its own; omit --routes"),
+        ("<net/>", "", "expected <meandata>, got a file of <net>"),
+        (meandata({"none": 3}), "", "edge none is not in"),
+        (meandata({"A1B1": 0}), "", "all counts (entered) are 0"),
+        (meandata(COUNTS).replace("entered", "flow"), "", "edge A1B1: entered: missing"),
+        (meandata(COUNTS), "--demand peak", "has vehicles of its own; omit --routes"),
     ],
 )
 def test_one_clear_line(city, tmp_path, content, options, expected):
     (tmp_path / "counts.xml").write_text(content)
-    given = "--counts", tmp_path / "counts.xml", "--regions", 2, "--out", tmp_path / "out"
-    assert expected in error_line(cosim("import", city, *given, *options))
+    given = ("--counts", tmp_path / "counts.xml", "--regions 2 --out", tmp_path / "out")
+    assert expected in error_line(cosim("import", city, *given, options))
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow
 def test_a_city_from_counts(city, tmp_path):
-    given = "--counts", city.parent / "counts.xml", "--regions", 2, "--seeds", 1
+    given = ("--counts", city.parent / "counts.xml", "--regions 2 --seeds 1")
     text = good(cosim("import", city, *given, "--out", tmp_path / "networks" / "city"))
     assert "counts: 100% of 3 streets have a GEH below 5" in text
     assert (tmp_path / "scenarios" / "city" / "vehicles.rou.xml.gz").is_file()

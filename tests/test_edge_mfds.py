@@ -71,7 +71,7 @@ def test_the_curve_that_made_the_data_comes_back(made, tmp_path):
 def test_the_command(made, tmp_path):
     """Two runs and one region, found without a table; the table of the terminal is narrow."""
     edges = made / "edges.xml"
-    options = "--regions", "1", "--explain", "--out", tmp_path
+    options = "--regions 1 --explain --out", tmp_path
     text = good(cosim("mfd", made / "city.net.xml", edges, edges, *options))
     assert max(map(len, text.splitlines())) <= 100
     line = text.splitlines()[1].split()
@@ -111,7 +111,7 @@ def test_one_clear_line(made, tmp_path, content, expected):
     if content.startswith("<interval"):
         content = f"<meandata>{content}</meandata>"
     (tmp_path / "edges.xml").write_text(content)
-    options = "--regions", "1", "--out", tmp_path / "out"
+    options = "--regions 1 --out", tmp_path / "out"
     line = error_line(cosim("mfd", made / "city.net.xml", tmp_path / "edges.xml", *options))
     assert expected in line
     assert not (tmp_path / "out").exists()

@@ -88,11 +88,7 @@ def test_the_folder_is_held_until_its_figures_are_drawn(tmp_path, ran, monkeypat
             FileLock(tmp_path / "out" / ".lock", timeout=0).acquire()
 
     monkeypatch.setattr("cosim.reporting.figures.draw_all", draw)
-    good(
-        cosim(
-            "evaluate", CITY, "--controllers", "no-control", "--seeds", 1, "--out", tmp_path / "out"
-        )
-    )
+    good(cosim("evaluate", CITY, "--controllers no-control --seeds 1 --out", tmp_path / "out"))
 
 
 def test_runs_come_seed_by_seed_and_are_kept(tmp_path, ran):
@@ -169,13 +165,7 @@ def test_a_small_evaluation_in_sumo(own, tmp_path):
     arguments = (
         "evaluate",
         own,
-        "--controllers",
-        "no-control,pi-gating",
-        "--seeds",
-        1,
-        "--steps",
-        3,
-        "--out",
+        "--controllers no-control,pi-gating --seeds 1 --steps 3 --out",
         out,
     )
     said = good(cosim(*arguments))
@@ -189,22 +179,13 @@ def test_a_small_evaluation_in_sumo(own, tmp_path):
     good(cosim(*arguments))
     assert before == {path: path.read_bytes() for path in out.glob("*/*.nc")}
     assert len(before) == 2
-    assert "no difference" in good(cosim(*arguments, "--check", 1))
+    assert "no difference" in good(cosim(*arguments, "--check 1"))
 
 
 def test_cosim_run_compares_with_what_against_names(tmp_path, monkeypatch):
     city = made_up.city_of(load_scenario(made_up.SCENARIO).network)
     made_up.instead_of_sumo(monkeypatch, partial(made_up.result, city=city))
-    arguments = (
-        "run",
-        made_up.SCENARIO,
-        "--controller",
-        "dpc-pcrg",
-        "--against",
-        "pi-gating",
-        "--steps",
-        5,
-    )
+    arguments = ("run", made_up.SCENARIO, "--controller dpc-pcrg --against pi-gating --steps 5")
     said = good(cosim(*arguments, "--out", tmp_path / "out"))
     assert "against pi-gating" in said
     assert re.search(r"^dpc-pcrg +1 +\S+ +-\d", said, re.M)

@@ -144,9 +144,7 @@ def test_wrong_faults(text):
 
 def test_faults_of_a_city_are_refused_on_the_regional_model(tmp_path):
     folder = tiny.write(tmp_path, scenario='faults = ["closed:x"]\n' + tiny.SCENARIO)
-    result = call(
-        "nmfd", "benchmark", folder, "--controllers", "no-control", "--out", tmp_path / "out"
-    )
+    result = call("nmfd", "benchmark", folder, "--controllers no-control --out", tmp_path / "out")
     assert result.exit_code == 2
     assert "closed is a fault of a city" in result.stderr
 
@@ -248,7 +246,7 @@ def test_faults_that_the_city_does_not_have(city, tmp_path, ordered, problem):
     file.write_text(f'faults = ["{ordered}"]\n{text}', encoding="utf-8")
     try:
         result = call(
-            "cosim", "run", city.folder, "--controller", "no-control", "--out", tmp_path / "out"
+            "cosim", "run", city.folder, "--controller no-control --out", tmp_path / "out"
         )
     finally:
         file.write_text(text, encoding="utf-8")

@@ -27,7 +27,7 @@ from nmfd.errors import InputError
 from nmfd.model.regional_model import load_network
 from nmfd.model.scenario import with_demand
 
-IMPORT = ("import", "--regions", 3, "--seeds", 1)
+IMPORT = "import --regions 3 --seeds 1"
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def config(tmp_path_factory):
 def imported(config, tmp_path_factory):
     """(project folder, what the import printed)."""
     project = tmp_path_factory.mktemp("project")
-    text = good(cosim(*IMPORT, config, "--out", project / "networks" / "tiny"))
+    text = good(cosim(IMPORT, config, "--out", project / "networks" / "tiny"))
     shutil.copytree(
         project, project.with_name("as-imported")
     )  # runs build something in the other one
@@ -132,7 +132,7 @@ def test_gateways_and_quality_add_up(imported):
 
 def test_import_is_deterministic_and_atomic(imported, config, tmp_path):
     project = imported[0].with_name("as-imported")
-    command = (*IMPORT, config, "--out", tmp_path / "networks" / "tiny")
+    command = (IMPORT, config, "--out", tmp_path / "networks" / "tiny")
     good(cosim(*command))
     for folder in ("networks", "scenarios"):
         here, there = (sorted((root / folder).rglob("*")) for root in (project, tmp_path))
@@ -175,8 +175,8 @@ def test_own_regions_come_back(imported, config, tmp_path):
 def test_networks_as_they_are(tmp_path):
     """Left-hand traffic; two signals; none at all: a working result."""
     for name, options, expected in (
-        ("left", ("--lefthand", "true", "--tls.set", "B1,C2"), "left-hand traffic; 2 signals"),
-        ("none", ("--default-junction-type", "priority"), "no gateway has a signal"),
+        ("left", ("--lefthand true --tls.set B1,C2",), "left-hand traffic; 2 signals"),
+        ("none", ("--default-junction-type priority",), "no gateway has a signal"),
     ):
         (tmp_path / name).mkdir()
         config = tiny_city.city(tmp_path / name, *options)
@@ -249,7 +249,7 @@ def test_options_and_includes_of_the_user_count(config, tmp_path):
     assert case.ignored == ("tripinfo-output",)
     assert case.options["max-depart-delay"] == "60"
     assert case.options["meso-junction-control"] == "false"
-    text = good(cosim(*IMPORT, tmp_path / "city.sumocfg", "--out", tmp_path / "networks" / "x"))
+    text = good(cosim(IMPORT, tmp_path / "city.sumocfg", "--out", tmp_path / "networks" / "x"))
     assert "150 vehicles in" in text
     assert "that only write files: tripinfo-output" in text
     scenario = load_scenario(tmp_path / "scenarios" / "x")
@@ -257,7 +257,7 @@ def test_options_and_includes_of_the_user_count(config, tmp_path):
     assert scenario.demand.sum() * scenario.step == pytest.approx(150.0)
     assert settings(scenario).mesoscopic
     options = ("--routes", tmp_path / "cars.rou.xml", "--out", tmp_path / "networks" / "y")
-    good(cosim(*IMPORT, tmp_path / "city.net.xml", *options))  # without any sumocfg
+    good(cosim(IMPORT, tmp_path / "city.net.xml", *options))  # without any sumocfg
     assert load_scenario(
         tmp_path / "scenarios" / "y"
     ).demand.sum() * scenario.step == pytest.approx(60.0)
@@ -313,7 +313,7 @@ def test_signal_plans_know_the_city_s_own_vehicles(imported):
 def test_one_clear_line(config, tmp_path, change, expected):
     shutil.copytree(config.parent, tmp_path, dirs_exist_ok=True)
     change(tmp_path)
-    command = (*IMPORT, tmp_path / "city.sumocfg", "--out", tmp_path / "networks" / "x")
+    command = (IMPORT, tmp_path / "city.sumocfg", "--out", tmp_path / "networks" / "x")
     assert expected in error_line(cosim(*command))
     assert not (tmp_path / "networks").exists() or not list((tmp_path / "networks").iterdir())
 

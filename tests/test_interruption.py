@@ -11,7 +11,7 @@ import time
 import pytest
 import tiny
 import torch
-from commands import good, nmfd, runs, same
+from commands import good, nmfd, runs, same, words
 
 from nmfd import api
 from nmfd.controllers import training
@@ -25,7 +25,7 @@ def stopped(program, *arguments, out, by, after="[!.]*.nc", wait=0.0):
     after: pattern of another file; wait: time after that (s). All processes have ended when stderr
         has
     """
-    command = [sys.executable, "-m", program, *map(str, arguments), "--out", str(out)]
+    command = [sys.executable, "-m", program, *words(*arguments, "--out", out)]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
     deadline = time.monotonic() + 120.0
     while (
@@ -47,16 +47,8 @@ def stopped(program, *arguments, out, by, after="[!.]*.nc", wait=0.0):
     ],
 )
 def test_ctrl_c_at_any_moment_is_one_line(tmp_path, after, wait):
-    command = (
-        "benchmark",
-        tiny.write(tmp_path),
-        "--controllers",
-        "no-control",
-        "--seeds",
-        200,
-        "--workers",
-        2,
-    )
+    options = "--controllers no-control --seeds 200 --workers 2"
+    command = ("benchmark", tiny.write(tmp_path), options)
     returned, said = stopped(
         "nmfd", *command, out=tmp_path / "out", by=signal.SIGINT, after=after, wait=wait
     )
@@ -73,15 +65,8 @@ def test_ctrl_c_at_any_moment_is_one_line(tmp_path, after, wait):
 @pytest.mark.slow
 @pytest.mark.parametrize("streams", ["<&- >&- 2>&-", "2>&1 | true"])
 def test_runs_are_kept_without_standard_streams(tmp_path, streams):
-    command = [
-        sys.executable,
-        "-m",
-        "nmfd",
-        "benchmark",
-        str(tiny.write(tmp_path)),
-        "--controllers",
-        "no-control",
-    ]
+    scenario = tiny.write(tmp_path)
+    command = words(sys.executable, "-m nmfd benchmark", scenario, "--controllers no-control")
     subprocess.run(
         [f"{shlex.join(command)} --workers 2 --seeds 2 --out {tmp_path}/out {streams}"], shell=True
     )
@@ -100,16 +85,8 @@ def test_runs_are_kept_without_standard_streams(tmp_path, streams):
 @pytest.mark.slow
 def test_a_stopped_benchmark_continues(tmp_path, monkeypatch, by, status):
     scenario = tiny.write(tmp_path)
-    command = (
-        "benchmark",
-        scenario,
-        "--controllers",
-        "no-control,pi-gating",
-        "--seeds",
-        10,
-        "--workers",
-        2,
-    )
+    options = "--controllers no-control,pi-gating --seeds 10 --workers 2"
+    command = ("benchmark", scenario, options)
     returned, said = stopped("nmfd", *command, out=tmp_path / "out", by=by)
     assert returned == status, said
     assert "Traceback" not in said
@@ -129,16 +106,7 @@ def test_a_stopped_benchmark_continues(tmp_path, monkeypatch, by, status):
 @pytest.mark.parametrize("stop", [2, 5])
 def test_a_resumed_training_is_the_uninterrupted_one(tmp_path, monkeypatch, stop):
     monkeypatch.setattr(training, "VALIDATION_PERIOD", 1)
-    command = (
-        "train",
-        tiny.write(tmp_path),
-        "--controller",
-        "dpc-pcrg",
-        "--steps",
-        5,
-        "--device",
-        "cpu",
-    )
+    command = ("train", tiny.write(tmp_path), "--controller dpc-pcrg --steps 5 --device cpu")
     good(nmfd(*command, "--out", tmp_path / "whole.pt"))
     steps, clip = [], torch.nn.utils.clip_grad_norm_
 

@@ -22,8 +22,8 @@ from cosim.view.picture import CityPicture
 from nmfd.api import load_scenario
 
 SIGNALS = ("B1", "B2", "C1", "C2")
-USUAL = ("--tls.set", ",".join(SIGNALS))
-ARROWS = ("--default-junction-type", "traffic_light_right_on_red")
+USUAL = ("--tls.set B1,B2,C1,C2",)
+ARROWS = ("--default-junction-type traffic_light_right_on_red",)
 CLOSED, OPEN = 0.1, 0.9
 
 
@@ -221,10 +221,7 @@ def test_max_pressure_says_why_it_cannot_run(made, tmp_path):
         ("C1", one_phase),
         ("C2", red_and_yellow),
     )
-    done = cosim(
-        *("run", made(unfit), "--controller", "max-pressure", "--steps", 1),
-        *("--out", tmp_path / "out"),
-    )
+    done = cosim("run", made(unfit), "--controller max-pressure --steps 1 --out", tmp_path / "out")
     assert done.exit_code != 0
     assert "none of the 4 signals here is one (" in done.stderr
     for reason in ("blinking", "switched off", "fewer than two green phases", "light u"):

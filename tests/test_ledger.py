@@ -83,8 +83,8 @@ def test_controls_that_move_more_than_there_is_stop_the_run(scenario, make):
 
 def test_the_command_says_it_in_one_line_and_keeps_what_was_finished(tmp_path, monkeypatch):
     out = tmp_path / "out"
-    command = ("benchmark", tiny.write(tmp_path), "--controllers", "no-control", "--out", out)
-    good(nmfd(*command, "--seeds", 1))
+    command = ("benchmark", tiny.write(tmp_path), "--controllers no-control --out", out)
+    good(nmfd(*command, "--seeds 1"))
     honest = dynamics.advance_counted
 
     def leaking(*arguments, **options):
@@ -92,7 +92,7 @@ def test_the_command_says_it_in_one_line_and_keeps_what_was_finished(tmp_path, m
         return 0.999 * x, ended
 
     monkeypatch.setattr(dynamics, "advance_counted", leaking)
-    result = nmfd(*command, "--seeds", 2)
+    result = nmfd(*command, "--seeds 2")
     assert result.exit_code == 1
     assert result.stderr.count("\n") == 1
     assert "no-control, seed 1: LedgerError: vehicle ledger broken at control step" in result.stderr

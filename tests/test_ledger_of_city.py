@@ -230,7 +230,7 @@ MANY = [
 @pytest.fixture(scope="module")
 def city(tmp_path_factory):
     folder = tmp_path_factory.mktemp("city")
-    net = tiny_city.network(folder, "--tls.set", "B1,B2,C1")
+    net = tiny_city.network(folder, "--tls.set B1,B2,C1")
     edges = [
         edge.get("id")
         for edge in ElementTree.parse(net).getroot().iter("edge")

@@ -292,7 +292,7 @@ def test_who_waits_on_a_street_that_is_closed_to_cars_gets_a_green(buses, first,
 
 def test_streets_that_are_closed_to_cars_are_read_with_their_signals(tmp_path):
     """A bus street from the north into B1 of the tiny city; footways at its signal are nobody's."""
-    file = tiny_city.network(tmp_path, "--tls.set", "B1,B2,C1,C2,B3,C0")
+    file = tiny_city.network(tmp_path, "--tls.set B1,B2,C1,C2,B3,C0")
     root = ElementTree.parse(file)
     for lane in root.iterfind("edge[@id='B2B1']/lane"):
         lane.set("allow", "bus")

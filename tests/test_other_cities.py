@@ -73,7 +73,7 @@ def imported(source, out=None, **options):
 def refused(config, *options):
     """The one line of an import that fails and leaves nothing behind."""
     result = cosim(
-        "import", config, "--regions", 2, "--out", config.parent / "networks" / "x", *options
+        "import", config, "--regions 2 --out", config.parent / "networks" / "x", *options
     )
     assert result.exit_code == 2, result.stdout + str(result.exception)
     assert result.stderr.count("\n") == 1
@@ -209,7 +209,7 @@ def test_options_that_are_wrong(city, options, expected):
 @pytest.mark.parametrize("name", [".", "..", "networks/a,b"])
 def test_folders_that_can_have_no_city(city, tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
-    result = cosim("import", city(), "--regions", 2, "--out", name)
+    result = cosim("import", city(), "--regions 2 --out", name)
     assert result.exit_code == 2
     assert "--out: expected a folder such as networks/mycity" in result.stderr
     assert not list(tmp_path.rglob("*.toml"))

@@ -33,11 +33,11 @@ def observation(accumulation):
 
 
 def test_the_template_is_copied_runs_and_counts_in_the_fingerprint(place):
-    assert command("new-controller", "mine.py").exit_code == 0
+    assert command("new-controller mine.py").exit_code == 0
     assert (
         "--controllers no-control,pi-gating,mine.py:MyController" in (place / "mine.py").read_text()
     )
-    assert command("new-controller", "mine.py").exit_code == 2
+    assert command("new-controller mine.py").exit_code == 2
     scenario, strategy = nmfd.load_scenario(place / "scenario"), parse("mine.py:MyController")
     assert nmfd.run(scenario, "mine.py:MyController")["perimeter"][:, 0, 1].max() == 0.9
     before = strategy.fingerprint(scenario)
@@ -60,7 +60,7 @@ def test_the_template_holds_regions_at_their_set_points():
 def test_it_has_a_table_of_its_own(place):
     with (place / "scenario" / "scenario.toml").open("a") as file:
         file.write("\n[controllers.own.my-controller]\ngain = 0.0\n")
-    assert command("new-controller", "mine.py").exit_code == 0
+    assert command("new-controller mine.py").exit_code == 0
     controller = nmfd.controller("mine.py:MyController", place / "scenario")
     assert (
         controller.act(observation(np.full((2, 2), 900.0))).perimeter[0, 1] == 0.9
@@ -87,7 +87,7 @@ def test_sumo_takes_it(place):
     copies.peak(place)
     name = "mine.py:Mine+max-pressure"
     assert name in good(
-        commands.cosim("run", "scenarios/peak", "--controller", name, "--steps", 2, "--out", "out")
+        commands.cosim("run scenarios/peak --controller", name, "--steps 2 --out out")
     )
 
 

@@ -22,19 +22,8 @@ from nmfd.errors import InputError
 def streets(tmp_path_factory):
     """A grid of 9 x 9 junctions, 150 m apart."""
     path = tmp_path_factory.mktemp("grid") / "grid.net.xml"
-    options = [
-        "--grid",
-        "--grid.number",
-        "9",
-        "--grid.length",
-        "150",
-        "--no-turnarounds",
-        "true",
-        "--seed",
-        "1",
-        "--output-file",
-    ]
-    tiny_city.run("netgenerate", *options, path)
+    options = "--grid --grid.number 9 --grid.length 150 --no-turnarounds true --seed 1"
+    tiny_city.run("netgenerate", options, "--output-file", path)
     return read_streets(path)
 
 

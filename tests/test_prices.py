@@ -51,7 +51,7 @@ def test_a_trained_network_closes_the_loop_and_its_trips_wait(tmp_path):
     options = "prices = true\nmetering = true\nsteps = 6\nfrom_no_control = true\n"
     table = f"\n[controllers.dpc-pcrg]\n{options}"
     (folder / "scenario.toml").write_text((folder / "scenario.toml").read_text() + table)
-    good(nmfd("train", folder, "--controller", "dpc-pcrg"))
+    good(nmfd("train", folder, "--controller dpc-pcrg"))
     scenario = load_scenario(folder)
     scenario = replace(scenario, demand=6.0 * scenario.demand)
     controller = parse("dpc-pcrg").make(scenario)

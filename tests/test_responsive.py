@@ -52,7 +52,7 @@ def town(request, tmp_path_factory):
     return request.param, imported(
         tmp_path_factory.mktemp("town") / request.param,
         "town",
-        signals=("--tls.set", "B1,B2,C1,C2", "--tls.default-type", request.param),
+        signals=(f"--tls.set B1,B2,C1,C2 --tls.default-type {request.param}",),
     )
 
 
@@ -168,7 +168,7 @@ def places(tmp_path_factory):
     folder, made = tmp_path_factory.mktemp("places"), {}
     for name, signals, options in (
         ("queues", ("--tls.set", "B1,B2"), {"mesoscopic": True}),
-        ("bare", ("--default-junction-type", "priority"), {}),
+        ("bare", ("--default-junction-type priority",), {}),
     ):
         made[name] = imported(folder / name, name, signals=signals, **options)
     return made
@@ -190,12 +190,10 @@ def test_what_cannot_run_here_is_refused_before_the_first_run(
     """One line that names it, though another strategy comes first; nothing is written."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.py").write_text(tiny.CONTROLLER)
-    names = (
-        ("--controller", "no-control", "--against", name)
-        if command == "run"
-        else ("--controllers", f"no-control,{name}")
-    )
-    done = cosim(command, places[city], *names, "--steps", 1, "--out", "out")
+    names = f"--controllers no-control,{name}"
+    if command == "run":
+        names = f"--controller no-control --against {name}"
+    done = cosim(command, places[city], names, "--steps 1 --out out")
     assert done.exit_code != 0
     assert len(done.stderr.strip().splitlines()) == 1, done.stderr
     assert f"controller {name} cannot run here: " in done.stderr

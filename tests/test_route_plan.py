@@ -197,7 +197,7 @@ def test_the_word():
 @pytest.mark.slow
 def test_a_plan_is_made_followed_and_resumed(tmp_path):
     scenario = tiny_city.imported(tmp_path)
-    command = ("plan", scenario, "--controller", "max-pressure", "--iterations", 2, "--demand", 2)
+    command = ("plan", scenario, "--controller max-pressure --iterations 2 --demand 2")
     told = good(cosim(*command, "--out", tmp_path / "runs"))
     assert len(told.splitlines()) == 1 + 3 + 1
     first = (scenario / "plan.csv.gz").read_bytes()
@@ -208,6 +208,6 @@ def test_a_plan_is_made_followed_and_resumed(tmp_path):
     assert (scenario / "plan.csv.gz").read_bytes() == first
     assert [run.stat().st_mtime_ns for run in runs] == before
     assert len(read_driven(tmp_path / "runs" / "routes-2.xml")) > 100
-    evaluate = ("evaluate", scenario, "--seeds", "7-7", "--demand", 2, "--out", tmp_path / "other")
-    good(cosim(*evaluate, "--controllers", "planned+guided+compliance-50,no-control"))
-    good(cosim(*evaluate, "--controllers", "planned+max-pressure", "--set", "sumo.routes=[]"))
+    evaluate = ("evaluate", scenario, "--seeds 7-7 --demand 2 --out", tmp_path / "other")
+    good(cosim(*evaluate, "--controllers planned+guided+compliance-50,no-control"))
+    good(cosim(*evaluate, "--controllers planned+max-pressure --set sumo.routes=[]"))

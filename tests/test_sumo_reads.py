@@ -161,16 +161,8 @@ def trips(file) -> dict[str, dict[str, str]]:
 def plain(config):
     """The trips of SUMO alone."""
     out = config.with_name("plain.xml")
-    tiny_city.run(
-        "sumo",
-        "-c",
-        config,
-        "--tripinfo-output",
-        out,
-        "--tripinfo-output.write-unfinished",
-        "--seed",
-        0,
-    )
+    usual = "--tripinfo-output.write-unfinished --seed 0 --tripinfo-output"
+    tiny_city.run("sumo", "-c", config, usual, out)
     return trips(out)
 
 
@@ -293,9 +285,8 @@ def drive_and_compare(config, ended):
 def test_vehicles_of_a_loaded_state_begin_where_they_are(tmp_path):
     config = city(tmp_path, ["trip", "via", "period", "later"])
     state = tmp_path / "state.xml"
-    tiny_city.run(
-        "sumo", "-c", config, "--save-state.times", 50, "--save-state.files", state, "--end", 51
-    )
+    saving = "--end 51 --save-state.times 50 --save-state.files"
+    tiny_city.run("sumo", "-c", config, saving, state)
     config.write_text(config.read_text().replace("<end", '<load-state value="state.xml"/><end'))
     case = read_sumo_input(config)
     traffic = read_traffic(case, read_streets(case.net, case.additional), seed=0)

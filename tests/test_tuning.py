@@ -157,29 +157,16 @@ def test_a_failed_first_candidate_has_no_number(city, tmp_path, runs):
     ],
 )
 def test_one_line_for_what_cannot_be_tuned(city, tmp_path, arguments, expected):
-    options = [word for text in arguments for word in ("--option", text)]
-    done = cosim(
-        "tune", city.folder, "--controller", "pi-gating", *options, "--out", tmp_path / "out"
-    )
+    options = [f"--option {text}" for text in arguments]
+    done = cosim("tune", city.folder, "--controller pi-gating", *options, "--out", tmp_path / "out")
     assert done.exit_code == 2
     assert expected in done.stderr
     assert not (tmp_path / "out").exists()
 
 
 def test_the_command(city, tmp_path, runs):
-    options = (
-        "--option",
-        "set_point[0]=200:600",
-        "--option",
-        "kp=0.1:10",
-        "--candidates",
-        3,
-        "--seeds",
-        1,
-    )
-    said = good(
-        cosim("tune", city.folder, "--controller", "pi-gating", *options, "--out", tmp_path / "out")
-    )
+    options = "--option set_point[0]=200:600 --option kp=0.1:10 --candidates 3 --seeds 1 --out"
+    said = good(cosim("tune", city.folder, "--controller pi-gating", options, tmp_path / "out"))
     assert "# Best of 3 candidates: " in said
     assert "set_point = [" in said
     assert len(pd.read_csv(tmp_path / "out" / "tune.csv")) == 3

@@ -70,7 +70,7 @@ def test_nobody_waits_on_an_empty_lane_or_for_another_turn():
 
 def test_the_sheet_of_a_run(tmp_path):
     """Cars of one street only: max-pressure leaves the other links red, but nobody waits there."""
-    net = tiny_city.network(tmp_path, "--tls.set", "B1,B2,C1,C2")
+    net = tiny_city.network(tmp_path, "--tls.set B1,B2,C1,C2")
     (tmp_path / "cars.rou.xml").write_text(f"<routes>{FLOW}</routes>")
     (tmp_path / "city.sumocfg").write_text(
         f'<configuration><net-file value="{net}"/><route-files value="cars.rou.xml"/>'

@@ -14,6 +14,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import sumo
+from commands import words
 from scipy.sparse.csgraph import connected_components
 
 from cosim.importing.importer import import_city
@@ -61,7 +62,7 @@ BUSES = """<routes>
 
 def run(program: str, *arguments) -> None:
     done = subprocess.run(
-        [str(Path(sumo.SUMO_HOME) / "bin" / program), *map(str, arguments)],
+        words(Path(sumo.SUMO_HOME) / "bin" / program, *arguments),
         capture_output=True,
         text=True,
     )
@@ -71,28 +72,17 @@ def run(program: str, *arguments) -> None:
 def network(folder: Path, *options: str, name: str = "city.net.xml") -> Path:
     """A grid of 4 x 4 junctions A0 to D3, 200 m apart, with signals at all inner ones unless told
     otherwise."""
-    (folder / name).write_bytes(_grid(options or ("--tls.set", "B1,B2,C1,C2,B3,C0")))
+    (folder / name).write_bytes(_grid(options or ("--tls.set B1,B2,C1,C2,B3,C0",)))
     return folder / name
 
 
 @cache
 def _grid(options: tuple[str, ...]) -> bytes:
-    grid = [
-        "--grid",
-        "--grid.number",
-        "4",
-        "--grid.length",
-        "200",
-        "--default.lanenumber",
-        "2",
-        "--no-turnarounds",
-        "true",
-        "--seed",
-        "1",
-    ]
+    grid = "--grid --grid.number 4 --grid.length 200 --default.lanenumber 2"
+    usual = "--no-turnarounds true --seed 1 --output-file"
     with TemporaryDirectory() as folder:
         file = Path(folder) / "city.net.xml"
-        run("netgenerate", *grid, "--output-file", file, *options)
+        run("netgenerate", grid, usual, file, *options)
         return file.read_bytes()
 
 
