@@ -106,6 +106,18 @@ def plant_of(scenario):
 
 
 @pytest.fixture
+def train(scenario, tmp_path):
+    """Trains a policy, by default on the module's scenario."""
+    from nmfd.controllers import training  # not before annotations are checked
+    from nmfd.controllers.strategy import parse
+
+    def file(name="dpc-pc", *, on=scenario, seed=0, out=tmp_path / "p.pt", **how):
+        return training.train(on, parse(name), seed=seed, out=out, **how)
+
+    return file
+
+
+@pytest.fixture
 def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
     """No check of annotations: for tests of what users are told who give something of a wrong
     type."""

@@ -8,14 +8,13 @@ import pytest
 import torch
 from commands import good, nmfd
 
-from nmfd import api, closed_loop
+from nmfd import api
 from nmfd.api import load_scenario
 from nmfd.controllers import open_loop
 from nmfd.errors import InputError
 from nmfd.metrics import total_time_spent
 from nmfd.model import dynamics
 from nmfd.model.integration import SCHEMES
-from nmfd.model.plant import NmfdPlant
 from nmfd.model.scenario import with_demand
 from nmfd.studies import bound
 
@@ -23,7 +22,7 @@ ECONOMIC = "economic_mpc"
 
 
 def closed(scenario, controller):
-    return total_time_spent(closed_loop.run(NmfdPlant(scenario), controller, scenario, seed=0))
+    return total_time_spent(api.run(scenario, controller))
 
 
 def test_where_nothing_congests_the_bound_is_an_open_perimeter(scenario):
@@ -32,7 +31,7 @@ def test_where_nothing_congests_the_bound_is_an_open_perimeter(scenario):
     assert (
         plan.perimeter[:8, 0, 1].min() > 0.85
     )  # later intervals move vehicles that the horizon does not count
-    uncontrolled = closed(free, api.controller("no-control", free))
+    uncontrolled = closed(free, "no-control")
     assert closed(free, plan) == pytest.approx(uncontrolled, rel=1e-3)
 
 
@@ -61,9 +60,7 @@ def test_the_bound_is_not_above_the_closed_loop_it_started_from(scenario):
     crowded = replace(scenario, demand=3.0 * scenario.demand)
     plan = bound.compute(crowded, "bound-pc", iterations=120)
     # A sigmoid never quite reaches the bounds of u.
-    assert plan.totals[plan.start] <= (1.0 + 1e-4) * closed(
-        crowded, api.controller("pi-gating", crowded)
-    )
+    assert plan.totals[plan.start] <= (1.0 + 1e-4) * closed(crowded, "pi-gating")
 
 
 def test_an_interrupted_descent_keeps_the_best_so_far(scenario):

@@ -12,16 +12,15 @@ import tiny
 import tiny_city
 from commands import call
 
+import nmfd
 from cosim.plant.gates import DEFAULT_YELLOW_S
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
 from cosim.sumo.net import city_of
 from nmfd import faults
 from nmfd.api import load_scenario
-from nmfd.closed_loop import run
 from nmfd.controllers.rules import Constant
 from nmfd.errors import InputError
-from nmfd.model.plant import AcyclicPlant, NmfdPlant
 from nmfd.types import Controls
 
 STEPS = 8
@@ -51,7 +50,7 @@ class Diary(Constant):
 def driven(scenario, *ordered):
     """Exact accumulations (T, 2, 2), observed ones, and notes of a run with these faults."""
     diary = Diary(scenario)
-    result = run(NmfdPlant(scenario), diary, replace(scenario, faults=ordered), seed=0)
+    result = nmfd.run(replace(scenario, faults=ordered), diary)
     assert [m.step for m in diary.seen] == list(range(scenario.steps))
     return (
         result["accumulation"][:-1],
@@ -105,7 +104,7 @@ class Mad(Constant):
         return Controls(**arrays)
 
 
-@pytest.mark.parametrize("plant", [NmfdPlant, AcyclicPlant])
+@pytest.mark.parametrize("plant", ["nmfd", "acyclic"])
 @pytest.mark.parametrize(
     "wrong, at",
     [("perimeter", (0, 1)), ("splits", (1, 0, 0)), ("prices", (1,)), ("metering", (0,))],
@@ -119,7 +118,7 @@ def test_a_number_that_is_not_finite_is_named(scenario, plant, wrong, at, value)
         f"no-control: interval 3: {wrong}{list(at)}: expected a finite number, got {value} instead"
     )
     with pytest.raises(InputError, match=f"^{re.escape(expected)}$"):
-        run(plant(scenario), controller, scenario, seed=0)
+        nmfd.run(scenario, controller, plant=plant)
 
 
 @pytest.mark.parametrize(

@@ -5,17 +5,16 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import tiny
 
 from nmfd import api
 from nmfd.api import load_scenario
-from nmfd.closed_loop import run
 from nmfd.controllers.rules import filled
 from nmfd.errors import InputError
 from nmfd.metrics import summary
 from nmfd.model.planning import planning_model
-from nmfd.model.plant import NmfdPlant
 from nmfd.model.regional_model import RegionalModel
-from nmfd.types import Observation, Status
+from nmfd.types import Status
 
 SCENARIO = load_scenario("economic_mpc")
 NETWORK, CENTRE = SCENARIO.network, 3
@@ -26,9 +25,7 @@ def seen(vehicles, step=0):
     """A measurement with `vehicles` in the centre."""
     accumulation = np.zeros((7, 7))
     accumulation[CENTRE, 0] = vehicles
-    return Observation(
-        step=step, time=30.0 * step, accumulation=accumulation, backlog=np.zeros((7, 7))
-    )
+    return tiny.seen(accumulation, step)
 
 
 def gate(controls):
@@ -43,7 +40,7 @@ def with_options(**options):
 
 
 def test_benchmark_row():
-    trajectory = run(NmfdPlant(SCENARIO), api.controller("pi-gating", SCENARIO), SCENARIO, seed=0)
+    trajectory = api.run(SCENARIO, "pi-gating")
     row = summary(trajectory)
     assert row["total_time_spent_veh_s"] == pytest.approx(8.9e7, rel=0.02)
     assert row["final_accumulation_veh"] < 500.0
@@ -157,9 +154,7 @@ def test_every_protected_region_is_held_at_its_set_point():
     controller = api.controller("pi-gating", replace(with_options(**options), protected=(5, 3)))
     accumulation = np.zeros((7, 7))
     accumulation[5, 0], accumulation[3, 1] = 1200.0, 3300.0
-    controls = controller.act(
-        Observation(step=0, time=0.0, accumulation=accumulation, backlog=np.zeros((7, 7)))
-    )
+    controls = controller.act(tiny.seen(accumulation))
     for region, error in ((5, 200.0), (3, 300.0)):
         entries = controls.perimeter[NETWORK.adjacency[:, region], region]
         assert entries == pytest.approx(

@@ -12,7 +12,6 @@ from tiny import random_controls
 
 from nmfd import api
 from nmfd.api import load_scenario
-from nmfd.closed_loop import run
 from nmfd.controllers.mpc import controller as mpc
 from nmfd.controllers.mpc import edge_model
 from nmfd.controllers.mpc.controller import TOLERANCE
@@ -20,9 +19,8 @@ from nmfd.controllers.rules import Constant
 from nmfd.errors import InputError
 from nmfd.metrics import summary
 from nmfd.model import dynamics
-from nmfd.model.plant import NmfdPlant
 from nmfd.model.scenario import with_demand
-from nmfd.types import Controls, Observation, Status
+from nmfd.types import Controls, Status
 
 SCENARIO = load_scenario("economic_mpc")
 NETWORK = SCENARIO.network
@@ -33,16 +31,8 @@ BOTH = pytest.mark.parametrize("guidance", [False, True], ids=["pc", "pcrg"])
 def states():
     """Measurements of a run without control: its first 50 intervals, from empty to gridlock in the
     centre."""
-    trajectory = run(
-        NmfdPlant(SCENARIO),
-        api.controller("no-control", SCENARIO),
-        with_demand(SCENARIO, steps=50),
-        seed=0,
-    )
-    return [
-        Observation(step=k, time=30.0 * k, accumulation=x, backlog=np.zeros((7, 7)))
-        for k, x in enumerate(trajectory["accumulation"])
-    ]
+    trajectory = api.run(SCENARIO, "no-control", steps=50)
+    return [tiny.seen(x, k) for k, x in enumerate(trajectory["accumulation"])]
 
 
 def cost(controller, start, demand, plan):
@@ -107,7 +97,7 @@ def test_two_decisions_against_brute_force(tmp_path):
     scenario = load_scenario(tiny.write(tmp_path, network=network))
     controller = api.controller("mpc-pc", with_options(scenario, horizon=6))
     accumulation = np.array([[0.0, 900.0], [0.0, 330.0]])
-    measurement = Observation(step=0, time=0.0, accumulation=accumulation, backlog=np.zeros((2, 2)))
+    measurement = tiny.seen(accumulation)
     assert controller.act(measurement).status == Status.OK
     forecast, plan = controller.forecast(measurement), controller._plan
     assert plan.shape == (5, 2)  # u and the one share, 1
@@ -248,14 +238,7 @@ def test_wrong_options(options, problem):
     "guidance, most", [pytest.param(False, 1.381e8, id="pc"), pytest.param(True, 9.0e7, id="pcrg")]
 )
 def test_benchmark_row(guidance, most):
-    row = summary(
-        run(
-            NmfdPlant(SCENARIO),
-            api.controller("mpc-pcrg" if guidance else "mpc-pc", SCENARIO),
-            SCENARIO,
-            seed=0,
-        )
-    )
+    row = summary(api.run(SCENARIO, "mpc-pcrg" if guidance else "mpc-pc"))
     assert row["total_time_spent_veh_s"] < most
     assert row["solver_failures"] == 0
 
@@ -314,7 +297,7 @@ def test_a_decision_that_came_late_is_late_in_the_books(tmp_path):
         ),
         (api.controller("no-control", scenario), [Status.OK] * 3, ""),
     ):
-        trajectory = run(NmfdPlant(scenario), controller, scenario, seed=0)
+        trajectory = api.run(scenario, controller)
         assert list(trajectory["status"]) == [kind.value for kind in kinds]
         assert trajectory["note"][1] == note
         assert summary(trajectory)["late_decisions"] == kinds.count(Status.LATE)

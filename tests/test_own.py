@@ -15,7 +15,6 @@ import nmfd
 from nmfd.controllers import template
 from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
-from nmfd.types import Observation
 
 GOOD = tiny.CONTROLLER
 
@@ -26,10 +25,6 @@ def place(tmp_path, monkeypatch):
     tiny.write(tmp_path)
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-def observation(accumulation):
-    return Observation(step=0, time=0.0, accumulation=accumulation, backlog=0 * accumulation)
 
 
 def test_the_template_is_copied_runs_and_counts_in_the_fingerprint(place):
@@ -51,7 +46,7 @@ def test_the_template_holds_regions_at_their_set_points():
     controller = nmfd.controller(f"{template.__file__}:MyController", scenario)
     accumulation = np.zeros((7, 7))
     accumulation[3, 0] = 2 * scenario.network.mfds[3].critical
-    perimeter = controller.act(observation(accumulation)).perimeter
+    perimeter = controller.act(tiny.seen(accumulation)).perimeter
     entries = scenario.network.adjacency[:, 3]
     assert (perimeter[entries, 3] == scenario.network.u_min).all()
     assert (perimeter[3, entries] == scenario.network.u_max).all()
@@ -63,7 +58,7 @@ def test_it_has_a_table_of_its_own(place):
     assert command("new-controller mine.py").exit_code == 0
     controller = nmfd.controller("mine.py:MyController", place / "scenario")
     assert (
-        controller.act(observation(np.full((2, 2), 900.0))).perimeter[0, 1] == 0.9
+        controller.act(tiny.seen(np.full((2, 2), 900.0))).perimeter[0, 1] == 0.9
     )  # without gain nothing is held
 
 
@@ -75,7 +70,7 @@ def test_files_and_modules_beside_it(place):
         source.replace("class Mine:\n", 'class Mine:\n    files = ("weights.txt",)\n')
     )
     scenario, strategy = nmfd.load_scenario(place / "scenario"), parse("mine.py:Mine")
-    assert strategy.make(scenario).act(observation(np.zeros((2, 2)))).perimeter[0, 1] == 0.5
+    assert strategy.make(scenario).act(tiny.seen(np.zeros((2, 2)))).perimeter[0, 1] == 0.5
     before = strategy.fingerprint(scenario)
     (place / "weights.txt").write_text("2")
     assert strategy.fingerprint(scenario) != before

@@ -10,7 +10,6 @@ from commands import good, nmfd
 
 from cosim.evaluation.model_validation import expected_splits
 from cosim.plant.strategy import parse
-from nmfd import closed_loop
 from nmfd.api import load_scenario, run
 from nmfd.controllers.dpc.policy import Architecture, Policy
 from nmfd.controllers.dpc.rollout import Rollout
@@ -55,13 +54,13 @@ def test_a_trained_network_closes_the_loop_and_its_trips_wait(tmp_path):
     scenario = load_scenario(folder)
     scenario = replace(scenario, demand=6.0 * scenario.demand)
     controller = parse("dpc-pcrg").make(scenario)
-    run = closed_loop.run(NmfdPlant(scenario), controller, scenario, seed=0)
+    result = run(scenario, controller)
     expected = (
-        controller.policy.prices(torch.from_numpy(run["observed"][:-1]).float()).detach().numpy()
+        controller.policy.prices(torch.from_numpy(result["observed"][:-1]).float()).detach().numpy()
     )
-    np.testing.assert_allclose(run["prices"], expected, rtol=1e-4)
-    assert run["prices"].max() < 1.0
-    assert run["backlog"].max() > 1.0
+    np.testing.assert_allclose(result["prices"], expected, rtol=1e-4)
+    assert result["prices"].max() < 1.0
+    assert result["backlog"].max() > 1.0
 
 
 def test_the_lower_bound_without_metering_is_not_that_of_a_policy_that_meters():
@@ -110,11 +109,11 @@ def test_expected_splits_are_written_as_commanded_only_where_they_are_obeyed():
     rule = parse("pricing-rule(numbers=[1.0,1.0,0.0,9.0,0.0,0.0,0.6,1.5])")
     x = np.where(scenario.network.split_mask.any(axis=1), 50.0, 0.0)
     scenario = replace(scenario, initial=x)
-    obeyed = closed_loop.run(NmfdPlant(scenario), rule.make(scenario), scenario, seed=0)
+    obeyed = run(scenario, rule.make(scenario))
     assert "expected_splits" not in obeyed
     nominal = scenario.network.nominal_splits
     assert np.abs(obeyed["splits"][0] - nominal).max() > 0.1
-    answered = closed_loop.run(AnsweringPlant(scenario), rule.make(scenario), scenario, seed=0)
+    answered = run(scenario, rule.make(scenario), plant=AnsweringPlant(scenario))
     np.testing.assert_array_equal(answered["expected_splits"][0], obeyed["splits"][0])
     np.testing.assert_array_equal(answered["splits"][0], nominal)
     np.testing.assert_array_equal(expected_splits(answered), answered["expected_splits"])

@@ -24,10 +24,9 @@ from filelock import FileLock
 from trajectories import trajectory
 
 from cosim.plant.record import RECORD
-from nmfd import closed_loop, metrics
+from nmfd import api, metrics
 from nmfd.api import load_scenario
 from nmfd.errors import InputError, RunFailed
-from nmfd.model.plant import NmfdPlant
 from nmfd.runs import files
 from nmfd.runs import run_many as module
 from nmfd.runs.run_many import Run, finished_table, raise_failures, read_manifest, run_many
@@ -114,7 +113,7 @@ def test_decision_times_are_processor_times_of_all_threads(tmp_path):
             time.sleep(0.03)
             return Controls(perimeter=np.where(scenario.network.adjacency, 0.5, 0.0))
 
-    row = metrics.summary(closed_loop.run(NmfdPlant(scenario), Sleeper(), scenario, seed=0))
+    row = metrics.summary(api.run(scenario, Sleeper()))
     assert (
         row["control_step_ms_first"]
         == row["control_step_ms_max"]

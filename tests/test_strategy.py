@@ -12,7 +12,6 @@ from cosim.plant.strategy import WORDS, Word, parse, vocabulary
 from nmfd.controllers import strategy as regional
 from nmfd.controllers.strategy import ALONE, CONTROLLERS
 from nmfd.errors import InputError
-from nmfd.types import Observation
 
 
 @pytest.mark.parametrize(
@@ -246,6 +245,6 @@ def test_a_missing_policy_is_named(scenario):
 def test_controllers_are_made_from_arrays_of_their_own(scenario, name):
     controller, x = parse(name).make(scenario), np.full((2, 2), 100.0)
     controller.reset(1)
-    controls = controller.act(Observation(step=0, time=0.0, accumulation=x, backlog=0 * x))
+    controls = controller.act(tiny.seen(x))
     assert controls.perimeter.shape == (2, 2)
     assert not np.shares_memory(controls.perimeter, scenario.network.adjacency)

@@ -9,7 +9,7 @@ import numpy as np
 
 from nmfd.model.mfd import Mfd, PiecewiseLinear, trapezoid
 from nmfd.model.regional_model import RegionalModel
-from nmfd.types import Result
+from nmfd.types import Observation, Result
 
 NETWORK = """
 name = "{name}"
@@ -138,6 +138,16 @@ def random_controls(random, network, batch=()):
     splits = random.uniform(size=(*shape, network.regions)) ** 3 * network.split_mask
     sums = splits.sum(axis=-2, keepdims=True)
     return perimeter, splits / np.where(sums > 0, sums, 1.0)
+
+
+def seen(accumulation, step: int = 0) -> Observation:
+    """What is measured of (R, R) vehicles, with nobody outside."""
+    return Observation(
+        step=step,
+        time=30.0 * step,
+        accumulation=accumulation,
+        backlog=np.zeros_like(accumulation),
+    )
 
 
 def made(**fields) -> Result:
