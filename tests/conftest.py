@@ -88,6 +88,16 @@ def scenario(folder):
 
 
 @pytest.fixture
+def three_regions(tmp_path):
+    """The tiny scenario with three regions in a row."""
+    import tiny  # not before annotations are checked
+
+    from nmfd.api import load_scenario
+
+    return load_scenario(tiny.write(tmp_path, network=tiny.row_network(3)))
+
+
+@pytest.fixture
 def plant_of(scenario):
     """Plants of a module's scenario that are closed in any case: SUMO allows one session per
     process."""

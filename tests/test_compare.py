@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import tiny
 import torch
 import trajectories
 
@@ -217,25 +216,26 @@ def test_an_empty_region_keeps_its_model_in_identification(scenario, result):
     assert (kept.storage[1:] == 10.0).all()
 
 
-def test_the_regions_to_protect_are_proposed_and_written(tmp_path):
-    loaded = load_scenario(tiny.write(tmp_path, network=tiny.row_network(3)))
-    file = loaded.folder / "scenario.toml"
+def test_the_regions_to_protect_are_proposed_and_written(three_regions):
+    file = three_regions.folder / "scenario.toml"
     before = file.read_text()
-    assert identify._proposal(loaded, (), written=True) == []
-    assert identify._proposal(loaded, (1,), written=True) == []
-    (line,) = identify._proposal(loaded, (0, 2), written=False)
+    assert identify._proposal(three_regions, (), written=True) == []
+    assert identify._proposal(three_regions, (1,), written=True) == []
+    (line,) = identify._proposal(three_regions, (0, 2), written=False)
     assert "protected = [0, 2] instead of [1] in" in line
     assert file.read_text() == before
-    identify.write_protected(loaded, (0, 2))
+    identify.write_protected(three_regions, (0, 2))
     assert file.read_text() == before.replace("protected = [1]", "protected = [0, 2]")
     file.write_text(before.replace("protected = [1]\n", ""))
-    identify.write_protected(loaded, (2,))
-    assert load_scenario(loaded.folder).protected == (2,)
+    identify.write_protected(three_regions, (2,))
+    assert load_scenario(three_regions.folder).protected == (2,)
 
 
-def test_the_same_command_goes_on_after_ctrl_c_in_the_second_model(tmp_path, monkeypatch):
+def test_the_same_command_goes_on_after_ctrl_c_in_the_second_model(
+    tmp_path, three_regions, monkeypatch
+):
     """Until its end the command changes nothing that its loading runs depend on."""
-    folder = tiny.write(tmp_path, network=tiny.row_network(3))
+    folder = three_regions.folder
     before = (folder / "scenario.toml").read_text()
     verdict = SimpleNamespace(protect=(0, 2), sentences=("Yes.",))
     found = SimpleNamespace(verdict=verdict, write=lambda out, target: None, text=lambda: "")

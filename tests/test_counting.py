@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
-import tiny
 import torch
 
 import nmfd
@@ -179,13 +178,12 @@ def test_mpc_solves_its_plans_on_a_counted_model(truth, runs):
     assert (result["status"] == 0).all()
 
 
-def test_a_model_worse_than_as_now_is_refused(tmp_path):
-    scenario = load_scenario(tiny.write(tmp_path, network=tiny.row_network(3)))
-    poor = replace(scenario, network=replace(scenario.network, held_out=WORSE))
+def test_a_model_worse_than_as_now_is_refused(tmp_path, three_regions):
+    poor = replace(three_regions, network=replace(three_regions.network, held_out=WORSE))
     worse = r"beyond critical its error is 7 veh, of 6; .*--anyway"
     with pytest.raises(InputError, match=worse):
         check(poor, parse("dpc-pc"))
-    check(scenario, parse("dpc-pc"))
+    check(three_regions, parse("dpc-pc"))
     with pytest.raises(InputError, match="predicts worse.*; set anyway = true to plan with it"):
         parse("mpc-pc").make(poor)
     forced = parse(EconomicMpc(anyway=True))
@@ -193,7 +191,7 @@ def test_a_model_worse_than_as_now_is_refused(tmp_path):
     assert forced.name == "mpc-pc(anyway=true)"  # in all tables of results
     assert "beyond critical" in forced.model_warning(poor)
     assert parse("pi-gating").model_warning(poor) == ""
-    assert parse("mpc-pc").model_warning(scenario) == ""
+    assert parse("mpc-pc").model_warning(three_regions) == ""
     assert isinstance(EconomicMpc().misfit(parse("no-control").own_planning(poor)), Problem)
     file = train(poor, parse("dpc-pc"), seed=0, out=tmp_path / "p.pt", steps=1, anyway=True)
     known = torch.load(file, weights_only=True)["configuration"]
