@@ -7,17 +7,19 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
+import tiny
 import trajectories
 
+import nmfd
 from cosim.evaluation import identify, model_validation
 from cosim.evaluation.identify import as_it_was, static_model
 from cosim.evaluation.model_validation import observed, outflow_samples, predict
 from cosim.plant.strategy import parse
 from nmfd.api import load_scenario
-from nmfd.model import dynamics, mfd
+from nmfd.model import mfd
 from nmfd.model.mfd import held_up
 from nmfd.studies.fit_quality import fit_table, nearly_empty, predictions, region_fits, with_guesses
+from nmfd.types import Controls
 
 
 @pytest.fixture(scope="module")
@@ -30,40 +32,20 @@ def result(scenario):
     """A run of the regional model under random controls, recorded as if it were the
     microsimulation."""
     random, network = np.random.default_rng(0), scenario.network
-    p, x = dynamics.parameters(network), torch.zeros((7, 7), dtype=torch.float64)
-    states, perimeter, crossings, arrivals = [x.numpy()], [], [], []
-    splits = torch.from_numpy(network.nominal_splits)
-    for k in range(scenario.steps):
-        u = (
-            random.uniform(network.u_min, network.u_max, 7)[:, None] * network.adjacency
-        )  # one u per region, see below
-        completions, transfers = dynamics.flows(p, x, torch.from_numpy(u), splits)
-        x = dynamics.advance(
-            p, x, torch.from_numpy(scenario.demand[k]), torch.from_numpy(u), splits, scenario.step
-        )
-        states.append(x.numpy())
-        perimeter.append(u)
-        crossings.append(scenario.step * transfers.numpy())
-        arrivals.append(scenario.step * completions.numpy())
-    trajectory = trajectories.made(
-        controller="random",
-        plant="sumo",
-        seed=0,
-        step=scenario.step,
-        accumulation=np.stack(states),
-        backlog=np.zeros((scenario.steps + 1, 7, 7)),
-        completed=np.zeros(scenario.steps + 1),
-        perimeter=np.stack(perimeter),
-        splits=np.repeat(network.nominal_splits[None], scenario.steps, axis=0),
-    )
+
+    def gates(_):
+        """One u per region, see below."""
+        u = random.uniform(network.u_min, network.u_max, 7)
+        return Controls(perimeter=u[:, None] * network.adjacency)
+
+    run = nmfd.run(scenario, tiny.Acting(gates))
+    completions, transfers = trajectories.flows(scenario, run)
     record = {
         "departures": scenario.step * scenario.demand,
-        "crossings": crossings,
-        "arrivals": arrivals,
+        "crossings": scenario.step * transfers,
+        "arrivals": scenario.step * completions,
     }
-    return trajectories.recorded(
-        trajectory, {name: np.stack(values) for name, values in record.items()}, {}
-    )
+    return trajectories.recorded(run, record, {})
 
 
 def test_a_perfect_model_has_no_error(scenario, result):

@@ -6,7 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
+import tiny
 import torch
+import trajectories
 
 import nmfd
 from cosim.evaluation import identify
@@ -18,12 +20,13 @@ from nmfd.controllers.mpc.controller import EconomicMpc
 from nmfd.controllers.strategy import parse
 from nmfd.controllers.training import check, train
 from nmfd.errors import InputError
-from nmfd.model import dynamics
 from nmfd.model.counting import counted, mfd_of
 from nmfd.model.identification import Observed, prediction_errors
 from nmfd.model.mfd import RoundedLinear, trapezoid
 from nmfd.model.regional_model import Errors, HeldOut, load_network, network_toml
+from nmfd.model.scenario import Scenario
 from nmfd.runs.config import Problem
+from nmfd.types import Controls
 
 SCHEME = {"step": 30.0, "substeps": 1, "integrator": "euler"}
 STEPS = 160
@@ -48,36 +51,23 @@ def truth():
     )
 
 
-def drive(network, factor, seed, steps=STEPS):
+def drive(network, factor, seed):
     """Return a run of the regional model under random gates, with what left each region."""
     random = np.random.default_rng(seed)
-    p = dynamics.parameters(network)
-    splits = torch.from_numpy(network.nominal_splits)
-    wave = np.sin(np.linspace(0.0, np.pi, steps)) ** 2
+    wave = np.sin(np.linspace(0.0, np.pi, STEPS)) ** 2
     demand = factor * random.uniform(0.02, 0.1, (7, 7)) * wave[:, None, None]
-    x = torch.zeros((7, 7), dtype=torch.float64)
-    states = [x.numpy()]
-    gates = []
-    exits = []
-    crossings = []
-    for k in range(steps):
-        gate = random.uniform(0.6, 0.9) * network.adjacency
-        completions, transfers = dynamics.flows(p, x, torch.from_numpy(gate), splits)
-        left = transfers.sum(1) + torch.diag_embed(completions)
-        x = dynamics.advance(
-            p, x, torch.from_numpy(demand[k]), torch.from_numpy(gate), splits, 30.0
-        )
-        states.append(x.numpy())
-        gates.append(gate)
-        exits.append(30.0 * left.numpy())
-        crossings.append(30.0 * transfers.sum(2).numpy())
+    scenario = Scenario(name="driven", network=network, step=30.0, steps=STEPS, demand=demand)
+    gates = tiny.Acting(lambda _: Controls(perimeter=random.uniform(0.6, 0.9) * network.adjacency))
+    run = nmfd.run(scenario, gates)
+    completions, transfers = trajectories.flows(scenario, run)
+    left = transfers.sum(axis=2) + completions[:, :, None] * np.eye(7)
     return Observed(
-        accumulation=np.stack(states),
+        accumulation=run["accumulation"],
         demand=demand,
-        perimeter=np.stack(gates),
-        splits=np.repeat(network.nominal_splits[None], steps, axis=0),
-        crossings=np.stack(crossings),
-        exits=np.stack(exits),
+        perimeter=run["perimeter"],
+        splits=run["splits"],
+        crossings=30.0 * transfers.sum(axis=3),
+        exits=30.0 * left,
     )
 
 
