@@ -1,12 +1,14 @@
-"""Commands, called in this process as a user calls them."""
+"""Commands, called in this process as a user calls them, and what is said of wrong input."""
 
 from functools import partial
 from pathlib import Path
 
+import pytest
 from click.testing import CliRunner, Result
 
 import cosim.cli
 import nmfd.cli
+from nmfd.errors import InputError
 from nmfd.types import Result as Run
 
 MAINS = {"nmfd": nmfd.cli.main, "cosim": cosim.cli.main}
@@ -51,3 +53,11 @@ def error_line(result: Result, program: str = "cosim") -> str:
         result.stderr
     )
     return line
+
+
+def problem(read, *arguments, **options) -> str:
+    """Return the one line of the InputError that `read` raises."""
+    with pytest.raises(InputError) as caught:
+        read(*arguments, **options)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)

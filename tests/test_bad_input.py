@@ -17,14 +17,13 @@ import pytest
 import tiny
 import tiny_city
 import torch
-from commands import call, cosim, error_line, good, nmfd
+from commands import call, cosim, error_line, good, nmfd, problem
 
 from cosim.plant.settings import settings
 from cosim.sumo.recorded_trips import read_recorded_trips
 from nmfd.api import load_scenario
 from nmfd.controllers.dpc.policy import Architecture, Policy
 from nmfd.controllers.dpc.policy_file import checkpoint
-from nmfd.errors import InputError
 from nmfd.model.regional_model import load_network
 
 ROOT = Path(__file__).parents[1]
@@ -39,14 +38,6 @@ SCENARIO_KEYS = (
     *(("demand", key) for key in ("from", "to", "start", "peak", "ramp_up", "flat", "ramp_down")),
 )
 NETWORK_KEYS = (("", "name"), ("perimeter", "min"), ("mfd", "a"), ("regions", "adjacent"))
-
-
-def problem(read, *arguments) -> str:
-    """Return the one line of the InputError that `read` raises."""
-    with pytest.raises(InputError) as caught:
-        read(*arguments)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
 
 
 def params(cases):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from commands import problem
 
 import nmfd
 from nmfd import api
@@ -110,16 +111,11 @@ def test_a_policy_file_gives_the_policy_back(tmp_path, guidance):
     assert content["configuration"] == {"seed": 0}
 
 
-def one_line(caught, path):
-    assert str(caught.value).startswith(f"{path}: ")
-    assert "\n" not in str(caught.value)
-
-
 def test_a_policy_for_another_network_is_refused(tmp_path, scenario):
     path = saved(tmp_path / "p.pt", policy(guidance=False), NETWORK)
-    with pytest.raises(InputError, match="trained for network 'hexagon7'") as caught:
-        load_policy(path, scenario.network)
-    one_line(caught, path)
+    line = problem(load_policy, path, scenario.network)
+    assert line.startswith(f"{path}: ")
+    assert "trained for network 'hexagon7'" in line
     wider = replace(NETWORK, u_max=1.0)
     with pytest.raises(InputError, match="network_hash"):
         load_policy(path, wider)
@@ -129,9 +125,9 @@ def test_a_policy_of_the_other_kind_is_refused(tmp_path, scenario):
     path = saved(
         tmp_path / "p.pt", policy(guidance=False, network=scenario.network), scenario.network
     )
-    with pytest.raises(InputError, match="dpc-pc policy, not dpc-pcrg") as caught:
-        load(path, planning_model(scenario), guidance=True)
-    one_line(caught, path)
+    line = problem(load, path, planning_model(scenario), guidance=True)
+    assert line.startswith(f"{path}: ")
+    assert "dpc-pc policy, not dpc-pcrg" in line
 
 
 def weights(path):
@@ -175,9 +171,9 @@ def test_what_is_no_state_of_a_training_cannot_be_resumed(tmp_path, train, conte
         (tmp_path / "p.pt.resume").write_bytes(content)
     else:
         torch.save(content, tmp_path / "p.pt.resume")
-    with pytest.raises(InputError, match="is no state of a training; train without") as caught:
-        train(steps=4, resume=True)
-    one_line(caught, tmp_path / "p.pt.resume")
+    line = problem(train, steps=4, resume=True)
+    assert line.startswith(f"{tmp_path / 'p.pt.resume'}: ")
+    assert "is no state of a training; train without" in line
 
 
 def test_a_policy_cannot_be_resumed(tmp_path, train):
@@ -246,7 +242,7 @@ def test_the_device_is_the_gpu_where_there_is_one(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "controller, options, problem",
+    "controller, options, expected",
     [
         ("dpc-pc", {"widht": 3}, "widht: unknown key"),
         ("dpc-pc", {"steps": 0}, "steps: should be greater"),
@@ -282,9 +278,9 @@ def test_the_device_is_the_gpu_where_there_is_one(monkeypatch):
         ),
     ],
 )
-def test_wrong_training_settings(scenario, controller, options, problem):
+def test_wrong_training_settings(scenario, controller, options, expected):
     wrong = replace(scenario, protected=(), controller_options={controller: options})
-    with pytest.raises(InputError, match=f"controllers.{controller}.{problem}"):
+    with pytest.raises(InputError, match=f"controllers.{controller}.{expected}"):
         training.settings(wrong, parse(controller))
 
 

@@ -20,6 +20,7 @@ import pytest
 import tiny
 import trajectories
 import xarray as xr
+from commands import problem
 from filelock import FileLock
 from trajectories import trajectory
 
@@ -132,9 +133,7 @@ def test_what_is_no_run_is_one_line(tmp_path, damage):
         file.write_bytes(
             {"cut off": whole[: len(whole) // 2], "empty": b"", "a table": b"a,b\n1,2\n"}[damage]
         )
-    with pytest.raises(InputError, match=r"a\.nc: (no such run|is no run)") as error:
-        Result.read(file)
-    assert "\n" not in str(error.value)
+    assert re.search(r"a\.nc: (no such run|is no run)", problem(Result.read, file))
 
 
 def test_atomic_write_leaves_the_old_file_when_interrupted(tmp_path):
@@ -238,9 +237,8 @@ def test_files_that_are_no_runs_are_left_alone(tmp_path, capsys):
 def test_a_damaged_manifest_is_one_line(tmp_path, content):
     run_many([run_of()], tmp_path / "out", workers=0)
     (tmp_path / "out" / "manifest.json").write_text(content)
-    with pytest.raises(InputError, match="manifest.json: is no manifest of runs, or damaged") as e:
-        run_many([run_of()], tmp_path / "out", workers=0)
-    assert "\n" not in str(e.value)
+    line = problem(run_many, [run_of()], tmp_path / "out", workers=0)
+    assert "manifest.json: is no manifest of runs, or damaged" in line
 
 
 def test_a_name_that_no_file_can_have_is_refused_before_the_runs(tmp_path):
