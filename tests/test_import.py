@@ -50,7 +50,7 @@ def test_traffic_keeps_cars_and_leaves_the_rest_alone(config):
     case = read_sumo_input(config)
     assert case.begin == 600.0
     assert case.end == 1500.0
-    traffic = read_traffic(case, read_streets(case.net, case.additional), seed=0)
+    traffic = tiny_city.traffic_of(config)
     ids = [vehicle.get("id") for vehicle in traffic.vehicles]
     assert len(set(ids)) == len(ids)
     assert {"round", "stops", "short"} <= set(ids)
@@ -144,8 +144,7 @@ def test_import_is_deterministic_and_atomic(imported, config, tmp_path):
 
 def test_scenario_drives_the_original_vehicles(imported, config):
     scenario = load_scenario(imported[0] / "scenarios" / "tiny")
-    case = read_sumo_input(config)
-    traffic = read_traffic(case, read_streets(case.net, case.additional), seed=0)
+    traffic = tiny_city.traffic_of(config)
     assert scenario.demand.sum() * scenario.step == pytest.approx(len(traffic.vehicles), rel=1e-4)
     assert settings(scenario).begin == 600.0
     assert settings(scenario).ways_return

@@ -12,7 +12,6 @@ from tiny_city import driven
 
 from cosim.api import run as cosim_run
 from cosim.importing.case import read_sumo_input
-from cosim.importing.demand import read_traffic
 from cosim.importing.importer import import_city
 from cosim.importing.quality import left_alone
 from cosim.importing.streets import read_streets
@@ -53,11 +52,6 @@ def project(tmp_path_factory):
     folder = tmp_path_factory.mktemp("project")
     tiny_city.imported(folder)
     return folder
-
-
-def traffic_of(config):
-    case = read_sumo_input(config)
-    return read_traffic(case, read_streets(case.net, case.additional), seed=0)
 
 
 def imported(source, out=None, **options):
@@ -296,7 +290,10 @@ def test_what_else_changes_routes_and_vehicles(city, tmp_path, monkeypatch):
     )
     text, scenario = imported(config)
     assert " 1 without a route or a free lane" in text
-    assert {element.get("id") for element in traffic_of(config).vehicles} >= {"begins", "shut"}
+    assert {element.get("id") for element in tiny_city.traffic_of(config).vehicles} >= {
+        "begins",
+        "shut",
+    }
     _, departed, arrived, inside, _ = driven(scenario, 5, 0.4, rerouting=0.5)
     assert departed - arrived == inside
     assert departed > 40
@@ -434,7 +431,7 @@ def test_sumos_own_words_in_one_line(city, capfd):
 def test_speeds_and_coordinates(city):
     """A fixed speed is deadly before a signal under control; trips between coordinates are
     driven."""
-    traffic = traffic_of(
+    traffic = tiny_city.traffic_of(
         city(
             '<trip id="a" depart="1" from="A1B1" to="C1D1" departSpeed="13.9"/>'
             '<trip id="b" depart="1" fromXY="1,1" toXY="9,9"/>'

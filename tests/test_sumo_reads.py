@@ -288,10 +288,9 @@ def test_vehicles_of_a_loaded_state_begin_where_they_are(tmp_path):
     saving = "--end 51 --save-state.times 50 --save-state.files"
     tiny_city.run("sumo", "-c", config, saving, state)
     config.write_text(config.read_text().replace("<end", '<load-state value="state.xml"/><end'))
-    case = read_sumo_input(config)
-    traffic = read_traffic(case, read_streets(case.net, case.additional), seed=0)
+    traffic = tiny_city.traffic_of(config)
     placed = [vehicle for vehicle in traffic.vehicles if float(vehicle.get("depart")) == 50.0]
-    assert case.begin == 50.0
+    assert read_sumo_input(config).begin == 50.0
     assert {"trip", "via", "period.0"} <= {vehicle.get("id") for vehicle in placed}
     assert all(vehicle.get("departLane") in "01" and vehicle.get("departPos") for vehicle in placed)
     assert len(traffic.vehicles) == len(plain(config)) == 11
@@ -317,8 +316,7 @@ def test_what_is_left_out_is_said_first_and_last(tmp_path):
 
 
 def read(config):
-    case = read_sumo_input(config)
-    return read_traffic(case, read_streets(case.net, case.additional), seed=0)
+    return tiny_city.traffic_of(config)
 
 
 RIDE = '<person id="p{0}" depart="1"><ride from="A1B1" to="B1C1" lines="{0}"/></person>'

@@ -5,20 +5,23 @@ import gzip
 import shutil
 import subprocess
 from atexit import register
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
 from types import SimpleNamespace
+from xml.etree.ElementTree import parse
 
 import numpy as np
 import sumo
 from commands import words
 from scipy.sparse.csgraph import connected_components
 
+from cosim.importing.case import read_sumo_input
+from cosim.importing.demand import Traffic, read_traffic
 from cosim.importing.importer import import_city
-from cosim.importing.streets import Streets, graph
+from cosim.importing.streets import Streets, graph, read_streets
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
 from nmfd.model.scenario import Scenario, with_demand
@@ -86,6 +89,15 @@ def _grid(options: tuple[str, ...]) -> bytes:
         return file.read_bytes()
 
 
+def regions(net: Path, region_of: Callable[[str], int]) -> Path:
+    """The table of regions of all edges of a network, beside it."""
+    edges = [edge.get("id") for edge in parse(net).iterfind("edge") if not edge.get("function")]
+    file = net.with_name("regions.csv")
+    lines = (f"{edge},{region_of(edge)}\n" for edge in sorted(edges))
+    file.write_text("edge,region\n" + "".join(lines))
+    return file
+
+
 def pieces(streets: Streets, members: np.ndarray) -> int:
     """Number of parts into which some edges fall by the connections between them."""
     numbers = np.cumsum(members) - 1
@@ -102,6 +114,12 @@ def city(folder: Path, *options: str) -> Path:
         stream.write(CARS)
     (folder / "city.sumocfg").write_text(CONFIG)
     return folder / "city.sumocfg"
+
+
+def traffic_of(config: Path) -> Traffic:
+    """What an import reads of a city's vehicles."""
+    case = read_sumo_input(config)
+    return read_traffic(case, read_streets(case.net, case.additional), seed=0)
 
 
 def imported(folder: Path, regions: int = 3, source: Path | None = None, **options) -> Path:
