@@ -45,11 +45,11 @@ def test_the_trips_give_the_counts(city, tmp_path):
         numbers = tuple(streets.number[edge] for edge in edges)
         ways[numbers, numbers[-1]] += 1
     assert {edge: passed[edge] for edge in COUNTS} == pytest.approx(COUNTS, abs=3)
-    baseline = Baseline(presence=np.zeros((1, 1)), ways=ways, teleports=0, waiting=0, running=0)
+    baseline = Baseline(presence=np.zeros((1, 1)), ways=ways)
     expected = "counts: 100% of 3 streets have a GEH below 5 by the sampled routes, 100% in the run"
     assert found.text(streets, baseline).startswith(expected)
     stuck = {((), 0): 9}  # on their first street
-    nobody = Baseline(presence=np.zeros((1, 1)), ways=stuck, teleports=0, waiting=0, running=0)
+    nobody = Baseline(presence=np.zeros((1, 1)), ways=stuck)
     assert "0% in the run without control; WARNING" in found.text(streets, nobody)
 
 

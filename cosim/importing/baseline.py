@@ -64,9 +64,9 @@ class Baseline:
 
     presence: Float[np.ndarray, "K E"]
     ways: Mapping[Way, int]
-    teleports: int
-    waiting: int
-    running: int
+    teleports: int = 0
+    waiting: int = 0
+    running: int = 0
     dropped: int = 0
     removed: int = 0
     slowness: float = np.nan
