@@ -164,7 +164,7 @@ def test_mpc_solves_its_plans_on_a_counted_model(truth, runs):
     """Kinks are rounded: at sharp ones the solver of MPC stops."""
     scenario = load_scenario("economic_mpc")
     city = replace(scenario, network=count(truth, runs), measurement_std=0.0)
-    result = nmfd.run(city, "mpc-pc", steps=40, progress=False)
+    result = nmfd.run(city, "mpc-pc", steps=40)
     assert (result["status"] == 0).all()
 
 

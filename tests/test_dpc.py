@@ -212,7 +212,7 @@ def test_torch_s_default_dtype_changes_nothing(
         default_dtype(dtype)
         out = tmp_path / f"{dtype}.pt"
         files.append(train(controller, on=chosen, out=out, steps=2))
-        runs.append(nmfd.run(chosen, controller, policy=out, progress=False))
+        runs.append(nmfd.run(chosen, controller, policy=out))
     assert files[0].read_bytes() == files[1].read_bytes()
     np.testing.assert_array_equal(runs[0].perimeter, runs[1].perimeter)
     np.testing.assert_array_equal(runs[0].accumulation, runs[1].accumulation)

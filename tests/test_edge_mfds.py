@@ -157,7 +157,7 @@ def test_the_accumulations_are_those_of_the_run(tmp_path, junctions):
     options = f'freq="90" withInternal="{junctions}" file="{output}"'
     measure.write_text(f'<additional><edgeData id="a" {options}/></additional>')
     scenario = load_scenario("demo", {"sumo.additional": [str(measure)], "steps": 12})
-    run = api.run(scenario, "no-control", seed=1000, progress=False)
+    run = api.run(scenario, "no-control", seed=1000)
     net, regions = city_files(scenario.network)
     found = api.mfd(net, output, regions=regions, out=tmp_path / "out")
     columns = ["accumulation_veh", "production_veh_km_h"]

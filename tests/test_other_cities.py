@@ -175,7 +175,7 @@ def test_private_trips_are_those_of_the_demand(city):
     bus = '<vehicle id="b" line="1" depart="1"><route edges="A1B1 B1C1"/></vehicle>'
     text, scenario = imported(city(FLOW + bus + PERSONS, MADE, '<end value="600"/>'))
     assert "60 vehicles in" in text
-    run = cosim_run(scenario, "no-control", seed=0, progress=False)
+    run = cosim_run(scenario, "no-control", seed=0)
     assert run.trips == 60
     assert run.removed_veh == run.removed_waiting_veh == run.given_up.sum() == 0
     assert run.completed_veh == run.completed[-1] == run.private_arrivals.sum() == 60

@@ -266,7 +266,7 @@ def drive_and_compare(config, ended):
     report = imported(config)
     tmp_path = config.parent
     out = tmp_path / "t.xml"
-    run(tmp_path / "scenarios" / "x", "no-control", seed=0, tripinfo=out, progress=False)
+    run(tmp_path / "scenarios" / "x", "no-control", seed=0, tripinfo=out)
     keys = ("depart", "arrival", "routeLength", "departLane", "arrivalLane", "timeLoss")
     mine, alone = (
         {name: [trip[key] for key in keys] for name, trip in t.items()}
@@ -295,7 +295,7 @@ def test_vehicles_of_a_loaded_state_begin_where_they_are(tmp_path):
     assert all(vehicle.get("departLane") in "01" and vehicle.get("departPos") for vehicle in placed)
     assert len(traffic.vehicles) == len(plain(config)) == 11
     imported(config)
-    result = run(tmp_path / "scenarios" / "x", "no-control", seed=0, progress=False)
+    result = run(tmp_path / "scenarios" / "x", "no-control", seed=0)
     assert result["departures"].sum() == 11
 
 
