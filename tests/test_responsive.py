@@ -15,11 +15,8 @@ from signal_rules import MIN_GREEN, watched
 
 from cosim.importing.importer import import_city
 from cosim.plant.gates import DEFAULT_YELLOW_S
-from cosim.plant.plant import SumoPlant
-from cosim.plant.settings import settings
 from nmfd.api import load_scenario
 from nmfd.model.scenario import with_demand
-from nmfd.types import Controls
 
 CONFIG = """<configuration>
   <input><net-file value="city.net.xml"/><route-files value="cars.rou.xml"/></input>
@@ -66,14 +63,11 @@ def drive(folder, gates, faults=(), **overrides):
     """A run under u = gates[k] in interval k: what every signal shows second by second, and
     more."""
     scenario = replace(with_demand(load_scenario(folder), steps=len(gates)), faults=tuple(faults))
-    plant = SumoPlant(
-        scenario, settings=settings(scenario).changed(**({"chain_limit": 0.0} | overrides))
-    )
-    try:
+    with tiny_city.plant_of(scenario, **({"chain_limit": 0.0} | overrides)) as plant:
         plant.reset(1)
         shown = watched(plant)
         for gate in gates:
-            plant.step(Controls(perimeter=np.where(scenario.network.adjacency, gate, 0.0)))
+            plant.step(tiny.gates_at(scenario, gate))
         return SimpleNamespace(
             shown=shown,
             record=SimpleNamespace(**plant.record()),
@@ -81,8 +75,6 @@ def drive(folder, gates, faults=(), **overrides):
             gateways=plant.city.gateways,
             programmes={name: plant.session.programme_id(name) for name in shown},
         )
-    finally:
-        plant.close()
 
 
 def test_gateways_of_actuated_signals_are_controlled(town):

@@ -31,7 +31,7 @@ from nmfd.errors import InputError, RunFailed
 from nmfd.runs import files
 from nmfd.runs import run_many as module
 from nmfd.runs.run_many import Run, finished_table, raise_failures, read_manifest, run_many
-from nmfd.types import VARIABLES, Controls, Result
+from nmfd.types import VARIABLES, Result
 
 
 def test_a_result_is_read_as_it_was_written(tmp_path):
@@ -112,7 +112,7 @@ def test_decision_times_are_processor_times_of_all_threads(tmp_path):
                 thread.start()
                 thread.join()
             time.sleep(0.03)
-            return Controls(perimeter=np.where(scenario.network.adjacency, 0.5, 0.0))
+            return tiny.gates_at(scenario, 0.5)
 
     row = metrics.summary(api.run(scenario, Sleeper()))
     assert (

@@ -9,7 +9,8 @@ import numpy as np
 
 from nmfd.model.mfd import Mfd, PiecewiseLinear, trapezoid
 from nmfd.model.regional_model import RegionalModel
-from nmfd.types import Observation, Result
+from nmfd.model.scenario import Scenario
+from nmfd.types import Controls, Observation, Result
 
 NETWORK = """
 name = "{name}"
@@ -148,6 +149,11 @@ def seen(accumulation, step: int = 0) -> Observation:
         accumulation=accumulation,
         backlog=np.zeros_like(accumulation),
     )
+
+
+def gates_at(scenario: Scenario, u: float) -> Controls:
+    """All gates at u."""
+    return Controls(perimeter=np.where(scenario.network.adjacency, u, 0.0))
 
 
 def made(**fields) -> Result:

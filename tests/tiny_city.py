@@ -7,6 +7,7 @@ import subprocess
 from atexit import register
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
@@ -17,6 +18,7 @@ import numpy as np
 import sumo
 from commands import words
 from scipy.sparse.csgraph import connected_components
+from tiny import gates_at
 
 from cosim.importing.case import read_sumo_input
 from cosim.importing.demand import Traffic, read_traffic
@@ -25,7 +27,6 @@ from cosim.importing.streets import Streets, graph, read_streets
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
 from nmfd.model.scenario import Scenario, with_demand
-from nmfd.types import Controls
 
 CONFIG = """<configuration>
   <input><net-file value="city.net.xml"/><route-files value="cars.rou.xml.gz,buses.rou.xml"/>
@@ -152,19 +153,26 @@ class Record(SimpleNamespace):
 
 
 @contextmanager
+def plant_of(scenario: Scenario, **overrides) -> Iterator[SumoPlant]:
+    """The plant of a scenario with other settings, closed at the end."""
+    plant = SumoPlant(scenario, settings=settings(scenario).changed(**overrides))
+    try:
+        yield plant
+    finally:
+        plant.close()
+
+
+@contextmanager
 def played(
     scenario: Scenario, intervals: int, gates: float, splits: np.ndarray | None = None, **overrides
 ) -> Iterator:
     """A plant after so many intervals with all u at `gates`, its state and its record; the ledger
     is checked in every interval."""
     scenario = with_demand(scenario, steps=max(intervals, 1))
-    plant = SumoPlant(scenario, settings=settings(scenario).changed(**overrides))
-    controls = Controls(perimeter=np.where(scenario.network.adjacency, gates, 0.0), splits=splits)
-    try:
+    controls = replace(gates_at(scenario, gates), splits=splits)
+    with plant_of(scenario, **overrides) as plant:
         states = [plant.reset(0), *(plant.step(controls) for _ in range(intervals))]
         yield plant, states[-1], Record(**plant.record()) if intervals else None
-    finally:
-        plant.close()
 
 
 def driven(scenario: Scenario, intervals: int, gates: float, **overrides) -> tuple:
