@@ -46,6 +46,11 @@ def imported(config, tmp_path_factory):
     return project, text
 
 
+@pytest.fixture
+def scenario(imported):
+    return load_scenario(imported[0] / "scenarios" / "tiny")
+
+
 def test_traffic_keeps_cars_and_leaves_the_rest_alone(config):
     case = read_sumo_input(config)
     assert case.begin == 600.0
@@ -142,8 +147,7 @@ def test_import_is_deterministic_and_atomic(imported, config, tmp_path):
     assert "exists; choose another name" in error_line(cosim(*command))
 
 
-def test_scenario_drives_the_original_vehicles(imported, config):
-    scenario = load_scenario(imported[0] / "scenarios" / "tiny")
+def test_scenario_drives_the_original_vehicles(scenario, config):
     traffic = tiny_city.traffic_of(config)
     assert scenario.demand.sum() * scenario.step == pytest.approx(len(traffic.vehicles), rel=1e-4)
     assert settings(scenario).begin == 600.0
@@ -204,8 +208,7 @@ def test_signals_that_are_left_alone(config, tmp_path):
     assert settings(scenario).leave_signals == ("C2",)
 
 
-def test_mesoscopic_models_keep_the_ledger_and_differ(imported):
-    scenario = load_scenario(imported[0] / "scenarios" / "tiny")
+def test_mesoscopic_models_keep_the_ledger_and_differ(scenario):
     crossings = []
     for model in (True, "ltm"):
         with tiny_city.played(scenario, 8, 0.5, mesoscopic=model) as (_, _, record):
@@ -217,8 +220,7 @@ def test_mesoscopic_models_keep_the_ledger_and_differ(imported):
 
 
 @pytest.mark.parametrize("key, value", [("signals", "max-pressure"), ("measurement", "estimate")])
-def test_mesoscopic_has_no_lanes(imported, key, value):
-    scenario = load_scenario(imported[0] / "scenarios" / "tiny")
+def test_mesoscopic_has_no_lanes(scenario, key, value):
     with pytest.raises(InputError, match=f"sumo.{key}: {value} .* has no lanes"):
         SumoPlant(scenario, settings=settings(scenario).changed(mesoscopic=True, **{key: value}))
 
@@ -267,10 +269,10 @@ def test_options_and_includes_of_the_user_count(config, tmp_path):
         read_traffic(case, read_streets(case.net), seed=0)
 
 
-def test_signal_plans_know_the_city_s_own_vehicles(imported):
+def test_signal_plans_know_the_city_s_own_vehicles(scenario):
     """Turning flows are those of its routes, and of fastest ways; every signal plan runs on its
     signals."""
-    scenario = with_demand(load_scenario(imported[0] / "scenarios" / "tiny"), steps=2)
+    scenario = with_demand(scenario, steps=2)
     own, additional = (
         [scenario.folder / name for name in names]
         for names in (settings(scenario).routes, settings(scenario).additional)

@@ -91,10 +91,9 @@ def imported(folder, programmes=(), network=plain, options="", signals=USUAL):
     (folder / "more.add.xml").write_text(f"<additional>{contents}</additional>")
     more = f'<additional-files value="more.add.xml"/>{options}'
     (folder / "city.sumocfg").write_text(CONFIG.replace("</input>", f"{more}</input>"))
-    own = "\n".join(f"{edge},{int(edge[0] in 'CD')}" for edge in edges_of(net))
-    (folder / "own.csv").write_text(f"edge,region\n{own}\n")
+    own = tiny_city.regions(net, lambda edge: int(edge[0] in "CD"))
     out = folder / "networks" / "x"
-    import_city(folder / "city.sumocfg", out, regions=folder / "own.csv", seeds=1)
+    import_city(folder / "city.sumocfg", out, regions=own, seeds=1)
     return folder / "scenarios" / "x"
 
 
@@ -107,10 +106,6 @@ def made(tmp_path_factory):
         return imported(tmp_path_factory.mktemp("city"), *given, **options)
 
     return make
-
-
-def edges_of(net):
-    return [edge.get("id") for edge in read_xml(net).iter("edge") if edge.get("function") is None]
 
 
 def told(folder):
