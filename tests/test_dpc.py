@@ -401,8 +401,7 @@ def test_a_policy_begins_as_a_gate(scenario):
     assert min(share[:, 1, 0].min() for share in shares) > 0.8
 
 
-PEAK = load_scenario("grid7_peak")
-PEAK = replace(PEAK, steps=12, demand=PEAK.demand[20:32], measurement_std=0.0)
+PEAK = replace(tiny.part(load_scenario("grid7_peak"), 20, 12), measurement_std=0.0)
 
 
 class Gated(torch.nn.Module):

@@ -104,8 +104,7 @@ def test_a_price_everywhere_diverts_nobody_from_ways_that_take_the_same_time():
 
 
 def test_expected_splits_are_written_as_commanded_only_where_they_are_obeyed():
-    scenario = load_scenario("grid7_peak")
-    scenario = replace(scenario, steps=3, demand=scenario.demand[:3])
+    scenario = tiny.part(load_scenario("grid7_peak"), 0, 3)
     rule = parse("pricing-rule(numbers=[1.0,1.0,0.0,9.0,0.0,0.0,0.6,1.5])")
     x = np.where(scenario.network.split_mask.any(axis=1), 50.0, 0.0)
     scenario = replace(scenario, initial=x)

@@ -151,6 +151,11 @@ def seen(accumulation, step: int = 0) -> Observation:
     )
 
 
+def part(scenario: Scenario, begin: int, steps: int) -> Scenario:
+    """`steps` intervals of a scenario, from its interval `begin` on."""
+    return replace(scenario, steps=steps, demand=scenario.demand[begin : begin + steps])
+
+
 def gates_at(scenario: Scenario, u: float) -> Controls:
     """All gates at u."""
     return Controls(perimeter=np.where(scenario.network.adjacency, u, 0.0))
