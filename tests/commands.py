@@ -45,6 +45,13 @@ def same(left: dict, right: dict) -> bool:
     return set(left) == set(right) and all(left[name].identical(right[name]) for name in left)
 
 
+def last_words(result: Result, code: int) -> str:
+    """Return the one line of stderr with which a command ended in this exit code."""
+    assert result.exit_code == code, result.output + repr(result.exception)
+    [line] = result.stderr.splitlines()
+    return line
+
+
 def error_line(result: Result, program: str = "cosim") -> str:
     """Return the line that a command ended with: ours alone, or the last one of click."""
     assert result.exit_code == 2, result.output + repr(result.exception)

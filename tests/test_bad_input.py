@@ -18,6 +18,7 @@ import tiny
 import tiny_city
 import torch
 from commands import call, cosim, error_line, good, nmfd, problem
+from copies import ROOT
 
 from cosim.plant.settings import settings
 from cosim.sumo.recorded_trips import read_recorded_trips
@@ -26,7 +27,6 @@ from nmfd.controllers.dpc.policy import Architecture, Policy
 from nmfd.controllers.dpc.policy_file import checkpoint
 from nmfd.model.regional_model import load_network
 
-ROOT = Path(__file__).parents[1]
 ECONOMIC, PEAK = ROOT / "scenarios" / "economic_mpc", ROOT / "scenarios" / "grid7_peak"
 SCENARIO_TEXT, CITY_TEXT = (
     (folder / "scenario.toml").read_text().replace("../../networks", str(ROOT / "networks"))

@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 import sumo
 from commands import cosim, error_line, good
+from copies import ROOT
 from tiny_city import driven, pieces
 
 from cosim.evaluation.simulate import Simulation, simulate
@@ -20,9 +21,8 @@ from cosim.plant.strategy import parse
 from nmfd.api import load_scenario
 from nmfd.metrics import total_time_spent
 
-ROOT = Path(__file__).parents[1]
 GAMES = Path(sumo.SUMO_HOME) / "tools" / "game"
-CITIES = Path(os.environ.get("CITIES", Path(__file__).parents[2] / "shared" / "cities"))
+CITIES = Path(os.environ.get("CITIES", ROOT.parent / "shared" / "cities"))
 REAL = {
     "bologna": ("bologna/run.sumocfg", 4),
     "ingolstadt": ("ingolstadt21/ingolstadt21.sumocfg", 3),

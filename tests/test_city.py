@@ -6,16 +6,16 @@ import shutil
 import tomllib
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 from commands import problem
+from copies import ROOT
 
 from cosim.sumo.net import check_adjacency, city_files, load_city
 from nmfd.errors import InputError
 from nmfd.model.regional_model import load_network
 
-GRID7 = Path(__file__).parents[1] / "networks" / "grid7"
+GRID7 = ROOT / "networks" / "grid7"
 
 
 @pytest.mark.parametrize("name", ["demo", "grid7"])

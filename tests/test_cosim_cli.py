@@ -2,7 +2,6 @@
 lines."""
 
 import re
-from pathlib import Path
 
 import copies
 import numpy as np
@@ -10,6 +9,7 @@ import pandas as pd
 import pytest
 import torch
 from commands import cosim, error_line, good
+from copies import ROOT
 
 from cosim.evaluation.model_validation import predict
 from cosim.plant.strategy import parse
@@ -17,8 +17,6 @@ from nmfd.api import load_scenario
 from nmfd.controllers.dpc.policy import Architecture, Policy
 from nmfd.controllers.dpc.policy_file import checkpoint
 from nmfd.types import Result
-
-ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope="module")

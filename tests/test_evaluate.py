@@ -43,9 +43,7 @@ def ran(monkeypatch):
 
     def made(scenario, strategy, *, seed, demand):
         done.append((strategy.name, seed, demand))
-        return trajectories.in_city(
-            scenario, strategy, seed, demand, tts=900.0, trips=9, completed=9
-        )
+        return trajectories.in_city(scenario, strategy, seed, demand, tts=900.0)
 
     made_up.instead_of_sumo(monkeypatch, made)
     return done

@@ -17,6 +17,11 @@ from nmfd.types import Controls
 
 SCENARIO = load_scenario("economic_mpc")
 LIMITED = tiny.limited(SCENARIO.network)
+KINDS = pytest.mark.parametrize(
+    "network",
+    [SCENARIO.network, LIMITED, tiny.mixed(LIMITED)],
+    ids=["published", "limited", "mixed"],
+)
 
 
 def busy(seed, **changes):
@@ -34,11 +39,7 @@ def completions(network, accumulation):
     )
 
 
-@pytest.mark.parametrize(
-    "network",
-    [SCENARIO.network, LIMITED, tiny.mixed(LIMITED)],
-    ids=["published", "limited", "mixed"],
-)
+@KINDS
 @pytest.mark.parametrize("make", [NmfdPlant, AcyclicPlant])
 def test_conservation_and_non_negativity_under_random_controls(make, network):
     """Trip ends, integrated here from the states, account for every vehicle that is no longer
@@ -57,11 +58,7 @@ def test_conservation_and_non_negativity_under_random_controls(make, network):
     assert ended > 10_000.0
 
 
-@pytest.mark.parametrize(
-    "network",
-    [SCENARIO.network, LIMITED, tiny.mixed(LIMITED)],
-    ids=["published", "limited", "mixed"],
-)
+@KINDS
 def test_without_control_both_plants_are_the_same(network):
     """Shortest ways never turn back."""
     scenario = replace(SCENARIO, network=network)

@@ -3,12 +3,12 @@ published figures."""
 
 import runpy
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import tiny
 import torch
+from copies import ROOT
 
 import nmfd
 from cosim.plant.settings import settings
@@ -23,7 +23,7 @@ from nmfd.model.regional_model import load_network
 from nmfd.model.scenario import with_demand
 from nmfd.studies import bound
 
-SCENARIOS = Path(__file__).parents[1] / "scenarios"
+SCENARIOS = ROOT / "scenarios"
 INITIAL = "initial = [[0.0, 100.0], [0.0, 50.0]]"
 
 

@@ -4,16 +4,14 @@ workers."""
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import tiny
 import tiny_city
 from commands import cosim, good, nmfd, runs, same, words
+from copies import ROOT
 
 from nmfd import api
-
-ROOT = Path(__file__).parents[1]
 
 
 def elsewhere(program, *arguments):

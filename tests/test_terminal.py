@@ -2,10 +2,10 @@
 
 import runpy
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from copies import ROOT
 
 import nmfd
 from nmfd.api import load_scenario
@@ -16,7 +16,7 @@ from nmfd.errors import InputError
 from nmfd.model.planning import planning_model
 
 NAME = "mpc-pc-terminal"
-SCRIPT = Path(__file__).parents[1] / "scenarios" / "economic_mpc" / "terminal_cost.py"
+SCRIPT = ROOT / "scenarios" / "economic_mpc" / "terminal_cost.py"
 script = runpy.run_path(str(SCRIPT))
 learn, write = script["learn"], script["write"]
 

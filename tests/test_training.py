@@ -27,25 +27,27 @@ def generator():
     return torch.Generator().manual_seed(0)
 
 
+@pytest.fixture
+def rollout(scenario):
+    return Rollout(planning_model(scenario), dtype=torch.float64)
+
+
 def made(scenario, *, guidance=False):
     torch.manual_seed(0)
     return Policy(scenario.network, Architecture(width=8, guidance=guidance))
 
 
-def test_starts_without_a_spread_are_those_of_the_scenario(scenario, generator):
-    x, demand = Rollout(planning_model(scenario), dtype=torch.float64).random_start(
-        3, 0.0, 0.0, generator
-    )
+def test_starts_without_a_spread_are_those_of_the_scenario(scenario, rollout, generator):
+    x, demand = rollout.random_start(3, 0.0, 0.0, generator)
     assert x.shape == (3, 2, 2)
     assert not x.any()
     for n in range(3):
         np.testing.assert_array_equal(demand[:, n], scenario.demand)
 
 
-def test_spread_and_level_scale_the_flows(scenario, generator):
+def test_spread_and_level_scale_the_flows(scenario, rollout, generator):
     """Every flow for itself by 1 +- 0.3, evenly and the same at all times; all of a rollout by 0.5
     to 2."""
-    rollout = Rollout(planning_model(scenario), dtype=torch.float64)
     _, demand = rollout.random_start(4000, 0.3, 0.0, generator)
     busy = int(scenario.demand[:, 0, 1].argmax())
     factor = demand[busy, :, 0, 1] / scenario.demand[busy, 0, 1]
@@ -62,10 +64,9 @@ def test_spread_and_level_scale_the_flows(scenario, generator):
     assert level.mean() == pytest.approx(1.25, abs=0.03)
 
 
-def test_a_share_of_the_rollouts_starts_later_in_a_random_state(scenario, generator):
+def test_a_share_of_the_rollouts_starts_later_in_a_random_state(scenario, rollout, generator):
     """Three quarters of them: up to 80 % of the jam, only for destinations in use; the demand goes
     on from there."""
-    rollout = Rollout(planning_model(scenario), dtype=torch.float64)
     x, demand = rollout.random_start(4000, 0.0, 0.75, generator)
     assert not x[3000:].any()
     assert (x[:3000].sum((1, 2)) > 0).all()
@@ -94,9 +95,8 @@ def test_every_destination_in_use_gets_its_part(scenario, generator):
     assert (x[:, 0, 0] > x[:, 0, 1]).double().mean() == pytest.approx(0.5, abs=0.05)
 
 
-def test_noise_on_the_demand(scenario, generator):
+def test_noise_on_the_demand(rollout, generator):
     """Of the pairs that have any, with the sigma of the rollout."""
-    rollout = Rollout(planning_model(scenario), dtype=torch.float64)
     demand = torch.full((20, 4000, 2, 2), 50.0, dtype=torch.float64)
     assert rollout.perturb(demand, torch.ones(4000), 0.0, generator) is demand
     level = torch.linspace(0.0, 1.0, 4000, dtype=torch.float64)

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import trajectories
-from commands import cosim, good
+from commands import cosim, error_line, good
 
 from cosim.evaluation import tuning
 from cosim.plant.strategy import parse
@@ -34,7 +34,7 @@ def runs(monkeypatch):
         tts = 1e6 * demand * (1.0 + seed / 1e4) * (1.0 + away)
         if len(done) in failing:
             return "SUMO fell over"
-        return trajectories.in_city(scenario, strategy, seed, demand, tts=tts, trips=9, completed=9)
+        return trajectories.in_city(scenario, strategy, seed, demand, tts=tts)
 
     made_up.instead_of_sumo(monkeypatch, made)
     return done, failing
@@ -159,8 +159,7 @@ def test_a_failed_first_candidate_has_no_number(city, tmp_path, runs):
 def test_one_line_for_what_cannot_be_tuned(city, tmp_path, arguments, expected):
     options = [f"--option {text}" for text in arguments]
     done = cosim("tune", city.folder, "--controller pi-gating", *options, "--out", tmp_path / "out")
-    assert done.exit_code == 2
-    assert expected in done.stderr
+    assert expected in error_line(done)
     assert not (tmp_path / "out").exists()
 
 
@@ -177,9 +176,7 @@ def test_options_that_train_a_policy_train_one_for_every_candidate(city, tmp_pat
 
     def made(scenario, strategy, *, seed, demand):
         seen.append(scenario.controller_options["dpc-pcrg"]["mfd_scale"])
-        return trajectories.in_city(
-            scenario, strategy, seed, demand, tts=1e6 * seen[-1], trips=9, completed=9
-        )
+        return trajectories.in_city(scenario, strategy, seed, demand, tts=1e6 * seen[-1])
 
     monkeypatch.setattr(
         tuning, "in_processes", lambda jobs, *_: [(n, job()) for n, job in enumerate(jobs)]

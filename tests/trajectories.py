@@ -57,7 +57,7 @@ def trajectory(controller="no-control", seed=0, steps=4):
 
 
 def in_city(
-    scenario, strategy, seed: int, demand: float, *, tts: float, trips: int, completed: int
+    scenario, strategy, seed: int, demand: float, *, tts: float, trips: int = 9, completed: int = 9
 ) -> Result:
     """A run of one interval; tts: its total time spent [veh s]."""
     regions = scenario.network.regions
