@@ -51,7 +51,7 @@ def with_room(streets: Streets, uncontrollable: Collection[str]) -> LinkMask:
     uncontrollable: signals that perimeter control cannot use
     """
     before, behind = streets.links.T
-    free = np.array([signal is None for signal in streets.link_signals], dtype=bool)
+    free = ~streets.signalled
     room = streets.lane_metres.copy()
     np.add.at(room, behind[free], streets.lane_metres[before[free]])
     return streets.controllable(uncontrollable) & (room[before] >= ROOM_M)

@@ -90,6 +90,11 @@ class Streets:
         """Length times lanes for cars (E,) [m]."""
         return self.length * self.lanes
 
+    @property
+    def signalled(self) -> LinkMask:
+        """Links that have a signal (L,)."""
+        return np.array([signal is not None for signal in self.link_signals], dtype=bool)
+
     def controllable(self, left_alone: Collection[str]) -> LinkMask:
         """Return the links (L,) that perimeter control can hold.
 
