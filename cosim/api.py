@@ -37,7 +37,7 @@ from nmfd.errors import RunFailed
 from nmfd.metrics import summary
 from nmfd.model.scenario import Scenario
 from nmfd.runs import shipped
-from nmfd.runs.files import default_folder, folder_of, write_table
+from nmfd.runs.files import default_folder, folder_of, path_of, write_table
 from nmfd.runs.frame import Table
 from nmfd.runs.progress import Progress, watched
 from nmfd.runs.run_many import Run, locked, raise_failures, run_many
@@ -94,10 +94,8 @@ def run(
     strategy = parse(controller, city)
     shortened = loaded(scenario, steps=steps)
     loaded(shortened, demand=demand)  # checks the factor
-    policy_file = None if policy is None else Path(policy)
-    trip_file = None if tripinfo is None else Path(tripinfo)
     with watched(strategy.name, progress) as show:
-        job = Simulation(shortened, strategy, seed, demand, policy_file, trip_file)
+        job = Simulation(shortened, strategy, seed, demand, path_of(policy), path_of(tripinfo))
         return simulate(job, progress=show)
 
 
@@ -260,7 +258,7 @@ def evaluate(
         out=out,
     )
     with locked(out):
-        rows = evaluation.evaluate(
+        return evaluation.evaluate(
             runs,
             out,
             _draw_all,
@@ -270,8 +268,6 @@ def evaluate(
             overwrite=overwrite,
             progress=progress,
         )
-    rows.attrs["folder"] = str(out)
-    return rows
 
 
 def _draw_all(finished: results.Finished) -> None:
@@ -495,9 +491,9 @@ def study(
         Path(source),
         regions=str(regions),
         routes=[Path(file) for file in routes],
-        counts=None if counts is None else Path(counts),
+        counts=path_of(counts),
         most_seeds=most_seeds,
-        out=None if out is None else Path(out),
+        out=path_of(out),
         workers=workers,
     )
 
@@ -548,7 +544,7 @@ def links(
     """
     from cosim.evaluation.links import write_links
 
-    return write_links(loaded(scenario), None if out is None else Path(out), seeds)
+    return write_links(loaded(scenario), path_of(out), seeds)
 
 
 def catalogue() -> dict[str, dict[str, str]]:

@@ -26,7 +26,7 @@ from nmfd.controllers.strategy import (
 from nmfd.errors import InputError, did_you_mean
 from nmfd.model.scenario import Scenario, read_scenario, with_demand
 from nmfd.runs import shipped
-from nmfd.runs.files import default_folder, folder_of, run_name
+from nmfd.runs.files import default_folder, folder_of, path_of, run_name
 from nmfd.runs.progress import Progress, watched
 from nmfd.runs.run_many import Run, locked, run_many
 from nmfd.runs.run_many import raise_failures as raise_failures
@@ -154,7 +154,7 @@ def controller(
     Raises: InputError for an unknown name, a wrong option, or a policy that is missing or made for
         another network
     """
-    return parse(controller).make(loaded(scenario), _path(policy))
+    return parse(controller).make(loaded(scenario), path_of(policy))
 
 
 def run(
@@ -194,7 +194,7 @@ def run(
     strategy = parse(controller).regional()
     scenario = loaded(scenario, steps=steps, demand=demand)
     _check_plant(plant)
-    acting = strategy.make(scenario, _path(policy))
+    acting = strategy.make(scenario, path_of(policy))
     name = type(plant).__name__
     if isinstance(plant, str):
         name = plant
@@ -234,7 +234,8 @@ def benchmark(
     steps: control intervals; the scenario's if None
     plant: "nmfd", "acyclic" or "links"
     policies: controller -> file, if not SCENARIO/NAME.pt
-    out: run folder, runs/SCENARIO-TIME if None; finished runs in it are kept
+    out: run folder, runs/SCENARIO-TIME if None; it is `table.attrs["folder"]`, and finished runs in
+        it are kept
     workers: runs at a time
     scheduler: address of a Dask scheduler that does the runs instead
     time_limit: seconds after which a run is ended; see nmfd.runs.run_many
@@ -579,10 +580,6 @@ def _file(scenario: Scenario, name: str, out: Path | str | None) -> Path:
     if not file.parent.is_dir():
         raise InputError(f"{file.parent}: no such folder; make it or choose another --out")
     return file
-
-
-def _path(file: Path | str | None) -> Path | None:
-    return None if file is None else Path(file)
 
 
 def _regional(controller: ControllerLike) -> Strategy:
