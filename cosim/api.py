@@ -26,6 +26,7 @@ from cosim.sumo.trips import PLANNING_SEEDS
 from nmfd.api import (
     Controllers,
     ScenarioLike,
+    checked_factor,
     levels_of,
     loaded,
     policy_files,
@@ -93,9 +94,9 @@ def run(
     """
     strategy = parse(controller, city)
     shortened = loaded(scenario, steps=steps)
-    loaded(shortened, demand=demand)  # checks the factor
+    factor = checked_factor(demand)
     with watched(strategy.name, progress) as show:
-        job = Simulation(shortened, strategy, seed, demand, path_of(policy), path_of(tripinfo))
+        job = Simulation(shortened, strategy, seed, factor, path_of(policy), path_of(tripinfo))
         return simulate(job, progress=show)
 
 
@@ -187,9 +188,9 @@ def watch(
     from cosim.view import live
 
     loaded_one = loaded(scenario)
-    loaded(loaded_one, demand=demand)  # checks the factor
+    factor = checked_factor(demand)
     strategies = _reference_first(parse_many(controllers, loaded_one, lambda one: parse(one, city)))
-    jobs = [Simulation(loaded_one, strategy, seed, demand) for strategy in strategies]
+    jobs = [Simulation(loaded_one, strategy, seed, factor) for strategy in strategies]
     if gui:
         try:
             with watched("watch", None) as show:
@@ -299,10 +300,7 @@ def planned(
         suite, seeds = evaluation.read_suite(Path(scenario), settings)
     else:
         levels = levels_of(demand)
-        one = loaded(scenario, settings=settings)
-        for level in levels:
-            loaded(one, demand=level)  # checks the factor
-        suite = [(one, levels)]
+        suite = [(loaded(scenario, settings=settings), levels)]
     suite = [(loaded(one, steps=steps), levels) for one, levels in suite]
     first = suite[0][0]
     strategies = parse_many(controllers, first, lambda one: parse(one, city))
@@ -443,7 +441,6 @@ def plan(
     from cosim.evaluation import plan_routes
 
     one = loaded(scenario)
-    loaded(one, demand=demand)  # checks the factor
     if plan_file is None:
         folder = one.folder or Path()
         plan_file = shipped.beside(folder, PLAN, "--plan-file FILE", scenario=True)
@@ -451,7 +448,7 @@ def plan(
         scenario=one,
         strategy=parse(controller, city),
         out=folder_of(one.name, "plan", out),
-        demand=demand,
+        demand=checked_factor(demand),
         seed=seed,
         iterations=iterations,
     )

@@ -98,18 +98,23 @@ def loaded(
     """
     if not isinstance(scenario, Scenario):
         scenario = load_scenario(scenario, settings)
+    return with_demand(scenario, steps=steps, factor=checked_factor(demand))
+
+
+def checked_factor(demand: float) -> float:
+    """Return a factor of the demand. Raise InputError for one that no scenario takes."""
     if not 0.0 < demand <= MOST_DEMAND:
         raise InputError(
             f"demand: expected a number above 0 up to {MOST_DEMAND:g}, got {demand:g} instead"
         )
-    return with_demand(scenario, steps=steps, factor=demand)
+    return float(demand)
 
 
 def levels_of(demand: float | Iterable[float]) -> list[float]:
-    """Return the factors of the demand of a study as a list."""
+    """Return the factors of the demand of a study as a list. Raise InputError for a wrong one."""
     if isinstance(demand, int | float):
-        return [float(demand)]
-    return [float(one) for one in demand]
+        return [checked_factor(demand)]
+    return [checked_factor(one) for one in demand]
 
 
 def seeds_of(seeds: int | Iterable[int], first: int = 0) -> list[int]:
