@@ -108,13 +108,16 @@ class Streets:
         """Links within the main part."""
         return self.links[self.main_part[self.links].all(axis=1)]
 
-    def between(self, labels: EdgeNumbers) -> Pairs:
-        """Return the pairs of different labels that links join.
+    def joins(self, labels: EdgeNumbers) -> csr_array:
+        """Return the number of links (U, U) that join two of U labels, in any direction.
 
         labels: (E,), -1 for none
         """
         ends = labels[self.links]
-        return ends[(ends >= 0).all(axis=1) & (ends[:, 0] != ends[:, 1])]
+        ends = ends[(ends >= 0).all(axis=1) & (ends[:, 0] != ends[:, 1])]
+        found = graph(np.concatenate([ends, ends[:, ::-1]]), int(labels.max()) + 1)
+        found.sum_duplicates()
+        return found
 
     @property
     def parts(self) -> int:
