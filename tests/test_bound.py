@@ -25,14 +25,20 @@ def closed(scenario, controller):
     return total_time_spent(api.run(scenario, controller))
 
 
-def test_where_nothing_congests_the_bound_is_an_open_perimeter(scenario):
-    free = replace(scenario, demand=0.01 * scenario.demand, protected=())
-    plan = bound.compute(free, "bound-pc", iterations=100)
+@pytest.fixture
+def free(scenario):
+    """The scenario with hardly any demand, and the best plan for it."""
+    empty = replace(scenario, demand=0.01 * scenario.demand, protected=())
+    return empty, bound.compute(empty, "bound-pc", iterations=100)
+
+
+def test_where_nothing_congests_the_bound_is_an_open_perimeter(free):
+    empty, plan = free
     assert (
         plan.perimeter[:8, 0, 1].min() > 0.85
     )  # later intervals move vehicles that the horizon does not count
-    uncontrolled = closed(free, "no-control")
-    assert closed(free, plan) == pytest.approx(uncontrolled, rel=1e-3)
+    uncontrolled = closed(empty, "no-control")
+    assert closed(empty, plan) == pytest.approx(uncontrolled, rel=1e-3)
 
 
 @pytest.mark.parametrize("name", bound.NAMES)
@@ -192,9 +198,8 @@ def test_every_trajectory_meets_the_relaxation(variant, guidance):
     assert abs(lp.equal @ z - lp.given).max() > 1e-6
 
 
-def test_without_congestion_the_lower_bound_is_nearly_reached(scenario):
-    free = replace(scenario, demand=0.01 * scenario.demand, protected=())
-    plan = bound.compute(free, "bound-pc", iterations=100)
+def test_without_congestion_the_lower_bound_is_nearly_reached(free):
+    empty, plan = free
     assert 0.97 * plan.totals[plan.start] < plan.lower <= plan.totals[plan.start]
     with pytest.raises(InputError, match="process_std: expected 0 for a lower bound, got 0.25"):
-        bound.lower_bound(replace(free, process_std=0.25), guidance=False)
+        bound.lower_bound(replace(empty, process_std=0.25), guidance=False)
