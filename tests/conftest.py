@@ -81,6 +81,12 @@ def folder(tmp_path):
 
 
 @pytest.fixture
+def out(tmp_path):
+    """A folder to write into, which is not there yet."""
+    return tmp_path / "out"
+
+
+@pytest.fixture
 def scenario(folder):
     from nmfd.api import load_scenario
 

@@ -84,12 +84,12 @@ HALF = tiny.Acting(
 )
 
 
-def test_figures_are_drawn_again_if_a_run_is_new(tmp_path):
+def test_figures_are_drawn_again_if_a_run_is_new(tmp_path, out):
     scenario = tiny.write(tmp_path)
 
     def drawn(*controllers):
-        nmfd.benchmark(scenario, controllers, steps=2, out=tmp_path / "out")
-        return (tmp_path / "out" / "region_accumulation.png").stat().st_mtime_ns
+        nmfd.benchmark(scenario, controllers, steps=2, out=out)
+        return (out / "region_accumulation.png").stat().st_mtime_ns
 
     first = drawn("no-control")
     assert drawn("no-control") == first

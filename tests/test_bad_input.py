@@ -175,12 +175,12 @@ def test_policies(tmp_path, policy, monkeypatch, name):
         ]
     ),
 )
-def test_plans(tmp_path, content):
+def test_plans(tmp_path, out, content):
     scenario = tiny.write(tmp_path)
     (scenario / "bound-pc.npz").write_bytes(content)
-    done = nmfd("benchmark", scenario, "--controllers bound-pc --out", tmp_path / "out")
+    done = nmfd("benchmark", scenario, "--controllers bound-pc --out", out)
     assert "bound-pc.npz: " in error_line(done, "nmfd")
-    assert not (tmp_path / "out").exists()
+    assert not out.exists()
 
 
 HEAD = "interval,from,to,veh_s\n"

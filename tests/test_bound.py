@@ -80,14 +80,12 @@ def test_an_interrupted_descent_keeps_the_best_so_far(scenario):
     assert all(short.totals[name] < first.totals[name] for name in start)
 
 
-def test_a_plan_that_benchmark_replays(folder, tmp_path):
+def test_a_plan_that_benchmark_replays(folder, out):
     text = api.bound_report(api.bound(folder, "bound-pcrg", iterations=20))
     assert "(kept)" in text
     assert "from pi-gating:" in text
     assert "the best plan is at most" in text
-    text = good(
-        nmfd("benchmark", folder, "--controllers no-control,bound-pcrg --out", tmp_path / "out")
-    )
+    text = good(nmfd("benchmark", folder, "--controllers no-control,bound-pcrg --out", out))
     assert "above the optimum" in text
     assert "≤ " in text
     assert any(line.startswith("bound-pcrg ") for line in text.splitlines())

@@ -20,9 +20,9 @@ HEAVY = ("pydantic", "torch", "casadi", "libsumo", "numpy", "pandas", "matplotli
 
 
 @pytest.fixture
-def both(folder, tmp_path):
+def both(folder, out):
     options = "--controllers no-control,pi-gating --seeds 2 --out"
-    return ["benchmark", folder, options, tmp_path / "out"]
+    return ["benchmark", folder, options, out]
 
 
 @pytest.fixture
@@ -79,11 +79,11 @@ def test_benchmark_writes_a_run_folder(both, tmp_path):
     }
 
 
-def test_settings(folder, tmp_path):
+def test_settings(folder, out):
     """--set changes a key, in a nested table too, and mistakes name the key."""
-    command = ("benchmark", folder, "--controllers pi-gating --out", tmp_path / "out", "--set")
+    command = ("benchmark", folder, "--controllers pi-gating --out", out, "--set")
     good(nmfd(*command, "steps=3 --set controllers.pi-gating.kp=2.5"))
-    assert Result.read(tmp_path / "out" / "pi-gating-0.nc").accumulation.shape[0] == 4
+    assert Result.read(out / "pi-gating-0.nc").accumulation.shape[0] == 4
     for text, problem in (
         ("stepz=3", "scenario.toml: stepz: unknown key; did you mean step?"),
         ("steps=x", "scenario.toml: steps: should be a valid integer, got 'x'"),
@@ -94,15 +94,15 @@ def test_settings(folder, tmp_path):
 
 
 def test_a_failing_controller_names_itself_and_the_others_are_kept(
-    both, tmp_path, monkeypatch, in_process
+    both, out, monkeypatch, in_process
 ):
     monkeypatch.setattr(PiGate, "act", lambda self, measurement: 1 / 0)
     line = last_words(nmfd(*both), 1)
     assert "pi-gating, seed 0: ZeroDivisionError: division by zero (test_cli.py:" in line
-    assert set(runs(tmp_path / "out")) == {"no-control-0.nc", "no-control-1.nc"}
+    assert set(runs(out)) == {"no-control-0.nc", "no-control-1.nc"}
 
 
-def test_an_interrupted_benchmark_continues(both, tmp_path, monkeypatch, in_process):
+def test_an_interrupted_benchmark_continues(both, tmp_path, out, monkeypatch, in_process):
     good(nmfd(*both[:-1], tmp_path / "whole"))
     calls, run = [], closed_loop.run
 
@@ -115,10 +115,10 @@ def test_an_interrupted_benchmark_continues(both, tmp_path, monkeypatch, in_proc
     monkeypatch.setattr(closed_loop, "run", stopped)
     line = last_words(nmfd(*both), 130)
     assert line.startswith("nmfd: interrupted: finished runs are in ")
-    assert len(runs(tmp_path / "out")) == 2
+    assert len(runs(out)) == 2
     good(nmfd(*both))
     assert len(calls) == 5  # two, the interrupted one, and the two that were left
-    assert same(runs(tmp_path / "out"), runs(tmp_path / "whole"))
+    assert same(runs(out), runs(tmp_path / "whole"))
 
 
 def test_without_a_compiler_training_is_not_compiled(folder, tmp_path, monkeypatch):

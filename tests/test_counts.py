@@ -69,11 +69,11 @@ def test_geh():
         (meandata(COUNTS), "--demand peak", "has vehicles of its own; omit --routes"),
     ],
 )
-def test_one_clear_line(city, tmp_path, content, options, expected):
+def test_one_clear_line(city, tmp_path, out, content, options, expected):
     (tmp_path / "counts.xml").write_text(content)
-    given = ("--counts", tmp_path / "counts.xml", "--regions 2 --out", tmp_path / "out")
+    given = ("--counts", tmp_path / "counts.xml", "--regions 2 --out", out)
     assert expected in error_line(cosim("import", city, *given, options))
-    assert not (tmp_path / "out").exists()
+    assert not out.exists()
 
 
 @pytest.mark.slow

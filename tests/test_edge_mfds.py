@@ -107,14 +107,14 @@ ONE = '<interval begin="0" end="{}">{}</interval>'
         ),
     ],
 )
-def test_one_clear_line(made, tmp_path, content, expected):
+def test_one_clear_line(made, tmp_path, out, content, expected):
     if content.startswith("<interval"):
         content = f"<meandata>{content}</meandata>"
     (tmp_path / "edges.xml").write_text(content)
-    options = "--regions 1 --out", tmp_path / "out"
+    options = "--regions 1 --out", out
     line = error_line(cosim("mfd", made / "city.net.xml", tmp_path / "edges.xml", *options))
     assert expected in line
-    assert not (tmp_path / "out").exists()
+    assert not out.exists()
 
 
 def test_missing_files_and_odd_numbers(made, tmp_path):

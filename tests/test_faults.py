@@ -227,15 +227,13 @@ def test_a_signal_that_does_not_obey_is_safe(city, signals, gateway):
 @pytest.mark.parametrize(
     "ordered, problem", [("closed:no", "edge 'no' is not in"), ("signal:no", "'no' is no signal")]
 )
-def test_faults_that_the_city_does_not_have(city, tmp_path, ordered, problem):
+def test_faults_that_the_city_does_not_have(city, out, ordered, problem):
     file = city.folder / "scenario.toml"
     text = file.read_text(encoding="utf-8")
     file.write_text(f'faults = ["{ordered}"]\n{text}', encoding="utf-8")
     try:
-        result = call(
-            "cosim", "run", city.folder, "--controller no-control --out", tmp_path / "out"
-        )
+        result = call("cosim", "run", city.folder, "--controller no-control --out", out)
     finally:
         file.write_text(text, encoding="utf-8")
     assert problem in error_line(result)
-    assert not (tmp_path / "out").exists()
+    assert not out.exists()

@@ -46,16 +46,14 @@ def stopped(program, *arguments, out, by, after="[!.]*.nc", wait=0.0):
         ("manifest.json", 0.3),
     ],
 )
-def test_ctrl_c_at_any_moment_is_one_line(tmp_path, after, wait):
+def test_ctrl_c_at_any_moment_is_one_line(tmp_path, out, after, wait):
     options = "--controllers no-control --seeds 200 --workers 2"
     command = ("benchmark", tiny.write(tmp_path), options)
-    returned, said = stopped(
-        "nmfd", *command, out=tmp_path / "out", by=signal.SIGINT, after=after, wait=wait
-    )
+    returned, said = stopped("nmfd", *command, out=out, by=signal.SIGINT, after=after, wait=wait)
     while "init_import_site" in said:  # before Python itself had started, on a busy machine
         wait *= 2
         returned, said = stopped(
-            "nmfd", *command, out=tmp_path / "out", by=signal.SIGINT, after=after, wait=wait
+            "nmfd", *command, out=out, by=signal.SIGINT, after=after, wait=wait
         )
     assert returned == 130, said
     assert said.startswith("nmfd: interrupted")
@@ -64,14 +62,14 @@ def test_ctrl_c_at_any_moment_is_one_line(tmp_path, after, wait):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("streams", ["<&- >&- 2>&-", "2>&1 | true"])
-def test_runs_are_kept_without_standard_streams(tmp_path, streams):
+def test_runs_are_kept_without_standard_streams(tmp_path, out, streams):
     scenario = tiny.write(tmp_path)
     command = words(sys.executable, "-m nmfd benchmark", scenario, "--controllers no-control")
     subprocess.run(
         [f"{shlex.join(command)} --workers 2 --seeds 2 --out {tmp_path}/out {streams}"], shell=True
     )
-    assert len(runs(tmp_path / "out")) == 2
-    assert (tmp_path / "out" / "total_accumulation.png").exists()
+    assert len(runs(out)) == 2
+    assert (out / "total_accumulation.png").exists()
 
 
 @pytest.mark.parametrize(
@@ -83,23 +81,23 @@ def test_runs_are_kept_without_standard_streams(tmp_path, streams):
     ],
 )
 @pytest.mark.slow
-def test_a_stopped_benchmark_continues(tmp_path, monkeypatch, by, status):
+def test_a_stopped_benchmark_continues(tmp_path, out, monkeypatch, by, status):
     scenario = tiny.write(tmp_path)
     options = "--controllers no-control,pi-gating --seeds 10 --workers 2"
     command = ("benchmark", scenario, options)
-    returned, said = stopped("nmfd", *command, out=tmp_path / "out", by=by)
+    returned, said = stopped("nmfd", *command, out=out, by=by)
     assert returned == status, said
     assert "Traceback" not in said
     if status == 130:
         assert said.splitlines()[-1].startswith("nmfd: interrupted: finished runs are in"), said
-    first = runs(tmp_path / "out")
+    first = runs(out)
     assert 0 < len(first) < 20
     monkeypatch.setattr(api, "run_many", lambda *a, **o: run_many(*a, **{**o, "workers": 0}))
-    good(nmfd(*command, "--out", tmp_path / "out"))
+    good(nmfd(*command, "--out", out))
     good(nmfd(*command, "--out", tmp_path / "whole"))
     whole = runs(tmp_path / "whole")
     assert len(whole) == 20
-    assert same(runs(tmp_path / "out"), whole)
+    assert same(runs(out), whole)
     assert same(first, {name: whole[name] for name in first})
 
 

@@ -192,9 +192,8 @@ def test_turns_on_red_leak_and_the_other_gates_hold(made):
     assert seen.flow[seen.controlled].sum() < 0.5 * free[seen.controlled].sum()
 
 
-def test_a_whole_run(made, tmp_path):
+def test_a_whole_run(made, out):
     """Without words about broken rules; a timetable may cut the green of a programme short."""
-    out = tmp_path / "out"
     text = run_controllers(made(LIGHTS), ["no-control"], steps=3, out=out)
     assert "break their rules" not in text
     row = pd.read_csv(out / "runs.csv").iloc[0]
@@ -209,14 +208,14 @@ def test_max_pressure_runs_signals_with_turns_on_red(made):
         assert record.gateway_flow.sum() > 0.0
 
 
-def test_max_pressure_says_why_it_cannot_run(made, tmp_path):
+def test_max_pressure_says_why_it_cannot_run(made, out):
     unfit = (
         ("B1", same_light("o")),
         ("B2", off),
         ("C1", one_phase),
         ("C2", red_and_yellow),
     )
-    done = cosim("run", made(unfit), "--controller max-pressure --steps 1 --out", tmp_path / "out")
+    done = cosim("run", made(unfit), "--controller max-pressure --steps 1 --out", out)
     assert done.exit_code != 0
     assert "none of the 4 signals here is one (" in done.stderr
     for reason in ("blinking", "switched off", "fewer than two green phases", "light u"):

@@ -76,8 +76,7 @@ def test_controls_that_move_more_than_there_is_stop_the_run(scenario, make):
             plant.step(tiny.gates_at(scenario, u=20.0))
 
 
-def test_the_command_says_it_in_one_line_and_keeps_what_was_finished(tmp_path, monkeypatch):
-    out = tmp_path / "out"
+def test_the_command_says_it_in_one_line_and_keeps_what_was_finished(tmp_path, out, monkeypatch):
     command = ("benchmark", tiny.write(tmp_path), "--controllers no-control --out", out)
     good(nmfd(*command, "--seeds 1"))
     honest = dynamics.advance_counted

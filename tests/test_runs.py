@@ -237,23 +237,23 @@ def test_files_that_are_no_runs_are_left_alone(tmp_path, capsys):
 @pytest.mark.parametrize(
     "content", ["[]", "{", '{"folders": {"": {}}, "sessions": [{}]}', '{"folders": {}}']
 )
-def test_a_damaged_manifest_is_one_line(tmp_path, content):
-    run_here([run_of()], tmp_path / "out")
-    (tmp_path / "out" / "manifest.json").write_text(content)
-    line = problem(run_here, [run_of()], tmp_path / "out")
+def test_a_damaged_manifest_is_one_line(out, content):
+    run_here([run_of()], out)
+    (out / "manifest.json").write_text(content)
+    line = problem(run_here, [run_of()], out)
     assert "manifest.json: is no manifest of runs, or damaged" in line
 
 
-def test_a_name_that_no_file_can_have_is_refused_before_the_runs(tmp_path):
+def test_a_name_that_no_file_can_have_is_refused_before_the_runs(out):
     calls = []
     with pytest.raises(InputError, match="its name is longer than the 200 bytes"):
-        run_here([run_of("a" * 250, calls=calls)], tmp_path / "out")
+        run_here([run_of("a" * 250, calls=calls)], out)
     assert calls == []
 
 
-def test_a_run_that_lasts_too_long_is_ended_and_the_others_go_on(tmp_path):
+def test_a_run_that_lasts_too_long_is_ended_and_the_others_go_on(out):
     runs = [run_of("a", work=partial(time.sleep, 600)), run_of("b")]
-    rows = run_many(runs, tmp_path / "out", time_limit=3.0).set_index("controller")["failure"]
+    rows = run_many(runs, out, time_limit=3.0).set_index("controller")["failure"]
     assert rows["a"] == "its time limit of 3 s is over"
     assert rows["b"] == ""
 
@@ -276,8 +276,8 @@ def test_folders_of_killed_processes_are_swept(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_run_that_is_cut_off_is_done_again(tmp_path):
-    calls, file = [], tmp_path / "out" / "a-0.nc"
+def test_a_run_that_is_cut_off_is_done_again(out):
+    calls, file = [], out / "a-0.nc"
     run_here([run_of("a", calls=calls)], file.parent)
     file.write_bytes(file.read_bytes()[:100])
     assert len(run_here([run_of("a", calls=calls)], file.parent)) == 1
@@ -346,16 +346,16 @@ def test_some_arrays_are_those_of_the_whole_file(two_runs):
     assert list(some.data) == ["accumulation"]
 
 
-def test_levels_have_folders_of_their_own(tmp_path):
+def test_levels_have_folders_of_their_own(out):
     runs = [run_of("path/to/file.py:Class", level, folder=f"demand-{level}") for level in (1, 2)]
-    rows = run_here(runs, tmp_path / "out")
+    rows = run_here(runs, out)
     assert list(rows["folder"]) == ["demand-1", "demand-2"]
     assert set(rows["controller"]) == {"path/to/file.py:Class"}
-    assert len(list((tmp_path / "out" / "demand-1").glob("*.nc"))) == 1
-    assert len(run_here(runs[:1], tmp_path / "out")) == 2
+    assert len(list((out / "demand-1").glob("*.nc"))) == 1
+    assert len(run_here(runs[:1], out)) == 2
 
 
-def test_failures_are_rows_and_the_others_go_on(tmp_path):
+def test_failures_are_rows_and_the_others_go_on(out):
     def mistaken():
         raise InputError("policy.pt: no such file")
 
@@ -365,14 +365,14 @@ def test_failures_are_rows_and_the_others_go_on(tmp_path):
         run_of("c", work=lambda: exit(3)),
         run_of("d"),
     ]
-    rows = run_here(runs, tmp_path / "out").set_index("controller")["failure"]
+    rows = run_here(runs, out).set_index("controller")["failure"]
     assert rows["a"].startswith("ZeroDivisionError: division by zero (test_runs.py:")
     assert rows["b"] == "policy.pt: no such file"
     assert rows["c"].startswith("SystemExit: 3")
     assert rows["d"] == ""
     with pytest.raises(RunFailed, match=r"^a, seed 0: ZeroDivisionError.*; b, seed 0: policy.pt"):
-        raise_failures(run_here(runs, tmp_path / "out"))
-    assert set(run_here([run_of(name) for name in "abcd"], tmp_path / "out")["failure"]) == {""}
+        raise_failures(run_here(runs, out))
+    assert set(run_here([run_of(name) for name in "abcd"], out)["failure"]) == {""}
 
 
 @pytest.mark.slow
@@ -410,23 +410,23 @@ print(list(run_many([run_of("a"), run_of("b")], {str(tmp_path / "out")!r}, worke
     assert done.stdout.split("\n") == ["begun", "['', '']", ""], done.stderr
 
 
-def test_a_folder_is_that_of_one_process_and_of_runs(tmp_path):
+def test_a_folder_is_that_of_one_process_and_of_runs(tmp_path, out):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="file: is a file"):
         run_here([run_of()], tmp_path / "file")
     with pytest.raises(InputError, match="is not empty and holds no manifest.json"):
         run_here([run_of()], tmp_path)
-    run_here([run_of()], tmp_path / "out")
+    run_here([run_of()], out)
     with (
-        FileLock(tmp_path / "out" / ".lock"),
+        FileLock(out / ".lock"),
         pytest.raises(InputError, match="another process is writing to it"),
     ):
-        run_here([run_of()], tmp_path / "out")
-    with module.locked(tmp_path / "out"):  # as a command does
-        run_here([run_of()], tmp_path / "out")
+        run_here([run_of()], out)
+    with module.locked(out):  # as a command does
+        run_here([run_of()], out)
 
 
-def test_a_full_disk_leaves_nothing_that_is_refused(tmp_path, monkeypatch):
+def test_a_full_disk_leaves_nothing_that_is_refused(tmp_path, out, monkeypatch):
     def full(path, _):
         raise OSError(errno.ENOSPC, "No space left on device", str(path))
 
@@ -435,48 +435,48 @@ def test_a_full_disk_leaves_nothing_that_is_refused(tmp_path, monkeypatch):
         pytest.raises(OSError, match="No space left on device: .*manifest.json"),
     ):
         patch.setattr(module, "write_text", full)
-        run_here([run_of()], tmp_path / "out")
+        run_here([run_of()], out)
     assert list(tmp_path.iterdir()) == []
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / ".manifest-1.tmp.json").write_text("{")  # of a process that was killed
-    assert len(run_here([run_of()], tmp_path / "out")) == 1
+    out.mkdir()
+    (out / ".manifest-1.tmp.json").write_text("{")  # of a process that was killed
+    assert len(run_here([run_of()], out)) == 1
 
 
-def test_progress_counts_runs(tmp_path):
+def test_progress_counts_runs(out):
     shown = []
     run_here(
         [run_of("a"), run_of("b")],
-        tmp_path / "out",
+        out,
         progress=lambda *what: shown.append(what),
     )
     assert shown == [(0, 2, ""), (1, 2, "a-0"), (2, 2, "b-0")]
 
 
 @pytest.mark.slow
-def test_a_dask_cluster_gives_the_same_runs(tmp_path):
+def test_a_dask_cluster_gives_the_same_runs(out):
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(
         n_workers=1, threads_per_worker=2, dashboard_address=None
     ) as cluster:
         runs = [run_of("a"), run_of("b", work=die), run_of("c", work=divide)]
-        rows = run_many(runs, tmp_path / "out", scheduler=cluster.scheduler_address).set_index(
-            "controller"
-        )["failure"]
+        rows = run_many(runs, out, scheduler=cluster.scheduler_address).set_index("controller")[
+            "failure"
+        ]
     assert rows["a"] == ""
     assert rows["b"] == "its process died (status 3)"
     assert "ZeroDivisionError" in rows["c"]
     assert (
-        Result.read(tmp_path / "out" / "a-0.nc")
+        Result.read(out / "a-0.nc")
         .without_times()
         .identical(trajectory("a").assign(key=json.dumps(dict(runs[0].key))).without_times())
     )
 
 
-def test_a_scheduler_that_does_not_answer_is_one_line(tmp_path, monkeypatch):
+def test_a_scheduler_that_does_not_answer_is_one_line(out, monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr(module, "DASK_PATIENCE_S", 0.2)
     with pytest.raises(InputError, match="no Dask scheduler answers at 'tcp://127.0.0.1:1'"):
-        run_many([run_of()], tmp_path / "out", scheduler="tcp://127.0.0.1:1")
+        run_many([run_of()], out, scheduler="tcp://127.0.0.1:1")
 
 
 @pytest.mark.slow

@@ -46,10 +46,9 @@ def ran(monkeypatch):
     return made
 
 
-def test_from_a_scenario_to_a_page(ran, tmp_path):
+def test_from_a_scenario_to_a_page(ran, out):
     """An interrupted study goes on. Guidance saves most time, but leaves trips; max-pressure is
     recommended."""
-    out = tmp_path / "out"
     ran.interrupted = 7
     assert cosim("study demo --out", out).exit_code != 0
     assert not (out / "study.html").exists()
@@ -201,12 +200,11 @@ def test_more_seeds_at_most_double():
 
 
 @pytest.mark.slow
-def test_from_a_sumo_configuration_to_a_page(tmp_path, monkeypatch):
+def test_from_a_sumo_configuration_to_a_page(tmp_path, out, monkeypatch):
     monkeypatch.setattr(stages, "LEVELS", (1.0,))
     for name in [*EVERYWHERE]:
         if name != PRESSURE:
             monkeypatch.delitem(EVERYWHERE, name)
-    out = tmp_path / "out"
     source = tiny_city.city(tmp_path)
     text = good(cosim("study", source, "--most-seeds 3 --workers 2 --out", out))
     labels = ", ".join(AT_CRITICAL.values())
