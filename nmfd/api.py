@@ -102,7 +102,10 @@ def loaded(
 
 
 def checked_factor(demand: float) -> float:
-    """Return a factor of the demand. Raise InputError for one that no scenario takes."""
+    """Return a factor of the demand.
+
+    Raises: InputError for one that no scenario takes
+    """
     if not 0.0 < demand <= MOST_DEMAND:
         raise InputError(
             f"demand: expected a number above 0 up to {MOST_DEMAND:g}, got {demand:g} instead"
@@ -111,7 +114,10 @@ def checked_factor(demand: float) -> float:
 
 
 def levels_of(demand: float | Iterable[float]) -> list[float]:
-    """Return the factors of the demand of a study as a list. Raise InputError for a wrong one."""
+    """Return the factors of the demand of a study as a list.
+
+    Raises: InputError for a wrong one
+    """
     if isinstance(demand, int | float):
         return [checked_factor(demand)]
     return [checked_factor(one) for one in demand]

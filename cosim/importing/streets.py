@@ -109,7 +109,9 @@ class Streets:
         return self.links[self.main_part[self.links].all(axis=1)]
 
     def joins(self, labels: EdgeNumbers) -> csr_array:
-        """Return the number of links (U, U) that join two of U labels, in any direction.
+        """Return the number of links (U, U) that join two of U labels.
+
+        Either way counts.
 
         labels: (E,), -1 for none
         """
