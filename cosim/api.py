@@ -26,6 +26,7 @@ from cosim.sumo.trips import PLANNING_SEEDS
 from nmfd.api import (
     Controllers,
     ScenarioLike,
+    checked_factor,
     levels_of,
     loaded,
     policy_files,
@@ -37,7 +38,7 @@ from nmfd.errors import RunFailed
 from nmfd.metrics import summary
 from nmfd.model.scenario import Scenario
 from nmfd.runs import shipped
-from nmfd.runs.files import default_folder, folder_of, write_table
+from nmfd.runs.files import default_folder, folder_of, path_of, write_table
 from nmfd.runs.frame import Table
 from nmfd.runs.progress import Progress, watched
 from nmfd.runs.run_many import Run, locked, raise_failures, run_many
@@ -95,11 +96,9 @@ def run(
     """
     strategy = parse(controller, city)
     shortened = loaded(scenario, steps=steps)
-    loaded(shortened, demand=demand)  # checks the factor
-    policy_file = None if policy is None else Path(policy)
-    trip_file = None if tripinfo is None else Path(tripinfo)
+    factor = checked_factor(demand)
     with watched(strategy.name, progress) as show:
-        job = Simulation(shortened, strategy, seed, demand, policy_file, trip_file)
+        job = Simulation(shortened, strategy, seed, factor, path_of(policy), path_of(tripinfo))
         return simulate(job, progress=show)
 
 
@@ -191,9 +190,9 @@ def watch(
     from cosim.view import live
 
     loaded_one = loaded(scenario)
-    loaded(loaded_one, demand=demand)  # checks the factor
+    factor = checked_factor(demand)
     strategies = _reference_first(parse_many(controllers, loaded_one, lambda one: parse(one, city)))
-    jobs = [Simulation(loaded_one, strategy, seed, demand) for strategy in strategies]
+    jobs = [Simulation(loaded_one, strategy, seed, factor) for strategy in strategies]
     if gui:
         try:
             with watched("watch", None) as show:
@@ -262,7 +261,7 @@ def evaluate(
         out=out,
     )
     with locked(out):
-        rows = evaluation.evaluate(
+        return evaluation.evaluate(
             runs,
             out,
             _draw_all,
@@ -272,8 +271,6 @@ def evaluate(
             overwrite=overwrite,
             progress=progress,
         )
-    rows.attrs["folder"] = str(out)
-    return rows
 
 
 def _draw_all(finished: results.Finished) -> None:
@@ -305,10 +302,7 @@ def planned(
         suite, seeds = evaluation.read_suite(Path(scenario), settings)
     else:
         levels = levels_of(demand)
-        one = loaded(scenario, settings=settings)
-        for level in levels:
-            loaded(one, demand=level)  # checks the factor
-        suite = [(one, levels)]
+        suite = [(loaded(scenario, settings=settings), levels)]
     suite = [(loaded(one, steps=steps), levels) for one, levels in suite]
     first = suite[0][0]
     strategies = parse_many(controllers, first, lambda one: parse(one, city))
@@ -449,7 +443,6 @@ def plan(
     from cosim.evaluation import plan_routes
 
     one = loaded(scenario)
-    loaded(one, demand=demand)  # checks the factor
     if plan_file is None:
         folder = one.folder or Path()
         plan_file = shipped.beside(folder, PLAN, "--plan-file FILE", scenario=True)
@@ -457,7 +450,7 @@ def plan(
         scenario=one,
         strategy=parse(controller, city),
         out=folder_of(one.name, "plan", out),
-        demand=demand,
+        demand=checked_factor(demand),
         seed=seed,
         iterations=iterations,
     )
@@ -497,9 +490,9 @@ def study(
         Path(source),
         regions=str(regions),
         routes=[Path(file) for file in routes],
-        counts=None if counts is None else Path(counts),
+        counts=path_of(counts),
         most_seeds=most_seeds,
-        out=None if out is None else Path(out),
+        out=path_of(out),
         workers=workers,
     )
 
@@ -552,7 +545,7 @@ def links(
     """
     from cosim.evaluation.links import write_links
 
-    return write_links(loaded(scenario), None if out is None else Path(out), seeds, numbers)
+    return write_links(loaded(scenario), path_of(out), seeds, numbers)
 
 
 def fit_links(runs: Path | str, *, progress: Progress = None) -> "Fit":

@@ -26,7 +26,7 @@ from nmfd.controllers.strategy import (
 from nmfd.errors import InputError, did_you_mean
 from nmfd.model.scenario import Scenario, read_scenario, with_demand
 from nmfd.runs import shipped
-from nmfd.runs.files import default_folder, folder_of, run_name
+from nmfd.runs.files import default_folder, folder_of, path_of, run_name
 from nmfd.runs.progress import Progress, watched
 from nmfd.runs.run_many import Run, locked, run_many
 from nmfd.runs.run_many import raise_failures as raise_failures
@@ -98,18 +98,29 @@ def loaded(
     """
     if not isinstance(scenario, Scenario):
         scenario = load_scenario(scenario, settings)
+    return with_demand(scenario, steps=steps, factor=checked_factor(demand))
+
+
+def checked_factor(demand: float) -> float:
+    """Return a factor of the demand.
+
+    Raises: InputError for one that no scenario takes
+    """
     if not 0.0 < demand <= MOST_DEMAND:
         raise InputError(
             f"demand: expected a number above 0 up to {MOST_DEMAND:g}, got {demand:g} instead"
         )
-    return with_demand(scenario, steps=steps, factor=demand)
+    return float(demand)
 
 
 def levels_of(demand: float | Iterable[float]) -> list[float]:
-    """Return the factors of the demand of a study as a list."""
+    """Return the factors of the demand of a study as a list.
+
+    Raises: InputError for a wrong one
+    """
     if isinstance(demand, int | float):
-        return [float(demand)]
-    return [float(one) for one in demand]
+        return [checked_factor(demand)]
+    return [checked_factor(one) for one in demand]
 
 
 def seeds_of(seeds: int | Iterable[int], first: int = 0) -> list[int]:
@@ -154,7 +165,7 @@ def controller(
     Raises: InputError for an unknown name, a wrong option, or a policy that is missing or made for
         another network
     """
-    return parse(controller).make(loaded(scenario), _path(policy))
+    return parse(controller).make(loaded(scenario), path_of(policy))
 
 
 def run(
@@ -194,7 +205,7 @@ def run(
     strategy = parse(controller).regional()
     scenario = loaded(scenario, steps=steps, demand=demand)
     _check_plant(plant)
-    acting = strategy.make(scenario, _path(policy))
+    acting = strategy.make(scenario, path_of(policy))
     name = type(plant).__name__
     if isinstance(plant, str):
         name = plant
@@ -234,7 +245,8 @@ def benchmark(
     steps: control intervals; the scenario's if None
     plant: "nmfd", "acyclic" or "links"
     policies: controller -> file, if not SCENARIO/NAME.pt
-    out: run folder, runs/SCENARIO-TIME if None; finished runs in it are kept
+    out: run folder, runs/SCENARIO-TIME if None; it is `table.attrs["folder"]`, and finished runs in
+        it are kept
     workers: runs at a time
     scheduler: address of a Dask scheduler that does the runs instead
     time_limit: seconds after which a run is ended; see nmfd.runs.run_many
@@ -579,10 +591,6 @@ def _file(scenario: Scenario, name: str, out: Path | str | None) -> Path:
     if not file.parent.is_dir():
         raise InputError(f"{file.parent}: no such folder; make it or choose another --out")
     return file
-
-
-def _path(file: Path | str | None) -> Path | None:
-    return None if file is None else Path(file)
 
 
 def _regional(controller: ControllerLike) -> Strategy:

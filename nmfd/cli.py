@@ -368,7 +368,7 @@ def show(scenario: Path | None, settings: dict, out: Path | None) -> None:
 @POLICIES
 @RUNNING
 @out_option("runs/SCENARIO-TIME")
-def benchmark(scenario: Path, settings: dict, out: Path | None, **options: Any) -> None:
+def benchmark(scenario: Path, settings: dict, **options: Any) -> None:
     """Run controllers on a regional model and compare them.
 
     SCENARIO is a name that `nmfd show` lists, or a folder with a scenario.toml. The run folder
@@ -379,9 +379,8 @@ def benchmark(scenario: Path, settings: dict, out: Path | None, **options: Any) 
     Example:
       nmfd benchmark economic_mpc --controllers no-control,dpc-pc --seeds 5
     """
-    loaded = nmfd.load_scenario(scenario, settings)
-    out = out or nmfd.api.default_folder(loaded.name)
-    rows = nmfd.api.benchmark(loaded, out=out, **options)
+    rows = nmfd.api.benchmark(nmfd.load_scenario(scenario, settings), **options)
+    out = rows.attrs["folder"]
     click.echo(nmfd.api.summary_table(rows))
     click.echo(f"Written to {out}: see the figures; more seeds: --seeds N --out {out}")
     nmfd.api.raise_failures(rows)
@@ -405,7 +404,7 @@ def benchmark(scenario: Path, settings: dict, out: Path | None, **options: Any) 
 @STEPS
 @RUNNING
 @out_option("runs/SCENARIO-TIME")
-def robustness(scenario: Path, settings: dict, out: Path | None, **options: Any) -> None:
+def robustness(scenario: Path, settings: dict, **options: Any) -> None:
     """Run controllers under unexpected demand or MFDs.
 
     demand adds noise per pair of regions and control interval; demand-total then restores the
@@ -416,11 +415,9 @@ def robustness(scenario: Path, settings: dict, out: Path | None, **options: Any)
     Example:
       nmfd robustness economic_mpc --controllers pi-gating,dpc-pcrg --out runs/robust
     """
-    loaded = nmfd.load_scenario(scenario, settings)
-    out = out or nmfd.api.default_folder(loaded.name)
-    rows = nmfd.api.robustness(loaded, out=out, **options)
+    rows = nmfd.api.robustness(nmfd.load_scenario(scenario, settings), **options)
     click.echo(nmfd.api.improvement_table(rows))
-    click.echo(f"Written to {out}: see runs.csv and robustness.png")
+    click.echo(f"Written to {rows.attrs['folder']}: see runs.csv and robustness.png")
     nmfd.api.raise_failures(rows)
 
 

@@ -81,10 +81,26 @@ def folder(tmp_path):
 
 
 @pytest.fixture
+def out(tmp_path):
+    """A folder to write into, which is not there yet."""
+    return tmp_path / "out"
+
+
+@pytest.fixture
 def scenario(folder):
     from nmfd.api import load_scenario
 
     return load_scenario(folder)
+
+
+@pytest.fixture
+def three_regions(tmp_path):
+    """The tiny scenario with three regions in a row."""
+    import tiny  # not before annotations are checked
+
+    from nmfd.api import load_scenario
+
+    return load_scenario(tiny.write(tmp_path, network=tiny.row_network(3)))
 
 
 @pytest.fixture
@@ -103,6 +119,18 @@ def plant_of(scenario):
     yield make
     for plant in plants:
         plant.close()
+
+
+@pytest.fixture
+def train(scenario, tmp_path):
+    """Trains a policy, by default on the module's scenario."""
+    from nmfd.controllers import training  # not before annotations are checked
+    from nmfd.controllers.strategy import parse
+
+    def file(name="dpc-pc", *, on=scenario, seed=0, out=tmp_path / "p.pt", **how):
+        return training.train(on, parse(name), seed=seed, out=out, **how)
+
+    return file
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Copies of the committed cities, which a test may change."""
+"""The folder of the project, and copies of its cities, which a test may change."""
 
 import shutil
 from pathlib import Path

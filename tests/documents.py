@@ -10,9 +10,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from copies import ROOT
 from markdown_it import MarkdownIt
 
-ROOT = Path(__file__).parents[1]
 FOLDERS = ("cosim", "networks", "nmfd", "scenarios", "tests")
 FILES = [
     ROOT / "README.md",

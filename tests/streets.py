@@ -46,6 +46,14 @@ def city(
     )
 
 
+def side_street(length: float = 40.0) -> City:
+    """A main road a m b t of 10 s each, of which m is in region 1 and t in 2, and the side street s
+    from a to t, at 1 m/s."""
+    region_of = {"a": 0, "b": 0, "m": 1, "s": 0, "t": 2}
+    after = {"a": ("m", "s"), "b": ("t",), "m": ("b",), "s": ("t",), "t": ()}
+    return city(region_of, after, length=dict.fromkeys(after, 10.0) | {"s": length})
+
+
 def session(routes: dict[str, tuple[str, ...]], **others: Any) -> SimpleNamespace:
     """Return a session of drivers on the first edges of their `routes`, none of whom is near the
     end of a lane."""

@@ -12,12 +12,12 @@ from importlib import resources
 import numpy as np
 import pytest
 import tiny
-from click.testing import CliRunner
+from commands import good
+from commands import nmfd as command
 from documents import ROOT, kind, read
 
 import cosim
 import nmfd
-from nmfd.cli import main
 from nmfd.studies.benchmark import summary_table
 
 
@@ -69,18 +69,14 @@ def test_every_public_name_is_there_with_help_and_types(package):
 
 def test_run_and_benchmark_agree_with_the_command_line(tmp_path):
     folder, out = tiny.write(tmp_path), tmp_path / "out"
-    done = CliRunner().invoke(
-        main,
-        ["benchmark", str(folder), "--controllers", "pi-gating", "--seeds", "2", "--out", str(out)],
-    )
-    assert done.exit_code == 0, done.output
+    said = good(command("benchmark", folder, "--controllers pi-gating --seeds 2 --out", out))
     trajectory = nmfd.run(folder, "pi-gating", seed=1)
     assert trajectory.without_times().identical(
         nmfd.Result.read(out / "pi-gating-1.nc").without_times()
     )
     rows = nmfd.benchmark(folder, ["pi-gating"], seeds=2, out=out)
     assert len(rows) == 2
-    assert summary_table(rows) in done.output
+    assert summary_table(rows) in said
 
 
 HALF = tiny.Acting(
@@ -88,12 +84,12 @@ HALF = tiny.Acting(
 )
 
 
-def test_figures_are_drawn_again_if_a_run_is_new(tmp_path):
+def test_figures_are_drawn_again_if_a_run_is_new(tmp_path, out):
     scenario = tiny.write(tmp_path)
 
     def drawn(*controllers):
-        nmfd.benchmark(scenario, controllers, steps=2, out=tmp_path / "out")
-        return (tmp_path / "out" / "region_accumulation.png").stat().st_mtime_ns
+        nmfd.benchmark(scenario, controllers, steps=2, out=out)
+        return (out / "region_accumulation.png").stat().st_mtime_ns
 
     first = drawn("no-control")
     assert drawn("no-control") == first

@@ -8,14 +8,13 @@ import re
 import subprocess
 import sys
 import textwrap
-from pathlib import Path
 
 import pytest
+from copies import ROOT
 
 import cosim
 import nmfd
 
-ROOT = Path(__file__).parents[1]
 SLOW = ("cosim", "cosim.api", "nmfd.rl.env")  # SUMO
 FILES = {
     ".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(

@@ -94,7 +94,7 @@ def test_an_assignment_that_sumo_refuses(fork):
 
 def test_an_import_assigns_its_peak(tmp_path):
     """The gap is in the report, the routes in the scenario."""
-    net = tiny_city.network(tmp_path, "--tls.set", "B1,C2", name="tiny.net.xml")
+    net = tiny_city.network(tmp_path, "--tls.set B1,C2", name="tiny.net.xml")
     folder = tiny_city.imported(tmp_path, 2, net, demand="peak", mesoscopic=True, iterations=1)
     scenario, text = (
         load_scenario(folder),

@@ -4,16 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import tiny
 
 from nmfd.model.authority import Boundaries, verdict
-from nmfd.model.regional_model import load_network
 
 
 @pytest.fixture
-def network(tmp_path):
-    tiny.write(tmp_path, network=tiny.row_network(3))
-    return load_network(tmp_path / "network")
+def network(three_regions):
+    return three_regions.network
 
 
 def crossing(flow, share):

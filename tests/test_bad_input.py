@@ -17,17 +17,16 @@ import pytest
 import tiny
 import tiny_city
 import torch
-from commands import call, cosim, error_line, good, nmfd
+from commands import call, cosim, error_line, good, nmfd, problem
+from copies import ROOT
 
 from cosim.plant.settings import settings
 from cosim.sumo.recorded_trips import read_recorded_trips
 from nmfd.api import load_scenario
 from nmfd.controllers.dpc.policy import Architecture, Policy
 from nmfd.controllers.dpc.policy_file import checkpoint
-from nmfd.errors import InputError
 from nmfd.model.regional_model import load_network
 
-ROOT = Path(__file__).parents[1]
 ECONOMIC, PEAK = ROOT / "scenarios" / "economic_mpc", ROOT / "scenarios" / "grid7_peak"
 SCENARIO_TEXT, CITY_TEXT = (
     (folder / "scenario.toml").read_text().replace("../../networks", str(ROOT / "networks"))
@@ -39,14 +38,6 @@ SCENARIO_KEYS = (
     *(("demand", key) for key in ("from", "to", "start", "peak", "ramp_up", "flat", "ramp_down")),
 )
 NETWORK_KEYS = (("", "name"), ("perimeter", "min"), ("mfd", "a"), ("regions", "adjacent"))
-
-
-def problem(read, *arguments) -> str:
-    """Return the one line of the InputError that `read` raises."""
-    with pytest.raises(InputError) as caught:
-        read(*arguments)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
 
 
 def params(cases):
@@ -99,11 +90,11 @@ def test_files_that_do_not_fit_together(tmp_path, case, command):
     scenario, network, expected = FILES[case]
     folder, out = tiny.write(tmp_path, scenario=scenario, network=network), tmp_path / "out"
     options = {
-        "benchmark": ["--controllers", "no-control"],
-        "train": ["--controller", "dpc-pc"],
-        "show": [],
+        "benchmark": "--controllers no-control",
+        "train": "--controller dpc-pc",
+        "show": "",
     }
-    assert expected in error_line(nmfd(command, folder, *options[command], "--out", out), "nmfd")
+    assert expected in error_line(nmfd(command, folder, options[command], "--out", out), "nmfd")
     assert not out.exists()
 
 
@@ -167,17 +158,8 @@ def test_policies(tmp_path, policy, monkeypatch, name):
     scenario = tiny.write(tmp_path)
     if (content := POLICIES[name](*policy)) is not None:
         Path("p.pt").write_bytes(content)
-    command = (
-        "benchmark",
-        scenario,
-        "--controllers",
-        "dpc-pc",
-        "--out",
-        "out",
-        "--policy",
-        "dpc-pc=p.pt",
-    )
-    assert "p.pt: " in error_line(nmfd(*command), "nmfd")
+    done = nmfd("benchmark", scenario, "--controllers dpc-pc --out out --policy dpc-pc=p.pt")
+    assert "p.pt: " in error_line(done, "nmfd")
     assert not Path("executed").exists()
     assert not Path("out").exists()
 
@@ -193,12 +175,12 @@ def test_policies(tmp_path, policy, monkeypatch, name):
         ]
     ),
 )
-def test_plans(tmp_path, content):
+def test_plans(tmp_path, out, content):
     scenario = tiny.write(tmp_path)
     (scenario / "bound-pc.npz").write_bytes(content)
-    command = ("benchmark", scenario, "--controllers", "bound-pc", "--out", tmp_path / "out")
-    assert "bound-pc.npz: " in error_line(nmfd(*command), "nmfd")
-    assert not (tmp_path / "out").exists()
+    done = nmfd("benchmark", scenario, "--controllers bound-pc --out", out)
+    assert "bound-pc.npz: " in error_line(done, "nmfd")
+    assert not out.exists()
 
 
 HEAD = "interval,from,to,veh_s\n"
@@ -270,15 +252,8 @@ def test_files_of_a_city(city, tmp_path, file, name):
         gzip.decompress(path.read_bytes()).decode() if packed else path.read_text()
     )
     path.write_bytes(gzip.compress(text.encode()) if packed else text.encode())
-    command = (
-        "run",
-        tmp_path / "project" / "scenarios" / "tiny",
-        "--controller",
-        "no-control",
-        "--set",
-        "steps=1",
-    )
-    line = error_line(cosim(*command, "--out", out))
+    scenario = tmp_path / "project" / "scenarios" / "tiny"
+    line = error_line(cosim("run", scenario, "--controller no-control --set steps=1 --out", out))
     assert path.name in line or "nowhere" in line or "has no region" in line
     assert not out.exists()
 

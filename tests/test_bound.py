@@ -8,14 +8,13 @@ import pytest
 import torch
 from commands import good, nmfd
 
-from nmfd import api, closed_loop
+from nmfd import api
 from nmfd.api import load_scenario
 from nmfd.controllers import open_loop
 from nmfd.errors import InputError
 from nmfd.metrics import total_time_spent
 from nmfd.model import dynamics
 from nmfd.model.integration import SCHEMES
-from nmfd.model.plant import NmfdPlant
 from nmfd.model.scenario import with_demand
 from nmfd.studies import bound
 
@@ -23,17 +22,23 @@ ECONOMIC = "economic_mpc"
 
 
 def closed(scenario, controller):
-    return total_time_spent(closed_loop.run(NmfdPlant(scenario), controller, scenario, seed=0))
+    return total_time_spent(api.run(scenario, controller))
 
 
-def test_where_nothing_congests_the_bound_is_an_open_perimeter(scenario):
-    free = replace(scenario, demand=0.01 * scenario.demand, protected=())
-    plan = bound.compute(free, "bound-pc", iterations=100)
+@pytest.fixture
+def free(scenario):
+    """The scenario with hardly any demand, and the best plan for it."""
+    empty = replace(scenario, demand=0.01 * scenario.demand, protected=())
+    return empty, bound.compute(empty, "bound-pc", iterations=100)
+
+
+def test_where_nothing_congests_the_bound_is_an_open_perimeter(free):
+    empty, plan = free
     assert (
         plan.perimeter[:8, 0, 1].min() > 0.85
     )  # later intervals move vehicles that the horizon does not count
-    uncontrolled = closed(free, api.controller("no-control", free))
-    assert closed(free, plan) == pytest.approx(uncontrolled, rel=1e-3)
+    uncontrolled = closed(empty, "no-control")
+    assert closed(empty, plan) == pytest.approx(uncontrolled, rel=1e-3)
 
 
 @pytest.mark.parametrize("name", bound.NAMES)
@@ -61,9 +66,7 @@ def test_the_bound_is_not_above_the_closed_loop_it_started_from(scenario):
     crowded = replace(scenario, demand=3.0 * scenario.demand)
     plan = bound.compute(crowded, "bound-pc", iterations=120)
     # A sigmoid never quite reaches the bounds of u.
-    assert plan.totals[plan.start] <= (1.0 + 1e-4) * closed(
-        crowded, api.controller("pi-gating", crowded)
-    )
+    assert plan.totals[plan.start] <= (1.0 + 1e-4) * closed(crowded, "pi-gating")
 
 
 def test_an_interrupted_descent_keeps_the_best_so_far(scenario):
@@ -77,16 +80,12 @@ def test_an_interrupted_descent_keeps_the_best_so_far(scenario):
     assert all(short.totals[name] < first.totals[name] for name in start)
 
 
-def test_a_plan_that_benchmark_replays(folder, tmp_path):
+def test_a_plan_that_benchmark_replays(folder, out):
     text = api.bound_report(api.bound(folder, "bound-pcrg", iterations=20))
     assert "(kept)" in text
     assert "from pi-gating:" in text
     assert "the best plan is at most" in text
-    text = good(
-        nmfd(
-            "benchmark", folder, "--controllers", "no-control,bound-pcrg", "--out", tmp_path / "out"
-        )
-    )
+    text = good(nmfd("benchmark", folder, "--controllers no-control,bound-pcrg --out", out))
     assert "above the optimum" in text
     assert "≤ " in text
     assert any(line.startswith("bound-pcrg ") for line in text.splitlines())
@@ -197,9 +196,8 @@ def test_every_trajectory_meets_the_relaxation(variant, guidance):
     assert abs(lp.equal @ z - lp.given).max() > 1e-6
 
 
-def test_without_congestion_the_lower_bound_is_nearly_reached(scenario):
-    free = replace(scenario, demand=0.01 * scenario.demand, protected=())
-    plan = bound.compute(free, "bound-pc", iterations=100)
+def test_without_congestion_the_lower_bound_is_nearly_reached(free):
+    empty, plan = free
     assert 0.97 * plan.totals[plan.start] < plan.lower <= plan.totals[plan.start]
     with pytest.raises(InputError, match="process_std: expected 0 for a lower bound, got 0.25"):
-        bound.lower_bound(replace(free, process_std=0.25), guidance=False)
+        bound.lower_bound(replace(empty, process_std=0.25), guidance=False)

@@ -11,7 +11,8 @@ from pathlib import Path
 import pandas as pd
 import pytest
 import sumo
-from commands import cosim, good
+from commands import cosim, error_line, good
+from copies import ROOT
 from tiny_city import driven, pieces
 
 from cosim.evaluation.simulate import Simulation, simulate
@@ -20,9 +21,8 @@ from cosim.plant.strategy import parse
 from nmfd.api import load_scenario
 from nmfd.metrics import total_time_spent
 
-ROOT = Path(__file__).parents[1]
 GAMES = Path(sumo.SUMO_HOME) / "tools" / "game"
-CITIES = Path(os.environ.get("CITIES", Path(__file__).parents[2] / "shared" / "cities"))
+CITIES = Path(os.environ.get("CITIES", ROOT.parent / "shared" / "cities"))
 REAL = {
     "bologna": ("bologna/run.sumocfg", 4),
     "ingolstadt": ("ingolstadt21/ingolstadt21.sumocfg", 3),
@@ -62,16 +62,16 @@ def check(folder: Path, name: str, intervals: int) -> None:
 )
 def test_demos_of_sumo(tmp_path, name, expected):
     result = cosim(
-        *("import", GAMES / f"{name}.sumocfg", "--regions", 3, "--seeds", 1),
-        *("--out", tmp_path / "networks" / name),
+        "import",
+        GAMES / f"{name}.sumocfg",
+        "--regions 3 --seeds 1 --out",
+        tmp_path / "networks" / name,
     )
     if expected is None:
         good(result)
         check(tmp_path, name, 2)
     else:
-        assert result.exit_code == 2
-        assert expected in result.stderr
-        assert result.stderr.count("\n") == 1
+        assert expected in error_line(result)
         assert not list((tmp_path / "networks").glob("*"))
         assert not list((tmp_path / "scenarios").glob("*"))
 
@@ -82,9 +82,9 @@ def test_real_cities(tmp_path, name):
     source, count = REAL[name]
     if not (CITIES / source).is_file():
         pytest.skip(f"no real city: {CITIES / source} is not there")
-    peak = ("--demand", "peak", "--level", "0.05") if name == "luxembourg" else ()
+    peak = "--demand peak --level 0.05" if name == "luxembourg" else ""
     out = tmp_path / "networks" / name
-    text = good(cosim("import", CITIES / source, "--regions", count, *peak, "--out", out))
+    text = good(cosim("import", CITIES / source, "--regions", count, peak, "--out", out))
     assert "regions instead of" not in text
     check(tmp_path, name, 2)
 
@@ -97,7 +97,7 @@ def test_max_pressure_takes_no_longer_than_fixed_time(tmp_path, name, level):
     (config,) = (CITIES / name).glob("*.sumocfg") if (CITIES / name).is_dir() else (None,)
     if config is None:
         pytest.skip(f"no real city: {CITIES / name} is not there")
-    good(cosim("import", config, "--regions", 3, "--out", tmp_path / "networks" / name))
+    good(cosim("import", config, "--regions 3 --out", tmp_path / "networks" / name))
     spent = {}
     for signals in ("no-control", "max-pressure"):
         run = simulate(
@@ -135,14 +135,5 @@ def test_committed_cities_run_under_their_policies(tmp_path, name):
     scenario = ROOT / "scenarios" / name
     for strategy in ("route-guidance", *(policy.stem for policy in scenario.glob("*.pt"))):
         good(
-            cosim(
-                "run",
-                scenario,
-                "--controller",
-                strategy,
-                "--steps",
-                2,
-                "--out",
-                tmp_path / strategy,
-            )
+            cosim("run", scenario, "--controller", strategy, "--steps 2 --out", tmp_path / strategy)
         )

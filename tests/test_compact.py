@@ -79,7 +79,7 @@ def crowded(network, seed=0):
 
 def test_gates_and_prices_are_those_of_the_formula(network):
     x = crowded(network)
-    seen = Observation(step=0, time=0.0, accumulation=x, backlog=0.0 * x)
+    seen = tiny.seen(x)
     controls = DpcController(policy(network)).act(seen)
     full = x.sum(axis=1) / network.critical
     for i, h in np.argwhere(network.adjacency):
@@ -139,10 +139,7 @@ def test_with_an_integral_it_contains_the_pi_gate_and_relief_comes_on_top(networ
         for k, full in enumerate((0.2, 0.7, 0.9, 1.0, 0.8, 0.8, 0.4, 3.2, 3.0, 0.7)):
             x[CENTRE, CENTRE] = full * critical
             expected, found, more = (
-                controller.act(
-                    Observation(step=k, time=0.0, accumulation=x, backlog=0.0 * x)
-                ).perimeter
-                for controller in (gate, alone, relieved)
+                controller.act(tiny.seen(x, k)).perimeter for controller in (gate, alone, relieved)
             )
             np.testing.assert_allclose(found, expected, atol=1e-5)
             np.testing.assert_allclose(
@@ -195,7 +192,7 @@ def test_every_number_has_a_gradient_and_perimeter_control_alone_has_no_prices(n
 def test_it_is_trained_and_kept_in_a_file(tmp_path):
     scenario = tiny.write(tmp_path)
     (scenario / "scenario.toml").write_text((scenario / "scenario.toml").read_text() + TABLE)
-    good(nmfd("train", scenario, "--controller", "dpc-pcrg"))
+    good(nmfd("train", scenario, "--controller dpc-pcrg"))
     loaded = load_scenario(scenario)
     trained, content = load_policy(scenario / "dpc-pcrg.pt", loaded.network)
     rule = parse("gating-rule").make(loaded)
@@ -210,16 +207,7 @@ def test_it_is_trained_and_kept_in_a_file(tmp_path):
         rule.policy, Rollout(parse("dpc-pcrg").own_planning(loaded)), 0, setup
     )
     assert content["configuration"]["validation_veh_s"] < untrained
-    good(
-        nmfd(
-            "benchmark",
-            scenario,
-            "--controllers",
-            "dpc-pcrg,gating-rule",
-            "--out",
-            tmp_path / "out",
-        )
-    )
+    good(nmfd("benchmark", scenario, "--controllers dpc-pcrg,gating-rule --out", tmp_path / "out"))
 
 
 def test_descent_from_a_saturated_gate_takes_the_single_change_that_gains(tmp_path):

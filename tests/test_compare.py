@@ -8,17 +8,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import tiny
-import torch
 import trajectories
 
+import nmfd
 from cosim.evaluation import identify, model_validation
 from cosim.evaluation.identify import as_it_was, static_model
 from cosim.evaluation.model_validation import observed, outflow_samples, predict
 from cosim.plant.strategy import parse
 from nmfd.api import load_scenario
-from nmfd.model import dynamics, mfd
+from nmfd.model import mfd
 from nmfd.model.mfd import held_up
 from nmfd.studies.fit_quality import fit_table, nearly_empty, predictions, region_fits, with_guesses
+from nmfd.types import Controls
 
 
 @pytest.fixture(scope="module")
@@ -31,40 +32,20 @@ def result(scenario):
     """A run of the regional model under random controls, recorded as if it were the
     microsimulation."""
     random, network = np.random.default_rng(0), scenario.network
-    p, x = dynamics.parameters(network), torch.zeros((7, 7), dtype=torch.float64)
-    states, perimeter, crossings, arrivals = [x.numpy()], [], [], []
-    splits = torch.from_numpy(network.nominal_splits)
-    for k in range(scenario.steps):
-        u = (
-            random.uniform(network.u_min, network.u_max, 7)[:, None] * network.adjacency
-        )  # one u per region, see below
-        completions, transfers = dynamics.flows(p, x, torch.from_numpy(u), splits)
-        x = dynamics.advance(
-            p, x, torch.from_numpy(scenario.demand[k]), torch.from_numpy(u), splits, scenario.step
-        )
-        states.append(x.numpy())
-        perimeter.append(u)
-        crossings.append(scenario.step * transfers.numpy())
-        arrivals.append(scenario.step * completions.numpy())
-    trajectory = trajectories.made(
-        controller="random",
-        plant="sumo",
-        seed=0,
-        step=scenario.step,
-        accumulation=np.stack(states),
-        backlog=np.zeros((scenario.steps + 1, 7, 7)),
-        completed=np.zeros(scenario.steps + 1),
-        perimeter=np.stack(perimeter),
-        splits=np.repeat(network.nominal_splits[None], scenario.steps, axis=0),
-    )
+
+    def gates(_):
+        """One u per region, see below."""
+        u = random.uniform(network.u_min, network.u_max, 7)
+        return Controls(perimeter=u[:, None] * network.adjacency)
+
+    run = nmfd.run(scenario, tiny.Acting(gates))
+    completions, transfers = trajectories.flows(scenario, run)
     record = {
         "departures": scenario.step * scenario.demand,
-        "crossings": crossings,
-        "arrivals": arrivals,
+        "crossings": scenario.step * transfers,
+        "arrivals": scenario.step * completions,
     }
-    return trajectories.recorded(
-        trajectory, {name: np.stack(values) for name, values in record.items()}, {}
-    )
+    return trajectories.recorded(run, record, {})
 
 
 def test_a_perfect_model_has_no_error(scenario, result):
@@ -217,25 +198,26 @@ def test_an_empty_region_keeps_its_model_in_identification(scenario, result):
     assert (kept.storage[1:] == 10.0).all()
 
 
-def test_the_regions_to_protect_are_proposed_and_written(tmp_path):
-    loaded = load_scenario(tiny.write(tmp_path, network=tiny.row_network(3)))
-    file = loaded.folder / "scenario.toml"
+def test_the_regions_to_protect_are_proposed_and_written(three_regions):
+    file = three_regions.folder / "scenario.toml"
     before = file.read_text()
-    assert identify._proposal(loaded, (), written=True) == []
-    assert identify._proposal(loaded, (1,), written=True) == []
-    (line,) = identify._proposal(loaded, (0, 2), written=False)
+    assert identify._proposal(three_regions, (), written=True) == []
+    assert identify._proposal(three_regions, (1,), written=True) == []
+    (line,) = identify._proposal(three_regions, (0, 2), written=False)
     assert "protected = [0, 2] instead of [1] in" in line
     assert file.read_text() == before
-    identify.write_protected(loaded, (0, 2))
+    identify.write_protected(three_regions, (0, 2))
     assert file.read_text() == before.replace("protected = [1]", "protected = [0, 2]")
     file.write_text(before.replace("protected = [1]\n", ""))
-    identify.write_protected(loaded, (2,))
-    assert load_scenario(loaded.folder).protected == (2,)
+    identify.write_protected(three_regions, (2,))
+    assert load_scenario(three_regions.folder).protected == (2,)
 
 
-def test_the_same_command_goes_on_after_ctrl_c_in_the_second_model(tmp_path, monkeypatch):
+def test_the_same_command_goes_on_after_ctrl_c_in_the_second_model(
+    tmp_path, three_regions, monkeypatch
+):
     """Until its end the command changes nothing that its loading runs depend on."""
-    folder = tiny.write(tmp_path, network=tiny.row_network(3))
+    folder = three_regions.folder
     before = (folder / "scenario.toml").read_text()
     verdict = SimpleNamespace(protect=(0, 2), sentences=("Yes.",))
     found = SimpleNamespace(verdict=verdict, write=lambda out, target: None, text=lambda: "")

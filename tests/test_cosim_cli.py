@@ -2,7 +2,6 @@
 lines."""
 
 import re
-from pathlib import Path
 
 import copies
 import numpy as np
@@ -10,6 +9,7 @@ import pandas as pd
 import pytest
 import torch
 from commands import cosim, error_line, good
+from copies import ROOT
 
 from cosim.evaluation.model_validation import predict
 from cosim.plant.strategy import parse
@@ -17,9 +17,6 @@ from nmfd.api import load_scenario
 from nmfd.controllers.dpc.policy import Architecture, Policy
 from nmfd.controllers.dpc.policy_file import checkpoint
 from nmfd.types import Result
-
-ROOT = Path(__file__).parents[1]
-STEPS = "2"
 
 
 @pytest.fixture(scope="module")
@@ -43,8 +40,8 @@ def small(tmp_path_factory):
 
 def test_controllers_with_a_model_run(small, tmp_path):
     out, names = tmp_path / "run", ("mpc-pcrg", "dpc-pcrg")
-    both = ("--controller", names[0], "--against", names[1])
-    text = good(cosim("run", small, *both, "--steps", STEPS, "--out", out))
+    both = f"--controller {names[0]} --against {names[1]} --steps 2 --out"
+    text = good(cosim("run", small, both, out))
     for name in names:
         result = Result.read(out / f"{name}-0.nc")
         assert name in text
@@ -58,20 +55,7 @@ def test_controllers_with_a_model_run(small, tmp_path):
 @pytest.mark.slow
 def test_compare(small, tmp_path):
     out = tmp_path / "run"
-    good(
-        cosim(
-            "run",
-            small,
-            "--controller",
-            "pi-gating",
-            "--against",
-            "no-control",
-            "--steps",
-            STEPS,
-            "--out",
-            out,
-        )
-    )
+    good(cosim("run", small, "--controller pi-gating --against no-control --steps 2 --out", out))
     assert "whole run" in good(cosim("compare", out))
     rows = pd.read_csv(out / "foresight.csv")
     assert set(rows["controller"]) == {"no-control", "pi-gating"}
@@ -88,55 +72,45 @@ def test_compare(small, tmp_path):
     )
 
 
-RUN = ("run", "{small}", "--controller", "no-control", "--out", "{tmp}/out")
-EVALUATE = ("evaluate", "{small}", "--out", "{tmp}/out", "--controllers")
-IMPORT = ("import", "--out", "{tmp}/out/city")
+RUN = "run {small} --controller no-control --out {tmp}/out"
+EVALUATE = "evaluate {small} --out {tmp}/out --controllers"
+IMPORT = "import --out {tmp}/out/city"
 
 
 @pytest.mark.parametrize(
-    "arguments, expected",
+    "line, expected",
     [
         (
-            (*RUN, "--set", "sumo.complience=1"),
+            f"{RUN} --set sumo.complience=1",
             "sumo.complience: unknown key; did you mean compliance?",
         ),
         (
-            (*RUN, "--set", "sumo.step_length=0.7"),
+            f"{RUN} --set sumo.step_length=0.7",
             "sumo.step_length: expected a divisor of the control interval",
         ),
-        ((*RUN, "--set", f"network={ROOT / 'networks' / 'hexagon7'}"), "sumo"),
-        ((*RUN, "--demand", "nan"), "Invalid value for '--demand': 'nan' is not a number"),
-        (("identify", "grid8"), "no scenario or network of that name comes with the package"),
-        ((*RUN, "--policy", "x.pt"), "reads no policy"),
-        (("run", "{small}"), "`nmfd show` lists them"),
-        (("run", "{tmp}/none", "--controller", "no-control"), "scenario.toml: no such file"),
-        ((*EVALUATE, "no-control,nobody"), "'nobody' is unknown"),
+        (f"{RUN} --set network={ROOT / 'networks' / 'hexagon7'}", "sumo"),
+        (f"{RUN} --demand nan", "Invalid value for '--demand': 'nan' is not a number"),
+        ("identify grid8", "no scenario or network of that name comes with the package"),
+        (f"{RUN} --policy x.pt", "reads no policy"),
+        ("run {small}", "`nmfd show` lists them"),
+        ("run {tmp}/none --controller no-control", "scenario.toml: no such file"),
+        (f"{EVALUATE} no-control,nobody", "'nobody' is unknown"),
         (
-            (*EVALUATE, "no-control", "--policy", "dpc-pc=x.pt"),
+            f"{EVALUATE} no-control --policy dpc-pc=x.pt",
             "--policy: 'dpc-pc' is not among no-control; add it",
         ),
-        (("compare", "{tmp}"), "holds no finished runs"),
-        (
-            ("identify", "{small}", "--levels", "0,1"),
-            "'--levels': 0.0 is not in the range 0.0<x<=10.0",
-        ),
-        (
-            ("watch", "{small}", "--controller", "no-control", "--against", "x", "--gui"),
-            "omit --against",
-        ),
-        (("tune", "{small}", "--controller", "pi-gating", "--option", "kp"), "--option"),
-        ((*IMPORT, "--regions", "3"), "expected either a file or --bbox"),
-        (
-            (*IMPORT, "{tmp}/none.sumocfg", "--regions", "1"),
-            "--regions: expected 2 or more regions",
-        ),
-        ((*IMPORT, "{tmp}/none.sumocfg", "--regions", "3"), "none.sumocfg"),
-        (("drive",), "No such command 'drive'"),
-        (("list",), "No such command 'list': it is `nmfd show`"),
+        ("compare {tmp}", "holds no finished runs"),
+        ("identify {small} --levels 0,1", "'--levels': 0.0 is not in the range 0.0<x<=10.0"),
+        ("watch {small} --controller no-control --against x --gui", "omit --against"),
+        ("tune {small} --controller pi-gating --option kp", "--option"),
+        (f"{IMPORT} --regions 3", "expected either a file or --bbox"),
+        (f"{IMPORT} {{tmp}}/none.sumocfg --regions 1", "--regions: expected 2 or more regions"),
+        (f"{IMPORT} {{tmp}}/none.sumocfg --regions 3", "none.sumocfg"),
+        ("drive", "No such command 'drive'"),
+        ("list", "No such command 'list': it is `nmfd show`"),
     ],
-    ids=lambda value: " ".join(value[-2:])[:60] if isinstance(value, tuple) else "",
+    ids=lambda value: value[-60:],
 )
-def test_error_lines(small, tmp_path, arguments, expected):
-    filled = [argument.format(small=small, tmp=tmp_path) for argument in arguments]
-    assert expected in error_line(cosim(*filled))
+def test_error_lines(small, tmp_path, line, expected):
+    assert expected in error_line(cosim(line.format(small=small, tmp=tmp_path)))
     assert not (tmp_path / "out").exists()

@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 import tiny
 import torch
+import trajectories
 
 import nmfd
 from cosim.evaluation import identify
@@ -19,12 +20,13 @@ from nmfd.controllers.mpc.controller import EconomicMpc
 from nmfd.controllers.strategy import parse
 from nmfd.controllers.training import check, train
 from nmfd.errors import InputError
-from nmfd.model import dynamics
 from nmfd.model.counting import counted, mfd_of
 from nmfd.model.identification import Observed, prediction_errors
 from nmfd.model.mfd import RoundedLinear, trapezoid
 from nmfd.model.regional_model import Errors, HeldOut, load_network, network_toml
+from nmfd.model.scenario import Scenario
 from nmfd.runs.config import Problem
+from nmfd.types import Controls
 
 SCHEME = {"step": 30.0, "substeps": 1, "integrator": "euler"}
 STEPS = 160
@@ -49,36 +51,23 @@ def truth():
     )
 
 
-def drive(network, factor, seed, steps=STEPS):
+def drive(network, factor, seed):
     """Return a run of the regional model under random gates, with what left each region."""
     random = np.random.default_rng(seed)
-    p = dynamics.parameters(network)
-    splits = torch.from_numpy(network.nominal_splits)
-    wave = np.sin(np.linspace(0.0, np.pi, steps)) ** 2
+    wave = np.sin(np.linspace(0.0, np.pi, STEPS)) ** 2
     demand = factor * random.uniform(0.02, 0.1, (7, 7)) * wave[:, None, None]
-    x = torch.zeros((7, 7), dtype=torch.float64)
-    states = [x.numpy()]
-    gates = []
-    exits = []
-    crossings = []
-    for k in range(steps):
-        gate = random.uniform(0.6, 0.9) * network.adjacency
-        completions, transfers = dynamics.flows(p, x, torch.from_numpy(gate), splits)
-        left = transfers.sum(1) + torch.diag_embed(completions)
-        x = dynamics.advance(
-            p, x, torch.from_numpy(demand[k]), torch.from_numpy(gate), splits, 30.0
-        )
-        states.append(x.numpy())
-        gates.append(gate)
-        exits.append(30.0 * left.numpy())
-        crossings.append(30.0 * transfers.sum(2).numpy())
+    scenario = Scenario(name="driven", network=network, step=30.0, steps=STEPS, demand=demand)
+    gates = tiny.Acting(lambda _: Controls(perimeter=random.uniform(0.6, 0.9) * network.adjacency))
+    run = nmfd.run(scenario, gates)
+    completions, transfers = trajectories.flows(scenario, run)
+    left = transfers.sum(axis=2) + completions[:, :, None] * np.eye(7)
     return Observed(
-        accumulation=np.stack(states),
+        accumulation=run["accumulation"],
         demand=demand,
-        perimeter=np.stack(gates),
-        splits=np.repeat(network.nominal_splits[None], steps, axis=0),
-        crossings=np.stack(crossings),
-        exits=np.stack(exits),
+        perimeter=run["perimeter"],
+        splits=run["splits"],
+        crossings=30.0 * transfers.sum(axis=3),
+        exits=30.0 * left,
     )
 
 
@@ -175,17 +164,16 @@ def test_mpc_solves_its_plans_on_a_counted_model(truth, runs):
     """Kinks are rounded: at sharp ones the solver of MPC stops."""
     scenario = load_scenario("economic_mpc")
     city = replace(scenario, network=count(truth, runs), measurement_std=0.0)
-    result = nmfd.run(city, "mpc-pc", steps=40, progress=False)
+    result = nmfd.run(city, "mpc-pc", steps=40)
     assert (result["status"] == 0).all()
 
 
-def test_a_model_worse_than_as_now_is_refused(tmp_path):
-    scenario = load_scenario(tiny.write(tmp_path, network=tiny.row_network(3)))
-    poor = replace(scenario, network=replace(scenario.network, held_out=WORSE))
+def test_a_model_worse_than_as_now_is_refused(tmp_path, three_regions):
+    poor = replace(three_regions, network=replace(three_regions.network, held_out=WORSE))
     worse = r"beyond critical its error is 7 veh, of 6; .*--anyway"
     with pytest.raises(InputError, match=worse):
         check(poor, parse("dpc-pc"))
-    check(scenario, parse("dpc-pc"))
+    check(three_regions, parse("dpc-pc"))
     with pytest.raises(InputError, match="predicts worse.*; set anyway = true to plan with it"):
         parse("mpc-pc").make(poor)
     forced = parse(EconomicMpc(anyway=True))
@@ -193,7 +181,7 @@ def test_a_model_worse_than_as_now_is_refused(tmp_path):
     assert forced.name == "mpc-pc(anyway=true)"  # in all tables of results
     assert "beyond critical" in forced.model_warning(poor)
     assert parse("pi-gating").model_warning(poor) == ""
-    assert parse("mpc-pc").model_warning(scenario) == ""
+    assert parse("mpc-pc").model_warning(three_regions) == ""
     assert isinstance(EconomicMpc().misfit(parse("no-control").own_planning(poor)), Problem)
     file = train(poor, parse("dpc-pc"), seed=0, out=tmp_path / "p.pt", steps=1, anyway=True)
     known = torch.load(file, weights_only=True)["configuration"]

@@ -45,11 +45,11 @@ def test_the_trips_give_the_counts(city, tmp_path):
         numbers = tuple(streets.number[edge] for edge in edges)
         ways[numbers, numbers[-1]] += 1
     assert {edge: passed[edge] for edge in COUNTS} == pytest.approx(COUNTS, abs=3)
-    baseline = Baseline(presence=np.zeros((1, 1)), ways=ways, teleports=0, waiting=0, running=0)
+    baseline = Baseline(presence=np.zeros((1, 1)), ways=ways)
     expected = "counts: 100% of 3 streets have a GEH below 5 by the sampled routes, 100% in the run"
     assert found.text(streets, baseline).startswith(expected)
     stuck = {((), 0): 9}  # on their first street
-    nobody = Baseline(presence=np.zeros((1, 1)), ways=stuck, teleports=0, waiting=0, running=0)
+    nobody = Baseline(presence=np.zeros((1, 1)), ways=stuck)
     assert "0% in the run without control; WARNING" in found.text(streets, nobody)
 
 
@@ -62,23 +62,23 @@ def test_geh():
 @pytest.mark.parametrize(
     "content, options, expected",
     [
-        ("<net/>", (), "expected <meandata>, got a file of <net>"),
-        (meandata({"none": 3}), (), "edge none is not in"),
-        (meandata({"A1B1": 0}), (), "all counts (entered) are 0"),
-        (meandata(COUNTS).replace("entered", "flow"), (), "edge A1B1: entered: missing"),
-        (meandata(COUNTS), ("--demand", "peak"), "has vehicles of its own; omit --routes"),
+        ("<net/>", "", "expected <meandata>, got a file of <net>"),
+        (meandata({"none": 3}), "", "edge none is not in"),
+        (meandata({"A1B1": 0}), "", "all counts (entered) are 0"),
+        (meandata(COUNTS).replace("entered", "flow"), "", "edge A1B1: entered: missing"),
+        (meandata(COUNTS), "--demand peak", "has vehicles of its own; omit --routes"),
     ],
 )
-def test_one_clear_line(city, tmp_path, content, options, expected):
+def test_one_clear_line(city, tmp_path, out, content, options, expected):
     (tmp_path / "counts.xml").write_text(content)
-    given = "--counts", tmp_path / "counts.xml", "--regions", 2, "--out", tmp_path / "out"
-    assert expected in error_line(cosim("import", city, *given, *options))
-    assert not (tmp_path / "out").exists()
+    given = ("--counts", tmp_path / "counts.xml", "--regions 2 --out", out)
+    assert expected in error_line(cosim("import", city, *given, options))
+    assert not out.exists()
 
 
 @pytest.mark.slow
 def test_a_city_from_counts(city, tmp_path):
-    given = "--counts", city.parent / "counts.xml", "--regions", 2, "--seeds", 1
+    given = ("--counts", city.parent / "counts.xml", "--regions 2 --seeds 1")
     text = good(cosim("import", city, *given, "--out", tmp_path / "networks" / "city"))
     assert "counts: 100% of 3 streets have a GEH below 5" in text
     assert (tmp_path / "scenarios" / "city" / "vehicles.rou.xml.gz").is_file()

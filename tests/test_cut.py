@@ -6,7 +6,6 @@ import tiny_city
 from cosim.importing import get
 from cosim.importing.case import read_sumo_input
 from cosim.importing.cut import DELAY, UNKNOWN_SPEED, Trip, trips_inside
-from cosim.importing.demand import read_traffic
 from cosim.importing.streets import read_streets
 
 ROUTES = """<routes>
@@ -77,8 +76,7 @@ def test_get_makes_the_cut(monkeypatch, tmp_path):
     text = get.get("there", out)
     assert f"cosim import {out}/tiny.sumocfg --regions {out}/dublin-regions.csv" in text
     assert (out / "dublin-regions.csv").is_file()
-    case = read_sumo_input(out / "tiny.sumocfg")
-    assert case.end == 600.0
-    traffic = read_traffic(case, read_streets(case.net), 0)
+    assert read_sumo_input(out / "tiny.sumocfg").end == 600.0
+    traffic = tiny_city.traffic_of(out / "tiny.sumocfg")
     assert [vehicle.get("id") for vehicle in traffic.vehicles] == ["early", "late"]
     assert [vehicle.get("departPos") for vehicle in traffic.vehicles] == ["random_free", "base"]

@@ -26,7 +26,7 @@ def made(monkeypatch):
 
 def test_report_and_page(made, tmp_path):
     out = tmp_path / "with space"
-    lines = good(cosim("demo", "--out", out)).splitlines()
+    lines = good(cosim("demo --out", out)).splitlines()
     assert re.fullmatch(
         r"no-control:  6,400 of 600 trips completed, \d+\.\d minutes per trip", lines[0]
     )
@@ -34,13 +34,13 @@ def test_report_and_page(made, tmp_path):
     assert len(lines) == 3
     assert f"Both side by side: {out.resolve() / 'report.html'}; next: " in lines[2]
     assert (out / "report.html").is_file()
-    good(cosim("demo", "--out", out))  # finished runs are kept
+    good(cosim("demo --out", out))  # finished runs are kept
 
 
 @pytest.mark.slow
 def test_the_city_locks_without_gates_and_flows_with_them(tmp_path):
     """Half a minute on two cores."""
-    said = good(cosim("demo", "--out", tmp_path / "demo")).splitlines()
+    said = good(cosim("demo --out", tmp_path / "demo")).splitlines()
     (locked, trips), (served, same) = (
         [
             float(number.replace(",", ""))

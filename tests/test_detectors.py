@@ -21,14 +21,12 @@ from nmfd.model.planning import planning_model
 from nmfd.types import Controls
 
 SCENARIO = "grid7_peak"
-INTERVALS = 2
 
 
 @pytest.fixture(scope="module")
 def scenario():
     """The peak from its middle on: the forecast is right, and the city fills."""
-    loaded = load_scenario(SCENARIO)
-    return replace(loaded, steps=INTERVALS, demand=loaded.demand[14 : 14 + INTERVALS])
+    return tiny.part(load_scenario(SCENARIO), 14, 2)
 
 
 @pytest.fixture(scope="module")

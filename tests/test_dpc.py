@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from commands import problem
 
 import nmfd
 from nmfd import api
@@ -22,7 +23,7 @@ from nmfd.model import dynamics
 from nmfd.model.planning import planning_model
 from nmfd.model.plant import NmfdPlant
 from nmfd.model.regional_model import load_network
-from nmfd.types import Controls, Observation, Status
+from nmfd.types import Controls, Status
 
 PRICED = {"guidance": True, "prices": True, "metering": True}
 NETWORK = load_network("hexagon7")
@@ -37,12 +38,6 @@ def policy(*, guidance, network=NETWORK, spread=1.0, **outputs):
     return made
 
 
-def measurement(accumulation):
-    return Observation(
-        step=0, time=0.0, accumulation=accumulation, backlog=np.zeros_like(accumulation)
-    )
-
-
 @pytest.mark.parametrize(
     "outputs", [{}, {"guidance": True}, PRICED, {**PRICED, "sparse": True}], ids=str
 )
@@ -52,7 +47,7 @@ def test_any_weights_and_any_state_give_admissible_controls(outputs):
         np.random.default_rng(0),
     )
     for scale in (0.0, 1.0, 1e3, 1e5, 1e7):
-        controls = controller.act(measurement(scale * random.standard_normal((7, 7))))
+        controls = controller.act(tiny.seen(scale * random.standard_normal((7, 7))))
         assert controls.status == Status.OK
         u = controls.perimeter[NETWORK.adjacency]
         assert NETWORK.u_min - 1e-7 <= u.min()
@@ -116,16 +111,11 @@ def test_a_policy_file_gives_the_policy_back(tmp_path, guidance):
     assert content["configuration"] == {"seed": 0}
 
 
-def one_line(caught, path):
-    assert str(caught.value).startswith(f"{path}: ")
-    assert "\n" not in str(caught.value)
-
-
 def test_a_policy_for_another_network_is_refused(tmp_path, scenario):
     path = saved(tmp_path / "p.pt", policy(guidance=False), NETWORK)
-    with pytest.raises(InputError, match="trained for network 'hexagon7'") as caught:
-        load_policy(path, scenario.network)
-    one_line(caught, path)
+    line = problem(load_policy, path, scenario.network)
+    assert line.startswith(f"{path}: ")
+    assert "trained for network 'hexagon7'" in line
     wider = replace(NETWORK, u_max=1.0)
     with pytest.raises(InputError, match="network_hash"):
         load_policy(path, wider)
@@ -135,28 +125,25 @@ def test_a_policy_of_the_other_kind_is_refused(tmp_path, scenario):
     path = saved(
         tmp_path / "p.pt", policy(guidance=False, network=scenario.network), scenario.network
     )
-    with pytest.raises(InputError, match="dpc-pc policy, not dpc-pcrg") as caught:
-        load(path, planning_model(scenario), guidance=True)
-    one_line(caught, path)
+    line = problem(load, path, planning_model(scenario), guidance=True)
+    assert line.startswith(f"{path}: ")
+    assert "dpc-pc policy, not dpc-pcrg" in line
 
 
 def weights(path):
     return torch.load(path, weights_only=True)["weights"]
 
 
-def test_another_seed_is_another_policy(tmp_path, scenario):
-    paths = [
-        training.train(scenario, parse("dpc-pc"), seed=seed, out=tmp_path / f"{seed}.pt", steps=1)
-        for seed in (0, 1)
-    ]
+def test_another_seed_is_another_policy(tmp_path, train):
+    paths = [train(seed=seed, out=tmp_path / f"{seed}.pt", steps=1) for seed in (0, 1)]
     assert not torch.equal(
         weights(paths[0])["backbone.0.weight"], weights(paths[1])["backbone.0.weight"]
     )
 
 
-def test_training_lowers_the_total_time_spent(tmp_path, scenario):
+def test_training_lowers_the_total_time_spent(train, scenario):
     """An untrained policy holds the perimeter half closed, to no purpose."""
-    trained = training.train(scenario, parse("dpc-pc"), seed=0, out=tmp_path / "p.pt", steps=20)
+    trained = train(steps=20)
     rollout = training.Rollout(planning_model(scenario))
     torch.manual_seed(0)
     fresh = Policy(scenario.network, Architecture())
@@ -164,42 +151,38 @@ def test_training_lowers_the_total_time_spent(tmp_path, scenario):
     assert after < training.validate(fresh, rollout, 0, Dpc())
 
 
-def test_resume_needs_something_to_resume_and_the_same_settings(tmp_path, scenario, monkeypatch):
+def test_resume_needs_something_to_resume_and_the_same_settings(train, monkeypatch):
     monkeypatch.setattr(training, "VALIDATION_PERIOD", 1)
 
     def interrupt(done, steps, note):
         raise KeyboardInterrupt
 
-    out = tmp_path / "p.pt"
     with pytest.raises(InputError, match="nothing to resume"):
-        training.train(scenario, parse("dpc-pc"), seed=0, out=out, steps=4, resume=True)
+        train(steps=4, resume=True)
     with pytest.raises(KeyboardInterrupt):
-        training.train(scenario, parse("dpc-pc"), seed=0, out=out, steps=4, progress=interrupt)
+        train(steps=4, progress=interrupt)
     with pytest.raises(InputError, match="seed: was 0, now 1"):
-        training.train(scenario, parse("dpc-pc"), seed=1, out=out, steps=4, resume=True)
+        train(seed=1, steps=4, resume=True)
 
 
 @pytest.mark.parametrize("content", [{}, {"configuration": 1}, [1.0], b"", b"x"], ids=str)
-def test_what_is_no_state_of_a_training_cannot_be_resumed(tmp_path, scenario, content):
-    out = tmp_path / "p.pt"
+def test_what_is_no_state_of_a_training_cannot_be_resumed(tmp_path, train, content):
     if isinstance(content, bytes):
         (tmp_path / "p.pt.resume").write_bytes(content)
     else:
         torch.save(content, tmp_path / "p.pt.resume")
-    with pytest.raises(InputError, match="is no state of a training; train without") as caught:
-        training.train(scenario, parse("dpc-pc"), seed=0, out=out, steps=4, resume=True)
-    one_line(caught, tmp_path / "p.pt.resume")
+    line = problem(train, steps=4, resume=True)
+    assert line.startswith(f"{tmp_path / 'p.pt.resume'}: ")
+    assert "is no state of a training; train without" in line
 
 
-def test_a_policy_cannot_be_resumed(tmp_path, scenario):
+def test_a_policy_cannot_be_resumed(tmp_path, train):
     """Nor the state of another architecture, though the settings are the same."""
-    out = tmp_path / "p.pt"
-    training.train(scenario, parse("dpc-pc"), seed=0, out=out, steps=1)
-    trained = torch.load(out, weights_only=True)
+    trained = torch.load(train(steps=1), weights_only=True)
     for wrong in ({}, {"policy": {}}, {"policy": trained["weights"], "optimizer": {}}):
         torch.save({**trained, **wrong}, tmp_path / "p.pt.resume")
         with pytest.raises(InputError, match="is no state of a training"):
-            training.train(scenario, parse("dpc-pc"), seed=0, out=out, steps=1, resume=True)
+            train(steps=1, resume=True)
 
 
 @pytest.fixture
@@ -219,7 +202,7 @@ def default_dtype():
     ],
 )
 def test_torch_s_default_dtype_changes_nothing(
-    tmp_path, scenario, default_dtype, monkeypatch, controller, table
+    tmp_path, train, scenario, default_dtype, monkeypatch, controller, table
 ):
     """float64 is a usual first line of scripts: the same weights, and the same run."""
     monkeypatch.setattr(first_policy, "GATE_STEPS", 3)
@@ -228,8 +211,8 @@ def test_torch_s_default_dtype_changes_nothing(
     for dtype in (torch.float32, torch.float64):
         default_dtype(dtype)
         out = tmp_path / f"{dtype}.pt"
-        files.append(training.train(chosen, parse(controller), seed=0, out=out, steps=2))
-        runs.append(nmfd.run(chosen, controller, policy=out, progress=False))
+        files.append(train(controller, on=chosen, out=out, steps=2))
+        runs.append(nmfd.run(chosen, controller, policy=out))
     assert files[0].read_bytes() == files[1].read_bytes()
     np.testing.assert_array_equal(runs[0].perimeter, runs[1].perimeter)
     np.testing.assert_array_equal(runs[0].accumulation, runs[1].accumulation)
@@ -259,7 +242,7 @@ def test_the_device_is_the_gpu_where_there_is_one(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "controller, options, problem",
+    "controller, options, expected",
     [
         ("dpc-pc", {"widht": 3}, "widht: unknown key"),
         ("dpc-pc", {"steps": 0}, "steps: should be greater"),
@@ -295,9 +278,9 @@ def test_the_device_is_the_gpu_where_there_is_one(monkeypatch):
         ),
     ],
 )
-def test_wrong_training_settings(scenario, controller, options, problem):
+def test_wrong_training_settings(scenario, controller, options, expected):
     wrong = replace(scenario, protected=(), controller_options={controller: options})
-    with pytest.raises(InputError, match=f"controllers.{controller}.{problem}"):
+    with pytest.raises(InputError, match=f"controllers.{controller}.{expected}"):
         training.settings(wrong, parse(controller))
 
 
@@ -322,7 +305,7 @@ def test_a_sparse_policy_is_the_dense_one_with_the_same_weights(guidance):
         if a is not None:
             torch.testing.assert_close(a, b)
     both = [
-        DpcController(made).act(measurement(x[0].numpy().astype(float))) for made in (dense, sparse)
+        DpcController(made).act(tiny.seen(x[0].numpy().astype(float))) for made in (dense, sparse)
     ]
     np.testing.assert_allclose(both[0].perimeter, both[1].perimeter, rtol=1e-6)
     if guidance:
@@ -345,7 +328,7 @@ def test_a_local_policy_looks_around_every_boundary():
     assert perimeter[2, 0].item() == pytest.approx(0.1 + 0.8 * share.item(), rel=1e-5)
     assert ((perimeter > 0.0).numpy() == NETWORK.adjacency).all()
     np.testing.assert_allclose(
-        DpcController(local).act(measurement(x.numpy().astype(float))).perimeter,
+        DpcController(local).act(tiny.seen(x.numpy().astype(float))).perimeter,
         perimeter.detach(),
         rtol=1e-5,
     )
@@ -418,8 +401,7 @@ def test_a_policy_begins_as_a_gate(scenario):
     assert min(share[:, 1, 0].min() for share in shares) > 0.8
 
 
-PEAK = load_scenario("grid7_peak")
-PEAK = replace(PEAK, steps=12, demand=PEAK.demand[20:32], measurement_std=0.0)
+PEAK = replace(tiny.part(load_scenario("grid7_peak"), 20, 12), measurement_std=0.0)
 
 
 class Gated(torch.nn.Module):

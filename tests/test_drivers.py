@@ -12,10 +12,7 @@ import streets
 from cosim.plant.drivers import MESO_THRESHOLD, SWITCHING_THRESHOLD, Drivers, Present
 from cosim.plant.routes import TravelTimes
 
-REGION_OF = {"a": 0, "b": 0, "m": 1, "s": 0, "t": 2}
-AFTER = {"a": ("m", "s"), "b": ("t",), "m": ("b",), "s": ("t",), "t": ()}
-LENGTH = dict.fromkeys(AFTER, 10.0) | {"s": 40.0}  # at 1 m/s
-CITY = streets.city(REGION_OF, AFTER, length=LENGTH)
+CITY = streets.side_street()
 
 
 def drivers_of(*, ways_return=True, lanes=True):

@@ -71,7 +71,7 @@ def test_the_curve_that_made_the_data_comes_back(made, tmp_path):
 def test_the_command(made, tmp_path):
     """Two runs and one region, found without a table; the table of the terminal is narrow."""
     edges = made / "edges.xml"
-    options = "--regions", "1", "--explain", "--out", tmp_path
+    options = "--regions 1 --explain --out", tmp_path
     text = good(cosim("mfd", made / "city.net.xml", edges, edges, *options))
     assert max(map(len, text.splitlines())) <= 100
     line = text.splitlines()[1].split()
@@ -107,14 +107,14 @@ ONE = '<interval begin="0" end="{}">{}</interval>'
         ),
     ],
 )
-def test_one_clear_line(made, tmp_path, content, expected):
+def test_one_clear_line(made, tmp_path, out, content, expected):
     if content.startswith("<interval"):
         content = f"<meandata>{content}</meandata>"
     (tmp_path / "edges.xml").write_text(content)
-    options = "--regions", "1", "--out", tmp_path / "out"
+    options = "--regions 1 --out", out
     line = error_line(cosim("mfd", made / "city.net.xml", tmp_path / "edges.xml", *options))
     assert expected in line
-    assert not (tmp_path / "out").exists()
+    assert not out.exists()
 
 
 def test_missing_files_and_odd_numbers(made, tmp_path):
@@ -157,7 +157,7 @@ def test_the_accumulations_are_those_of_the_run(tmp_path, junctions):
     options = f'freq="90" withInternal="{junctions}" file="{output}"'
     measure.write_text(f'<additional><edgeData id="a" {options}/></additional>')
     scenario = load_scenario("demo", {"sumo.additional": [str(measure)], "steps": 12})
-    run = api.run(scenario, "no-control", seed=1000, progress=False)
+    run = api.run(scenario, "no-control", seed=1000)
     net, regions = city_files(scenario.network)
     found = api.mfd(net, output, regions=regions, out=tmp_path / "out")
     columns = ["accumulation_veh", "production_veh_km_h"]

@@ -2,12 +2,12 @@
 edge."""
 
 import xml.etree.ElementTree as ElementTree
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
+import tiny
 import tiny_city
 
 import cosim
@@ -17,6 +17,7 @@ from cosim.plant.plant import SumoPlant
 from cosim.sumo.outputs import TripReader
 from nmfd import metrics
 from nmfd.api import load_scenario
+from nmfd.model.scenario import with_demand
 from nmfd.types import Controls
 
 SCENARIO = "grid7_peak"
@@ -65,8 +66,7 @@ def test_trips_that_never_began_count_with_what_they_have_waited():
 def run():
     """Two intervals in the middle of the peak, second by second: plant, record, vehicles on the
     road, facts."""
-    loaded = load_scenario(SCENARIO)
-    scenario = replace(loaded, steps=2, demand=2.0 * loaded.demand[20:22])
+    scenario = with_demand(tiny.part(load_scenario(SCENARIO), 20, 2), factor=2.0)
     plant = SumoPlant(scenario)
     try:
         plant.reset(1)

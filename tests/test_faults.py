@@ -10,18 +10,15 @@ import numpy as np
 import pytest
 import tiny
 import tiny_city
-from commands import call
+from commands import call, error_line
 
+import nmfd
 from cosim.plant.gates import DEFAULT_YELLOW_S
-from cosim.plant.plant import SumoPlant
-from cosim.plant.settings import settings
 from cosim.sumo.net import city_of
 from nmfd import faults
 from nmfd.api import load_scenario
-from nmfd.closed_loop import run
 from nmfd.controllers.rules import Constant
 from nmfd.errors import InputError
-from nmfd.model.plant import AcyclicPlant, NmfdPlant
 from nmfd.types import Controls
 
 STEPS = 8
@@ -51,7 +48,7 @@ class Diary(Constant):
 def driven(scenario, *ordered):
     """Exact accumulations (T, 2, 2), observed ones, and notes of a run with these faults."""
     diary = Diary(scenario)
-    result = run(NmfdPlant(scenario), diary, replace(scenario, faults=ordered), seed=0)
+    result = nmfd.run(replace(scenario, faults=ordered), diary)
     assert [m.step for m in diary.seen] == list(range(scenario.steps))
     return (
         result["accumulation"][:-1],
@@ -105,7 +102,7 @@ class Mad(Constant):
         return Controls(**arrays)
 
 
-@pytest.mark.parametrize("plant", [NmfdPlant, AcyclicPlant])
+@pytest.mark.parametrize("plant", ["nmfd", "acyclic"])
 @pytest.mark.parametrize(
     "wrong, at",
     [("perimeter", (0, 1)), ("splits", (1, 0, 0)), ("prices", (1,)), ("metering", (0,))],
@@ -119,7 +116,7 @@ def test_a_number_that_is_not_finite_is_named(scenario, plant, wrong, at, value)
         f"no-control: interval 3: {wrong}{list(at)}: expected a finite number, got {value} instead"
     )
     with pytest.raises(InputError, match=f"^{re.escape(expected)}$"):
-        run(plant(scenario), controller, scenario, seed=0)
+        nmfd.run(scenario, controller, plant=plant)
 
 
 @pytest.mark.parametrize(
@@ -144,11 +141,8 @@ def test_wrong_faults(text):
 
 def test_faults_of_a_city_are_refused_on_the_regional_model(tmp_path):
     folder = tiny.write(tmp_path, scenario='faults = ["closed:x"]\n' + tiny.SCENARIO)
-    result = call(
-        "nmfd", "benchmark", folder, "--controllers", "no-control", "--out", tmp_path / "out"
-    )
-    assert result.exit_code == 2
-    assert "closed is a fault of a city" in result.stderr
+    result = call("nmfd", "benchmark", folder, "--controllers no-control --out", tmp_path / "out")
+    assert "closed is a fault of a city" in error_line(result, "nmfd")
 
 
 @pytest.fixture(scope="module")
@@ -160,18 +154,13 @@ def in_sumo(city, *ordered, perimeter=None, watch=None, **changed):
     """The states and the record of a run with these faults; watch(plant) is called after the
     reset."""
     scenario = replace(city, faults=ordered)
-    plant = SumoPlant(scenario, settings=settings(scenario).changed(**changed))
-    opened = np.where(
-        city.network.adjacency, city.network.u_max if perimeter is None else perimeter, 0.0
-    )
-    try:
+    gates = tiny.gates_at(city, city.network.u_max if perimeter is None else perimeter)
+    with tiny_city.plant_of(scenario, **changed) as plant:
         states = [plant.reset(0)]
         if watch:
             watch(plant)
-        states += [plant.step(Controls(perimeter=opened)) for _ in range(STEPS)]
+        states += [plant.step(gates) for _ in range(STEPS)]
         return states, SimpleNamespace(**plant.record())
-    finally:
-        plant.close()
 
 
 def test_a_closed_street(city):
@@ -209,16 +198,12 @@ def test_a_signal_that_does_not_obey_shows_its_own_green(city):
 )
 def test_a_signal_that_does_not_obey_is_safe(city, signals, gateway):
     """Second by second its own programme, with yellow before and after."""
-    plant = SumoPlant(city)
-    gateways = {gateway.signal for gateway in plant.city.gateways}
-    name = next(one.id for one in plant.steered if (one.id in gateways) == gateway)
-    plant.reset(0)
-    own = [
-        phase.state
-        for phase in plant.session.programme(name).phases
-        for _ in range(round(phase.duration))
-    ]
-    plant.close()
+    with tiny_city.plant_of(city) as plant:
+        gateways = {gateway.signal for gateway in plant.city.gateways}
+        name = next(one.id for one in plant.steered if (one.id in gateways) == gateway)
+        plant.reset(0)
+        phases = plant.session.programme(name).phases
+    own = [phase.state for phase in phases for _ in range(round(phase.duration))]
     shown = []
 
     def watch(plant):
@@ -242,16 +227,13 @@ def test_a_signal_that_does_not_obey_is_safe(city, signals, gateway):
 @pytest.mark.parametrize(
     "ordered, problem", [("closed:no", "edge 'no' is not in"), ("signal:no", "'no' is no signal")]
 )
-def test_faults_that_the_city_does_not_have(city, tmp_path, ordered, problem):
+def test_faults_that_the_city_does_not_have(city, out, ordered, problem):
     file = city.folder / "scenario.toml"
     text = file.read_text(encoding="utf-8")
     file.write_text(f'faults = ["{ordered}"]\n{text}', encoding="utf-8")
     try:
-        result = call(
-            "cosim", "run", city.folder, "--controller", "no-control", "--out", tmp_path / "out"
-        )
+        result = call("cosim", "run", city.folder, "--controller no-control --out", out)
     finally:
         file.write_text(text, encoding="utf-8")
-    assert result.exit_code == 2
-    assert problem in result.stderr
-    assert not (tmp_path / "out").exists()
+    assert problem in error_line(result)
+    assert not out.exists()

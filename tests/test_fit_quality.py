@@ -6,12 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
-import tiny
 
 from cosim.evaluation import model_validation
 from nmfd.model.identification import Observed
 from nmfd.model.mfd import Cubic
-from nmfd.model.regional_model import Errors, HeldOut, load_network
+from nmfd.model.regional_model import Errors, HeldOut
 from nmfd.studies.fit_quality import (
     MEANINGS,
     ahead_table,
@@ -31,9 +30,8 @@ GROWING[:, 0, 0] = 10.0 * np.arange(9)
 
 
 @pytest.fixture
-def network(tmp_path):
-    tiny.write(tmp_path, network=tiny.row_network(3))
-    return load_network(tmp_path / "network")
+def network(three_regions):
+    return three_regions.network
 
 
 def cloud(x, outflow):

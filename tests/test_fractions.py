@@ -30,7 +30,7 @@ def fractional(beyond):
 @pytest.fixture(scope="module", params=["mixed", pytest.param("halves", marks=pytest.mark.slow)])
 def town(request, tmp_path_factory):
     """A city with fixed-time gateway signals, beside actuated signals elsewhere."""
-    others = ("--tls.set", ",".join((*SIGNALS, "A1", "D2")), "--tls.default-type", "actuated")
+    others = ("--tls.set B1,B2,C1,C2,A1,D2 --tls.default-type actuated",)
     made = fractional(DURATIONS[request.param])
     programmes = [(signal, made) for signal in SIGNALS]
     return imported(tmp_path_factory.mktemp(request.param), programmes, signals=others)

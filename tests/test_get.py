@@ -88,4 +88,4 @@ def test_the_list_and_the_names():
     for name, city in get.published().items():
         assert name in text
         assert city["licence"] in text
-    assert "did you mean cologne8?" in error_line(cosim("get", "colone8"))
+    assert "did you mean cologne8?" in error_line(cosim("get colone8"))

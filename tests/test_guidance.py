@@ -154,26 +154,19 @@ def test_ways_home_are_the_fastest_up_to_a_limit(city, kept):
                     assert cost == pytest.approx(exact[here, target]) == takes(way, city)
 
 
-# A main road a m b t of 10 s each, of which m is in another region, and the side street s of `side`
-# s from a to t.
-REGION_OF = {"a": 0, "b": 0, "m": 1, "s": 0, "t": 2}
-AFTER = {"a": ("m", "s"), "b": ("t",), "m": ("b",), "s": ("t",), "t": ()}
-
-
 DRIVER = Event(vehicle="driver", source=None, region=0, destination=2, edge="t")
 
 
 def crossroads(route, *, ways_return, side=40.0, to_region_1=0.5, period=0.0, lanes=True):
-    """A guide, its commands, the routes of the drivers, and where they are, which is at their
-    routes' first edges."""
-    length = dict.fromkeys(AFTER, 10.0) | {"s": side}
+    """A guide in the city with a side street of `side` s, its commands, the routes of the drivers,
+    and where they are, which is at their routes' first edges."""
     routes, road = {"driver": route}, Mock(side_effect=lambda vehicle: routes[vehicle][0])
     own, splits = np.zeros((2, 3, 3, 3))
     own[0, 1:, 2], own[1, 0, 2] = 0.5, 1.0
     splits[0, 1:, 2], splits[1, 0, 2] = (to_region_1, 1.0 - to_region_1), 1.0
     guide = Guide(
         streets.session(routes, road=road),
-        streets.city(REGION_OF, AFTER, length=length),
+        streets.side_street(side),
         own,
         compliance=1.0,
         most_detour=60.0,

@@ -30,7 +30,6 @@ AFTER = {
     "v": (),
 }
 EDGES = tuple(sorted(REGION_OF))
-HOMEWARD = Event(vehicle="x", source=None, region=3, destination=3, edge="v")
 
 
 @pytest.fixture(autouse=True)
@@ -46,9 +45,9 @@ class Town:
     def __init__(
         self,
         *,
-        through_a,
-        through_b,
-        theta,
+        through_a=30.0,
+        through_b=90.0,
+        theta=0.5,
         own=0.5,
         most_detour=1e9,
         compliance=1.0,
@@ -91,18 +90,28 @@ class Town:
         streets = seen(seen_speeds, crossing=(0.0, 0.0), crossed=(0.0, 0.0)) if speeds else None
         self.guide.command(self.shares[1], streets)
 
+    def sent(self, way, *, region=0, edge="t", free=True):
+        """The way of one more driver who was on this one, in this region and bound for `edge`."""
+        vehicle = str(len(self.routes))
+        self.routes[vehicle] = tuple(way)
+        self.guide.apply(
+            [
+                Event(
+                    vehicle=vehicle, source=None, region=region, destination=3, edge=edge, free=free
+                )
+            ]
+        )
+        return self.routes[vehicle]
+
+    def home(self, *way):
+        """The way of a driver in the region of the destination, bound for v."""
+        return self.sent(way, region=3, edge="v")
+
     def drive(self, count, by="a", free=True):
         """By which of a and b each of `count` drivers goes who were on their way by `by`."""
-        ways = ""
-        for n in range(count):
-            vehicle = f"{len(self.routes)}-{n}"
-            self.routes[vehicle] = ("s", by, "t")
-            self.guide.apply(
-                [Event(vehicle=vehicle, source=None, region=0, destination=3, edge="t", free=free)]
-            )
-            assert self.routes[vehicle] in (("s", "a", "t"), ("s", "b", "t"))
-            ways += self.routes[vehicle][1]
-        return ways
+        ways = [self.sent(("s", by, "t"), free=free) for _ in range(count)]
+        assert set(ways) <= {("s", "a", "t"), ("s", "b", "t")}
+        return "".join(way[1] for way in ways)
 
 
 @pytest.mark.parametrize("theta, expected", [(0.0, 0), (0.25, 20), (0.4, 32), (0.5, 40), (0.8, 40)])
@@ -131,9 +140,7 @@ def test_a_longer_way_is_taken_as_soon_as_its_region_is_far_enough_behind(
 @pytest.mark.parametrize("most, expected", [(59.0, "a"), (61.0, "b")])
 def test_nobody_is_sent_on_a_longer_detour_whatever_theta_says(most, expected):
     """60 s more by b, where all are sent: or, where that is too much, the fastest way of all."""
-    assert (
-        Town(through_a=30.0, through_b=90.0, theta=0.0, most_detour=most).drive(3) == 3 * expected
-    )
+    assert Town(theta=0.0, most_detour=most).drive(3) == 3 * expected
     other = {"a": "b", "b": "a"}[expected]  # the same with the ways exchanged
     assert (
         Town(through_a=90.0, through_b=30.0, theta=1.0, most_detour=most).drive(3, by="b")
@@ -146,9 +153,7 @@ def test_travel_times_are_those_seen(by_b, expected):
     """a, 20 s when it is free, takes 70 s."""
     town = Town(through_a=20.0, through_b=by_b, theta=0.5)
     town.command(a=20.0 / 70.0)
-    town.routes["new"] = ("s",)
-    town.guide.apply([Event(vehicle="new", source=None, region=0, destination=3, edge="t")])
-    assert town.routes["new"][1] == expected
+    assert town.sent("s")[1] == expected
 
 
 @pytest.mark.parametrize("waited, expected", [(18.0, "a"), (24.0, "b")])
@@ -161,24 +166,20 @@ def test_who_waits_on_a_junction_is_seen(waited, expected):
         town.guide.command(
             town.shares[1], seen(np.full(len(EDGES), np.nan), crossing=crossing, crossed=(0.5, 0.5))
         )
-        town.routes["new"] = ("s",)
-        town.guide.apply([Event(vehicle="new", source=None, region=0, destination=3, edge="t")])
-        assert town.routes["new"][1] == expected
+        assert town.sent("s")[1] == expected
 
 
 def test_a_refused_way_counts_for_no_region():
-    town = Town(through_a=30.0, through_b=90.0, theta=0.5)
+    town = Town()
     town.takes_it = False
     assert town.drive(3, by="b") == "bbb"
     assert town.guide.realised.sum() == 0
 
 
 def test_compliance_and_drivers_who_are_not_free():
-    assert (
-        Town(through_a=30.0, through_b=90.0, theta=0.5, compliance=0.0).drive(5, by="b") == "bbbbb"
-    )
-    assert Town(through_a=30.0, through_b=90.0, theta=0.5).drive(5, by="b", free=False) == "bbbbb"
-    half = Town(through_a=30.0, through_b=90.0, theta=0.5, compliance=0.5).drive(200, by="b")
+    assert Town(compliance=0.0).drive(5, by="b") == "bbbbb"
+    assert Town().drive(5, by="b", free=False) == "bbbbb"
+    half = Town(compliance=0.5).drive(200, by="b")
     assert 75 < half.count("a") < 125
 
 
@@ -189,10 +190,8 @@ def test_compliance_and_drivers_who_are_not_free():
 )
 def test_in_the_region_of_the_destination_it_is_the_fastest_way(present, expected):
     """By u it is 5 s less. A way over roads that are closed to cars is left alone."""
-    town = Town(through_a=30.0, through_b=90.0, theta=0.5)
-    town.routes["x"] = tuple(present.split())
-    town.guide.apply([HOMEWARD])
-    assert town.routes["x"] == tuple(expected.split())
+    town = Town()
+    assert town.home(*present.split()) == tuple(expected.split())
     assert town.guide.realised.sum() == 0
 
 
@@ -201,25 +200,21 @@ def test_in_the_region_of_the_destination_it_is_the_fastest_way(present, expecte
 def test_the_more_delay_the_more_another_way_must_save(present, at_v, best):
     """It takes 12 s and that of v by t2, 5 s less by u. Of 42.5 s by t2, 20.5 s are delay: he keeps
     it for less than 0.6 20.5^2 / 42.5 = 5.9 s. Of 39.5 s, 17.5 s: less than 4.7 s."""
-    town = Town(through_a=30.0, through_b=90.0, theta=0.5)
+    town = Town()
     town.command(v=10.0 / at_v)
-    town.routes["x"] = ("t", present, "v")
-    town.guide.apply([HOMEWARD])
-    assert town.routes["x"] == ("t", "u" if best else present, "v")
+    assert town.home("t", present, "v") == ("t", "u" if best else present, "v")
 
 
 @pytest.mark.parametrize("at_v, best", [(16.0, False), (4.0, True)])
 def test_in_the_mesoscopic_model_another_way_must_save_a_share_of_its_own_time(at_v, best):
     """v takes 13 s, the mean of now and before: 25 s by t2 and 20 by u, 1.25 times. Or t2 takes 22
     s: 34 and 17 s."""
-    town = Town(through_a=30.0, through_b=90.0, theta=0.5, lanes=False)
+    town = Town(lanes=False)
     town.command(t2=10.0 / (34.0 if best else 10.0), v=10.0 / at_v)
     assert town.guide._times.edges[EDGES.index("t2")] == pytest.approx(
         22.0 if best else 10.0
     )  # smoothed: half of it
-    town.routes["x"] = ("t", "t2", "v")
-    town.guide.apply([HOMEWARD])
-    assert town.routes["x"] == ("t", "u" if best else "t2", "v")
+    assert town.home("t", "t2", "v") == ("t", "u" if best else "t2", "v")
 
 
 def test_guided_is_guidance_by_travel_times_wherever_the_controller_says_nothing():

@@ -54,14 +54,14 @@ def test_a_pattern_stands_for_what_has_a_policy(tmp_path, monkeypatch):
     assert "mpc-pc" in names
     assert not any(name.startswith("dpc") for name in names)
     table = good(
-        command("benchmark", folder, "--controllers", "no-*,pi-gating", "--out", tmp_path / "out")
+        command("benchmark", folder, "--controllers no-*,pi-gating --out", tmp_path / "out")
     )
     assert re.findall("^(no-control|pi-gating) ", table, re.MULTILINE) == [
         "no-control",
         "pi-gating",
     ]
     assert "matches 'dpc-*'" in error_line(
-        command("benchmark", folder, "--controllers", "dpc-*"), "nmfd"
+        command("benchmark", folder, "--controllers dpc-*"), "nmfd"
     )
     for name in ("dpc-pc.pt", "dpc-pc+max-pressure.pt", "dpc-pc+nonsense.pt"):
         (folder / name).touch()

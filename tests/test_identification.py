@@ -8,12 +8,11 @@ import pytest
 import tiny
 import torch
 
-from nmfd import api, closed_loop
+from nmfd import api
 from nmfd.api import load_scenario
 from nmfd.model import dynamics, identification
 from nmfd.model.identification import Observed, Windows
 from nmfd.model.mfd import Cubic
-from nmfd.model.plant import NmfdPlant
 
 
 @pytest.fixture(scope="module")
@@ -33,8 +32,7 @@ def scenario():
 
 def observe(scenario, seed, factor):
     demanded = replace(scenario, demand=factor * scenario.demand)
-    controller = api.controller("probing-pc", demanded)
-    trajectory = closed_loop.run(NmfdPlant(demanded), controller, demanded, seed=seed)
+    trajectory = api.run(demanded, "probing-pc", seed=seed)
     return Observed(
         accumulation=trajectory["accumulation"],
         demand=demanded.demand[: demanded.steps],
@@ -85,8 +83,7 @@ def test_windows_are_the_intervals_in_order(runs):
 
 def test_probing_moves_every_gate_and_repeats_itself(scenario):
     def trajectory(seed, guidance=True):
-        controller = api.controller("probing-pcrg" if guidance else "probing-pc", scenario)
-        return closed_loop.run(NmfdPlant(scenario), controller, scenario, seed=seed)
+        return api.run(scenario, "probing-pcrg" if guidance else "probing-pc", seed=seed)
 
     first, again, other = trajectory(0), trajectory(0), trajectory(1)
     np.testing.assert_array_equal(first["perimeter"], again["perimeter"])

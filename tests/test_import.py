@@ -27,7 +27,7 @@ from nmfd.errors import InputError
 from nmfd.model.regional_model import load_network
 from nmfd.model.scenario import with_demand
 
-IMPORT = ("import", "--regions", 3, "--seeds", 1)
+IMPORT = "import --regions 3 --seeds 1"
 
 
 @pytest.fixture(scope="module")
@@ -39,18 +39,23 @@ def config(tmp_path_factory):
 def imported(config, tmp_path_factory):
     """(project folder, what the import printed)."""
     project = tmp_path_factory.mktemp("project")
-    text = good(cosim(*IMPORT, config, "--out", project / "networks" / "tiny"))
+    text = good(cosim(IMPORT, config, "--out", project / "networks" / "tiny"))
     shutil.copytree(
         project, project.with_name("as-imported")
     )  # runs build something in the other one
     return project, text
 
 
+@pytest.fixture
+def scenario(imported):
+    return load_scenario(imported[0] / "scenarios" / "tiny")
+
+
 def test_traffic_keeps_cars_and_leaves_the_rest_alone(config):
     case = read_sumo_input(config)
     assert case.begin == 600.0
     assert case.end == 1500.0
-    traffic = read_traffic(case, read_streets(case.net, case.additional), seed=0)
+    traffic = tiny_city.traffic_of(config)
     ids = [vehicle.get("id") for vehicle in traffic.vehicles]
     assert len(set(ids)) == len(ids)
     assert {"round", "stops", "short"} <= set(ids)
@@ -132,7 +137,7 @@ def test_gateways_and_quality_add_up(imported):
 
 def test_import_is_deterministic_and_atomic(imported, config, tmp_path):
     project = imported[0].with_name("as-imported")
-    command = (*IMPORT, config, "--out", tmp_path / "networks" / "tiny")
+    command = (IMPORT, config, "--out", tmp_path / "networks" / "tiny")
     good(cosim(*command))
     for folder in ("networks", "scenarios"):
         here, there = (sorted((root / folder).rglob("*")) for root in (project, tmp_path))
@@ -142,10 +147,8 @@ def test_import_is_deterministic_and_atomic(imported, config, tmp_path):
     assert "exists; choose another name" in error_line(cosim(*command))
 
 
-def test_scenario_drives_the_original_vehicles(imported, config):
-    scenario = load_scenario(imported[0] / "scenarios" / "tiny")
-    case = read_sumo_input(config)
-    traffic = read_traffic(case, read_streets(case.net, case.additional), seed=0)
+def test_scenario_drives_the_original_vehicles(scenario, config):
+    traffic = tiny_city.traffic_of(config)
     assert scenario.demand.sum() * scenario.step == pytest.approx(len(traffic.vehicles), rel=1e-4)
     assert settings(scenario).begin == 600.0
     assert settings(scenario).ways_return
@@ -175,8 +178,8 @@ def test_own_regions_come_back(imported, config, tmp_path):
 def test_networks_as_they_are(tmp_path):
     """Left-hand traffic; two signals; none at all: a working result."""
     for name, options, expected in (
-        ("left", ("--lefthand", "true", "--tls.set", "B1,C2"), "left-hand traffic; 2 signals"),
-        ("none", ("--default-junction-type", "priority"), "no gateway has a signal"),
+        ("left", ("--lefthand true --tls.set B1,C2",), "left-hand traffic; 2 signals"),
+        ("none", ("--default-junction-type priority",), "no gateway has a signal"),
     ):
         (tmp_path / name).mkdir()
         config = tiny_city.city(tmp_path / name, *options)
@@ -205,8 +208,7 @@ def test_signals_that_are_left_alone(config, tmp_path):
     assert settings(scenario).leave_signals == ("C2",)
 
 
-def test_mesoscopic_models_keep_the_ledger_and_differ(imported):
-    scenario = load_scenario(imported[0] / "scenarios" / "tiny")
+def test_mesoscopic_models_keep_the_ledger_and_differ(scenario):
     crossings = []
     for model in (True, "ltm"):
         with tiny_city.played(scenario, 8, 0.5, mesoscopic=model) as (_, _, record):
@@ -218,8 +220,7 @@ def test_mesoscopic_models_keep_the_ledger_and_differ(imported):
 
 
 @pytest.mark.parametrize("key, value", [("signals", "max-pressure"), ("measurement", "estimate")])
-def test_mesoscopic_has_no_lanes(imported, key, value):
-    scenario = load_scenario(imported[0] / "scenarios" / "tiny")
+def test_mesoscopic_has_no_lanes(scenario, key, value):
     with pytest.raises(InputError, match=f"sumo.{key}: {value} .* has no lanes"):
         SumoPlant(scenario, settings=settings(scenario).changed(mesoscopic=True, **{key: value}))
 
@@ -249,7 +250,7 @@ def test_options_and_includes_of_the_user_count(config, tmp_path):
     assert case.ignored == ("tripinfo-output",)
     assert case.options["max-depart-delay"] == "60"
     assert case.options["meso-junction-control"] == "false"
-    text = good(cosim(*IMPORT, tmp_path / "city.sumocfg", "--out", tmp_path / "networks" / "x"))
+    text = good(cosim(IMPORT, tmp_path / "city.sumocfg", "--out", tmp_path / "networks" / "x"))
     assert "150 vehicles in" in text
     assert "that only write files: tripinfo-output" in text
     scenario = load_scenario(tmp_path / "scenarios" / "x")
@@ -257,7 +258,7 @@ def test_options_and_includes_of_the_user_count(config, tmp_path):
     assert scenario.demand.sum() * scenario.step == pytest.approx(150.0)
     assert settings(scenario).mesoscopic
     options = ("--routes", tmp_path / "cars.rou.xml", "--out", tmp_path / "networks" / "y")
-    good(cosim(*IMPORT, tmp_path / "city.net.xml", *options))  # without any sumocfg
+    good(cosim(IMPORT, tmp_path / "city.net.xml", *options))  # without any sumocfg
     assert load_scenario(
         tmp_path / "scenarios" / "y"
     ).demand.sum() * scenario.step == pytest.approx(60.0)
@@ -268,10 +269,10 @@ def test_options_and_includes_of_the_user_count(config, tmp_path):
         read_traffic(case, read_streets(case.net), seed=0)
 
 
-def test_signal_plans_know_the_city_s_own_vehicles(imported):
+def test_signal_plans_know_the_city_s_own_vehicles(scenario):
     """Turning flows are those of its routes, and of fastest ways; every signal plan runs on its
     signals."""
-    scenario = with_demand(load_scenario(imported[0] / "scenarios" / "tiny"), steps=2)
+    scenario = with_demand(scenario, steps=2)
     own, additional = (
         [scenario.folder / name for name in names]
         for names in (settings(scenario).routes, settings(scenario).additional)
@@ -313,7 +314,7 @@ def test_signal_plans_know_the_city_s_own_vehicles(imported):
 def test_one_clear_line(config, tmp_path, change, expected):
     shutil.copytree(config.parent, tmp_path, dirs_exist_ok=True)
     change(tmp_path)
-    command = (*IMPORT, tmp_path / "city.sumocfg", "--out", tmp_path / "networks" / "x")
+    command = (IMPORT, tmp_path / "city.sumocfg", "--out", tmp_path / "networks" / "x")
     assert expected in error_line(cosim(*command))
     assert not (tmp_path / "networks").exists() or not list((tmp_path / "networks").iterdir())
 

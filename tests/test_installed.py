@@ -11,8 +11,8 @@ from hashlib import sha256
 from pathlib import Path
 
 import pytest
+from copies import ROOT
 
-ROOT = Path(__file__).parents[1]
 pytestmark = pytest.mark.slow
 NOT_FOR_USERS = ("/reference/", "/tests/", ".png", "ppo.")
 

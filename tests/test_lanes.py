@@ -101,20 +101,21 @@ def guide_of(session, *, period, turn_late=False):
     return guide
 
 
+def ways_out(lanes):
+    """The way of either leader, [] if there is none."""
+    return {vehicle: lanes.way_out(vehicle, target) for vehicle, target in LEADERS.items()}
+
+
 @pytest.mark.parametrize("session", [-0.5], indirect=True)
 def test_with_a_way_out_each_goes_on_where_the_lane_leads(session):
     lanes = Lanes(session)
-    assert not any(
-        lanes.way_out(vehicle, target) for vehicle, target in LEADERS.items()
-    )  # they have just come
+    assert not any(ways_out(lanes).values())  # they have just come
     assert not drive(session, int(LEADER_PATIENCE_S) + 20)
-    ways = {vehicle: lanes.way_out(vehicle, target) for vehicle, target in LEADERS.items()}
+    ways = ways_out(lanes)
     assert ways == {"left0": ["ab", "br", "rl", "le"], "right0": ["ab", "bl", "lr", "re"]}
     for vehicle, way in ways.items():
         assert session.set_route(vehicle, way)
-    assert not any(
-        lanes.way_out(vehicle, target) for vehicle, target in LEADERS.items()
-    )  # they are in the right lane
+    assert not any(ways_out(lanes).values())  # they are in the right lane
     for _ in range(60):
         session.step()
     assert not LEADERS.keys() & {

@@ -22,8 +22,8 @@ from cosim.view.picture import CityPicture
 from nmfd.api import load_scenario
 
 SIGNALS = ("B1", "B2", "C1", "C2")
-USUAL = ("--tls.set", ",".join(SIGNALS))
-ARROWS = ("--default-junction-type", "traffic_light_right_on_red")
+USUAL = ("--tls.set B1,B2,C1,C2",)
+ARROWS = ("--default-junction-type traffic_light_right_on_red",)
 CLOSED, OPEN = 0.1, 0.9
 
 
@@ -91,10 +91,9 @@ def imported(folder, programmes=(), network=plain, options="", signals=USUAL):
     (folder / "more.add.xml").write_text(f"<additional>{contents}</additional>")
     more = f'<additional-files value="more.add.xml"/>{options}'
     (folder / "city.sumocfg").write_text(CONFIG.replace("</input>", f"{more}</input>"))
-    own = "\n".join(f"{edge},{int(edge[0] in 'CD')}" for edge in edges_of(net))
-    (folder / "own.csv").write_text(f"edge,region\n{own}\n")
+    own = tiny_city.regions(net, lambda edge: int(edge[0] in "CD"))
     out = folder / "networks" / "x"
-    import_city(folder / "city.sumocfg", out, regions=folder / "own.csv", seeds=1)
+    import_city(folder / "city.sumocfg", out, regions=own, seeds=1)
     return folder / "scenarios" / "x"
 
 
@@ -107,10 +106,6 @@ def made(tmp_path_factory):
         return imported(tmp_path_factory.mktemp("city"), *given, **options)
 
     return make
-
-
-def edges_of(net):
-    return [edge.get("id") for edge in read_xml(net).iter("edge") if edge.get("function") is None]
 
 
 def told(folder):
@@ -197,9 +192,8 @@ def test_turns_on_red_leak_and_the_other_gates_hold(made):
     assert seen.flow[seen.controlled].sum() < 0.5 * free[seen.controlled].sum()
 
 
-def test_a_whole_run(made, tmp_path):
+def test_a_whole_run(made, out):
     """Without words about broken rules; a timetable may cut the green of a programme short."""
-    out = tmp_path / "out"
     text = run_controllers(made(LIGHTS), ["no-control"], steps=3, out=out)
     assert "break their rules" not in text
     row = pd.read_csv(out / "runs.csv").iloc[0]
@@ -214,17 +208,14 @@ def test_max_pressure_runs_signals_with_turns_on_red(made):
         assert record.gateway_flow.sum() > 0.0
 
 
-def test_max_pressure_says_why_it_cannot_run(made, tmp_path):
+def test_max_pressure_says_why_it_cannot_run(made, out):
     unfit = (
         ("B1", same_light("o")),
         ("B2", off),
         ("C1", one_phase),
         ("C2", red_and_yellow),
     )
-    done = cosim(
-        *("run", made(unfit), "--controller", "max-pressure", "--steps", 1),
-        *("--out", tmp_path / "out"),
-    )
+    done = cosim("run", made(unfit), "--controller max-pressure --steps 1 --out", out)
     assert done.exit_code != 0
     assert "none of the 4 signals here is one (" in done.stderr
     for reason in ("blinking", "switched off", "fewer than two green phases", "light u"):

@@ -230,16 +230,8 @@ MANY = [
 @pytest.fixture(scope="module")
 def city(tmp_path_factory):
     folder = tmp_path_factory.mktemp("city")
-    net = tiny_city.network(folder, "--tls.set", "B1,B2,C1")
-    edges = [
-        edge.get("id")
-        for edge in ElementTree.parse(net).getroot().iter("edge")
-        if not edge.get("function")
-    ]
-    (folder / "regions.csv").write_text(
-        "edge,region\n" + "".join(f"{edge},{REGION[edge[2]]}\n" for edge in sorted(edges))
-    )
-    return load_city(net, folder / "regions.csv", 3)
+    net = tiny_city.network(folder, "--tls.set B1,B2,C1")
+    return load_city(net, tiny_city.regions(net, lambda edge: REGION[edge[2]]), 3)
 
 
 def trips(city, case: Case, seed: int) -> str:

@@ -402,9 +402,7 @@ def test_what_streets_have_not_is_refused(key, value):
 
 
 def test_a_missing_file_names_the_command():
-    failed = nmfd_command(
-        "benchmark", "economic_mpc", "--plant", "links", "--controllers", "greedy"
-    )
+    failed = nmfd_command("benchmark economic_mpc --plant links --controllers greedy")
     assert "write it with 'cosim links'" in error_line(failed, "nmfd")
 
 
@@ -417,8 +415,8 @@ def test_a_file_of_another_kind_is_refused(tmp_path):
 
 def test_the_benchmark_takes_streets(tmp_path):
     out = tmp_path / "runs"
-    words = ("--plant", "links", "--controllers", "no-control", "--steps", "1")
-    printed = good(nmfd_command("benchmark", "grid7_peak", *words, "--out", out))
+    words = "--plant links --controllers no-control --steps 1 --out"
+    printed = good(nmfd_command("benchmark grid7_peak", words, out))
     assert "no-control" in printed
 
 

@@ -184,7 +184,8 @@ def test_who_waits_behind_a_piece_too_short_to_be_seen_on_is_seen():
     """A vehicle stands on x, before the 5 m of a, where a detector would find nobody: it gets its
     green."""
     town = replace(TOWN, length={**TOWN.length, "a": 5.0})
-    shown = [state for _, state in shown_by(CROSSING, {"x": 1.0, "c": 9.0}, 120, town=town)]
+    _, play = played({"x": 1.0, "c": 9.0}, town=town)
+    shown = [state for _, state in play(120)]
     assert shown.count("rG") == 2
     assert shown.count("Gr") >= 2
 
@@ -214,53 +215,40 @@ def test_a_lane_that_no_stage_serves_wholly_counts_as_its_first_vehicle_is_likel
     assert dense[3, movement["b", "f"]] == pytest.approx(0.25 * 0.25)
 
 
-@pytest.fixture
-def junctions():
-    """Max-pressure at both signals, what s has shown, and the vehicles on every lane of an edge."""
-    vehicles, shown = {}, []
-    session = SimpleNamespace(
-        time=0.0, lane_vehicles=lambda lane: vehicles.get(lane.partition("_")[0], 0.0)
-    )
+def played(vehicles, signals=(CROSSING,), town=TOWN):
+    """Max-pressure at these signals, with so many vehicles on every lane of an edge; and a function
+    that plays until a time and returns (time, state) of all that s has shown."""
+    session = SimpleNamespace(time=0.0, lane_vehicles=lambda lane: vehicles.get(lane[0], 0.0))
+    shown = []
 
     def show(name, state):
         if name == "s":
-            shown.append((session.time, name, state))
+            shown.append((session.time, state))
 
-    control = MaxPressure(session, TOWN, [CROSSING, END], FLOWS, show=show, lookahead=1.0)
+    control = MaxPressure(session, town, signals, FLOWS, show=show, lookahead=1.0)
 
     def play(until):
-        while session.time <= until:
+        while session.time < until:
             control.play(session.time)
             session.time += 1.0
         return shown
 
-    return control, vehicles, play
+    return control, play
 
 
-def shown_by(crossing, vehicles, seconds, *, town=TOWN, **options):
-    """(time, state) of all that max-pressure shows at one signal, with so many vehicles on every
-    lane of an edge."""
-    session, shown = (
-        SimpleNamespace(time=0.0, lane_vehicles=lambda lane: vehicles.get(lane[0], 0.0)),
-        [],
-    )
-
-    def show(name, state):
-        shown.append((session.time, state))
-
-    control = MaxPressure(session, town, [crossing], FLOWS, show=show, lookahead=1.0, **options)
-    for _ in range(seconds):
-        control.play(session.time)
-        session.time += 1.0
-    return shown
+@pytest.fixture
+def junctions():
+    """The vehicles on every lane of an edge, to be changed, and what plays both signals."""
+    vehicles = {}
+    return vehicles, played(vehicles, [CROSSING, END])[1]
 
 
 def test_no_green_outlasts_the_maximum_while_others_wait():
     """A single vehicle waits on c, a hundred on a; nobody anywhere else: then a keeps its green."""
 
     def greens(**vehicles):
-        shown = shown_by(CROSSING, vehicles, 200)
-        return [time for time, state in shown if state == "rG"]
+        _, play = played(vehicles)
+        return [time for time, state in play(200) if state == "rG"]
 
     assert greens(a=100.0) == []
     assert greens(a=100.0, c=1.0) == [
@@ -275,7 +263,8 @@ def test_who_waits_too_long_comes_first(monkeypatch):
     minimum green."""
     monkeypatch.setattr(max_pressure, "MAX_GREEN_S", 500.0)
     town = replace(TOWN, successors={**AFTER, "d": ("e",)})
-    shown = shown_by(CROSSING, {"a": 5.0, "c": 2.0, "d": 30.0}, 150, town=town)
+    _, play = played({"a": 5.0, "c": 2.0, "d": 30.0}, town=town)
+    shown = play(150)
     assert [entry for entry in shown if entry[1] == "rG"] == [(MAX_RED_S + 3.0, "rG")]
     assert shown[-1] == (MAX_RED_S + 13.0, "Gr")
 
@@ -286,22 +275,18 @@ def test_who_waits_on_a_street_that_is_closed_to_cars_gets_a_green(buses, first,
     wait for ever."""
     monkeypatch.setattr(max_pressure, "MAX_GREEN_S", 500.0)
     crossing = replace(CROSSING, links=(link(0, "a", "b"),), others=(link(1, "k", "d"),))
-    shown = shown_by(crossing, {"a": 5.0, "k": buses}, 150)
-    assert next(time for time, state in shown if state == "rG") == first
+    _, play = played({"a": 5.0, "k": buses}, [crossing])
+    assert next(time for time, state in play(150) if state == "rG") == first
 
 
 def test_streets_that_are_closed_to_cars_are_read_with_their_signals(tmp_path):
     """A bus street from the north into B1 of the tiny city; footways at its signal are nobody's."""
-    file = tiny_city.network(tmp_path, "--tls.set", "B1,B2,C1,C2,B3,C0")
+    file = tiny_city.network(tmp_path, "--tls.set B1,B2,C1,C2,B3,C0")
     root = ElementTree.parse(file)
     for lane in root.iterfind("edge[@id='B2B1']/lane"):
         lane.set("allow", "bus")
     root.write(file)
-    edges = [edge.get("id") for edge in root.iterfind("edge") if edge.get("function") != "internal"]
-    (tmp_path / "regions.csv").write_text(
-        "edge,region\n" + "".join(f"{edge},0\n" for edge in edges)
-    )
-    city = load_city(file, tmp_path / "regions.csv", 1)
+    city = load_city(file, tiny_city.regions(file, lambda edge: 0), 1)
     (found,) = (one for one in read_signals(city)[0] if one.id == "B1")
     assert {each.from_edge for each in found.others} == {"B2B1"}
     assert "B2B1" not in {each.from_edge for each in found.links}
@@ -312,11 +297,11 @@ def test_streets_that_are_closed_to_cars_are_read_with_their_signals(tmp_path):
 
 def test_the_green_goes_where_the_pressure_is_after_the_minimum(junctions):
     """Decided every 5 s; yellow for 3 s; and back in the same way."""
-    _, vehicles, play = junctions
+    vehicles, play = junctions
     vehicles["c"] = 3.0
-    assert play(8.0) == [(0.0, "s", "Gr"), (5.0, "s", "yr"), (8.0, "s", "rG")]
+    assert play(9.0) == [(0.0, "Gr"), (5.0, "yr"), (8.0, "rG")]
     vehicles.update(c=0.0, a=1.0)  # green since 8 s, until 13 s at least
-    assert play(60.0)[3:] == [(15.0, "s", "ry"), (18.0, "s", "Gr")]
+    assert play(61.0)[3:] == [(15.0, "ry"), (18.0, "Gr")]
 
 
 @pytest.mark.parametrize(
@@ -343,9 +328,9 @@ def test_the_green_goes_where_the_pressure_is_after_the_minimum(junctions):
 def test_the_higher_pressure_wins_and_the_green_stays_in_doubt(junctions, a, b, c, state):
     """The pressure of a is what waits there less what stands on b: 9 - 0.75 * 5.25 - 0.25 * 0.75 =
     4.9 - at b = 3. That of c has to be four times as high: 3 s of yellow for 1 s of green."""
-    _, vehicles, play = junctions
+    vehicles, play = junctions
     vehicles.update(a=a, b=b, c=c)
-    assert play(40.0)[-1][2] == state
+    assert play(41.0)[-1][1] == state
 
 
 def test_a_spent_ration_exerts_no_pressure():
@@ -355,42 +340,20 @@ def test_a_spent_ration_exerts_no_pressure():
         TOWN,
         gateways=(Gateway(source=0, target=1, from_edge="a", to_edge="b", signal="s", links=(0,)),),
     )
-    shown, session = (
-        [],
-        SimpleNamespace(
-            time=0.0, lane_vehicles=lambda lane: {"a": 50.0, "c": 1.0}.get(lane[0], 0.0)
-        ),
-    )
-    control = MaxPressure(
-        session,
-        town,
-        [CROSSING],
-        FLOWS,
-        show=lambda name, state: shown.append(state),
-        lookahead=1.0,
-    )
+    control, play = played({"a": 50.0, "c": 1.0}, town=town)
     control.command(np.full(1, 5.0 / 61.0))  # 5 s, and so much of the other 61 s
     assert control.green_time()["s"][0].shown == 0.0
-    for second in range(66):
-        session.time = float(second)
-        control.play(session.time)
-    session.time = 66.0
+    shown = play(66.0)
     assert control.green_time()["s"][0].shown == pytest.approx(10.0, abs=1.0)
-    assert shown[-1] == "rG"
+    assert shown[-1][1] == "rG"
 
 
 def test_what_is_known_of_a_run():
     """Of five lanes one is served in part by a stage of t; CROSS is 6 s of 66 s between its stages,
     and so is t."""
-    vehicles = {"a": 9.0, "c": 9.0}
-    session = SimpleNamespace(time=0.0, lane_vehicles=lambda lane: vehicles.get(lane[0], 0.0))
-    control = MaxPressure(
-        session, TOWN, [CROSSING, END], FLOWS, show=lambda *_: None, lookahead=1.0
-    )
-    for _ in range(100):
-        control.play(session.time)
-        session.time += 1.0
-    facts = control.facts(session.time)
+    control, play = played({"a": 9.0, "c": 9.0}, [CROSSING, END])
+    play(100.0)
+    facts = control.facts(100.0)
     assert (facts["signal_lanes"], facts["split_lanes"], facts["never_whole_lanes"]) == (4, 1, 0)
     assert facts["programmed_intergreen_share"] == pytest.approx(6.0 / 66.0)
     assert facts["intergreen_share"] == pytest.approx(0.5 * 3.0 / 100.0)  # s changes once, t never

@@ -10,8 +10,6 @@ import pytest
 import tiny_city
 
 from cosim.plant.metering import FILLING_S, KI, KP, Metering
-from cosim.plant.plant import SumoPlant
-from cosim.plant.settings import settings
 from cosim.sumo.recorded_trips import HeldTrips
 from cosim.sumo.xml_files import read_xml
 from nmfd.api import load_scenario
@@ -108,11 +106,9 @@ def ran(scenario, seed=5, **changes):
     network = scenario.network
     rate = changes.pop("rate", None)
     opened = Controls(perimeter=network.open_perimeter, metering=rate)
-    plant = SumoPlant(scenario, settings=settings(scenario).changed(**changes))
-    plant.reset(seed)
-    states, trips = [plant.step(opened) for _ in range(scenario.steps)], plant.meter.trips()
-    plant.close()
-    return states, trips
+    with tiny_city.plant_of(scenario, **changes) as plant:
+        plant.reset(seed)
+        return [plant.step(opened) for _ in range(scenario.steps)], plant.meter.trips()
 
 
 def test_in_a_city_the_books_hold_and_waiting_counts():

@@ -124,7 +124,7 @@ def days(generator, batch):
 )
 def test_a_network_and_mfd_serve_plants_rules_and_mpc(controller):
     for plant in ("nmfd", "acyclic", TripBased(ring())):
-        result = nmfd.run(ring(), controller, plant=plant, progress=False)
+        result = nmfd.run(ring(), controller, plant=plant)
         assert result["completed"][-1] + result["accumulation"][-1].sum() == pytest.approx(
             30.0 * ring().demand.sum()
         )
@@ -139,10 +139,10 @@ def test_a_policy_cost_constraint_and_days():
     for weight in (0.0, 1e4):
         torch.manual_seed(0)
         policy = Linear(scenario.network)
-        before = nmfd.run(scenario, nmfd.ModuleController(policy, scenario), progress=False)
+        before = nmfd.run(scenario, nmfd.ModuleController(policy, scenario))
         own = {"cost": burnt, "sample": days, "constraints": [(crowded, weight)]}
-        trained = nmfd.train(scenario, policy=policy, **own, steps=15, progress=False)
-        after = nmfd.run(scenario, nmfd.ModuleController(trained, scenario), progress=False)
+        trained = nmfd.train(scenario, policy=policy, **own, steps=15)
+        after = nmfd.run(scenario, nmfd.ModuleController(trained, scenario))
         most[weight] = after["accumulation"][:, 1].sum(-1).max()
         assert trained is policy
         assert nmfd.total_time_spent(after) < nmfd.total_time_spent(before)
@@ -155,7 +155,7 @@ def test_rollouts_are_the_closed_loop():
     run = rollout.trajectories(
         policy, rollout.start[None], rollout.demand[:, None], torch.Generator()
     )
-    result = nmfd.run(ring(), nmfd.ModuleController(policy, ring()), progress=False)
+    result = nmfd.run(ring(), nmfd.ModuleController(policy, ring()))
     np.testing.assert_allclose(run.states[:, 0].detach(), result["accumulation"][:-1], atol=1e-9)
     np.testing.assert_allclose(run.perimeter[:, 0].detach(), result["perimeter"], atol=1e-9)
     assert run.backlog.max() > 1.0
@@ -177,13 +177,12 @@ def test_a_policy_may_ignore_the_state():
         policy=plan,
         cost=lambda run: run.perimeter.mean((0, 2, 3)),
         steps=40,
-        progress=False,
     )
     assert (plan.weight > before + 0.5).all()
 
 
 def test_a_named_policy_takes_a_cost_too(tmp_path):
-    file = nmfd.train(ring(), cost=burnt, out=tmp_path / "mine.pt", steps=1, progress=False)
+    file = nmfd.train(ring(), cost=burnt, out=tmp_path / "mine.pt", steps=1)
     assert load_policy(file, ring().network)[1]["configuration"]["task"] == "burnt"
 
 
@@ -218,4 +217,4 @@ def test_a_named_policy_takes_a_cost_too(tmp_path):
 )
 def test_wrong_parts_are_one_line(given, message, unchecked):
     with pytest.raises(nmfd.InputError, match=message):
-        nmfd.train(ring(), steps=1, progress=False, **{"policy": Linear(ring().network), **given})
+        nmfd.train(ring(), steps=1, **{"policy": Linear(ring().network), **given})

@@ -29,10 +29,14 @@ VEHICLES = (
 )
 
 
+def recorded(folder, routes):
+    (folder / "cars.rou.xml").write_text(routes)
+    return read_recorded_trips([folder / "cars.rou.xml"])
+
+
 @pytest.fixture
 def originals(tmp_path):
-    (tmp_path / "cars.rou.xml").write_text(VEHICLES)
-    return read_recorded_trips([tmp_path / "cars.rou.xml"])
+    return recorded(tmp_path, VEHICLES)
 
 
 def test_seed_moves_departures_and_nothing_else(originals, tmp_path):
@@ -89,8 +93,7 @@ MIXED = """<routes>
 
 
 def test_whom_a_program_can_let_begin(tmp_path):
-    (tmp_path / "cars.rou.xml").write_text(MIXED)
-    originals = read_recorded_trips([tmp_path / "cars.rou.xml"])
+    originals = recorded(tmp_path, MIXED)
     drawn = draw(originals, seed=1, factor=1.0, jitter=0.0, begin=0.0)
     held = write_held_trips(
         originals, drawn, tmp_path / "out.xml", {"morning": ("b", "c")}, {"a": 0, "b": 1, "c": 2}
@@ -147,9 +150,8 @@ def test_factor_thins_and_duplicates(originals, factor, count):
     ],
 )
 def test_route_files_that_are_none(tmp_path, text, expected):
-    (tmp_path / "cars.rou.xml").write_text(text)
     with pytest.raises(InputError, match=expected):
-        read_recorded_trips([tmp_path / "cars.rou.xml"])
+        recorded(tmp_path, text)
 
 
 def with_demand_file(folder, rows):

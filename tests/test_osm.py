@@ -95,37 +95,28 @@ def test_import_makes_a_scenario_and_names_the_licence(tmp_path):
         cosim(
             "import",
             tmp_path / "city.osm.gz",
-            "--regions",
-            2,
-            "--demand",
-            "peak",
-            "--level",
-            0.1,
-            "--left-hand",
-            "--out",
+            "--regions 2 --demand peak --level 0.1 --left-hand --out",
             net,
         )
     )
     assert "OpenStreetMap contributors" in (net / "NOTICE.txt").read_text()
     assert "left-hand traffic; 4 signals" in (net / "import.txt").read_text()
-    good(
-        cosim("run", scenario, "--controller", "pi-gating", "--steps", 3, "--out", tmp_path / "run")
-    )
+    good(cosim("run", scenario, "--controller pi-gating --steps 3 --out", tmp_path / "run"))
 
 
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
         (
-            ("--bbox", "11.3,44.4,11.4,44.5"),
+            ("--bbox 11.3,44.4,11.4,44.5",),
             "osmGet.py got nothing from OpenStreetMap (urllib.error.URLError",
         ),
-        (("--bbox", "11.3,44.4,11.4"), "expected west,south,east,north in degrees"),
-        (("--bbox", "11.4,44.4,11.3,44.5"), "expected west,south,east,north in degrees"),
+        (("--bbox 11.3,44.4,11.4",), "expected west,south,east,north in degrees"),
+        (("--bbox 11.4,44.4,11.3,44.5",), "expected west,south,east,north in degrees"),
         ((), "either a file or --bbox"),
-        (("empty.osm", "--bbox", "11.3,44.4,11.4,44.5"), "either a file or --bbox"),
+        (("empty.osm --bbox 11.3,44.4,11.4,44.5",), "either a file or --bbox"),
         (("empty.osm",), "netconvert cannot run it: Error: No nodes loaded"),
-        (("other.net.xml", "--left-hand"), "--left-hand: other.net.xml says itself"),
+        (("other.net.xml --left-hand",), "--left-hand: other.net.xml says itself"),
         (("city.osm.pbf",), "osmium cat city.osm.pbf -o city.osm"),
         (
             ("other.xml",),
@@ -144,8 +135,6 @@ def test_one_line(tmp_path, monkeypatch, arguments, expected):
     }
     for name, content in files.items():
         (tmp_path / name).write_text(content)
-    assert expected in error_line(
-        cosim("import", *arguments, "--regions", 2, "--out", "networks/x")
-    )
+    assert expected in error_line(cosim("import", *arguments, "--regions 2 --out networks/x"))
     assert not (tmp_path / "networks" / "x").exists()
     assert not (tmp_path / "scenarios").exists()

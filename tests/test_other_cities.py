@@ -12,7 +12,6 @@ from tiny_city import driven
 
 from cosim.api import run as cosim_run
 from cosim.importing.case import read_sumo_input
-from cosim.importing.demand import read_traffic
 from cosim.importing.importer import import_city
 from cosim.importing.quality import left_alone
 from cosim.importing.streets import read_streets
@@ -55,11 +54,6 @@ def project(tmp_path_factory):
     return folder
 
 
-def traffic_of(config):
-    case = read_sumo_input(config)
-    return read_traffic(case, read_streets(case.net, case.additional), seed=0)
-
-
 def imported(source, out=None, **options):
     """(report, scenario) of an import into two regions."""
     out = out or source.parent / "networks" / "x"
@@ -73,7 +67,7 @@ def imported(source, out=None, **options):
 def refused(config, *options):
     """The one line of an import that fails and leaves nothing behind."""
     result = cosim(
-        "import", config, "--regions", 2, "--out", config.parent / "networks" / "x", *options
+        "import", config, "--regions 2 --out", config.parent / "networks" / "x", *options
     )
     assert result.exit_code == 2, result.stdout + str(result.exception)
     assert result.stderr.count("\n") == 1
@@ -181,7 +175,7 @@ def test_private_trips_are_those_of_the_demand(city):
     bus = '<vehicle id="b" line="1" depart="1"><route edges="A1B1 B1C1"/></vehicle>'
     text, scenario = imported(city(FLOW + bus + PERSONS, MADE, '<end value="600"/>'))
     assert "60 vehicles in" in text
-    run = cosim_run(scenario, "no-control", seed=0, progress=False)
+    run = cosim_run(scenario, "no-control", seed=0)
     assert run.trips == 60
     assert run.removed_veh == run.removed_waiting_veh == run.given_up.sum() == 0
     assert run.completed_veh == run.completed[-1] == run.private_arrivals.sum() == 60
@@ -209,7 +203,7 @@ def test_options_that_are_wrong(city, options, expected):
 @pytest.mark.parametrize("name", [".", "..", "networks/a,b"])
 def test_folders_that_can_have_no_city(city, tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
-    result = cosim("import", city(), "--regions", 2, "--out", name)
+    result = cosim("import", city(), "--regions 2 --out", name)
     assert result.exit_code == 2
     assert "--out: expected a folder such as networks/mycity" in result.stderr
     assert not list(tmp_path.rglob("*.toml"))
@@ -296,7 +290,10 @@ def test_what_else_changes_routes_and_vehicles(city, tmp_path, monkeypatch):
     )
     text, scenario = imported(config)
     assert " 1 without a route or a free lane" in text
-    assert {element.get("id") for element in traffic_of(config).vehicles} >= {"begins", "shut"}
+    assert {element.get("id") for element in tiny_city.traffic_of(config).vehicles} >= {
+        "begins",
+        "shut",
+    }
     _, departed, arrived, inside, _ = driven(scenario, 5, 0.4, rerouting=0.5)
     assert departed - arrived == inside
     assert departed > 40
@@ -434,7 +431,7 @@ def test_sumos_own_words_in_one_line(city, capfd):
 def test_speeds_and_coordinates(city):
     """A fixed speed is deadly before a signal under control; trips between coordinates are
     driven."""
-    traffic = traffic_of(
+    traffic = tiny_city.traffic_of(
         city(
             '<trip id="a" depart="1" from="A1B1" to="C1D1" departSpeed="13.9"/>'
             '<trip id="b" depart="1" fromXY="1,1" toXY="9,9"/>'

@@ -8,14 +8,13 @@ import copies
 import numpy as np
 import pytest
 import tiny
-from commands import good
+from commands import good, problem
 from commands import nmfd as command
 
 import nmfd
 from nmfd.controllers import template
 from nmfd.controllers.strategy import parse
 from nmfd.errors import InputError
-from nmfd.types import Observation
 
 GOOD = tiny.CONTROLLER
 
@@ -28,16 +27,12 @@ def place(tmp_path, monkeypatch):
     return tmp_path
 
 
-def observation(accumulation):
-    return Observation(step=0, time=0.0, accumulation=accumulation, backlog=0 * accumulation)
-
-
 def test_the_template_is_copied_runs_and_counts_in_the_fingerprint(place):
-    assert command("new-controller", "mine.py").exit_code == 0
+    assert command("new-controller mine.py").exit_code == 0
     assert (
         "--controllers no-control,pi-gating,mine.py:MyController" in (place / "mine.py").read_text()
     )
-    assert command("new-controller", "mine.py").exit_code == 2
+    assert command("new-controller mine.py").exit_code == 2
     scenario, strategy = nmfd.load_scenario(place / "scenario"), parse("mine.py:MyController")
     assert nmfd.run(scenario, "mine.py:MyController")["perimeter"][:, 0, 1].max() == 0.9
     before = strategy.fingerprint(scenario)
@@ -51,7 +46,7 @@ def test_the_template_holds_regions_at_their_set_points():
     controller = nmfd.controller(f"{template.__file__}:MyController", scenario)
     accumulation = np.zeros((7, 7))
     accumulation[3, 0] = 2 * scenario.network.mfds[3].critical
-    perimeter = controller.act(observation(accumulation)).perimeter
+    perimeter = controller.act(tiny.seen(accumulation)).perimeter
     entries = scenario.network.adjacency[:, 3]
     assert (perimeter[entries, 3] == scenario.network.u_min).all()
     assert (perimeter[3, entries] == scenario.network.u_max).all()
@@ -60,10 +55,10 @@ def test_the_template_holds_regions_at_their_set_points():
 def test_it_has_a_table_of_its_own(place):
     with (place / "scenario" / "scenario.toml").open("a") as file:
         file.write("\n[controllers.own.my-controller]\ngain = 0.0\n")
-    assert command("new-controller", "mine.py").exit_code == 0
+    assert command("new-controller mine.py").exit_code == 0
     controller = nmfd.controller("mine.py:MyController", place / "scenario")
     assert (
-        controller.act(observation(np.full((2, 2), 900.0))).perimeter[0, 1] == 0.9
+        controller.act(tiny.seen(np.full((2, 2), 900.0))).perimeter[0, 1] == 0.9
     )  # without gain nothing is held
 
 
@@ -75,7 +70,7 @@ def test_files_and_modules_beside_it(place):
         source.replace("class Mine:\n", 'class Mine:\n    files = ("weights.txt",)\n')
     )
     scenario, strategy = nmfd.load_scenario(place / "scenario"), parse("mine.py:Mine")
-    assert strategy.make(scenario).act(observation(np.zeros((2, 2)))).perimeter[0, 1] == 0.5
+    assert strategy.make(scenario).act(tiny.seen(np.zeros((2, 2)))).perimeter[0, 1] == 0.5
     before = strategy.fingerprint(scenario)
     (place / "weights.txt").write_text("2")
     assert strategy.fingerprint(scenario) != before
@@ -87,7 +82,7 @@ def test_sumo_takes_it(place):
     copies.peak(place)
     name = "mine.py:Mine+max-pressure"
     assert name in good(
-        commands.cosim("run", "scenarios/peak", "--controller", name, "--steps", 2, "--out", "out")
+        commands.cosim("run scenarios/peak --controller", name, "--steps 2 --out out")
     )
 
 
@@ -138,10 +133,7 @@ def test_sumo_takes_it(place):
 def test_mistakes(place, source, expected):
     if source is not None:
         (place / "mine.py").write_text(source)
-    with pytest.raises(InputError) as caught:
-        nmfd.controller("mine.py:Mine", place / "scenario")
-    text = str(caught.value)
-    assert "\n" not in text
+    text = problem(nmfd.controller, "mine.py:Mine", place / "scenario")
     assert expected in text or re.search(expected, text), text
 
 

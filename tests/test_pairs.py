@@ -126,9 +126,7 @@ def test_one_controller_alone(tmp_path):
 def test_the_benchmark_compares_with_the_first(tmp_path):
     scenario = tiny.write(tmp_path)
     out = good(
-        nmfd(
-            "benchmark", scenario, "--controllers", "pi-gating,probing-pc", "--out", tmp_path / "b"
-        )
+        nmfd("benchmark", scenario, "--controllers pi-gating,probing-pc --out", tmp_path / "b")
     )
     assert re.search(r"^probing-pc .*[-+]\d+\.\d %", out, re.M)
     assert "TTS against pi-gating" in " ".join(out.split())

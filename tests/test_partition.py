@@ -22,27 +22,21 @@ from nmfd.errors import InputError
 def streets(tmp_path_factory):
     """A grid of 9 x 9 junctions, 150 m apart."""
     path = tmp_path_factory.mktemp("grid") / "grid.net.xml"
-    options = [
-        "--grid",
-        "--grid.number",
-        "9",
-        "--grid.length",
-        "150",
-        "--no-turnarounds",
-        "true",
-        "--seed",
-        "1",
-        "--output-file",
-    ]
-    tiny_city.run("netgenerate", *options, path)
+    options = "--grid --grid.number 9 --grid.length 150 --no-turnarounds true --seed 1"
+    tiny_city.run("netgenerate", options, "--output-file", path)
     return read_streets(path)
+
+
+def every_turn(streets):
+    """Every turn as a way of its own, made once."""
+    return {(int(a), int(b)): 1 for a, b in streets.links}
 
 
 def baseline(streets, density):
     """A run with constant densities [veh/m of lane] in which one vehicle makes every turn."""
     presence = np.tile(density * streets.lane_metres * INTERVAL_S, (3, 1))
-    ways = {((int(a), int(b)), int(b)): 1 for a, b in streets.links}
-    return Baseline(presence=presence, ways=ways, teleports=0, waiting=0, running=0)
+    ways = {(turn, turn[1]): 1 for turn in every_turn(streets)}
+    return Baseline(presence=presence, ways=ways)
 
 
 def test_blocks_are_streets_with_both_directions(streets):
@@ -161,7 +155,7 @@ def test_the_chosen_partition_is_the_one_whose_gates_hold_most(tmp_path):
     streets = read_streets(tiny_city.network(tmp_path))
     density = np.where(streets.centre[:, 0] < 250.0, 0.08, 0.01)
     run = baseline(streets, density)
-    routes = {(int(a), int(b)): 1 for a, b in streets.links}
+    routes = every_turn(streets)
     signals = {signal for signal in streets.link_signals if signal}
 
     def entered(labels, uncontrollable=()):
@@ -184,7 +178,7 @@ def test_the_chosen_partition_is_the_one_whose_gates_hold_most(tmp_path):
 
 def test_two_regions_are_chosen_even_if_one_would_leak_less(tmp_path, monkeypatch):
     streets = read_streets(tiny_city.network(tmp_path))
-    routes = {(int(a), int(b)): 1 for a, b in streets.links}
+    routes = every_turn(streets)
     signals = {signal for signal in streets.link_signals if signal}
     run = baseline(streets, np.full(len(streets.edges), 0.01))
     everywhere = np.zeros(len(streets.edges), dtype=int)

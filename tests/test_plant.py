@@ -1,7 +1,6 @@
 """The SUMO plant: ledger, signals second by second, guidance, reproducibility. Small, seeded
 simulations of grid7."""
 
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,6 +8,7 @@ from types import SimpleNamespace
 import libsumo
 import numpy as np
 import pytest
+import tiny
 
 from cosim.plant.guidance import Guide
 from cosim.plant.sampling import StreetSampler
@@ -24,8 +24,7 @@ INTERVALS = 4
 @pytest.fixture(scope="module")
 def scenario():
     """The beginning of the peak, where the demand already flows."""
-    loaded = load_scenario(SCENARIO)
-    return replace(loaded, steps=INTERVALS, demand=loaded.demand[12 : 12 + INTERVALS])
+    return tiny.part(load_scenario(SCENARIO), 12, INTERVALS)
 
 
 def random_controls(scenario, random, *, guidance=False):

@@ -10,7 +10,6 @@ from tiny import random_controls
 
 from nmfd import api
 from nmfd.api import load_scenario
-from nmfd.closed_loop import run
 from nmfd.metrics import total_time_spent
 from nmfd.model import acyclic
 from nmfd.model.plant import AcyclicPlant, NmfdPlant
@@ -18,6 +17,11 @@ from nmfd.types import Controls
 
 SCENARIO = load_scenario("economic_mpc")
 LIMITED = tiny.limited(SCENARIO.network)
+KINDS = pytest.mark.parametrize(
+    "network",
+    [SCENARIO.network, LIMITED, tiny.mixed(LIMITED)],
+    ids=["published", "limited", "mixed"],
+)
 
 
 def busy(seed, **changes):
@@ -35,11 +39,7 @@ def completions(network, accumulation):
     )
 
 
-@pytest.mark.parametrize(
-    "network",
-    [SCENARIO.network, LIMITED, tiny.mixed(LIMITED)],
-    ids=["published", "limited", "mixed"],
-)
+@KINDS
 @pytest.mark.parametrize("make", [NmfdPlant, AcyclicPlant])
 def test_conservation_and_non_negativity_under_random_controls(make, network):
     """Trip ends, integrated here from the states, account for every vehicle that is no longer
@@ -58,25 +58,18 @@ def test_conservation_and_non_negativity_under_random_controls(make, network):
     assert ended > 10_000.0
 
 
-@pytest.mark.parametrize(
-    "network",
-    [SCENARIO.network, LIMITED, tiny.mixed(LIMITED)],
-    ids=["published", "limited", "mixed"],
-)
+@KINDS
 def test_without_control_both_plants_are_the_same(network):
     """Shortest ways never turn back."""
     scenario = replace(SCENARIO, network=network)
-    controller = api.controller("no-control", scenario)
-    nmfd, anmfd = (
-        run(make(scenario), controller, scenario, seed=0) for make in (NmfdPlant, AcyclicPlant)
-    )
+    nmfd, anmfd = (api.run(scenario, "no-control", plant=name) for name in ("nmfd", "acyclic"))
     assert total_time_spent(anmfd) == pytest.approx(total_time_spent(nmfd), rel=1e-3)
     np.testing.assert_allclose(anmfd.accumulation, nmfd.accumulation, rtol=0.0, atol=1e-6)
 
 
 def test_no_control_forces_no_move():
     plant = AcyclicPlant(SCENARIO)
-    run(plant, api.controller("no-control", SCENARIO), SCENARIO, seed=0)
+    api.run(SCENARIO, "no-control", plant=plant)
     assert plant.forced_moves == 0.0
 
 

@@ -3,13 +3,12 @@
 import ast
 import re
 import subprocess
-from pathlib import Path
 
 import pytest
+from copies import ROOT
 
 from nmfd.runs import files
 
-ROOT = Path(__file__).parents[1]
 RESERVED = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?|.*[. ]", re.IGNORECASE)  # on Windows
 
 

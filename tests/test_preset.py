@@ -37,7 +37,7 @@ def test_the_published_preset_trains_loads_and_drives(tmp_path, monkeypatch):
         return adam(self)
 
     monkeypatch.setattr(training.Adam, "step", step)
-    file = nmfd.train(scenario, "dpc-pcrg", out=tmp_path / "mine.pt", steps=12, progress=False)
+    file = nmfd.train(scenario, "dpc-pcrg", out=tmp_path / "mine.pt", steps=12)
     assert seen == [(1e-4, 1e-6, False, True)] * 10 + [(1e-4, 1e-6, True, False)] * 2
     weights = torch.load(file, weights_only=True)["weights"]
     assert {
@@ -50,7 +50,7 @@ def test_the_published_preset_trains_loads_and_drives(tmp_path, monkeypatch):
     }
     assert weights["backbone.1.a"] != 0.0
     assert weights["perimeter_decoder.1.a"] != 0.0
-    result = nmfd.run(scenario, "dpc-pcrg", policy=file, progress=False)
+    result = nmfd.run(scenario, "dpc-pcrg", policy=file)
     assert (result["perimeter"][:, 0, 1] >= 0.1).all()
     assert np.isfinite(result["accumulation"]).all()
 

@@ -10,7 +10,6 @@ from commands import good, nmfd
 
 from cosim.evaluation.model_validation import expected_splits
 from cosim.plant.strategy import parse
-from nmfd import closed_loop
 from nmfd.api import load_scenario, run
 from nmfd.controllers.dpc.policy import Architecture, Policy
 from nmfd.controllers.dpc.rollout import Rollout
@@ -51,17 +50,17 @@ def test_a_trained_network_closes_the_loop_and_its_trips_wait(tmp_path):
     options = "prices = true\nmetering = true\nsteps = 6\nfrom_no_control = true\n"
     table = f"\n[controllers.dpc-pcrg]\n{options}"
     (folder / "scenario.toml").write_text((folder / "scenario.toml").read_text() + table)
-    good(nmfd("train", folder, "--controller", "dpc-pcrg"))
+    good(nmfd("train", folder, "--controller dpc-pcrg"))
     scenario = load_scenario(folder)
     scenario = replace(scenario, demand=6.0 * scenario.demand)
     controller = parse("dpc-pcrg").make(scenario)
-    run = closed_loop.run(NmfdPlant(scenario), controller, scenario, seed=0)
+    result = run(scenario, controller)
     expected = (
-        controller.policy.prices(torch.from_numpy(run["observed"][:-1]).float()).detach().numpy()
+        controller.policy.prices(torch.from_numpy(result["observed"][:-1]).float()).detach().numpy()
     )
-    np.testing.assert_allclose(run["prices"], expected, rtol=1e-4)
-    assert run["prices"].max() < 1.0
-    assert run["backlog"].max() > 1.0
+    np.testing.assert_allclose(result["prices"], expected, rtol=1e-4)
+    assert result["prices"].max() < 1.0
+    assert result["backlog"].max() > 1.0
 
 
 def test_the_lower_bound_without_metering_is_not_that_of_a_policy_that_meters():
@@ -105,16 +104,15 @@ def test_a_price_everywhere_diverts_nobody_from_ways_that_take_the_same_time():
 
 
 def test_expected_splits_are_written_as_commanded_only_where_they_are_obeyed():
-    scenario = load_scenario("grid7_peak")
-    scenario = replace(scenario, steps=3, demand=scenario.demand[:3])
+    scenario = tiny.part(load_scenario("grid7_peak"), 0, 3)
     rule = parse("pricing-rule(numbers=[1.0,1.0,0.0,9.0,0.0,0.0,0.6,1.5])")
     x = np.where(scenario.network.split_mask.any(axis=1), 50.0, 0.0)
     scenario = replace(scenario, initial=x)
-    obeyed = closed_loop.run(NmfdPlant(scenario), rule.make(scenario), scenario, seed=0)
+    obeyed = run(scenario, rule.make(scenario))
     assert "expected_splits" not in obeyed
     nominal = scenario.network.nominal_splits
     assert np.abs(obeyed["splits"][0] - nominal).max() > 0.1
-    answered = closed_loop.run(AnsweringPlant(scenario), rule.make(scenario), scenario, seed=0)
+    answered = run(scenario, rule.make(scenario), plant=AnsweringPlant(scenario))
     np.testing.assert_array_equal(answered["expected_splits"][0], obeyed["splits"][0])
     np.testing.assert_array_equal(answered["splits"][0], nominal)
     np.testing.assert_array_equal(expected_splits(answered), answered["expected_splits"])

@@ -3,29 +3,27 @@ published figures."""
 
 import runpy
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import tiny
 import torch
+from copies import ROOT
 
+import nmfd
 from cosim.plant.settings import settings
 from nmfd.api import controller as make_controller
 from nmfd.api import load_scenario
-from nmfd.closed_loop import run
 from nmfd.controllers.dpc.rollout import Rollout
 from nmfd.errors import InputError
 from nmfd.metrics import summary, total_time_spent
 from nmfd.model import dynamics
 from nmfd.model.planning import planning_model
-from nmfd.model.plant import AcyclicPlant, NmfdPlant
 from nmfd.model.regional_model import load_network
 from nmfd.model.scenario import with_demand
 from nmfd.studies import bound
-from nmfd.types import Observation
 
-SCENARIOS = Path(__file__).parents[1] / "scenarios"
+SCENARIOS = ROOT / "scenarios"
 INITIAL = "initial = [[0.0, 100.0], [0.0, 50.0]]"
 
 
@@ -40,7 +38,7 @@ def begun(tmp_path):
     return load_scenario(tiny.write(tmp_path, scenario=INITIAL + tiny.SCENARIO))
 
 
-@pytest.mark.parametrize("plant", [NmfdPlant, AcyclicPlant])
+@pytest.mark.parametrize("plant", ["nmfd", "acyclic"])
 def test_the_noise_of_the_benchmark_is_a_standard_deviation_of_the_measurement_or_of_the_state(
     plant,
 ):
@@ -50,7 +48,7 @@ def test_the_noise_of_the_benchmark_is_a_standard_deviation_of_the_measurement_o
     assert (scenario.measurement_std, scenario.process_std) == (0.25, 0.0)
     moved = replace(scenario, measurement_std=0.0, process_std=0.25)
     quiet, first, again, noisy = (
-        run(plant(s), make_controller("no-control", s), s, seed=seed)
+        nmfd.run(s, "no-control", seed=seed, plant=plant)
         for s, seed in ((scenario, 0), (moved, 0), (moved, 0), (moved, 1))
     )
     assert (quiet.observed - quiet.accumulation).std() == pytest.approx(0.25, rel=0.05)
@@ -69,10 +67,7 @@ def test_the_benchmark_without_control():
     assert scenario.step * scenario.demand.sum() == pytest.approx(31_680)
     bare = tuple(replace(mfd, jam=1e9) for mfd in scenario.network.mfds)
     other = replace(scenario, network=replace(scenario.network, mfds=bare))
-    row, bare_row = (
-        summary(run(NmfdPlant(s), make_controller("no-control", s), s, seed=0))
-        for s in (scenario, other)
-    )
+    row, bare_row = (summary(nmfd.run(s, "no-control")) for s in (scenario, other))
     assert row["total_time_spent_veh_s"] == pytest.approx(1.773e8, rel=0.005)
     assert row["final_accumulation_veh"] == pytest.approx(25_526, rel=0.01)
     assert bare_row["final_accumulation_veh"] < 0.9 * 25_526
@@ -80,12 +75,7 @@ def test_the_benchmark_without_control():
 
 def seen(inside):
     """A measurement with so many vehicles in every region."""
-    return Observation(
-        step=0,
-        time=0.0,
-        accumulation=np.diag(np.array(inside, dtype=float)),
-        backlog=np.zeros((len(inside),) * 2),
-    )
+    return tiny.seen(np.diag(np.array(inside, dtype=float)))
 
 
 def test_the_curve_of_2013():
@@ -129,9 +119,7 @@ def test_greedy_closes_the_way_into_the_fuller_of_two_by_their_own_jam():
 
 def test_greedy_does_what_the_paper_has_it_do(two_regions):
     """Published: n1(590) = n2(590) = 4125, and 17.07 thousand trips completed in the hour."""
-    trajectory = run(
-        NmfdPlant(two_regions), make_controller("greedy", two_regions), two_regions, seed=0
-    )
+    trajectory = nmfd.run(two_regions, "greedy")
     assert trajectory["completed"][-1] == pytest.approx(17070.0, rel=0.01)
     n1, n2 = trajectory["accumulation"].sum(axis=2).T
     assert (n1[0], n2[0]) == (5400.0, 4000.0)
@@ -164,7 +152,7 @@ def test_demand_files_are_what_the_script_writes(name, arguments):
 def test_the_demand_of_figure_4_gives_the_published_row_without_control():
     """Tumu et al., table I: 1.7727e8 veh s; found by nobody's tuning here."""
     scenario = load_scenario("economic_mpc_figure4")
-    trajectory = run(NmfdPlant(scenario), make_controller("no-control", scenario), scenario, seed=0)
+    trajectory = nmfd.run(scenario, "no-control")
     assert total_time_spent(trajectory) == pytest.approx(1.7727e8, rel=0.02)
 
 
@@ -185,7 +173,7 @@ def test_a_control_horizon_of_one_holds_the_best_constant_controls(two_regions):
     """No pair of constant gates over the horizon is better than those that the solver finds."""
     options = {"mpc-pc": {"horizon": 10, "control_horizon": 1}}
     controller = make_controller("mpc-pc", replace(two_regions, controller_options=options))
-    begin = Observation(step=0, time=0.0, accumulation=two_regions.start, backlog=np.zeros((2, 2)))
+    begin = tiny.seen(two_regions.start)
     chosen = controller.act(begin).perimeter[[0, 1], [1, 0]]
     start, demand = controller.forecast(begin)
     theta = controller.admissible.open(1)[:, 2:]
@@ -198,11 +186,11 @@ def test_a_control_horizon_of_one_holds_the_best_constant_controls(two_regions):
     assert cost(chosen) <= min(map(cost, grid)) * (1.0 + 1e-5)
 
 
-@pytest.mark.parametrize("plant", [NmfdPlant, AcyclicPlant])
+@pytest.mark.parametrize("plant", ["nmfd", "acyclic"])
 def test_a_city_that_does_not_begin_empty(begun, plant):
     """Everybody who was inside at first is there, and reaches the end of the trip."""
     quiet = with_demand(begun, steps=20, factor=0.0)
-    trajectory = run(plant(quiet), make_controller("no-control", quiet), quiet, seed=0)
+    trajectory = nmfd.run(quiet, "no-control", plant=plant)
     np.testing.assert_array_equal(trajectory["accumulation"][0], [[0.0, 100.0], [0.0, 50.0]])
     assert trajectory["accumulation"][-1].sum() + trajectory["completed"][-1] == pytest.approx(
         150.0
@@ -224,9 +212,7 @@ def test_policies_are_trained_and_bounds_sought_from_the_same_start(begun):
     gates, splits = bound.neutral_starts(quiet.network, quiet.steps, guidance=False)["open"]
     controls = (torch.tensor(values).unsqueeze(1) for values in (gates, splits))
     (total,) = bound._total_time_spent(quiet, dynamics.parameters(quiet.network), *controls)
-    uncontrolled = total_time_spent(
-        run(NmfdPlant(quiet), make_controller("no-control", quiet), quiet, seed=0)
-    )
+    uncontrolled = total_time_spent(nmfd.run(quiet, "no-control"))
     assert float(total) == pytest.approx(uncontrolled, rel=1e-12)
     assert make_controller("mpc-pc", quiet).act(seen([100.0, 50.0])).note == ""
 

@@ -4,22 +4,20 @@ workers."""
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import tiny
 import tiny_city
-from commands import cosim, good, nmfd, runs, same
+from commands import cosim, good, nmfd, runs, same, words
+from copies import ROOT
 
 from nmfd import api
-
-ROOT = Path(__file__).parents[1]
 
 
 def elsewhere(program, *arguments):
     """In a process of its own, with another order of sets and dictionaries."""
     subprocess.run(
-        [sys.executable, "-m", program, *map(str, arguments)],
+        [sys.executable, "-m", program, *words(*arguments)],
         check=True,
         stdout=subprocess.DEVNULL,
         env={**os.environ, "PYTHONHASHSEED": "77", "PYTHONPATH": str(ROOT)},
@@ -32,13 +30,7 @@ def test_benchmarks(tmp_path):
     command = (
         "benchmark",
         scenario,
-        "--controllers",
-        "mpc-pcrg,probing-pcrg",
-        "--plant",
-        "acyclic",
-        "--set",
-        "steps=8",
-        "--out",
+        "--controllers mpc-pcrg,probing-pcrg --plant acyclic --set steps=8 --out",
     )
     controllers = ["mpc-pcrg", "probing-pcrg"]
     api.benchmark(scenario, controllers, steps=8, plant="acyclic", out=tmp_path / "a", workers=0)
@@ -49,17 +41,7 @@ def test_benchmarks(tmp_path):
 
 @pytest.mark.slow
 def test_trainings(tmp_path):
-    command = (
-        "train",
-        tiny.write(tmp_path),
-        "--controller",
-        "dpc-pcrg",
-        "--steps",
-        4,
-        "--device",
-        "cpu",
-        "--out",
-    )
+    command = ("train", tiny.write(tmp_path), "--controller dpc-pcrg --steps 4 --device cpu --out")
     good(nmfd(*command, tmp_path / "a.pt"))
     elsewhere("nmfd", *command, tmp_path / "b.pt")
     assert (tmp_path / "a.pt").read_bytes() == (tmp_path / "b.pt").read_bytes()
@@ -76,20 +58,7 @@ def test_runs_in_sumo_and_workers(city, tmp_path):
     their own."""
     names = ("route-guidance+rerouting-50", "probing-pcrg")
     for name in names:
-        good(
-            cosim(
-                "run",
-                city,
-                "--controller",
-                name,
-                "--seed",
-                5,
-                "--steps",
-                3,
-                "--out",
-                tmp_path / "a",
-            )
-        )
+        good(cosim("run", city, "--controller", name, "--seed 5 --steps 3 --out", tmp_path / "a"))
     both = f"--controller {names[0]} --against {names[1]} --seed 5 --steps 3".split()
     good(cosim("run", city, *both, "--out", tmp_path / "b"))
     assert same(runs(tmp_path / "a"), runs(tmp_path / "b"))

@@ -15,11 +15,8 @@ from signal_rules import MIN_GREEN, watched
 
 from cosim.importing.importer import import_city
 from cosim.plant.gates import DEFAULT_YELLOW_S
-from cosim.plant.plant import SumoPlant
-from cosim.plant.settings import settings
 from nmfd.api import load_scenario
 from nmfd.model.scenario import with_demand
-from nmfd.types import Controls
 
 CONFIG = """<configuration>
   <input><net-file value="city.net.xml"/><route-files value="cars.rou.xml"/></input>
@@ -52,7 +49,7 @@ def town(request, tmp_path_factory):
     return request.param, imported(
         tmp_path_factory.mktemp("town") / request.param,
         "town",
-        signals=("--tls.set", "B1,B2,C1,C2", "--tls.default-type", request.param),
+        signals=(f"--tls.set B1,B2,C1,C2 --tls.default-type {request.param}",),
     )
 
 
@@ -66,14 +63,11 @@ def drive(folder, gates, faults=(), **overrides):
     """A run under u = gates[k] in interval k: what every signal shows second by second, and
     more."""
     scenario = replace(with_demand(load_scenario(folder), steps=len(gates)), faults=tuple(faults))
-    plant = SumoPlant(
-        scenario, settings=settings(scenario).changed(**({"chain_limit": 0.0} | overrides))
-    )
-    try:
+    with tiny_city.plant_of(scenario, **({"chain_limit": 0.0} | overrides)) as plant:
         plant.reset(1)
         shown = watched(plant)
         for gate in gates:
-            plant.step(Controls(perimeter=np.where(scenario.network.adjacency, gate, 0.0)))
+            plant.step(tiny.gates_at(scenario, gate))
         return SimpleNamespace(
             shown=shown,
             record=SimpleNamespace(**plant.record()),
@@ -81,8 +75,6 @@ def drive(folder, gates, faults=(), **overrides):
             gateways=plant.city.gateways,
             programmes={name: plant.session.programme_id(name) for name in shown},
         )
-    finally:
-        plant.close()
 
 
 def test_gateways_of_actuated_signals_are_controlled(town):
@@ -168,7 +160,7 @@ def places(tmp_path_factory):
     folder, made = tmp_path_factory.mktemp("places"), {}
     for name, signals, options in (
         ("queues", ("--tls.set", "B1,B2"), {"mesoscopic": True}),
-        ("bare", ("--default-junction-type", "priority"), {}),
+        ("bare", ("--default-junction-type priority",), {}),
     ):
         made[name] = imported(folder / name, name, signals=signals, **options)
     return made
@@ -190,12 +182,10 @@ def test_what_cannot_run_here_is_refused_before_the_first_run(
     """One line that names it, though another strategy comes first; nothing is written."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.py").write_text(tiny.CONTROLLER)
-    names = (
-        ("--controller", "no-control", "--against", name)
-        if command == "run"
-        else ("--controllers", f"no-control,{name}")
-    )
-    done = cosim(command, places[city], *names, "--steps", 1, "--out", "out")
+    names = f"--controllers no-control,{name}"
+    if command == "run":
+        names = f"--controller no-control --against {name}"
+    done = cosim(command, places[city], names, "--steps 1 --out out")
     assert done.exit_code != 0
     assert len(done.stderr.strip().splitlines()) == 1, done.stderr
     assert f"controller {name} cannot run here: " in done.stderr

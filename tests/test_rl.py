@@ -24,8 +24,8 @@ rl = pytest.importorskip("nmfd.rl")
 
 
 @pytest.fixture
-def scenario(tmp_path):
-    return load_scenario(tiny.write(tmp_path, network=tiny.row_network(3)))
+def scenario(three_regions):
+    return three_regions
 
 
 @pytest.fixture(scope="module")

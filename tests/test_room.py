@@ -1,23 +1,22 @@
 """A command per boundary, shared over its gateways by the room before and behind them."""
 
-from contextlib import closing
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import streets
+import tiny
+import tiny_city
 from test_responsive import imported
 
-from cosim.plant.plant import SumoPlant
 from cosim.plant.room import Room, shared, upstream
-from cosim.plant.settings import settings
 from cosim.plant.supervisor import Supervisor
 from cosim.sumo.net import Gateway
 from nmfd import api
 from nmfd.api import load_scenario
 from nmfd.model.scenario import with_demand
-from nmfd.types import Controls, Observation
+from nmfd.types import Observation
 
 # Streets a and b lead to the gateways a -> x and b -> y; c, which has a signal at its end, d and e
 # lead to a.
@@ -109,13 +108,9 @@ def town(tmp_path_factory):
 @pytest.mark.parametrize("limit, held", [(0.6, True), (0.0, False)])
 def test_no_command_fills_the_street_before_a_gateway(town, limit, held):
     scenario = with_demand(load_scenario(town), steps=4)
-    with closing(
-        SumoPlant(scenario, settings=settings(scenario).changed(chain_limit=limit))
-    ) as plant:
+    with tiny_city.plant_of(scenario, chain_limit=limit) as plant:
         plant.reset(1)
-        closed = Controls(
-            perimeter=np.where(scenario.network.adjacency, scenario.network.u_min, 0.0)
-        )
+        closed = tiny.gates_at(scenario, scenario.network.u_min)
         realised = [plant.step(closed) for _ in range(4)][-1].realised
         record, streets = plant.record(), plant.city.edges
         before = [

@@ -36,12 +36,18 @@ def vehicle(name, edges="a b z", **attributes):
     return element
 
 
-def trips(elements):
-    return RecordedTrips(depart=np.zeros(len(elements)), elements=tuple(elements))
-
-
 def routes_of(found):
     return [element.find("route").get("edges") for element in found.originals.elements]
+
+
+def planned(plan, elements, departures=None, *, seed=1, compliance=1.0):
+    """The trips of these vehicles with a plan; they depart at once unless it is said."""
+    times = departures or [0.0] * len(elements)
+    drawn = [(times[n], n, each.get("id")) for n, each in enumerate(elements)]
+    trips = RecordedTrips(depart=np.zeros(len(elements)), elements=tuple(elements))
+    found = planned_trips(plan, trips, drawn, {}, seed=seed, compliance=compliance)
+    assert found.drawn == drawn
+    return found
 
 
 def plan_of(*rows):
@@ -53,20 +59,16 @@ def plan_of(*rows):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_drivers_share_routes_as_in_the_plan_whatever_the_seed(seed):
-    originals = trips([vehicle(f"v{n}") for n in range(9)])
-    drawn = [(float(n), n, f"v{n}") for n in range(9)]
     plan = plan_of((0.0, SHORT, 2), (0.0, LONG, 1), (900.0, LONG, 5))
-    found = planned_trips(plan, originals, drawn, {}, seed=seed, compliance=1.0)
+    times = [float(n) for n in range(9)]
+    found = planned(plan, [vehicle(f"v{n}") for n in range(9)], times, seed=seed)
     assert Counter(routes_of(found)) == {"a b z": 6, "a c z": 3}
     assert found.planned == {f"v{n}" for n in range(9)}
-    assert found.drawn == drawn
 
 
 def test_the_nearest_quarter_of_an_hour_counts():
-    originals = trips([vehicle("v"), vehicle("w")])
     plan = plan_of((0.0, LONG), (2700.0, SHORT))
-    drawn = [(1000.0, 0, "v"), (9000.0, 1, "w")]
-    found = planned_trips(plan, originals, drawn, {}, seed=1, compliance=1.0)
+    found = planned(plan, [vehicle("v"), vehicle("w")], [1000.0, 9000.0])
     assert routes_of(found) == ["a c z", "a b z"]
 
 
@@ -83,9 +85,7 @@ def test_only_drivers_with_a_plan_and_without_stops_are_planned():
         vehicle("v"),
         vehicle("round", "a b a"),
     ]
-    drawn = [(0.0, n, element.get("id")) for n, element in enumerate(elements)]
-    plan = plan_of((0.0, LONG))
-    found = planned_trips(plan, trips(elements), drawn, {}, seed=1, compliance=1.0)
+    found = planned(plan_of((0.0, LONG)), elements)
     assert found.planned == {"trip", "v"}
     assert routes_of(found) == ["a b z", "b z", "a c z", "a b z", "a c z", "a b a"]
     made = found.originals.elements[2]
@@ -94,9 +94,8 @@ def test_only_drivers_with_a_plan_and_without_stops_are_planned():
 
 
 def test_some_drivers_keep_their_route_if_not_all_comply():
-    originals = trips([vehicle(f"v{n}") for n in range(400)])
-    drawn = [(0.0, n, f"v{n}") for n in range(400)]
-    found = planned_trips(plan_of((0.0, LONG)), originals, drawn, {}, seed=1, compliance=0.5)
+    drivers = [vehicle(f"v{n}") for n in range(400)]
+    found = planned(plan_of((0.0, LONG)), drivers, compliance=0.5)
     assert len(found.planned) == 400  # none of them is guided either
     assert 160 < routes_of(found).count("a c z") < 240
 
@@ -197,7 +196,7 @@ def test_the_word():
 @pytest.mark.slow
 def test_a_plan_is_made_followed_and_resumed(tmp_path):
     scenario = tiny_city.imported(tmp_path)
-    command = ("plan", scenario, "--controller", "max-pressure", "--iterations", 2, "--demand", 2)
+    command = ("plan", scenario, "--controller max-pressure --iterations 2 --demand 2")
     told = good(cosim(*command, "--out", tmp_path / "runs"))
     assert len(told.splitlines()) == 1 + 3 + 1
     first = (scenario / "plan.csv.gz").read_bytes()
@@ -208,6 +207,6 @@ def test_a_plan_is_made_followed_and_resumed(tmp_path):
     assert (scenario / "plan.csv.gz").read_bytes() == first
     assert [run.stat().st_mtime_ns for run in runs] == before
     assert len(read_driven(tmp_path / "runs" / "routes-2.xml")) > 100
-    evaluate = ("evaluate", scenario, "--seeds", "7-7", "--demand", 2, "--out", tmp_path / "other")
-    good(cosim(*evaluate, "--controllers", "planned+guided+compliance-50,no-control"))
-    good(cosim(*evaluate, "--controllers", "planned+max-pressure", "--set", "sumo.routes=[]"))
+    evaluate = ("evaluate", scenario, "--seeds 7-7 --demand 2 --out", tmp_path / "other")
+    good(cosim(*evaluate, "--controllers planned+guided+compliance-50,no-control"))
+    good(cosim(*evaluate, "--controllers planned+max-pressure --set sumo.routes=[]"))

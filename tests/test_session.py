@@ -59,15 +59,15 @@ def test_a_result_has_labelled_arrays_and_lists_them(result, scenario):
     assert len(repr(result).splitlines()) <= 50
 
 
-def test_a_benchmark_takes_names_options_and_objects(scenario, tmp_path):
+def test_a_benchmark_takes_names_options_and_objects(scenario, out):
     table = nmfd.benchmark(
-        scenario, ["no-control", nmfd.PiGating(kp=2.0), Half()], seeds=1, out=tmp_path / "out"
+        scenario, ["no-control", nmfd.PiGating(kp=2.0), Half()], seeds=1, out=out
     )
     assert isinstance(table, pd.DataFrame)
     means = table.groupby("controller")["total_time_spent_veh_s"].mean()
     assert set(means.index) == {"no-control", "pi-gating(kp=2.0)", "Half"}
     assert means["pi-gating(kp=2.0)"] < means["no-control"]
-    again = nmfd.benchmark(scenario, [Half()], seeds=1, out=tmp_path / "out")
+    again = nmfd.benchmark(scenario, [Half()], seeds=1, out=out)
     assert set(again["failure"]) == {""}
 
 

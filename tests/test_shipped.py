@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import tiny
 from commands import call, error_line, good, nmfd
+from copies import ROOT
 
 from cosim.api import run as cosim_run
 from nmfd import __version__
@@ -19,8 +20,6 @@ from nmfd.controllers.strategy import CONTROLLERS
 from nmfd.errors import InputError
 from nmfd.model.regional_model import load_network
 from nmfd.runs import shipped
-
-ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture

@@ -35,7 +35,7 @@ def test_a_new_signal_control_runs_by_its_name(monkeypatch):
     monkeypatch.setitem(SIGNAL_CONTROLS, "turns", control)
     assert vocabulary()["+turns"] == "all phases in turn"
     assert parse("no-control+turns").city == cosim.Settings(signals="turns")
-    result = cosim.run("demo", "no-control+turns", steps=4, progress=False)
-    plain = cosim.run("demo", "no-control", steps=4, progress=False)
+    result = cosim.run("demo", "no-control+turns", steps=4)
+    plain = cosim.run("demo", "no-control", steps=4)
     assert result.controller == "no-control+turns"
     assert (result["gateway_flow"] != plain["gateway_flow"]).any()

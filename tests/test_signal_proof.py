@@ -126,10 +126,9 @@ def imported(tmp_path_factory):
         if kind not in ("static", "actuated", "delay_based"):
             return kind
         folder = tmp_path_factory.mktemp(kind)
-        crossings = ("--sidewalks.guess", "--sidewalks.guess.max-speed", "50", "--crossings.guess")
-        tiny_city.network(
-            folder, "--tls.set", "B1,B2,C1,C2", "--tls.default-type", kind, *crossings
-        )
+        crossings = "--sidewalks.guess --sidewalks.guess.max-speed 50 --crossings.guess"
+        signals = f"--tls.set B1,B2,C1,C2 --tls.default-type {kind}"
+        tiny_city.network(folder, signals, crossings)
         (folder / "cars.rou.xml").write_text(CARS)
         (folder / "city.sumocfg").write_text(CONFIG)
         return tiny_city.imported(folder, regions=2, source=folder / "city.sumocfg")

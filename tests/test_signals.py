@@ -7,6 +7,7 @@ from dataclasses import replace
 import libsumo
 import numpy as np
 import pytest
+import tiny
 from signal_rules import watched
 
 from cosim.plant.pressure import Roads
@@ -22,8 +23,7 @@ SCENARIO = "grid7_peak"
 @pytest.fixture(scope="module")
 def scenario():
     """The beginning of the peak, where the demand already flows."""
-    loaded = load_scenario(SCENARIO)
-    return replace(loaded, steps=3, demand=loaded.demand[14:17])
+    return tiny.part(load_scenario(SCENARIO), 14, 3)
 
 
 @pytest.fixture(scope="module")

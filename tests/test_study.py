@@ -46,16 +46,15 @@ def ran(monkeypatch):
     return made
 
 
-def test_from_a_scenario_to_a_page(ran, tmp_path):
+def test_from_a_scenario_to_a_page(ran, out):
     """An interrupted study goes on. Guidance saves most time, but leaves trips; max-pressure is
     recommended."""
-    out = tmp_path / "out"
     ran.interrupted = 7
-    assert cosim("study", "demo", "--out", out).exit_code != 0
+    assert cosim("study demo --out", out).exit_code != 0
     assert not (out / "study.html").exists()
     ran.interrupted = 0
     again = ran.done.pop()
-    text = good(cosim("study", "demo", "--out", out))
+    text = good(cosim("study demo --out", out))
     assert again in ran.done
     assert len(set(ran.done)) == len(ran.done)  # nothing twice
     compared = {seed for name, _, seed in ran.done if name != "no-control"}
@@ -82,7 +81,7 @@ def test_from_a_scenario_to_a_page(ran, tmp_path):
 
 def test_a_folder_holds_one_study(tmp_path):
     (tmp_path / "study.json").write_text(json.dumps({"source": "city.sumocfg"}))
-    line = error_line(cosim("study", "demo", "--out", tmp_path))
+    line = error_line(cosim("study demo --out", tmp_path))
     assert "holds another study (source, regions changed)" in line
 
 
@@ -201,14 +200,13 @@ def test_more_seeds_at_most_double():
 
 
 @pytest.mark.slow
-def test_from_a_sumo_configuration_to_a_page(tmp_path, monkeypatch):
+def test_from_a_sumo_configuration_to_a_page(tmp_path, out, monkeypatch):
     monkeypatch.setattr(stages, "LEVELS", (1.0,))
     for name in [*EVERYWHERE]:
         if name != PRESSURE:
             monkeypatch.delitem(EVERYWHERE, name)
-    out = tmp_path / "out"
     source = tiny_city.city(tmp_path)
-    text = good(cosim("study", source, "--most-seeds", 3, "--workers", 2, "--out", out))
+    text = good(cosim("study", source, "--most-seeds 3 --workers 2 --out", out))
     labels = ", ".join(AT_CRITICAL.values())
     empty = "every region was nearly empty in all runs without control"
     assert f"{labels}: not judged; {empty}" in " ".join(text.split())  # over two lines

@@ -161,16 +161,8 @@ def trips(file) -> dict[str, dict[str, str]]:
 def plain(config):
     """The trips of SUMO alone."""
     out = config.with_name("plain.xml")
-    tiny_city.run(
-        "sumo",
-        "-c",
-        config,
-        "--tripinfo-output",
-        out,
-        "--tripinfo-output.write-unfinished",
-        "--seed",
-        0,
-    )
+    usual = "--tripinfo-output.write-unfinished --seed 0 --tripinfo-output"
+    tiny_city.run("sumo", "-c", config, usual, out)
     return trips(out)
 
 
@@ -274,7 +266,7 @@ def drive_and_compare(config, ended):
     report = imported(config)
     tmp_path = config.parent
     out = tmp_path / "t.xml"
-    run(tmp_path / "scenarios" / "x", "no-control", seed=0, tripinfo=out, progress=False)
+    run(tmp_path / "scenarios" / "x", "no-control", seed=0, tripinfo=out)
     keys = ("depart", "arrival", "routeLength", "departLane", "arrivalLane", "timeLoss")
     mine, alone = (
         {name: [trip[key] for key in keys] for name, trip in t.items()}
@@ -293,19 +285,17 @@ def drive_and_compare(config, ended):
 def test_vehicles_of_a_loaded_state_begin_where_they_are(tmp_path):
     config = city(tmp_path, ["trip", "via", "period", "later"])
     state = tmp_path / "state.xml"
-    tiny_city.run(
-        "sumo", "-c", config, "--save-state.times", 50, "--save-state.files", state, "--end", 51
-    )
+    saving = "--end 51 --save-state.times 50 --save-state.files"
+    tiny_city.run("sumo", "-c", config, saving, state)
     config.write_text(config.read_text().replace("<end", '<load-state value="state.xml"/><end'))
-    case = read_sumo_input(config)
-    traffic = read_traffic(case, read_streets(case.net, case.additional), seed=0)
+    traffic = tiny_city.traffic_of(config)
     placed = [vehicle for vehicle in traffic.vehicles if float(vehicle.get("depart")) == 50.0]
-    assert case.begin == 50.0
+    assert read_sumo_input(config).begin == 50.0
     assert {"trip", "via", "period.0"} <= {vehicle.get("id") for vehicle in placed}
     assert all(vehicle.get("departLane") in "01" and vehicle.get("departPos") for vehicle in placed)
     assert len(traffic.vehicles) == len(plain(config)) == 11
     imported(config)
-    result = run(tmp_path / "scenarios" / "x", "no-control", seed=0, progress=False)
+    result = run(tmp_path / "scenarios" / "x", "no-control", seed=0)
     assert result["departures"].sum() == 11
 
 
@@ -326,8 +316,7 @@ def test_what_is_left_out_is_said_first_and_last(tmp_path):
 
 
 def read(config):
-    case = read_sumo_input(config)
-    return read_traffic(case, read_streets(case.net, case.additional), seed=0)
+    return tiny_city.traffic_of(config)
 
 
 RIDE = '<person id="p{0}" depart="1"><ride from="A1B1" to="B1C1" lines="{0}"/></person>'

@@ -2,23 +2,21 @@
 
 import runpy
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from copies import ROOT
 
-from nmfd import closed_loop
-from nmfd.api import controller as make_controller
+import nmfd
 from nmfd.api import load_scenario
 from nmfd.controllers.mpc import edge_model, terminal
 from nmfd.controllers.mpc.controller import EconomicMpc, MpcController
 from nmfd.controllers.strategy import check_tables, parse
 from nmfd.errors import InputError
 from nmfd.model.planning import planning_model
-from nmfd.model.plant import NmfdPlant
 
 NAME = "mpc-pc-terminal"
-SCRIPT = Path(__file__).parents[1] / "scenarios" / "economic_mpc" / "terminal_cost.py"
+SCRIPT = ROOT / "scenarios" / "economic_mpc" / "terminal_cost.py"
 script = runpy.run_path(str(SCRIPT))
 learn, write = script["learn"], script["write"]
 
@@ -95,12 +93,7 @@ def test_mpc_looks_beyond_its_horizon(scenario, learned):
     """Even with what little was learned here."""
     planning = parse(NAME).own_planning(scenario)
     plain, far = (
-        closed_loop.run(
-            NmfdPlant(scenario),
-            MpcController(planning, EconomicMpc(), terminal=known),
-            scenario,
-            seed=1,
-        )
+        nmfd.run(scenario, MpcController(planning, EconomicMpc(), terminal=known), seed=1)
         for known in (None, learned)
     )
     assert far["accumulation"].sum() < 0.9 * plain["accumulation"].sum()
@@ -112,7 +105,7 @@ def test_mpc_looks_beyond_its_horizon(scenario, learned):
     "name, most", [("mpc-pc-terminal", 8.787e7), ("mpc-pcrg-terminal", 5.475e7)]
 )
 def test_the_committed_ones_come_within_five_percent_of_the_bound(scenario, name, most):
-    run = closed_loop.run(NmfdPlant(scenario), make_controller(name, scenario), scenario, seed=1)
+    run = nmfd.run(scenario, name, seed=1)
     assert most < 30.0 * run.accumulation[:-1].sum() < 1.05 * most
 
 

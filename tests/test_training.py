@@ -4,7 +4,6 @@ regions."""
 import math
 import shutil
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -28,25 +27,27 @@ def generator():
     return torch.Generator().manual_seed(0)
 
 
+@pytest.fixture
+def rollout(scenario):
+    return Rollout(planning_model(scenario), dtype=torch.float64)
+
+
 def made(scenario, *, guidance=False):
     torch.manual_seed(0)
     return Policy(scenario.network, Architecture(width=8, guidance=guidance))
 
 
-def test_starts_without_a_spread_are_those_of_the_scenario(scenario, generator):
-    x, demand = Rollout(planning_model(scenario), dtype=torch.float64).random_start(
-        3, 0.0, 0.0, generator
-    )
+def test_starts_without_a_spread_are_those_of_the_scenario(scenario, rollout, generator):
+    x, demand = rollout.random_start(3, 0.0, 0.0, generator)
     assert x.shape == (3, 2, 2)
     assert not x.any()
     for n in range(3):
         np.testing.assert_array_equal(demand[:, n], scenario.demand)
 
 
-def test_spread_and_level_scale_the_flows(scenario, generator):
+def test_spread_and_level_scale_the_flows(scenario, rollout, generator):
     """Every flow for itself by 1 +- 0.3, evenly and the same at all times; all of a rollout by 0.5
     to 2."""
-    rollout = Rollout(planning_model(scenario), dtype=torch.float64)
     _, demand = rollout.random_start(4000, 0.3, 0.0, generator)
     busy = int(scenario.demand[:, 0, 1].argmax())
     factor = demand[busy, :, 0, 1] / scenario.demand[busy, 0, 1]
@@ -63,10 +64,9 @@ def test_spread_and_level_scale_the_flows(scenario, generator):
     assert level.mean() == pytest.approx(1.25, abs=0.03)
 
 
-def test_a_share_of_the_rollouts_starts_later_in_a_random_state(scenario, generator):
+def test_a_share_of_the_rollouts_starts_later_in_a_random_state(scenario, rollout, generator):
     """Three quarters of them: up to 80 % of the jam, only for destinations in use; the demand goes
     on from there."""
-    rollout = Rollout(planning_model(scenario), dtype=torch.float64)
     x, demand = rollout.random_start(4000, 0.0, 0.75, generator)
     assert not x[3000:].any()
     assert (x[:3000].sum((1, 2)) > 0).all()
@@ -95,9 +95,8 @@ def test_every_destination_in_use_gets_its_part(scenario, generator):
     assert (x[:, 0, 0] > x[:, 0, 1]).double().mean() == pytest.approx(0.5, abs=0.05)
 
 
-def test_noise_on_the_demand(scenario, generator):
+def test_noise_on_the_demand(rollout, generator):
     """Of the pairs that have any, with the sigma of the rollout."""
-    rollout = Rollout(planning_model(scenario), dtype=torch.float64)
     demand = torch.full((20, 4000, 2, 2), 50.0, dtype=torch.float64)
     assert rollout.perturb(demand, torch.ones(4000), 0.0, generator) is demand
     level = torch.linspace(0.0, 1.0, 4000, dtype=torch.float64)
@@ -229,9 +228,9 @@ def steps(monkeypatch):
     return seen
 
 
-def test_the_learning_rate_falls_to_a_tenth_along_a_cosine(tmp_path, scenario, steps):
+def test_the_learning_rate_falls_to_a_tenth_along_a_cosine(train, scenario, steps):
     chosen = replace(scenario, controller_options={"dpc-pc": {"learning_rate": 0.5}})
-    training.train(chosen, parse("dpc-pc"), seed=0, out=tmp_path / "p.pt", steps=4)
+    train(on=chosen, steps=4)
     expected = [0.5 * (0.1 + 0.45 * (1.0 + math.cos(math.pi * k / 4))) for k in range(4)]
     assert [rate for rate, _, _ in steps] == pytest.approx(expected)
     assert expected[0] == 0.5
@@ -239,28 +238,21 @@ def test_the_learning_rate_falls_to_a_tenth_along_a_cosine(tmp_path, scenario, s
     assert max(norm for _, _, norm in steps) <= 1.0 + 1e-5  # clipped
 
 
-def test_decoders_are_trained_in_turn(tmp_path, scenario, steps):
+def test_decoders_are_trained_in_turn(train, scenario, steps):
     """First the perimeter's, then that of the split ratios; the backbone always."""
-    training.train(scenario, parse("dpc-pcrg"), seed=0, out=tmp_path / "p.pt", steps=2)
+    train("dpc-pcrg", steps=2)
     names = [name for name, _ in made(scenario, guidance=True).named_parameters()]
     for (_, given, _), left in zip(steps, ("splits_decoder", "perimeter_decoder"), strict=True):
         for name, has in zip(names, given, strict=True):
             assert has == (not name.startswith(left)), name
 
 
-def test_the_best_validation_is_kept(tmp_path, scenario, monkeypatch):
+def test_the_best_validation_is_kept(train, monkeypatch):
     scores, notes = iter([7.0, 5.0, 6.0]), []
     monkeypatch.setattr(training, "VALIDATION_PERIOD", 2)
     monkeypatch.setattr(training, "validate", lambda *_: next(scores))
     monkeypatch.setattr(training, "changed_policies", lambda *_: [])
-    out = training.train(
-        scenario,
-        parse("dpc-pc"),
-        seed=3,
-        out=tmp_path / "p.pt",
-        steps=5,
-        progress=lambda *note: notes.append(note),
-    )
+    out = train(seed=3, steps=5, progress=lambda *note: notes.append(note))
     bests = ["no validation yet", "best 7 veh s", "best 7 veh s", "best 5 veh s", "best 5 veh s"]
     assert notes == [(k, 5, best) for k, best in enumerate(bests, 1)]
     expected = {
@@ -274,39 +266,37 @@ def test_the_best_validation_is_kept(tmp_path, scenario, monkeypatch):
     assert expected.items() <= torch.load(out, weights_only=True)["configuration"].items()
 
 
-def test_a_resumed_training_ends_as_if_it_had_never_stopped(tmp_path, scenario, monkeypatch):
+def test_a_resumed_training_ends_as_if_it_had_never_stopped(tmp_path, train, monkeypatch):
     monkeypatch.setattr(training, "VALIDATION_PERIOD", 1)
 
     def stop(done, steps, note):
         if done == 3:
             raise KeyboardInterrupt
 
-    train = partial(training.train, scenario, parse("dpc-pc"), seed=0, steps=6)
-    whole = train(out=tmp_path / "whole.pt")
-    out = tmp_path / "stopped.pt"
+    whole = train(steps=6, out=tmp_path / "whole.pt")
     with pytest.raises(KeyboardInterrupt):
-        train(out=out, progress=stop)
-    train(out=out, resume=True)
+        train(steps=6, progress=stop)
+    resumed = train(steps=6, resume=True)
     expected = torch.load(whole, weights_only=True)["weights"]
-    for name, weight in torch.load(out, weights_only=True)["weights"].items():
+    for name, weight in torch.load(resumed, weights_only=True)["weights"].items():
         assert torch.equal(weight, expected[name]), name
 
 
-def test_a_network_that_misses_a_single_change_says_so(tmp_path, scenario, monkeypatch, capsys):
+def test_a_network_that_misses_a_single_change_says_so(train, monkeypatch, capsys):
     """After two steps its gates are half open, on roads that never fill."""
-    training.train(scenario, parse("dpc-pc"), seed=0, out=tmp_path / "p.pt", steps=2)
+    train(steps=2)
     assert "misses a single change: gates" in capsys.readouterr().err
     monkeypatch.setattr(training, "CHANGE_WORTH", 0.5)
-    training.train(scenario, parse("dpc-pc"), seed=0, out=tmp_path / "p.pt", steps=2)
+    train(steps=2)
     assert "single change" not in capsys.readouterr().err
 
 
-def test_a_training_that_diverges_is_an_error(tmp_path, scenario, monkeypatch):
+def test_a_training_that_diverges_is_an_error(train, monkeypatch):
     monkeypatch.setattr(training, "validate", lambda *_: math.nan)
     with pytest.raises(
         RunFailed, match="dpc-pc: every validation of 2 steps diverged; lower the learning rate"
     ):
-        training.train(scenario, parse("dpc-pc"), seed=0, out=tmp_path / "p.pt", steps=2)
+        train(steps=2)
 
 
 def test_what_cannot_be_trained_is_named(scenario):
@@ -330,21 +320,17 @@ def test_the_model_that_a_controller_is_trained_on_must_be_measured(scenario):
         training.check(replace(scenario, network=shut), parse("dpc-pcrg"))
 
 
-def test_nothing_is_trained_on_a_guess_unless_anyway(scenario, tmp_path):
+def test_nothing_is_trained_on_a_guess_unless_anyway(scenario, train):
     city = replace(scenario, network=replace(scenario.network, placeholder=True))
     with pytest.raises(InputError, match="placeholder: is true"):
-        training.train(city, parse("dpc-pc"), seed=0, out=tmp_path / "a.pt", steps=1)
-    assert training.train(
-        city, parse("dpc-pc"), seed=0, out=tmp_path / "a.pt", steps=1, anyway=True
-    ).is_file()
+        train(on=city, steps=1)
+    assert train(on=city, steps=1, anyway=True).is_file()
 
 
-def test_a_policy_that_begins_as_no_control_and_gains_nothing_stays_open(
-    scenario, tmp_path, capsys
-):
+def test_a_policy_that_begins_as_no_control_and_gains_nothing_stays_open(scenario, train, capsys):
     table = {"from_no_control": True, "learning_rate": 1e-6, "holding_cost": 30.0}
     chosen = replace(scenario, controller_options={"dpc-pcrg": table})
-    file = training.train(chosen, parse("dpc-pcrg"), seed=0, out=tmp_path / "a.pt", steps=1)
+    file = train("dpc-pcrg", on=chosen, steps=1)
     assert "its gates stay open" in capsys.readouterr().err
     perimeter, splits = load_policy(file, scenario.network)[0](
         torch.rand(2, 2, generator=torch.manual_seed(0)) * 100.0

@@ -33,6 +33,11 @@ def learn(times, *speeds, vehicles=(2.0, 2.0, 2.0), **others):
     times.learn(seen(speeds, on, **{"crossing": (0.0, 0.0), "crossed": (0.0, 0.0)} | others))
 
 
+def seconds(driven, spent):
+    """The time of an edge by what was driven [veh m] and the time spent [veh s] on it."""
+    return pytest.approx(100.0 * (spent + PRIOR_VEH_S) / (driven + 10.0 * PRIOR_VEH_S))
+
+
 def test_at_first_everything_is_free(times):
     assert times.edges.tolist() == times.free.tolist() == [10.0] * 3
     assert times.turns.tolist() == times.free_turns.tolist() == [2.0, 1.0]
@@ -46,9 +51,7 @@ def test_at_first_everything_is_free(times):
 def test_many_count_more_than_few_and_nobody_is_faster_than_allowed(times):
     learn(times, 2.0, 2.0, 30.0, vehicles=(2.0, 0.01, 2.0), duration=60.0)
     for edge, spent in ((0, 120.0), (1, 0.6)):
-        assert times.edges[edge] == pytest.approx(
-            100.0 / ((2.0 * spent + 10.0 * PRIOR_VEH_S) / (spent + PRIOR_VEH_S))
-        )
+        assert times.edges[edge] == seconds(2.0 * spent, spent)
     assert times.edges[2] == 10.0
 
 
@@ -56,17 +59,9 @@ def test_the_newest_counts_most(times):
     learn(times, 2.0, 2.0, 2.0, duration=60.0)
     learn(times, 8.0, NOBODY, 8.0, vehicles=(1.0, 0.0, 1.0), duration=90.0)
     kept = math.exp(-90.0 / WINDOW_S)
-    driven, spent = 240.0 * kept + 8.0 * 90.0, 120.0 * kept + 90.0
-    assert times.edges[0] == pytest.approx(
-        100.0 * (spent + PRIOR_VEH_S) / (driven + 10.0 * PRIOR_VEH_S)
-    )
-    driven, spent = (
-        240.0 * EMPTY_WEIGHT,
-        120.0 * EMPTY_WEIGHT,
-    )  # an empty street is soon as good as free
-    assert times.edges[1] == pytest.approx(
-        100.0 * (spent + PRIOR_VEH_S) / (driven + 10.0 * PRIOR_VEH_S)
-    )
+    assert times.edges[0] == seconds(240.0 * kept + 8.0 * 90.0, 120.0 * kept + 90.0)
+    # An empty street is soon as good as free.
+    assert times.edges[1] == seconds(240.0 * EMPTY_WEIGHT, 120.0 * EMPTY_WEIGHT)
     for _ in range(12):
         learn(times, 8.0, NOBODY, 8.0, vehicles=(1.0, 0.0, 1.0))
     assert times.edges[1] == pytest.approx(10.0, rel=0.02)
@@ -77,9 +72,7 @@ def test_a_long_interval_leaves_less_of_an_empty_street(times):
     learn(times, 2.0, 2.0, 2.0, duration=60.0)
     learn(times, NOBODY, NOBODY, NOBODY, duration=900.0)
     kept = math.exp(-900.0 / WINDOW_S)
-    assert times.edges[0] == pytest.approx(
-        100.0 * (120.0 * kept + PRIOR_VEH_S) / (240.0 * kept + 10.0 * PRIOR_VEH_S)
-    )
+    assert times.edges[0] == seconds(240.0 * kept, 120.0 * kept)
 
 
 def test_closed_and_standing_streets_are_so_at_once(times):

@@ -44,10 +44,8 @@ def scenario(tmp_path_factory):
 @pytest.fixture(scope="module")
 def report(scenario, tmp_path_factory):
     out = tmp_path_factory.mktemp("report") / "run"
-    controllers = ("--controller", NAME, "--against", "no-control")
-    good(
-        call("cosim", "run", scenario, *controllers, "--seed", 3, "--set", "steps=6", "--out", out)
-    )
+    controllers = ("--controller", NAME, "--against no-control")
+    good(call("cosim", "run", scenario, *controllers, "--seed 3 --set steps=6 --out", out))
     good(call("cosim", "report", out))
     return out / "report.html"
 

@@ -68,16 +68,15 @@ def test_nobody_waits_on_an_empty_lane_or_for_another_turn():
     assert waited(street(route=("a", "c")), *moments) == 18.0
 
 
-def test_the_sheet_of_a_run(tmp_path):
+def test_the_sheet_of_a_run(tmp_path, out):
     """Cars of one street only: max-pressure leaves the other links red, but nobody waits there."""
-    net = tiny_city.network(tmp_path, "--tls.set", "B1,B2,C1,C2")
+    net = tiny_city.network(tmp_path, "--tls.set B1,B2,C1,C2")
     (tmp_path / "cars.rou.xml").write_text(f"<routes>{FLOW}</routes>")
     (tmp_path / "city.sumocfg").write_text(
         f'<configuration><net-file value="{net}"/><route-files value="cars.rou.xml"/>'
         '<time><end value="900"/></time></configuration>'
     )
     scenario = tiny_city.imported(tmp_path, regions=2, source=tmp_path / "city.sumocfg")
-    out = tmp_path / "out"
     run_controllers(scenario, ["no-control", "no-control+max-pressure"], steps=6, out=out)
     table = pd.read_csv(out / "signals.csv").set_index(["controller", "signal"])
     driven = table.loc[[(name, "B1") for name in ("no-control", "no-control+max-pressure")]]

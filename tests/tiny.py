@@ -9,7 +9,8 @@ import numpy as np
 
 from nmfd.model.mfd import Mfd, PiecewiseLinear, trapezoid
 from nmfd.model.regional_model import RegionalModel
-from nmfd.types import Result
+from nmfd.model.scenario import Scenario
+from nmfd.types import Controls, Observation, Result
 
 NETWORK = """
 name = "{name}"
@@ -138,6 +139,26 @@ def random_controls(random, network, batch=()):
     splits = random.uniform(size=(*shape, network.regions)) ** 3 * network.split_mask
     sums = splits.sum(axis=-2, keepdims=True)
     return perimeter, splits / np.where(sums > 0, sums, 1.0)
+
+
+def seen(accumulation, step: int = 0) -> Observation:
+    """What is measured of (R, R) vehicles, with nobody outside."""
+    return Observation(
+        step=step,
+        time=30.0 * step,
+        accumulation=accumulation,
+        backlog=np.zeros_like(accumulation),
+    )
+
+
+def part(scenario: Scenario, begin: int, steps: int) -> Scenario:
+    """`steps` intervals of a scenario, from its interval `begin` on."""
+    return replace(scenario, steps=steps, demand=scenario.demand[begin : begin + steps])
+
+
+def gates_at(scenario: Scenario, u: float) -> Controls:
+    """All gates at u."""
+    return Controls(perimeter=np.where(scenario.network.adjacency, u, 0.0))
 
 
 def made(**fields) -> Result:

@@ -5,23 +5,28 @@ import gzip
 import shutil
 import subprocess
 from atexit import register
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
 from types import SimpleNamespace
+from xml.etree.ElementTree import parse
 
 import numpy as np
 import sumo
+from commands import words
 from scipy.sparse.csgraph import connected_components
+from tiny import gates_at
 
+from cosim.importing.case import read_sumo_input
+from cosim.importing.demand import Traffic, read_traffic
 from cosim.importing.importer import import_city
-from cosim.importing.streets import Streets, graph
+from cosim.importing.streets import Streets, graph, read_streets
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import settings
 from nmfd.model.scenario import Scenario, with_demand
-from nmfd.types import Controls
 
 CONFIG = """<configuration>
   <input><net-file value="city.net.xml"/><route-files value="cars.rou.xml.gz,buses.rou.xml"/>
@@ -61,7 +66,7 @@ BUSES = """<routes>
 
 def run(program: str, *arguments) -> None:
     done = subprocess.run(
-        [str(Path(sumo.SUMO_HOME) / "bin" / program), *map(str, arguments)],
+        words(Path(sumo.SUMO_HOME) / "bin" / program, *arguments),
         capture_output=True,
         text=True,
     )
@@ -71,29 +76,27 @@ def run(program: str, *arguments) -> None:
 def network(folder: Path, *options: str, name: str = "city.net.xml") -> Path:
     """A grid of 4 x 4 junctions A0 to D3, 200 m apart, with signals at all inner ones unless told
     otherwise."""
-    (folder / name).write_bytes(_grid(options or ("--tls.set", "B1,B2,C1,C2,B3,C0")))
+    (folder / name).write_bytes(_grid(options or ("--tls.set B1,B2,C1,C2,B3,C0",)))
     return folder / name
 
 
 @cache
 def _grid(options: tuple[str, ...]) -> bytes:
-    grid = [
-        "--grid",
-        "--grid.number",
-        "4",
-        "--grid.length",
-        "200",
-        "--default.lanenumber",
-        "2",
-        "--no-turnarounds",
-        "true",
-        "--seed",
-        "1",
-    ]
+    grid = "--grid --grid.number 4 --grid.length 200 --default.lanenumber 2"
+    usual = "--no-turnarounds true --seed 1 --output-file"
     with TemporaryDirectory() as folder:
         file = Path(folder) / "city.net.xml"
-        run("netgenerate", *grid, "--output-file", file, *options)
+        run("netgenerate", grid, usual, file, *options)
         return file.read_bytes()
+
+
+def regions(net: Path, region_of: Callable[[str], int]) -> Path:
+    """The table of regions of all edges of a network, beside it."""
+    edges = [edge.get("id") for edge in parse(net).iterfind("edge") if not edge.get("function")]
+    file = net.with_name("regions.csv")
+    lines = (f"{edge},{region_of(edge)}\n" for edge in sorted(edges))
+    file.write_text("edge,region\n" + "".join(lines))
+    return file
 
 
 def pieces(streets: Streets, members: np.ndarray) -> int:
@@ -112,6 +115,12 @@ def city(folder: Path, *options: str) -> Path:
         stream.write(CARS)
     (folder / "city.sumocfg").write_text(CONFIG)
     return folder / "city.sumocfg"
+
+
+def traffic_of(config: Path) -> Traffic:
+    """What an import reads of a city's vehicles."""
+    case = read_sumo_input(config)
+    return read_traffic(case, read_streets(case.net, case.additional), seed=0)
 
 
 def imported(folder: Path, regions: int = 3, source: Path | None = None, **options) -> Path:
@@ -144,19 +153,26 @@ class Record(SimpleNamespace):
 
 
 @contextmanager
+def plant_of(scenario: Scenario, **overrides) -> Iterator[SumoPlant]:
+    """The plant of a scenario with other settings, closed at the end."""
+    plant = SumoPlant(scenario, settings=settings(scenario).changed(**overrides))
+    try:
+        yield plant
+    finally:
+        plant.close()
+
+
+@contextmanager
 def played(
     scenario: Scenario, intervals: int, gates: float, splits: np.ndarray | None = None, **overrides
 ) -> Iterator:
     """A plant after so many intervals with all u at `gates`, its state and its record; the ledger
     is checked in every interval."""
     scenario = with_demand(scenario, steps=max(intervals, 1))
-    plant = SumoPlant(scenario, settings=settings(scenario).changed(**overrides))
-    controls = Controls(perimeter=np.where(scenario.network.adjacency, gates, 0.0), splits=splits)
-    try:
+    controls = replace(gates_at(scenario, gates), splits=splits)
+    with plant_of(scenario, **overrides) as plant:
         states = [plant.reset(0), *(plant.step(controls) for _ in range(intervals))]
         yield plant, states[-1], Record(**plant.record()) if intervals else None
-    finally:
-        plant.close()
 
 
 def driven(scenario: Scenario, intervals: int, gates: float, **overrides) -> tuple:

@@ -1,11 +1,14 @@
 """Trajectories that nobody drove, for tests of what is made of them."""
 
 import numpy as np
+import torch
 from tiny import made
 
 from cosim.evaluation.signal_proof import SHEET
 from cosim.evaluation.simulate import FACTS
 from cosim.plant.record import RECORD, TOTALS
+from nmfd.model import dynamics
+from nmfd.model.scenario import Scenario
 from nmfd.types import Result, Status
 
 
@@ -14,6 +17,13 @@ def recorded(run: Result, arrays: dict[str, np.ndarray], facts: dict) -> Result:
     rules."""
     sheet = {name: np.zeros(1) for name in SHEET} | {"signal": np.array(["J"])}
     return run.add(facts, {**RECORD, **SHEET, **TOTALS}, **sheet, **arrays)
+
+
+def flows(scenario: Scenario, run: Result) -> list[np.ndarray]:
+    """Completions (T, R) and transfers (T, R, R, R) at the beginning of every interval [veh/s]."""
+    inputs = run["accumulation"][:-1], run["perimeter"], run["splits"]
+    found = dynamics.flows(dynamics.parameters(scenario.network), *map(torch.from_numpy, inputs))
+    return [values.numpy() for values in found]
 
 
 def record(steps: int, *, regions: int, gateways: int = 3, edges: int = 5) -> dict[str, np.ndarray]:
@@ -47,7 +57,7 @@ def trajectory(controller="no-control", seed=0, steps=4):
 
 
 def in_city(
-    scenario, strategy, seed: int, demand: float, *, tts: float, trips: int, completed: int
+    scenario, strategy, seed: int, demand: float, *, tts: float, trips: int = 9, completed: int = 9
 ) -> Result:
     """A run of one interval; tts: its total time spent [veh s]."""
     regions = scenario.network.regions

@@ -82,10 +82,7 @@ class Task:
         """
         controllers = GUIDED_STAGES if self.guided else UNGUIDED_STAGES
         strategy = parse("+".join([controllers[stage], *self.options]))
-        table = strategy.table(self.scenario)
-        tables = dict(self.scenario.controller_options)
-        tables[table] = {**tables.get(table, {}), **setup}
-        tuned = replace(self.scenario, controller_options=tables)
+        tuned = self.scenario.with_options(strategy.table(self.scenario), setup)
         runs = []
         for level in self.levels:
             folder = f"level-{level:g}"

@@ -1,6 +1,6 @@
 """Finished runs of a folder, with their scenario and city."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -63,14 +63,12 @@ class Level:
 
     @cached_property
     def _measures(self) -> list[Result]:
-        runs = []
-        for row in self.rows.itertuples():
-            file = self.folder / f"{run_name(row.controller, row.seed)}.nc"
-            runs.append(Result.read(file, only=MEASURES))
-        return runs
+        rows = self.rows.itertuples()
+        return [self.read(row.controller, row.seed, MEASURES) for row in rows]
 
-    def read(self, controller: str, seed: int) -> Result:
-        return Result.read(self.folder / f"{run_name(controller, seed)}.nc")
+    def read(self, controller: str, seed: int, only: Collection[str] | None = None) -> Result:
+        """Return a run; only: as in Result.read."""
+        return Result.read(self.folder / f"{run_name(controller, seed)}.nc", only)
 
 
 @dataclass(frozen=True, kw_only=True)

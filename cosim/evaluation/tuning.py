@@ -16,7 +16,7 @@ import math
 import re
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -111,10 +111,7 @@ class Tuning:
                 if index > len(numbers):
                     raise InputError(f"options: {name}: the numbers before it need a range, too")
                 numbers[index : index + 1] = [rounded]
-        name = self.strategy.table(self.scenario)
-        tables = dict(self.scenario.controller_options)
-        tables[name] = {**tables.get(name, {}), **table}
-        return replace(self.scenario, controller_options=tables)
+        return self.scenario.with_options(self.strategy.table(self.scenario), table)
 
     def value(self, key: str) -> Any:
         """Return an option of the scenario, or its default, or else None."""

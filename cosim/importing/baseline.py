@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cosim.importing.case import Progress
-from cosim.importing.comparison import ALL_TRIPS, NEVER, Trip, read_trips
+from cosim.importing.comparison import ALL_TRIPS, NEVER, QUIET, Trip, read_trips
 from cosim.importing.streets import Streets
 from cosim.sumo.arrays import EdgeNumbers, PerEdge
 from cosim.sumo.programs import run_sumo
@@ -33,8 +33,7 @@ INTERVAL_S = 300.0  # of the densities
 PEAK_INTERVALS = 3  # in a row: those with the most vehicles count for the partition
 # SUMO's options of all runs.
 SILENT = {
-    "no-step-log": "true",
-    "no-warnings": "true",
+    **QUIET,
     "ignore-route-errors": "true",
     "duration-log.statistics": "true",
     **ALL_TRIPS,
@@ -64,9 +63,9 @@ class Baseline:
 
     presence: Float[np.ndarray, "K E"]
     ways: Mapping[Way, int]
-    teleports: int
-    waiting: int
-    running: int
+    teleports: int = 0
+    waiting: int = 0
+    running: int = 0
     dropped: int = 0
     removed: int = 0
     slowness: float = np.nan

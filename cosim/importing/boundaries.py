@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from cosim.importing.streets import LinkMask, Streets, graph
+from cosim.importing.streets import LinkMask, Streets
 from cosim.sumo.arrays import EdgeMask, EdgeNumbers, PerEdge
 
 ROOM_M = 75.0  # of lanes before a gate, for ten vehicles; with less it holds nobody
@@ -51,7 +51,7 @@ def with_room(streets: Streets, uncontrollable: Collection[str]) -> LinkMask:
     uncontrollable: signals that perimeter control cannot use
     """
     before, behind = streets.links.T
-    free = np.array([signal is None for signal in streets.link_signals], dtype=bool)
+    free = ~streets.signalled
     room = streets.lane_metres.copy()
     np.add.at(room, behind[free], streets.lane_metres[before[free]])
     return streets.controllable(uncontrollable) & (room[before] >= ROOM_M)
@@ -110,15 +110,12 @@ class Clusters:
         count = int(of.max()) + 1
         lanes = streets.lane_metres[inside]
         mean = np.average(density[inside], weights=lanes)
-        ends = streets.between(of)
-        neighbours = graph(np.concatenate([ends, ends[:, ::-1]]), count)
-        neighbours.sum_duplicates()
         return cls(
             of=of,
             metres=np.bincount(of[inside], lanes, count),
             vehicles=np.bincount(of[inside], lanes * density[inside], count),
             variance=float(np.average((density[inside] - mean) ** 2, weights=lanes)),
-            neighbours=neighbours,
+            neighbours=streets.joins(of),
         )
 
     def on_edges(self, labels: Labels) -> EdgeNumbers:

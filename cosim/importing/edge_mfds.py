@@ -174,7 +174,7 @@ def _baseline(streets: Streets, rows: pd.DataFrame, days: int) -> Baseline:
     ways: dict[Way, int] = {}
     for (edge, following), passed in zip(pairs, vehicles, strict=True):
         ways[(edge, following), following] = passed
-    return Baseline(presence=presence, ways=ways, teleports=0, waiting=0, running=0)
+    return Baseline(presence=presence, ways=ways)
 
 
 def _turns(streets: Streets, rows: pd.DataFrame) -> np.ndarray:

@@ -50,8 +50,7 @@ def morning_peak(streets: Streets, *, level: float, begin: float, seed: int) -> 
         )
     random = np.random.default_rng([seed, 0x7065616B])
     ends = _Ends(streets, random)
-    signalled = np.array([signal is not None for signal in streets.link_signals])
-    turn = np.where(signalled, SIGNAL_DELAY_S, JUNCTION_DELAY_S)
+    turn = np.where(streets.signalled, SIGNAL_DELAY_S, JUNCTION_DELAY_S)
     time = streets.length / streets.speed + JUNCTION_DELAY_S  # with the junction before it
     noise = perception(len(time), random)
 
@@ -101,9 +100,8 @@ class _Ends:
         self._weight = weight
         self._fast = weight * streets.speed[self._edges] ** 2
         middle = np.average(streets.centre[self._edges], axis=0, weights=weight)
-        signalled = np.flatnonzero([signal is not None for signal in streets.link_signals])
-        if len(signalled):
-            middle = streets.centre[streets.links[signalled, 0]].mean(axis=0)
+        if streets.signalled.any():
+            middle = streets.centre[streets.links[streets.signalled, 0]].mean(axis=0)
         east, north = (streets.centre[self._edges] - middle).T
         self._distance = np.hypot(east, north)
         self._angle = np.arctan2(north, east)

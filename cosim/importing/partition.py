@@ -179,11 +179,8 @@ def make_blocks(streets: Streets) -> Blocks:
 
     weight = total(lanes)
     position = np.stack([total(axis * lanes) / weight for axis in streets.centre.T], axis=1)
-    ends = streets.between(of)
-    joins = graph(np.concatenate([ends, ends[:, ::-1]]), count)
-    joins.sum_duplicates()
     core = total(lanes * streets.core)
-    return Blocks(of=of, weight=weight, core=core, position=position, joins=joins)
+    return Blocks(of=of, weight=weight, core=core, position=position, joins=streets.joins(of))
 
 
 def without_signals(

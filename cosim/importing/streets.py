@@ -90,6 +90,11 @@ class Streets:
         """Length times lanes for cars (E,) [m]."""
         return self.length * self.lanes
 
+    @property
+    def signalled(self) -> LinkMask:
+        """Links that have a signal (L,)."""
+        return np.array([signal is not None for signal in self.link_signals], dtype=bool)
+
     def controllable(self, left_alone: Collection[str]) -> LinkMask:
         """Return the links (L,) that perimeter control can hold.
 
@@ -103,13 +108,18 @@ class Streets:
         """Links within the main part."""
         return self.links[self.main_part[self.links].all(axis=1)]
 
-    def between(self, labels: EdgeNumbers) -> Pairs:
-        """Return the pairs of different labels that links join.
+    def joins(self, labels: EdgeNumbers) -> csr_array:
+        """Return the number of links (U, U) that join two of U labels.
+
+        Either way counts.
 
         labels: (E,), -1 for none
         """
         ends = labels[self.links]
-        return ends[(ends >= 0).all(axis=1) & (ends[:, 0] != ends[:, 1])]
+        ends = ends[(ends >= 0).all(axis=1) & (ends[:, 0] != ends[:, 1])]
+        found = graph(np.concatenate([ends, ends[:, ::-1]]), int(labels.max()) + 1)
+        found.sum_duplicates()
+        return found
 
     @property
     def parts(self) -> int:

@@ -31,7 +31,6 @@ from nmfd.arrays import PerPair, PerRegion, PerTurn
 from nmfd.model import dynamics
 from nmfd.model.instruments import Instruments, Readings
 from nmfd.model.planning import PlanningModel
-from nmfd.model.regional_model import RegionalModel
 from nmfd.tensors import one_thread
 from nmfd.types import Controls
 
@@ -144,7 +143,7 @@ class Estimator:
         self._probe_share = instruments.probe_share
         self._regions = regions
         self._cells = cells
-        self._fastest = _fastest(network)
+        self._fastest = torch.from_numpy(network.fastest_rates)
         self._boundaries = np.argwhere(network.adjacency)
         self._turns = np.argwhere(network.split_mask)
         # The parts of Z, in its order.
@@ -435,15 +434,6 @@ class Estimator:
         loops = (1.0 + expansion) * matrix[self._mean] + mean * matrix[self._expansion]
         share = matrix[self._probes] - self._probe_share * matrix[self._x]
         return torch.cat([loops, matrix[self._crossings.start :], share])
-
-
-def _fastest(network: RegionalModel) -> Tensor:
-    """Return the largest rate (R,) [1/s] at which vehicles leave each region."""
-    rates = [mfd.rate(np.linspace(0.0, mfd.jam, 501)).max() for mfd in network.mfds]
-    fastest = torch.tensor(rates)
-    if network.exit_rates is not None:
-        fastest *= torch.from_numpy(network.exit_rates.max(axis=1))
-    return fastest
 
 
 def _product(left: Tensor, right: Tensor) -> _Product:

@@ -221,6 +221,12 @@ class RegionalModel:
         return np.array([mfd.rate_up_to_jam(0.0) for mfd in self.mfds])
 
     @property
+    def fastest_rates(self) -> PerRegion:
+        """Largest rates at which vehicles leave (1/s, (R,))."""
+        rates = [mfd.rate(np.linspace(0.0, mfd.jam, 2001)).max() for mfd in self.mfds]
+        return np.array(rates) * self.relative_rates.max(axis=1)
+
+    @property
     def relative_rates(self) -> PerPair:
         """`exit_rates`, 1 if they are None (R, R) [-]."""
         if self.exit_rates is None:
@@ -588,10 +594,7 @@ def check_step(network: RegionalModel, step: float, where: str) -> None:
 
     Raises: InputError
     """
-    for region, mfd in enumerate(network.mfds):
-        fastest = float(mfd.rate(np.linspace(0.0, mfd.jam, 2001)).max())
-        if network.exit_rates is not None:
-            fastest *= float(network.exit_rates[region].max())
+    for region, fastest in enumerate(network.fastest_rates.tolist()):
         if step * fastest > 1.0:
             raise InputError(
                 f"{where}: step: an integration step of {step:g} s is too long for region {region} "

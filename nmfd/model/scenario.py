@@ -146,6 +146,11 @@ class Scenario(Horizon):
             return np.zeros(self.demand.shape[1:])
         return self.initial.copy()
 
+    def with_options(self, table: str, options: Mapping[str, Any]) -> "Scenario":
+        """Return the scenario with other options in a table of controllers."""
+        own = {**self.controller_options.get(table, {}), **options}
+        return replace(self, controller_options={**self.controller_options, table: own})
+
     @cached_property
     def hash(self) -> str:
         """Hash of all that a run depends on, whatever the names of its files."""

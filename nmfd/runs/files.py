@@ -173,6 +173,11 @@ def folder_of(name: str, command: str, out: Path | str | None) -> Path:
     return Path(out)
 
 
+def path_of(file: Path | str | None) -> Path | None:
+    """Return a file or folder that a user may have given."""
+    return None if file is None else Path(file)
+
+
 def default_folder(scenario: str) -> Path:
     """Return runs/<scenario>-<timestamp>, a name that is not taken.
 

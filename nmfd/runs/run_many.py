@@ -128,7 +128,7 @@ def run_many(
 
     Columns are those of `nmfd.metrics.summary`, `folder` if there are several, and `failure`: "" of
     a finished run, else the reason with file and line. Finished runs of earlier calls that share
-    the keys come last.
+    the keys come last. The folder is `table.attrs["folder"]`.
 
     workers: runs at a time, each in a process of its own; 0: one after the other in this process
     scheduler: address of a Dask scheduler, whose workers do the runs; it takes TLS certificates
@@ -188,6 +188,7 @@ def run_many(
             content = {"made_by": _made_by(), "runs": kept}
             write_text(out / ROWS, json.dumps(content, default=lambda numbers: numbers.tolist()))
             write_if_changed(out / TABLE, table.to_csv(index=False))
+    table.attrs["folder"] = str(out)
     return table
 
 

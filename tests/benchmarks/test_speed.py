@@ -9,21 +9,20 @@ from pathlib import Path
 import numpy as np
 import plain
 import pytest
+import tiny
 import torch
 
 from nmfd import api
 from nmfd.api import controller as make_controller
 from nmfd.api import load_scenario
-from nmfd.closed_loop import run
 from nmfd.controllers.dpc.policy_file import load_policy
 from nmfd.controllers.mpc.ipopt import Ipopt
 from nmfd.model.links.model import Commands, LinkModel
 from nmfd.model.links.network import read_links
 from nmfd.model.links.plant import links_file
 from nmfd.model.planning import planning_model
-from nmfd.model.plant import NmfdPlant
-from nmfd.model.scenario import Scenario, with_demand
-from nmfd.types import Observation, Status
+from nmfd.model.scenario import Scenario
+from nmfd.types import Status
 
 SCALING = runpy.run_path(
     str(Path(__file__).parents[2] / "scenarios" / "large_grids" / "scaling.py")
@@ -45,16 +44,8 @@ def one_thread():
 @pytest.fixture(scope="module")
 def seen():
     """Measurements of a run without control."""
-    controller, short = (
-        api.controller("no-control", SCENARIO),
-        with_demand(SCENARIO, steps=WHEN[-1] + 1),
-    )
-    trajectory = run(NmfdPlant(SCENARIO), controller, short, seed=0)
-    return [measurement(trajectory["accumulation"][k], k) for k in WHEN]
-
-
-def measurement(x, k=0):
-    return Observation(step=k, time=30.0 * k, accumulation=x, backlog=np.zeros_like(x))
+    trajectory = api.run(SCENARIO, "no-control", steps=WHEN[-1] + 1)
+    return [tiny.seen(trajectory["accumulation"][k], k) for k in WHEN]
 
 
 def forecast(scenario, k):
@@ -70,7 +61,7 @@ def random_city(family, regions):
     scenario = Scenario(
         name="city", network=city, step=30.0, steps=10, demand=np.zeros((10, regions, regions))
     )
-    return scenario, measurement(SCALING["initial_state"](city, "congested"))
+    return scenario, tiny.seen(SCALING["initial_state"](city, "congested"))
 
 
 def compare(scenario, measured, guidance):
@@ -117,12 +108,7 @@ def test_mpc_has_the_optimum_of_plain_ipopt_in_random_cities(family, regions, gu
 
 
 def test_the_plain_model_is_the_model():
-    trajectory = run(
-        NmfdPlant(SCENARIO),
-        api.controller("no-control", SCENARIO),
-        with_demand(SCENARIO, steps=30),
-        seed=0,
-    )
+    trajectory = api.run(SCENARIO, "no-control", steps=30)
     x = trajectory["accumulation"][0]
     for k in range(30):
         x = plain.euler(
