@@ -62,6 +62,19 @@ def test_it_has_a_table_of_its_own(place):
     )  # without gain nothing is held
 
 
+def test_tuned_options_replace_those_of_its_table(place):
+    with (place / "scenario" / "scenario.toml").open("a") as file:
+        file.write("\n[controllers.own.my-controller]\ngain = 0.0\nother = 3\n")
+    assert command("new-controller mine.py").exit_code == 0
+    strategy = parse("mine.py:MyController")
+    scenario = nmfd.load_scenario(place / "scenario")
+    tuned = scenario.with_options(strategy.table(scenario), {"gain": 2.0})
+    assert strategy.fingerprint(tuned)["options"] == {"gain": 2.0, "other": 3}
+    full = tiny.seen(np.full((2, 2), 900.0))
+    assert strategy.make(scenario).act(full).perimeter[0, 1] == 0.9  # nothing is held
+    assert strategy.make(tuned).act(full).perimeter[0, 1] < 0.9
+
+
 def test_files_and_modules_beside_it(place):
     (place / "helper_of_mine.py").write_text("OPENING = 0.5\n")
     (place / "weights.txt").write_text("1")

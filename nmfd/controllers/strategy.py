@@ -266,15 +266,21 @@ class Strategy:
     def _own_table(self, scenario: Scenario) -> dict[str, Any]:
         """Return the options as they were given or written.
 
-        Those of the strategy's table replace those of the controller's.
+        Those of the strategy's table replace those of the controller's; what `cosim tune` tries
+        replaces those in the tables of the user's own controllers.
         """
         kind = self.controller
         if isinstance(kind, BuiltIn) and kind.given is not None:
             return kind.given.model_dump(exclude_unset=True, exclude=set(kind.fixed))
-        tables = scenario.controller_options
+        names = (kind.name, self.table(scenario))
+        places = [scenario.controller_options]
         if isinstance(kind, FromFile):
-            tables = {**tables, **tables.get(OWN, {})}
-        return {**tables.get(kind.name, {}), **tables.get(self.table(scenario), {})}
+            places.insert(0, scenario.controller_options.get(OWN, {}))
+        found: dict[str, Any] = {}
+        for tables in places:
+            for name in names:
+                found |= tables.get(name, {})
+        return found
 
     def _network(self, scenario: Scenario, model: Any, table: str) -> RegionalModel | None:
         """Return the regional model to plan with; None for the scenario's.
