@@ -33,8 +33,8 @@ PICTURE = Path(__file__).with_name("house.svg")
 # 175,000 was the aim, 205,000 with all that is to come. A step a line, options that are objects,
 # the guard and what cities do wrong took 25,000 more, the plant of streets 14,000, studies of a
 # city 7,000, cuts of published networks, single changes in training and rows of finished runs 3,000
-# together, plans of routes, MFDs of edgeData and trips from counts 6,000, chance, vehicles and a fit
-# in the plant of streets 4,000: names and steps were not cut to come under it.
+# together, plans of routes, MFDs of edgeData and trips from counts 6,000, chance, vehicles and a
+# fit in the plant of streets 4,000: names and steps were not cut to come under it.
 TOKENS = 246_000
 TEST_TOKENS = 169_500
 TOKENS_PER_LINE = 9.5
