@@ -66,7 +66,7 @@ def locks(run: nmfd.Result) -> bool:
 @click.command()
 @click.argument("folder", type=click.Path(path_type=Path, exists=True))
 def main(folder: Path) -> None:
-    """Print a row for each run."""
+    """Print a row for each run, and write them to links.csv in the folder."""
     rows = []
     for file in sorted(folder.rglob("[!.]*.nc")):
         run = nmfd.Result.read(file)
@@ -86,7 +86,9 @@ def main(folder: Path) -> None:
             }
         )
         click.echo(rows[-1])
-    click.echo(pd.DataFrame(rows).round(2).to_markdown(index=False))
+    table = pd.DataFrame(rows).round(3)
+    table.to_csv(folder / "links.csv", index=False)
+    click.echo(table.to_markdown(index=False))
 
 
 if __name__ == "__main__":
