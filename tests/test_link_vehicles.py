@@ -8,7 +8,6 @@ import pytest
 
 from cosim.evaluation.link_vehicles import CAR, drives_of, means_of
 from cosim.evaluation.links import link_network
-from cosim.plant.settings import settings
 from cosim.sumo.net import city_of
 from cosim.sumo.recorded_trips import RecordedTrips
 from nmfd import api
@@ -45,16 +44,14 @@ def test_trips_begin_and_end_along_their_streets(places, first, last):
     city = replace(city, length={**city.length, **dict.fromkeys(move, 100.0)})
     route = f'<route edges="{" ".join(move)}"/>'
     given = trips(f'<vehicle id="v" depart="0" {places}>{route}</vehicle>')
-    (drive,) = drives_of(given, [], city)
+    (drive,) = drives_of(given, {}, [], city)
     assert drive == (move, pytest.approx(first), pytest.approx(last))
 
 
-def test_trips_without_a_route_take_the_fastest_one(tmp_path):
+def test_trips_without_a_route_take_the_fastest_one():
     """Those that have no way, or drive on one street only, are left out."""
     city = city_of(api.load_scenario("demo").network)
     first, second = city.moves[0]
-    routes = tmp_path / "routes.xml"
-    routes.write_text(f'<additional><route id="r" edges="{first} {second}"/></additional>')
     given = trips(
         f'<vehicle id="v" depart="0"><route edges="{first}"/></vehicle>',
         f'<vehicle id="w" depart="0"><route edges="{first} unknown"/></vehicle>',
@@ -62,17 +59,16 @@ def test_trips_without_a_route_take_the_fastest_one(tmp_path):
         f'<trip id="y" depart="0" from="{first}" to="{second}"/>',
         f'<trip id="z" depart="0" from="{first}" to="unknown"/>',
     )
-    drives = drives_of(given, [routes], city)
+    drives = drives_of(given, {"r": (first, second)}, [], city)
     assert [drive.route for drive in drives] == 2 * [(first, second)]
 
 
 def test_the_average_vehicle(tmp_path):
-    (tmp_path / "types.xml").write_text(TYPES)
-    scenario = replace(api.load_scenario("demo"), folder=tmp_path)
-    chosen = settings(scenario).model_copy(update={"additional": ("types.xml",)})
+    file = tmp_path / "types.xml"
+    file.write_text(TYPES)
     types = ("van", "mix", "small", "unknown")
     given = trips(*(f'<vehicle id="{n}" depart="0" type="{n}"/>' for n in types))
-    means = means_of(scenario, chosen, given)
+    means = means_of(given, [file])
     assert means["length"] == pytest.approx(np.mean([8.0, 4.0, 3.0, CAR["length"]]))
     assert means["minGap"] == pytest.approx(np.mean([2.5, 1.25, 1.0, 2.5]))
     assert means["accel"] == CAR["accel"]

@@ -217,17 +217,16 @@ def test_vehicles_turn_by_chance_as_often_as_on_average():
 
 
 def test_chance_makes_queues_where_streams_have_none():
-    """At 90 % of the flow that green lets pass."""
-    network = replace(triangle(), cell_share=np.array([[1.0, 0.0, 1.0]]), **ONE_LANE)
-    model = model_of(network)
-    demand = demand_of(torch.tensor(0.9 * SATURATION * GREEN_S / CYCLE_S).double())
+    """Those who turn to b are 97 % of the flow that green lets pass."""
+    model = model_of()
+    demand = demand_of(torch.tensor(0.97 * SATURATION * GREEN_S / CYCLE_S / 0.7).double())
     spent = []
     for draws, chance in [([0], False), ([1], True), ([2], True)]:
         state = model.start(1, draws, chance=chance)
         for _ in range(20):
             state = model.advance(state, demand, Commands())
         spent.append(float(state.spent))
-    assert min(spent[1:]) > 0.99 * spent[0]
+    assert min(spent[1:]) > 1.015 * spent[0]
     assert spent[1] != spent[2]
 
 

@@ -7,7 +7,6 @@ controller of the run.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +16,7 @@ from scipy.optimize import minimize
 
 from cosim.evaluation.links import link_network
 from cosim.evaluation.results import Finished
+from cosim.plant.settings import settings
 from cosim.plant.strategy import of_finished
 from nmfd import closed_loop
 from nmfd.api import loaded
@@ -47,33 +47,30 @@ class Case:
     demand: factor
     scenario: with the demand and the settings of the run
     controller: name
+    network: streets with the routes of the run's seed
     """
 
     run: Result
     demand: float
     scenario: Scenario
     controller: str
+    network: LinkNetwork
 
-    def repeated(self, network: LinkNetwork, numbers: Numbers) -> list[Result]:
+    def repeated(self, numbers: Numbers) -> list[Result]:
         """Return the run in the link model, once for each of SEEDS."""
         runs = []
         for seed in SEEDS:
-            plant = LinkPlant(self.scenario, network=network, numbers=numbers)
+            plant = LinkPlant(self.scenario, network=self.network, numbers=numbers)
             controller = of_finished(self.controller).make(self.scenario)
             runs.append(closed_loop.run(plant, controller, self.scenario, seed=seed))
         return runs
-
-    @cached_property
-    def network(self) -> LinkNetwork:
-        """Streets with the routes of the run's seed."""
-        return link_network(self.scenario, [self.run.seed])
 
 
 class Fit(NamedTuple):
     """Numbers, and a row per run.
 
-    rows: city, demand, seed, in SUMO and in the model the time spent (1e6 veh s), whether they
-        lock, difference (-), and whether the numbers were fitted to the run
+    rows: controller, demand, seed, in SUMO and in the model the time spent (1e6 veh s) and whether
+        they lock, difference (-), and whether the numbers were fitted to the run
     left_out: why runs were not compared
     """
 
@@ -90,20 +87,22 @@ class Fit(NamedTuple):
                     "strategy": row.controller,
                     "demand": f"{row.demand:g}",
                     "seed": row.seed,
-                    "SUMO": f"{row.sumo:.3g}" + ", locks" * row.sumo_locks,
-                    "links": f"{row.links:.3g}" + ", locks" * row.links_lock,
+                    "SUMO": _spent(row.sumo, locked=row.sumo_locks),
+                    "links": _spent(row.links, locked=row.links_lock),
                     "difference": f"{row.difference:+.0%}",
                     "": "fitted" if row.fitted else "",
                 }
             )
         unseen = self.rows[~self.rows["fitted"] & ~self.rows["sumo_locks"]]
-        error = "no other run flows: the error is unknown"
+        error = "No other run flows: the error is unknown."
         if len(unseen):
             sizes = unseen["difference"].abs()
-            error = f"in {len(unseen)} other runs that flow: {sizes.median():.0%} in the median"
-            error += f", {sizes.max():.0%} at most"
-        numbers = ", ".join(f"{name} {value:.3g}" for name, value in vars(self.numbers).items())
-        caption = f"Total time spent [1e6 veh s]. Numbers: {numbers}. Error {error}."
+            error = (
+                f"Error in other runs that flow ({len(unseen)}): {sizes.median():.0%} in the "
+                f"median, {sizes.max():.0%} at most."
+            )
+        numbers = [f"{name} {value:.3g}" for name, value in self.numbers._asdict().items()]
+        caption = f"Total time spent [1e6 veh s]. Numbers: {', '.join(numbers)}. {error}"
         lines = [text_table(shown), *wrapped(caption, NARROW)]
         for reason in self.left_out:
             lines += wrapped(reason, NARROW)
@@ -114,6 +113,8 @@ def cases_of(found: Finished) -> tuple[list[Case], list[str]]:
     """Return the runs that the model can repeat, and why not the others."""
     cases = []
     left_out = []
+    recorded = bool(settings(found.scenario).routes)
+    networks: dict[tuple[float, int] | None, LinkNetwork] = {}
     for level in found.levels:
         for name in level.rows["controller"].unique():
             strategy = of_finished(name)
@@ -135,7 +136,10 @@ def cases_of(found: Finished) -> tuple[list[Case], list[str]]:
                 left_out.append(f"{name} is left out: {error}")
                 continue
             for run in runs:
-                cases.append(Case(run, level.demand, scenario, controller))
+                trips = None if recorded else (level.demand, run.seed)
+                if trips not in networks:
+                    networks[trips] = link_network(scenario, [run.seed])
+                cases.append(Case(run, level.demand, scenario, controller, networks[trips]))
     return cases, left_out
 
 
@@ -150,7 +154,7 @@ def fit(found: Finished, progress: Progress = None) -> Fit:
         raise InputError(f"{found.path}: holds no run that the link model can repeat: {reasons}")
     seed = min(case.run.seed for case in cases)
     first = [case for case in cases if case.run.seed == seed]
-    fitted = [case for case in first if not _locks(case.run)] or first
+    fitted = [case for case in first if not locks(case.run)] or first
     with watched("links", progress) as show:
         trial = 0
 
@@ -173,8 +177,16 @@ def fit(found: Finished, progress: Progress = None) -> Fit:
 
 def _numbers(logarithms: Numbering) -> Numbers:
     """Return numbers that are so far from their defaults."""
-    values = np.array(list(vars(Numbers()).values())) * np.exp(logarithms)
+    values = np.array(Numbers()) * np.exp(logarithms)
     return Numbers(*values.tolist())
+
+
+def _spent(total: float, *, locked: bool) -> str:
+    """Return the time spent (1e6 veh s) for the table."""
+    text = f"{total:.3g}"
+    if locked:
+        text += ", locks"
+    return text
 
 
 def _vehicles(run: Result) -> np.ndarray:
@@ -185,29 +197,29 @@ def _vehicles(run: Result) -> np.ndarray:
 def _error(case: Case, numbers: Numbers) -> float:
     """Return the RMSE of the vehicles, as a share of their mean in SUMO."""
     seen = _vehicles(case.run)
-    repeated = case.repeated(case.network, numbers)
+    repeated = case.repeated(numbers)
     mean = np.mean([_vehicles(run) for run in repeated], axis=0)
     return float(np.sqrt(np.mean((mean - seen) ** 2)) / seen.mean())
 
 
 def _row(case: Case, numbers: Numbers, *, fitted: bool) -> dict[str, object]:
     """Return a row of Fit."""
-    repeated = case.repeated(case.network, numbers)
+    repeated = case.repeated(numbers)
     spent = float(np.mean([run.total_time_spent for run in repeated]))
     return {
         "controller": case.run.controller,
         "demand": case.demand,
         "seed": case.run.seed,
         "sumo": case.run.total_time_spent / 1e6,
-        "sumo_locks": _locks(case.run),
+        "sumo_locks": locks(case.run),
         "links": spent / 1e6,
-        "links_lock": sum(map(_locks, repeated)) > len(repeated) / 2,
+        "links_lock": sum(map(locks, repeated)) > len(repeated) / 2,
         "difference": spent / case.run.total_time_spent - 1.0,
         "fitted": fitted,
     }
 
 
-def _locks(run: Result) -> bool:
+def locks(run: Result) -> bool:
     """Return True if many trips are not finished at the end."""
     left = float(_vehicles(run)[-1].sum())
     return left > LOCKED * (left + run.completed_trips)

@@ -1,6 +1,6 @@
 """Vehicles of the link model: routes, and the average vehicle."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 from xml.etree.ElementTree import Element
@@ -13,7 +13,7 @@ from cosim.sumo.net import City
 from cosim.sumo.programs import run_sumo
 from cosim.sumo.recorded_trips import RecordedTrips
 from cosim.sumo.trips import make_trips
-from cosim.sumo.xml_files import attribute, child, read_xml
+from cosim.sumo.xml_files import attribute, child, file_list, read_xml
 from nmfd.model.scenario import Scenario
 from nmfd.runs.files import temporary_folder
 
@@ -45,18 +45,20 @@ def draws_of(
     return [recorded.as_recorded(trips) for trips in made]
 
 
-def drives_of(trips: RecordedTrips, files: Sequence[Path], city: City) -> list[Drive]:
+def drives_of(
+    trips: RecordedTrips, shared: Mapping[str, Sequence[str]], files: Sequence[Path], city: City
+) -> list[Drive]:
     """Return the trips over two or more edges of the city.
 
     Those without a route take the fastest one in free flow.
-    files: with shared routes and vehicle types
+    shared: routes of several vehicles; files: with vehicle types
     Raises: InputError
     """
-    shared = recorded.read_routes(files)
     found = [recorded.edges_of(element, shared) for element in trips.elements]
     ways: dict[str, Route] = {}
-    if not all(driven for _, driven in found):
-        ways = _fastest(trips, files, city)
+    without = [n for n, (_, driven) in enumerate(found) if not driven]
+    if without:
+        ways = _fastest(trips, without, files, city)
     drives = []
     for element, (edges, driven) in zip(trips.elements, found, strict=True):
         route = tuple(edges)
@@ -69,24 +71,27 @@ def drives_of(trips: RecordedTrips, files: Sequence[Path], city: City) -> list[D
     return drives
 
 
-def _fastest(trips: RecordedTrips, files: Sequence[Path], city: City) -> dict[str, Route]:
+def _fastest(
+    trips: RecordedTrips, numbers: Sequence[int], files: Sequence[Path], city: City
+) -> dict[str, Route]:
     """Return vehicle -> its fastest route in free flow.
 
     Vehicles that have none are left out.
+    numbers: of the vehicles
     """
     with temporary_folder() as folder:
         given = folder / "given.rou.xml"
         found = folder / "found.rou.xml"
-        departures = enumerate(trips.depart.tolist())
-        drawn = [(depart, n, attribute(trips.elements[n], "id")) for n, depart in departures]
+        drawn = [(float(trips.depart[n]), n, attribute(trips.elements[n], "id")) for n in numbers]
         recorded.write_recorded_trips(trips, drawn, given)
-        options = {
-            "net-file": city.net_file,
+        options: dict[str, object] = {
+            "net-file": file_list([city.net_file]),
             "route-files": given,
-            "additional-files": ",".join(map(str, files)),
             "output-file": found,
         }
-        run_sumo("duarouter", options, "--ignore-errors", "--no-warnings", where=str(given))
+        if files:
+            options["additional-files"] = file_list(files)
+        run_sumo("duarouter", options, "--ignore-errors", "--no-warnings", where=str(city.net_file))
         routes = {}
         for vehicle in read_xml(found).iter("vehicle"):
             edges = attribute(child(vehicle, "route"), "edges")
@@ -94,9 +99,12 @@ def _fastest(trips: RecordedTrips, files: Sequence[Path], city: City) -> dict[st
         return routes
 
 
-def means_of(scenario: Scenario, settings: Settings, trips: RecordedTrips) -> dict[str, float]:
-    """Return the attributes CAR of the average vehicle."""
-    roots = [read_xml(path) for path in own_files(scenario, settings.additional)]
+def means_of(trips: RecordedTrips, files: Sequence[Path]) -> dict[str, float]:
+    """Return the attributes CAR of the average vehicle.
+
+    files: with vehicle types
+    """
+    roots = [read_xml(path) for path in files]
     known = {}
     for part in [*trips.types, *roots]:
         for one in part.iter("vType"):

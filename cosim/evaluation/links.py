@@ -67,7 +67,7 @@ def write_links(
         path = shipped.beside(folder, FILE, "--out FILE", scenario=True)
     network = link_network(scenario, seeds)
     if numbers is not None:
-        network = replace(network, numbers=np.array(list(vars(numbers).values())))
+        network = replace(network, numbers=np.array(numbers))
     network.write(path)
     return path
 
@@ -89,14 +89,14 @@ def link_network(scenario: Scenario, seeds: Sequence[int] = PLANNING_SEEDS) -> L
         for element in draw.elements:
             driven.update(recorded.edges_of(element, shared)[0])
     city = city_of(scenario.network, opened=driven & city.region_of.keys())
-    by_draw = [drives_of(draw, files, city) for draw in draws]
+    by_draw = [drives_of(draw, shared, files, city) for draw in draws]
     together = [drive for drives in by_draw for drive in drives]
     routes = [drive.route for drive in together]
     if not routes:
         raise InputError(f"{scenario.where}: sumo.routes: no trip leads over two streets for cars")
     streets = Streets(city, connections_of(city), routes, scenario.where)
     counts = Counts(streets, together)
-    means = means_of(scenario, chosen, draws[0])
+    means = means_of(draws[0], files)
     steered, _ = read_signals(city, files, HELD)
     obeying = {signal.id for signal in steered}.difference(chosen.leave_signals)
     gated = set()
@@ -106,7 +106,7 @@ def link_network(scenario: Scenario, seeds: Sequence[int] = PLANNING_SEEDS) -> L
     links = link_arrays(streets)
     return LinkNetwork(
         regions=city.regions,
-        numbers=np.array(list(vars(Numbers()).values())),
+        numbers=np.array(Numbers()),
         spacing=means["length"] + means["minGap"],
         headway=means["tau"],
         dawdling=0.5 * means["sigma"] * means["accel"],

@@ -150,7 +150,8 @@ def _placed(rows: pd.DataFrame, streets: Streets, path: Path) -> pd.DataFrame:
     rows = rows[inside | ~rows["edge"].str.startswith(ON_JUNCTION)].copy()
     rows.loc[inside, ["entered", "left"]] = 0.0
     before = {edge: place.before for edge, place in streets.inside.items()}
-    rows["number"] = numbers_of(rows["edge"].replace(before), streets, path)
+    own = rows["edge"].map(before).fillna(rows["edge"])
+    rows["number"] = numbers_of(own, streets, path)
     length = pd.Series(streets.length[rows["number"]], rows.index)
     lengths = {edge: place.length for edge, place in streets.inside.items()}
     length = rows["edge"].map(lengths).fillna(length)

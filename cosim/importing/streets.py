@@ -183,7 +183,7 @@ def read_streets(net: Path, additional: Iterable[Path] = ()) -> Streets:
             if element.tag == "edge" and element.get("function", "normal") in NORMAL:
                 rows[attribute(element, "id")] = _edge(element)
             elif element.tag == "edge" and element.get("function") == "internal":
-                internal[attribute(element, "id")] = size(element[0], "length")
+                internal[attribute(element, "id")] = size(next(element.iter("lane")), "length")
             elif element.tag == "connection":
                 links.append(element.attrib)
             elif element.tag == "roundabout":

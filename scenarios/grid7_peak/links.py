@@ -14,14 +14,13 @@ import numpy as np
 import pandas as pd
 
 import nmfd
+from cosim.evaluation.link_fit import GUIDING, locks
 from cosim.evaluation.links import link_network
 from nmfd import closed_loop
 from nmfd.api import loaded
 from nmfd.controllers.rules import Constant
 
-LOCKED = 0.05  # share of the trips that are not finished at the end
 SEEDS = (0, 1, 2)  # of the link model
-GUIDING = "route-guidance"  # by travel times
 
 
 def metered(network: nmfd.RegionalModel, rate: float) -> nmfd.Controller:
@@ -55,12 +54,6 @@ def in_links(run: nmfd.Result) -> list[nmfd.Result]:
         plant = nmfd.LinkPlant(scenario, network=network)
         runs.append(closed_loop.run(plant, controller, scenario, seed=seed))
     return runs
-
-
-def locks(run: nmfd.Result) -> bool:
-    """Return True if many trips are not finished at the end."""
-    left = float(run.accumulation[-1].sum() + run.backlog[-1].sum())
-    return left > LOCKED * (left + run.completed_trips)
 
 
 @click.command()

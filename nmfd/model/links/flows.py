@@ -19,8 +19,7 @@ in the order of arrival; s is the saturation flow. In each step of dt seconds
 Where all lanes of a link lead to all turns, steps 1 to 4 are the node model of Tampere, Corthout,
 Cattrysse and Immers, "A generic class of first order node models" (2011), with demand-proportional
 shares, if green lasts long enough: first in, first out, and no flow could be larger. Where lanes
-lead to some turns only, vehicles that all want one turn still move up in all lanes, and leave too
-fast.
+lead to some turns only, vehicles that all want one turn still move up in all lanes.
 A movement that gives way to a flow f has exp(-gap f) of its green, which is the chance that no
 vehicle comes within the critical gap. A vehicle that stood at the stop line takes longer along the
 next link: 1.6 s until it drives, and v / 2a as it accelerates. Trips begin and end where they do on
@@ -29,7 +28,6 @@ average along a street; one that ends in the queue moves up there.
 Every vehicle that leaves one count enters another one: mass and its derivative are conserved.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -48,8 +46,7 @@ BETWEEN_M = 4.8
 START_S = 1.6  # after which the first vehicle of a queue drives
 
 
-@dataclass(frozen=True)
-class Numbers:
+class Numbers(NamedTuple):
     """Calibration of the model to a city; the defaults are not fitted.
 
     time_factor: of the free-flow times (-)
@@ -224,9 +221,9 @@ class Flows:
         to_end = np.maximum(np.round(network.last * free_steps), 1).astype(int)
         flow = self._saturation(speed)
         wave = flow / (1.0 / self._spacing - flow / speed)
-        # The newest count is that of now. Between two steps counts change evenly.
         # A queue discharges at its flow, although its first vehicle is late on the next link.
         late = np.minimum(START_S + speed / (2.0 * network.acceleration), network.length / wave)
+        # The newest count is that of now. Between two steps counts change evenly.
         wave_steps = (network.length / wave - late) / self.dt + 1.0
         backwards = np.floor(wave_steps).astype(int)
         self._earlier = self.values(wave_steps - backwards)
@@ -268,7 +265,7 @@ class Flows:
         self._lane_share = self.values(1.0 / lanes_of_turn[network.served])
         self._pace = self.values(saturation / of_movement)
         self._per_step = self.values(saturation)
-        self._weight = min(self.dt / self.numbers.gap, 1.0)
+        self._smoothing = min(self.dt / self.numbers.gap, 1.0)
 
     def values(self, numbers: np.ndarray) -> Tensor:
         """Return an array of numbers as a tensor of this model."""
@@ -370,19 +367,18 @@ class Flows:
         leaving = first * going.index_select(1, self._turn_of_cell)
         flow = by_turn * going
         entered = self.sums(leaving, self.onward, self.entries)
-        stopped_here = self.sums(
-            leaving * stood.index_select(1, self._turn_of_cell), self.onward, self.entries
-        )
+        had_stood = leaving * stood.index_select(1, self._turn_of_cell)
+        started = self.sums(had_stood, self.onward, self.entries)
         passed = self.sums(flow, self._movement_of_turn, self.movements)
         left = self.sums(passed, self._link_left, self.links)
         put = put * rho
         begun = due * put.index_select(1, self.link_of_entry)
         completed = ends - in_queue + stopped
         coming = self.sums(flow, self._link_entered, self.links) + waiting * put
-        # Trips that begin along the street drive a share of it: they begin at its ends.
+        # Trips that drive a share of their first street begin at its two ends by this share.
         ahead = begun * self._ahead
         ending = entered.index_select(1, self._home) * ways.ends
-        starting = stopped_here * ways.goes_on
+        starting = started * ways.goes_on
         passing = entered * ways.goes_on - starting + begun - ahead
         return Traffic(
             held=traffic.held,
@@ -393,7 +389,7 @@ class Flows:
             standing=by_turn - flow,
             stopping=stopping - stopped,
             inside=traffic.inside + coming - left - completed,
-            recent=traffic.recent + self._weight * (passed / self.dt - traffic.recent),
+            recent=traffic.recent + self._smoothing * (passed / self.dt - traffic.recent),
             completed=traffic.completed + completed,
             entered=self._along.with_new(traffic.entered, passing),
             started=self._started.with_new(traffic.started, starting),

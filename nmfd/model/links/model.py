@@ -162,17 +162,17 @@ class LinkModel:
         draws: numbers of the draws of trips; the rollouts take them in turn
         chance: single vehicles draw their turns, with the draws as seeds
         """
+        flows = self.flows
         regions = self.network.regions
         seeds = np.resize(np.array(draws), batch)
         draw = seeds % len(self.network.origin)
-        traffic = self.flows.start(batch)
-        flows = self.flows
+        traffic = flows.start(batch)
         by_chance = None
         if chance:
             by_chance = Chance(seeds.tolist(), flows.entries, flows.entry_of_cell)
         return LinkState(
             interval=0,
-            draw=self.flows.places(draw),
+            draw=flows.places(draw),
             traffic=traffic,
             used=self._gates.start(batch),
             stages=None if self._pressure is None else self._pressure.start(batch),
