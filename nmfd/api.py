@@ -24,6 +24,7 @@ from nmfd.controllers.strategy import (
     parse_many,
 )
 from nmfd.errors import InputError, did_you_mean
+from nmfd.model.links.network import LINKS
 from nmfd.model.scenario import Scenario, read_scenario, with_demand
 from nmfd.runs import shipped
 from nmfd.runs.files import default_folder, folder_of, path_of, run_name
@@ -378,6 +379,7 @@ def train(
     sample: "Sample | None" = ...,
     constraints: "Sequence[tuple[Cost, float]]" = ...,
     out: Path | str | None = ...,
+    plant: str = ...,
     seed: int = ...,
     steps: int | None = ...,
     device: str = ...,
@@ -395,6 +397,7 @@ def train(
     sample: "Sample | None" = ...,
     constraints: "Sequence[tuple[Cost, float]]" = ...,
     out: Path | str | None = ...,
+    plant: str = ...,
     seed: int = ...,
     steps: int | None = ...,
     device: str = ...,
@@ -411,6 +414,7 @@ def train(
     sample: "Sample | None" = None,
     constraints: "Sequence[tuple[Cost, float]]" = (),
     out: Path | str | None = None,
+    plant: str = "nmfd",
     seed: int = 0,
     steps: int | None = None,
     device: str = "cpu",
@@ -430,6 +434,7 @@ def train(
     constraints: pairs of a function, nmfd.Trajectories -> penalty >= 0 (B,), and its weight; their
         means are added
     out: policy file, SCENARIO/NAME.pt if None
+    plant: "nmfd", the regional model, or "links", the streets of the scenario
     steps: Adam steps; those of scenario.toml, else 400, if None
     device: "cpu", which gives the same weights every time, "cuda" or "auto"
     resume: continue an interrupted training
@@ -446,6 +451,9 @@ def train(
         raise InputError(
             "policy: a module is returned, not written; omit out and resume, keep its state_dict()"
         )
+    if plant not in (training.REGIONAL, LINKS):
+        names = f"{training.REGIONAL} and {LINKS}"
+        raise InputError(f"plant {plant!r}: policies are trained through {names}; choose one")
     task = training.Task(cost=cost, sample=sample, constraints=constraints)
     chosen = training.settings(scenario, strategy, steps)
     device = training.available(device)
@@ -455,7 +463,8 @@ def train(
         if doubts:
             problem = f"the model of region {region} is doubtful: {'; '.join(doubts)}"
             print(f"nmfd: {problem}", file=sys.stderr)
-    worth = policy is None and chosen.steps >= training.WORTH_COMPILING
+    regional = plant == training.REGIONAL
+    worth = policy is None and regional and chosen.steps >= training.WORTH_COMPILING
     try:
         with watched(strategy.name, progress) as show:
             return training.train(
@@ -463,6 +472,7 @@ def train(
                 strategy,
                 seed=seed,
                 out=file,
+                plant=plant,
                 module=policy,
                 task=task,
                 steps=steps,

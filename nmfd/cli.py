@@ -425,6 +425,9 @@ def robustness(scenario: Path, settings: dict, **options: Any) -> None:
 @SCENARIO
 @controller_option("dpc-pc", "dpc-pc or dpc-pcrg.")
 @seed_option("Seed of the initial weights and the training states.")
+@click.option(
+    "--plant", type=click.Choice(["nmfd", "links"]), default="nmfd", help="Model to train through."
+)
 @click.option("--steps", type=COUNT, help="Adam steps. [default: as in scenario.toml, else 400]")
 @click.option(
     "--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True

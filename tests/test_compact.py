@@ -21,6 +21,7 @@ from nmfd.controllers.dpc.single_changes import (
     DOUBLED,
     GATE,
     HALVED,
+    METERED,
     OPEN,
     UNMETERED,
     UNPRICED,
@@ -235,7 +236,7 @@ def test_a_kept_number_is_not_changed():
         planning.network, Architecture(guidance=True, compact=(CENTRE,), metering=True)
     )
     names = [name for name, _ in changed_policies(policy, planning)]
-    assert names == [GATE, OPEN, HALVED, DOUBLED, UNPRICED, UNMETERED]
+    assert names == [GATE, OPEN, HALVED, DOUBLED, UNPRICED, UNMETERED, METERED]
     left = [name for name, _ in changed_policies(policy, planning, ["set_point", "metering"])]
     assert left == [HALVED, DOUBLED, UNPRICED]
 

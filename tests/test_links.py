@@ -4,12 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import tiny
 import torch
 from commands import error_line, good
 from commands import nmfd as nmfd_command
 
 from cosim.evaluation.links import link_network, write_links
 from nmfd import api
+from nmfd.controllers.dpc.numbers import Numbers
+from nmfd.controllers.dpc.policy_file import read_file as read_policy
+from nmfd.controllers.dpc.street_rollout import MOST_DELAYED, Bound
 from nmfd.errors import InputError
 from nmfd.model.links.chance import DRAWS
 from nmfd.model.links.flows import BETWEEN_M, REACTION
@@ -417,6 +421,38 @@ def test_the_benchmark_takes_streets(tmp_path):
     words = "--plant links --controllers no-control --steps 1 --out"
     printed = good(nmfd_command("benchmark grid7_peak", words, out))
     assert "no-control" in printed
+
+
+def test_training_through_streets_finds_what_holds_trips_for_nothing(tmp_path):
+    """The triangle flows, and metering at a fiftieth of the critical accumulation holds trips."""
+    network = tiny.NETWORK.format(name="triangle")
+    for region, others in enumerate(([1, 2], [0, 2], [0, 1])):
+        network += tiny.REGION.format(position=region, adjacent=others)
+    folder = tiny.write(tmp_path, network=network)
+    triangle().write(folder / "links.npz")
+    options = {"compact": True, "metering": True, "learning_rate": 0.01}
+    numbers = list(Numbers(metering=0.02, metering_slope=1.0))
+    table = {f"controllers.dpc-pc.{name}": value for name, value in options.items()}
+    kept = [name for name in Numbers._fields if not name.startswith("metering")]
+    table |= {"controllers.dpc-pc.numbers": numbers, "controllers.dpc-pc.kept": kept}
+    scenario = api.loaded(api.load_scenario(folder, table), steps=8)
+    out = tmp_path / "policy.pt"
+    api.train(scenario, "dpc-pc", plant="links", steps=2, out=out)
+    file = read_policy(out)
+    assert file["configuration"]["plant"] == "links"
+    trained = Numbers(*file["weights"]["numbers"].tolist())
+    assert trained.metering > 0.02
+
+
+def test_the_costate_of_a_vehicle_is_bounded():
+    vehicles_before = torch.ones(1, 1, requires_grad=True)
+    held = 1.0 * vehicles_before
+    bound = Bound()
+    bound.hold((held,))
+    states = torch.stack([held.detach(), -1e9 * held]).unsqueeze(-1)
+    bound.measure(states)
+    (3.0 * states.sum()).backward()
+    assert vehicles_before.grad.item() == pytest.approx(-3.0 * 2 * MOST_DELAYED)
 
 
 @pytest.fixture(scope="module")

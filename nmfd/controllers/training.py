@@ -2,6 +2,10 @@
 
 Every step rolls out the regional model under the policy. Rollouts start from random states and
 demands, because a rollout that ends in gridlock has no gradient.
+
+Streets (plant "links") begin empty. Where they lock, gradients are rough. So the policy is
+validated often there, and goes back to its best weights, with half the learning rate, when it comes
+out JUMP worse.
 """
 
 import copy
@@ -26,10 +30,13 @@ from nmfd.controllers.dpc.options import Dpc
 from nmfd.controllers.dpc.policy import ModuleController, Policy
 from nmfd.controllers.dpc.rollout import Demands, Rollout, States, Trajectories, compiled_step
 from nmfd.controllers.dpc.single_changes import changed_policies
+from nmfd.controllers.dpc.street_rollout import StreetRollout
 from nmfd.controllers.strategy import Strategy
 from nmfd.errors import InputError, RunFailed
 from nmfd.model.authority import NO_GATEWAY
 from nmfd.model.commands import admissible
+from nmfd.model.links.network import LINKS
+from nmfd.model.links.plant import link_model
 from nmfd.model.planning import PlanningModel
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
@@ -38,10 +45,14 @@ from nmfd.runs.progress import Show
 from nmfd.tensors import one_thread
 from nmfd.types import Observation
 
+REGIONAL = "nmfd"  # plant
 DEMAND_SPREAD = 0.2  # every flow is scaled by a factor drawn from 1 - this to 1 + this
 RANDOM_START_SHARE = 0.5  # of the rollouts start from a random state at a random time
 VALIDATION_PERIOD = 20  # Adam steps
 VALIDATION_ROLLOUTS = 16  # perturbed rollouts in a validation, if training perturbs demand or model
+ROUGH_PERIOD = 4  # as VALIDATION_PERIOD, through streets
+ROUGH_BATCH = 6  # rollouts in an Adam step there, each of which takes some seconds
+JUMP = 0.1
 WORTH_COMPILING = 200  # Adam steps
 # A policy that begins as no control must gain WORTH in validation. Otherwise one is kept whose
 # gates have this logit, which is open in every state.
@@ -163,6 +174,7 @@ def train(
     *,
     seed: int,
     out: Path | None,
+    plant: str = REGIONAL,
     module: nn.Module | None = None,
     task: Task = Task(),
     steps: int | None = None,
@@ -176,6 +188,7 @@ def train(
 
     The best in validation is written to `out`. The same seed gives the same weights.
 
+    plant: "nmfd", the regional model, or "links", the streets of the scenario
     module: trained in place instead of the policy and returned with its best weights; no file is
         written
     resume: continue from the state in `out`.resume
@@ -187,7 +200,7 @@ def train(
     setup = settings(scenario, strategy, steps)
     if module is not None:
         _check_module(module, scenario)
-    elif not anyway:
+    elif not anyway and plant == REGIONAL:
         check(scenario, strategy)
     planning = strategy.own_planning(scenario)
     torch.manual_seed(seed)
@@ -195,35 +208,44 @@ def train(
     if module is None:
         assert out is not None
         configuration = _configuration(strategy, planning, setup, task, seed, compiled)
+        configuration["plant"] = plant
         policy = first_policy(setup, planning, guidance=setup.guides)
         keeper = FileKeeper(policy, planning.network, configuration, out)
     else:
         keeper = ModuleKeeper(module)
         setup = setup.changed(from_gating=False, from_no_control=False)  # it begins as it is
-    run = TrainingRun(keeper, planning, setup, task, seed, device, compiled)
+    if isinstance(keeper.policy, CompactPolicy):
+        device = "cpu"  # a few numbers
+    dtype = next(keeper.policy.parameters()).dtype
+    if plant == LINKS:
+        streets = link_model(scenario, labels=strategy.labels, dtype=dtype, device=device)
+        rollout: Rollout = StreetRollout(planning, streets)
+    else:
+        rollout = _regional(planning, setup, dtype, device)
+    run = TrainingRun(keeper, rollout, setup, task, seed, compiled)
     if resume:
         keeper.resume(run.restore)
     else:
         run.prepare()
-    while True:
-        run.descend(progress)
-        if run.best == run.bar:
-            problem = f"no policy gained {WORTH:.0%} on the model: its gates stay open"
-            print(f"nmfd: {problem}", file=sys.stderr)
-            break
-        change = run.better_change()
-        if change is None:
-            break
-        if not run.restart(change):
-            problem = f"{change.name} would take {change.gain:.1%} less time on the model"
-            print(f"nmfd: the policy misses a single change: {problem}", file=sys.stderr)
-            break
+    run.finish(progress)
     if not math.isfinite(run.best):
         raise RunFailed(
             f"{strategy.name}: every validation of {setup.steps} steps diverged; "
             "lower the learning rate"
         )
     return keeper.finish()
+
+
+def _regional(planning: PlanningModel, setup: Dpc, dtype: torch.dtype, device: str) -> Rollout:
+    """Return rollouts of the regional model with the costs of the settings."""
+    return Rollout(
+        planning,
+        dtype,
+        device,
+        detour_cost=setup.detour_cost,
+        holding_cost=setup.holding_cost,
+        process_std=setup.recipe.process_std,
+    )
 
 
 class Change(NamedTuple):
@@ -282,11 +304,10 @@ class TrainingRun:
     def __init__(
         self,
         keeper: Keeper,
-        planning: PlanningModel,
+        rollout: Rollout,
         setup: Dpc,
         task: Task,
         seed: int,
-        device: str,
         compiled: bool,
     ):
         self.done = 0
@@ -300,19 +321,10 @@ class TrainingRun:
         self._task = task
         self._seed = seed
         self._generator = Generator().manual_seed(seed)
-        if isinstance(keeper.policy, CompactPolicy):
-            device = "cpu"  # a few numbers
-        self._policy = keeper.policy.to(device).train()
-        self._rollout = Rollout(
-            planning,
-            next(self._policy.parameters()).dtype,
-            device,
-            detour_cost=setup.detour_cost,
-            holding_cost=setup.holding_cost,
-            process_std=self._recipe.process_std,
-        )
-        step = self._rollout.step
-        self._advance = compiled_step(step) if compiled else step
+        self._policy = keeper.policy.to(rollout.device).train()
+        self._rollout = rollout
+        self._rate = 1.0
+        self._advance = compiled_step(rollout.step) if compiled else rollout.step
         self._optimizer = self._new_optimizer()
 
     def _new_optimizer(self) -> Adam:
@@ -349,13 +361,38 @@ class TrainingRun:
     def descend(self, progress: Show) -> None:
         """Take the steps of a descent that are left."""
         steps = self._setup.steps
+        period = ROUGH_PERIOD if self._rollout.rough else VALIDATION_PERIOD
         while self.done < steps:
             self.step()
-            if self.done % VALIDATION_PERIOD == 0 or self.done == steps:
-                self.validate()
+            if self.done % period == 0 or self.done == steps:
+                score = self.validate()
+                if self._rollout.rough and not score <= self.best * (1.0 + JUMP):
+                    self._step_back()
                 self._keeper.save(self.state())
             if progress:
                 progress(self.done, steps, self._best_text())
+
+    def finish(self, progress: Show) -> None:
+        """Descend, and again from a single change that is better."""
+        while True:
+            self.descend(progress)
+            if self.best == self.bar:
+                problem = f"no policy gained {WORTH:.0%} on the model: its gates stay open"
+                print(f"nmfd: {problem}", file=sys.stderr)
+                break
+            change = self.better_change()
+            if change is None:
+                break
+            if not self.restart(change):
+                problem = f"{change.name} would take {change.gain:.1%} less time on the model"
+                print(f"nmfd: the policy misses a single change: {problem}", file=sys.stderr)
+                break
+
+    def _step_back(self) -> None:
+        """Return to the best weights, with half the learning rate."""
+        self._policy.load_state_dict(self._best_weights)
+        self._optimizer = self._new_optimizer()
+        self._rate *= 0.5
 
     def _best_text(self) -> str:
         """Return the best validation so far as text."""
@@ -369,8 +406,9 @@ class TrainingRun:
         cosine = 0.5 * (1.0 + math.cos(math.pi * (self.done / self._setup.steps)))
         falling = self._setup.learning_rate * (0.1 + 0.9 * cosine)
         for group in self._optimizer.param_groups:
-            group["lr"] = self._recipe.learning_rate or falling
-        loss = self._loss(self._generator, self._recipe.batch, self._advance)
+            group["lr"] = self._rate * (self._recipe.learning_rate or falling)
+        batch = ROUGH_BATCH if self._rollout.rough else self._recipe.batch
+        loss = self._loss(self._generator, batch, self._advance)
         if not loss.requires_grad:
             raise InputError(
                 "cost: has no gradient by the weights of the policy; "
@@ -455,8 +493,8 @@ class TrainingRun:
         noise_level = torch.rand(batch, generator=generator, dtype=torch.float32)
         return x, rollout.perturb(demand, noise_level, setup.noise, generator)
 
-    def validate(self) -> None:
-        """Validate the policy, and keep it if it is the best so far."""
+    def validate(self) -> float:
+        """Return the validation of the policy, and keep the best one so far."""
         if self._task.own:
             key = "validation"
             fixed = Generator().manual_seed(self._seed)
@@ -469,6 +507,7 @@ class TrainingRun:
             self.best = score
             self._best_weights = copy.deepcopy(self._policy.state_dict())
             self._keeper.keep({key: score})
+        return score
 
     def better_change(self) -> Change | None:
         """Return the best single change of the best policy, if it gains enough.
@@ -514,6 +553,7 @@ class TrainingRun:
             "best": self.best,
             "best_weights": self._best_weights,
             "restarts": self._restarts,
+            "rate": self._rate,
             "policy": self._policy.state_dict(),
             "optimizer": self._optimizer.state_dict(),
             "generator": self._generator.get_state(),
@@ -528,19 +568,20 @@ class TrainingRun:
         self.best = float(state["best"])
         self._best_weights = state["best_weights"]
         self._restarts = int(state["restarts"])
+        self._rate = float(state["rate"])
 
 
 def validate(policy: Policy, rollout: Rollout, seed: int, setup: Dpc) -> float:
     """Return the total time spent (veh s) of the scenario itself.
 
-    It is a geometric mean over two draws of the noise. If training perturbs demand or model, there
-    are VALIDATION_ROLLOUTS more under increasing perturbations.
+    It is a geometric mean over two draws of the noise. If training perturbs demand or model, or
+    rollouts are rough, there are VALIDATION_ROLLOUTS more under increasing perturbations.
     """
     generator = Generator().manual_seed(seed)
     low = setup.demand_low
     high = setup.demand_high
     count = 2
-    if setup.noise or setup.mfd_spread or low < high:
+    if setup.noise or setup.mfd_spread or low < high or rollout.rough:
         count += VALIDATION_ROLLOUTS
     rollout.draw_model(count, setup.mfd_spread, generator, setup.mfd_scale)
     level = torch.linspace(0.0, 1.0, count // 2, dtype=torch.float32).repeat_interleave(2)

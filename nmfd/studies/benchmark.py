@@ -21,6 +21,7 @@ from nmfd.controllers import open_loop
 from nmfd.controllers.strategy import Strategy
 from nmfd.errors import InputError
 from nmfd.metrics import COUNTED, decision_ms, percent_change, summary
+from nmfd.model.links.network import LINKS
 from nmfd.model.scenario import Scenario, perturbed
 from nmfd.runs.files import file_hash, is_newer, run_name
 from nmfd.runs.run_many import TABLE
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
 
     from nmfd.runs.frame import Table
 
-LINKS = "links"
 PLANTS = ("nmfd", "acyclic", LINKS)
 MODULES = ("nmfd.model.plant", "nmfd.model.links.plant")  # of PLANTS, with torch
 REFERENCE = "no-control"

@@ -5,6 +5,7 @@ import shutil
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -53,7 +54,11 @@ class Rollout:
     """Regional model of a scenario as tensors.
 
     Random numbers are drawn on the CPU, so that devices agree.
+
+    rough: True if rollouts of the same demand differ, and their total may jump
     """
+
+    rough: ClassVar[bool] = False
 
     def __init__(
         self,

@@ -2,7 +2,7 @@
 
 Where a sigmoid is saturated, descent does not move it. So a training looks whether one output,
 replaced as a whole, is better on its own objective: gates at the critical accumulation or open,
-prices halved, doubled or off, no metering.
+prices halved, doubled or off, no metering, or with a compact policy a strict one.
 """
 
 import copy
@@ -19,13 +19,14 @@ from nmfd.tensors import PerPair, PerRegion
 
 GATE, OPEN = "gates at the critical accumulation", "gates open"
 HALVED, DOUBLED, UNPRICED = "prices halved", "prices doubled", "no prices"
-UNMETERED = "no metering"
+UNMETERED, METERED = "no metering", "strict metering"
 FACTORS = {HALVED: 0.5, DOUBLED: 2.0, UNPRICED: 0.0}
 STEEP = 20.0  # logit of a gate per relative accumulation
 # Numbers of a compact policy, on the flowing side of its sigmoids.
 GATE_NUMBERS = {"set_point": 1.0, "gain": 5.0}
 OPEN_NUMBERS = {"set_point": 2.0, "gain": 2.0}
 UNMETERED_NUMBERS = {"metering": 5.0, "metering_protected": 0.0}
+METERED_NUMBERS = {"metering": 0.7}
 
 
 def changed_policies(
@@ -46,6 +47,7 @@ def changed_policies(
             changes[name] = prices
     if policy.architecture.metering:
         changes[UNMETERED] = UNMETERED_NUMBERS
+        changes[METERED] = METERED_NUMBERS
     for name, values in changes.items():
         if not set(values) & set(kept):
             changed = copy.deepcopy(policy)

@@ -1,7 +1,7 @@
 """Differentiable rollouts of the link model of a city."""
 
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from nmfd.model.links.signals import (
     Programmes,
     Stages,
 )
+from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs import config
 from nmfd.runs.config import Share, setting
@@ -30,10 +31,13 @@ from nmfd.tensors import PerTurn as Turns
 OPEN_SHARE = 0.95  # of what a boundary can let through; above it a gate is open
 
 
+Signals = Literal["fixed", "max-pressure"]
+
+
 class Choices(config.Settings):
     """Signals and drivers of the city; other values are not in the link model."""
 
-    signals: Literal["fixed", "max-pressure"] = setting("control of the signals", "fixed")
+    signals: Signals = setting("control of the signals", "fixed")
     lookahead: float = setting("as of max-pressure in a city", 1.0, unit="s", gt=0.0)
     chain_limit: Share = setting(
         "share of a link's room beyond which no gate holds vehicles there; 0: no limit", 0.6
@@ -45,13 +49,27 @@ class Choices(config.Settings):
     measurement: Literal["exact"] = setting("what controllers see", "exact")
 
 
-def choices_of(scenario: Scenario) -> Choices:
+def choices_of(scenario: Scenario, labels: Sequence[str] = ()) -> Choices:
     """Return the choices of the table [sumo].
 
+    labels: of a strategy; names of signal controls replace that of the table
     Raises: InputError for a value that the link model has not
     """
     own = {name: value for name, value in scenario.sumo.items() if name in Choices.model_fields}
+    for label in labels:
+        if label in get_args(Signals):
+            own["signals"] = label
     return config.checked(Choices, own, scenario.where, "sumo.")
+
+
+def gate_shares(network: RegionalModel, perimeter: PerPair) -> PerPair:
+    """Return u as shares of what boundaries can let through (-, (B, R, R)).
+
+    It is 1 where regions are not adjacent.
+    """
+    share = (perimeter - network.u_min) / (network.u_max - network.u_min)
+    adjacent = torch.as_tensor(network.adjacency, device=share.device)
+    return torch.where(adjacent, share.clamp(0.0, 1.0), 1.0)
 
 
 class Commands(NamedTuple):
@@ -205,7 +223,12 @@ class LinkModel:
         light, yields, opens = self._programmes.read(state.interval * self.step, self._steps)
         opens = opens[:, self._gates.movements]
         ways = self._ways(state, commands)
-        share = None
+        gates = commands.gates
+        realised = torch.ones_like(state.realised)
+        if gates is not None:
+            realised = gates
+            if bool((gates >= OPEN_SHARE).all()):
+                gates = None
         mean_share = torch.zeros_like(used)
         present = torch.zeros_like(traffic.inside)
         outside = torch.zeros_like(traffic.inside)
@@ -227,8 +250,8 @@ class LinkModel:
                 number = state.interval * self._steps + n
                 stages, lights = self._pressure.step(number, stages, traffic.inside, lights)
             shown = lights.light
-            if commands.gates is not None:
-                share = self._gate_shares(commands.gates, traffic.inside)
+            if gates is not None:
+                share = self._gate_shares(gates, traffic.inside)
                 mean_share = mean_share + share / self._steps
                 shown = shown.expand(len(used), -1)
                 used, shown = self._gates.limit(used, shown, opens[n], share)
@@ -237,9 +260,8 @@ class LinkModel:
             outside = outside + traffic.outside
             if commands.metering is not None:
                 held = held + traffic.held
-        realised = state.realised
-        if commands.gates is not None:
-            realised = self._realised(commands.gates, mean_share)
+        if gates is not None:
+            realised = self._realised(gates, mean_share)
         before = state.traffic
         gone = traffic.left - before.left + traffic.completed - before.completed
         return LinkState(

@@ -9,6 +9,7 @@ import numpy as np
 from nmfd.errors import InputError
 from nmfd.runs.files import atomic
 
+LINKS = "links"  # name of the plant
 FILE = "links.npz"  # in the folder of a scenario
 
 

@@ -1,5 +1,6 @@
 """The link model as a plant, in float64."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import torch
 from nmfd import ledger
 from nmfd.errors import InputError
 from nmfd.model.links.flows import Numbers
-from nmfd.model.links.model import OPEN_SHARE, Commands, LinkModel, choices_of
+from nmfd.model.links.model import Commands, LinkModel, choices_of, gate_shares
 from nmfd.model.links.network import FILE, LinkNetwork, read_links
 from nmfd.model.scenario import Scenario
 from nmfd.types import Controls, Observation, State
@@ -44,26 +45,9 @@ class LinkPlant:
 
         Raises: InputError if the file is missing or does not fit the scenario
         """
-        where = links_file(scenario)
         self._scenario = scenario
         self._chance = chance
-        network = network or read_links(where)
-        if scenario.initial is not None:
-            raise InputError(f"{scenario.where}: initial: a city of links begins empty; remove it")
-        if scenario.step % 1.0:
-            raise InputError(
-                f"{scenario.where}: step: expected whole seconds, got {scenario.step:g}"
-            )
-        _check_demand(scenario, network, where)
-        self.model = LinkModel(
-            network,
-            scenario.step,
-            nominal=scenario.network.nominal_splits,
-            numbers=numbers or Numbers(*network.numbers.tolist()),
-            choices=choices_of(scenario),
-            dt=1.0 if scenario.step % DT_S else DT_S,
-            dtype=torch.float64,
-        )
+        self.model = link_model(scenario, network=network, numbers=numbers, dtype=torch.float64)
         self._demand = torch.from_numpy(scenario.demand).unsqueeze(1)
 
     def reset(self, seed: int) -> State:
@@ -78,19 +62,18 @@ class LinkPlant:
         Raises: LedgerError if vehicles appear or vanish
         """
         network = self._scenario.network
-        width = network.u_max - network.u_min
-        share = np.clip((controls.perimeter - network.u_min) / width, 0.0, 1.0)
-        share = np.where(network.adjacency, share, 1.0)
-        gates = None if (share >= OPEN_SHARE).all() else share
+        perimeter = torch.from_numpy(controls.perimeter).unsqueeze(0)
         commands = Commands(
-            *map(_batch, (gates, controls.metering, controls.splits, controls.prices))
+            gates=gate_shares(network, perimeter),
+            metering=_batch(controls.metering),
+            splits=_batch(controls.splits),
+            prices=_batch(controls.prices),
         )
         demand = self._demand[self.state.interval]
         with torch.inference_mode():
             self.state = self.model.advance(self.state, demand, commands)
-        if gates is not None:
-            share = self.state.realised[0].numpy()
-        self._realised = network.u_min + share * width
+        share = self.state.realised[0].numpy()
+        self._realised = network.u_min + share * (network.u_max - network.u_min)
         state = self._state()
         ledger.check(
             state.step,
@@ -115,6 +98,41 @@ class LinkPlant:
             completed=float(self.state.traffic.completed.sum()),
             realised=self._realised,
         )
+
+
+def link_model(
+    scenario: Scenario,
+    *,
+    network: LinkNetwork | None = None,
+    numbers: Numbers | None = None,
+    labels: Sequence[str] = (),
+    dtype: torch.dtype = torch.float32,
+    device: str = "cpu",
+) -> LinkModel:
+    """Return the link model of a scenario.
+
+    network, numbers: as of LinkPlant
+    labels: of a strategy (nmfd.controllers.strategy); names of signal controls replace that of the
+        scenario
+    Raises: InputError if the file is missing or does not fit the scenario
+    """
+    where = links_file(scenario)
+    network = network or read_links(where)
+    if scenario.initial is not None:
+        raise InputError(f"{scenario.where}: initial: a city of links begins empty; remove it")
+    if scenario.step % 1.0:
+        raise InputError(f"{scenario.where}: step: expected whole seconds, got {scenario.step:g}")
+    _check_demand(scenario, network, where)
+    return LinkModel(
+        network,
+        scenario.step,
+        nominal=scenario.network.nominal_splits,
+        numbers=numbers or Numbers(*network.numbers.tolist()),
+        choices=choices_of(scenario, labels),
+        dt=1.0 if scenario.step % DT_S else DT_S,
+        dtype=dtype,
+        device=device,
+    )
 
 
 def links_file(scenario: Scenario) -> Path:
