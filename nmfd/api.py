@@ -203,14 +203,14 @@ def run(
     The same seed gives the same result but for wall times (Result.without_times). Raises InputError
     for a wrong argument, and for an inadmissible command before the plant sees it.
     """
-    strategy = parse(controller).regional()
+    strategy = _parse_for(plant, controller)
     scenario = loaded(scenario, steps=steps, demand=demand)
     _check_plant(plant)
     acting = strategy.make(scenario, path_of(policy))
     name = type(plant).__name__
     if isinstance(plant, str):
         name = plant
-        plant = plant_of(plant, scenario)
+        plant = plant_of(plant, scenario, strategy.labels)
     with watched(strategy.name, progress) as show:
         result = closed_loop.run(plant, acting, scenario, seed=seed, progress=show)
     return result.assign(controller=strategy.name, plant=name, demand=float(demand))
@@ -262,7 +262,7 @@ def benchmark(
     scenarios = {level: loaded(scenario, steps=steps, demand=level) for level in levels}
     first = scenarios[levels[0]]
     _check_plant(plant)
-    strategies = parse_many(controllers, first, _regional)
+    strategies = parse_many(controllers, first, partial(_parse_for, plant))
     files = policy_files(policies, strategies)
     runs = []
     lower = {}
@@ -331,7 +331,7 @@ def robustness(
     """
     scenario = loaded(scenario, steps=steps, demand=demand)
     strategies: list[Strategy] = [parse(REFERENCE)]
-    for strategy in parse_many(controllers, scenario, _regional):
+    for strategy in parse_many(controllers, scenario, partial(_parse_for, "nmfd")):
         if strategy.name != REFERENCE:
             strategies.append(strategy)
     key = key_of(scenario, strategies, benchmark_study.PERTURBED_PLANT, {})
@@ -603,8 +603,12 @@ def _file(scenario: Scenario, name: str, out: Path | str | None) -> Path:
     return file
 
 
-def _regional(controller: ControllerLike) -> Strategy:
-    return parse(controller).regional()
+def _parse_for(plant: str | Plant, controller: ControllerLike) -> Strategy:
+    """Return the strategy of a controller; only streets know labels."""
+    strategy = parse(controller)
+    if plant == LINKS:
+        return strategy
+    return strategy.regional()
 
 
 def policy_files(

@@ -17,7 +17,7 @@ from nmfd.controllers.dpc.street_rollout import MOST_DELAYED, Bound
 from nmfd.errors import InputError
 from nmfd.model.links.chance import DRAWS
 from nmfd.model.links.flows import BETWEEN_M, REACTION
-from nmfd.model.links.model import Choices, Commands, LinkModel
+from nmfd.model.links.model import Choices, Commands, LinkModel, choices_of
 from nmfd.model.links.network import LinkNetwork, read_links
 from nmfd.model.links.plant import LinkPlant, links_file
 
@@ -402,6 +402,23 @@ def test_what_streets_have_not_is_refused(key, value):
     scenario = api.load_scenario("grid7_peak", {f"sumo.{key}": value})
     with pytest.raises(InputError, match=f"sumo.{key}"):
         LinkPlant(scenario)
+
+
+def test_words_of_a_strategy_change_streets():
+    choices = choices_of(api.load_scenario("grid7_peak"), ["max-pressure", "rerouting-30"])
+    assert choices.signals == "max-pressure"
+    assert choices.rerouting == pytest.approx(0.3)
+    by_word = api.run("grid7_peak", "no-control+max-pressure", plant="links", steps=4)
+    changed = api.load_scenario("grid7_peak", {"sumo.signals": "max-pressure"})
+    by_setting = api.run(changed, "no-control", plant="links", steps=4)
+    fixed = api.run("grid7_peak", "no-control", plant="links", steps=4)
+    assert np.array_equal(by_word["accumulation"], by_setting["accumulation"])
+    assert not np.array_equal(by_word["accumulation"], fixed["accumulation"])
+
+
+def test_a_word_that_streets_do_not_know_is_refused():
+    with pytest.raises(InputError, match=r"\+planned: streets .*max-pressure.*rerouting-30"):
+        api.run("grid7_peak", "no-control+planned", plant="links")
 
 
 def test_a_missing_file_names_the_command():

@@ -77,13 +77,13 @@ def compared_with(controllers: Iterable[str]) -> str:
     return REFERENCE if REFERENCE in names else names[0]
 
 
-def plant_of(name: str, scenario: Scenario) -> Plant:
-    """Return one of PLANTS."""
+def plant_of(name: str, scenario: Scenario, labels: Sequence[str] = ()) -> Plant:
+    """Return one of PLANTS; labels: of a strategy, for streets."""
     from nmfd.model.links.plant import LinkPlant  # torch takes two seconds
     from nmfd.model.plant import AcyclicPlant, NmfdPlant
 
     if name == LINKS:
-        return LinkPlant(scenario)
+        return LinkPlant(scenario, labels=labels)
     if name == "acyclic":
         return AcyclicPlant(scenario)
     return NmfdPlant(scenario)
@@ -106,7 +106,8 @@ def closed_loop_of(
     """
     controller = strategy.make(scenario, policy)
     actual = actual or scenario
-    result = closed_loop.run(plant_of(plant, actual), controller, actual, seed=seed)
+    city = plant_of(plant, actual, strategy.labels)
+    result = closed_loop.run(city, controller, actual, seed=seed)
     return result.assign(controller=strategy.name, plant=plant, demand=demand)
 
 
@@ -138,6 +139,9 @@ def key_of(
         policy = policies.get(strategy.name)
         strategy.make(scenario, policy)
         own[strategy.name] = strategy.fingerprint(scenario, policy)
+        if strategy.labels:
+            plant_of(plant, scenario, strategy.labels)  # or its error before the first run
+            own[strategy.name]["labels"] = strategy.labels
     shared = {
         "scenario": scenario.name,
         "scenario_hash": scenario.hash,

@@ -1,7 +1,7 @@
 """Differentiable rollouts of the link model of a city."""
 
 from collections.abc import Sequence
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from nmfd.arrays import PerTurn
+from nmfd.errors import InputError
 from nmfd.model.links.chance import Chance
 from nmfd.model.links.drivers import Drivers
 from nmfd.model.links.flows import LEAST, Flows, Numbers, Traffic, Ways
@@ -21,6 +22,7 @@ from nmfd.model.links.signals import (
     Programmes,
     Stages,
 )
+from nmfd.model.planning import GUIDED
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs import config
@@ -32,6 +34,7 @@ OPEN_SHARE = 0.95  # of what a boundary can let through; above it a gate is open
 
 
 Signals = Literal["fixed", "max-pressure"]
+SHARES = ("rerouting", "compliance")  # choices that labels give in percent
 
 
 class Choices(config.Settings):
@@ -52,14 +55,35 @@ class Choices(config.Settings):
 def choices_of(scenario: Scenario, labels: Sequence[str] = ()) -> Choices:
     """Return the choices of the table [sumo].
 
-    labels: of a strategy; names of signal controls replace that of the table
-    Raises: InputError for a value that the link model has not
+    labels: of a strategy (nmfd.controllers.strategy), which change some
+    Raises: InputError for a value or label that the link model has not
     """
     own = {name: value for name, value in scenario.sumo.items() if name in Choices.model_fields}
-    for label in labels:
-        if label in get_args(Signals):
-            own["signals"] = label
+    own |= _changes(labels)
     return config.checked(Choices, own, scenario.where, "sumo.")
+
+
+def _changes(labels: Sequence[str]) -> dict[str, Any]:
+    """Return the choices that labels change.
+
+    Commanded rates of metering are always obeyed, and guidance is once per control interval.
+    """
+    changes: dict[str, Any] = {}
+    for label in labels:
+        word, _, number = label.rpartition("-")
+        if label in get_args(Signals):
+            changes["signals"] = label
+        elif label == GUIDED:
+            changes["guided"] = True
+        elif word in SHARES and number.isdigit():
+            changes[word] = int(number) / 100.0
+        elif label != "metering" and word != "guidance-period":
+            known = ", ".join([*get_args(Signals), GUIDED, *(f"{share}-30" for share in SHARES)])
+            raise InputError(
+                f"+{label}: streets (plant links) know {known}, metering and guidance-period-60; "
+                "choose from these, or run it in SUMO (cosim)"
+            )
+    return changes
 
 
 def gate_shares(network: RegionalModel, perimeter: PerPair) -> PerPair:

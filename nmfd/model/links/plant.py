@@ -37,17 +37,21 @@ class LinkPlant:
         *,
         network: LinkNetwork | None = None,
         numbers: Numbers | None = None,
+        labels: Sequence[str] = (),
         chance: bool = True,
     ):
         """network: that of the scenario's file if None
         numbers: those of the network if None
+        labels: of a strategy, such as "max-pressure"
         chance: single vehicles draw their turns; without, streams divide
 
         Raises: InputError if the file is missing or does not fit the scenario
         """
         self._scenario = scenario
         self._chance = chance
-        self.model = link_model(scenario, network=network, numbers=numbers, dtype=torch.float64)
+        self.model = link_model(
+            scenario, network=network, numbers=numbers, labels=labels, dtype=torch.float64
+        )
         self._demand = torch.from_numpy(scenario.demand).unsqueeze(1)
 
     def reset(self, seed: int) -> State:
@@ -111,9 +115,7 @@ def link_model(
 ) -> LinkModel:
     """Return the link model of a scenario.
 
-    network, numbers: as of LinkPlant
-    labels: of a strategy (nmfd.controllers.strategy); names of signal controls replace that of the
-        scenario
+    network, numbers, labels: as of LinkPlant
     Raises: InputError if the file is missing or does not fit the scenario
     """
     where = links_file(scenario)
