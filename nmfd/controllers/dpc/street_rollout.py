@@ -7,6 +7,7 @@ jumps: training steps back (nmfd.controllers.training).
 
 import torch
 from torch import Generator, nn
+from torch.utils._pytree import tree_leaves
 
 from nmfd.controllers.dpc.policy import commanded
 from nmfd.controllers.dpc.rollout import Demands, Rollout, States
@@ -37,10 +38,9 @@ class Bound:
 
     def hold(self, traffic: Traffic) -> None:
         """Bound the derivatives by all parts of a state."""
-        for part in traffic:
-            for tensor in part if isinstance(part, tuple) else (part,):
-                if tensor.requires_grad:
-                    tensor.register_hook(self._held)
+        for tensor in tree_leaves(traffic):
+            if tensor.requires_grad:
+                tensor.register_hook(self._held)
 
     def _measured(self, derivative: Demands) -> None:
         all_the_time = derivative.abs().amax((0, 2, 3)) * len(derivative)

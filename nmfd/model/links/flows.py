@@ -28,6 +28,7 @@ average along a street; one that ends in the queue moves up there.
 Every vehicle that leaves one count enters another one: mass and its derivative are conserved.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -62,7 +63,7 @@ class Numbers(NamedTuple):
     gap: float = 4.7
 
 
-History: TypeAlias = tuple[Tensor, ...]
+History: TypeAlias = tuple[tuple[Tensor, ...], ...]
 
 
 class Traffic(NamedTuple):
@@ -78,12 +79,12 @@ class Traffic(NamedTuple):
     inside: all vehicles, by link (B, L)
     recent: flow of each movement, smoothed over the critical gap (veh/s, (B, M))
     completed: completed trips, by link (B, L)
-    entered: vehicles that entered in each of the last steps, the newest last, by entry (B, E)
+    entered: vehicles that entered in the last steps, by entry (Delay)
     started: the same for vehicles that had stood at the stop line before
     moved: vehicles that moved up to the stop line so far, by entry (B, E)
-    ending: those that entered to end their trip there, by link (B, L)
+    ending: those that entered to end their trip there, by link (Delay)
     left: vehicles that left each link so far (B, L)
-    had_left: the same at the ends of the last steps, the newest last
+    had_left: the same at the ends of the last steps (Delay)
     """
 
     held: Tensor
@@ -122,39 +123,53 @@ class Ways(NamedTuple):
 class Delay:
     """Histories of columns that are read at an age of their own.
 
-    A history is a tuple, the newest last, with the columns in the order of their ages.
+    A history has a part for each age, with the columns of that age: their values at the ends of the
+    last steps, the newest last, up to one older than the age.
     """
 
     def __init__(self, steps: np.ndarray, device: torch.device):
         """steps: age of each column, 1 for the newest (n,)"""
         order = np.argsort(steps, kind="stable")
-        ages, begins = np.unique(steps[order], return_index=True)
-        ends = [*begins[1:], len(steps)]
-        self.longest = int(steps.max(initial=1))
+        ages, sizes = np.unique(steps, return_counts=True)
         self._ages = ages.tolist()
-        self._slices = [slice(*ends) for ends in zip(begins.tolist(), ends, strict=True)]
+        self._sizes = sizes.tolist()
         self._sorted = bool((np.diff(steps) >= 0).all())
         self._order = torch.as_tensor(order, device=device)
         self._back = torch.as_tensor(np.argsort(order), device=device)
-        self._steps = torch.as_tensor(steps[order], device=device)
+
+    def start(self, values: Tensor) -> History:
+        """Return the history of values (B, n) that never changed."""
+        history = []
+        for age, part in zip(self._ages, self._parts(values), strict=True):
+            history.append((part,) * (age + 1))
+        return tuple(history)
 
     def with_new(self, history: History, values: Tensor) -> History:
         """Return the history with new values (B, n), without its oldest ones."""
-        if not self._sorted:
-            values = values.index_select(1, self._order)
-        return (*history[1:], values)
+        pairs = zip(history, self._parts(values), strict=True)
+        return tuple((*part[1:], newest) for part, newest in pairs)
 
     def read(self, history: History) -> Tensor:
         """Return the values that have the age of their column (B, n)."""
-        pairs = zip(self._ages, self._slices, strict=True)
-        return self._natural(torch.cat([history[-age][:, part] for age, part in pairs], dim=1))
+        return self._natural([part[1] for part in history])
+
+    def older(self, history: History) -> Tensor:
+        """Return the values that are a step older (B, n)."""
+        return self._natural([part[0] for part in history])
 
     def younger(self, history: History) -> Tensor:
         """Return the sums of values that have not come to this age (B, n)."""
-        age = torch.arange(len(history), 0, -1, device=self._steps.device)[:, None, None]
-        return self._natural((torch.stack(history) * (age <= self._steps)).sum(0))
+        return self._natural([torch.stack(part[1:]).sum(0) for part in history])
 
-    def _natural(self, values: Tensor) -> Tensor:
+    def _parts(self, values: Tensor) -> tuple[Tensor, ...]:
+        """Return the columns of each age."""
+        if not self._sorted:
+            values = values.index_select(1, self._order)
+        return values.split(self._sizes, dim=1)
+
+    def _natural(self, parts: Sequence[Tensor]) -> Tensor:
+        """Return the columns of all ages in their own order."""
+        values = torch.cat(list(parts), dim=1)
         if self._sorted:
             return values
         return values.index_select(1, self._back)
@@ -230,12 +245,10 @@ class Flows:
         self._along = Delay(along[network.entry_link], self.device)
         part = np.maximum(free_steps - along, 0.0)
         self._part = self.values(part[network.entry_link])
-        self._later = Delay(along[network.entry_link] + 1, self.device)
         started = np.maximum(np.round(free_steps + late / self.dt), 1).astype(int)
         self._started = Delay(started[network.entry_link], self.device)
         self._to_end = Delay(to_end, self.device)
         self._backwards = Delay(backwards, self.device)
-        self._before = Delay(backwards + 1, self.device)
 
     def _saturation(self, speed: np.ndarray) -> np.ndarray:
         """Return the flow of a lane at green (veh/s); speed: of cars (m/s)."""
@@ -301,12 +314,12 @@ class Flows:
             inside=empty(self.links),
             recent=empty(self.movements),
             completed=empty(self.links),
-            entered=tuple(empty(self.entries) for _ in range(self._later.longest)),
-            started=tuple(empty(self.entries) for _ in range(self._started.longest)),
+            entered=self._along.start(empty(self.entries)),
+            started=self._started.start(empty(self.entries)),
             moved=empty(self.entries),
-            ending=tuple(empty(self.links) for _ in range(self._to_end.longest)),
+            ending=self._to_end.start(empty(self.links)),
             left=empty(self.links),
-            had_left=tuple(empty(self.links) for _ in range(self._before.longest)),
+            had_left=self._backwards.start(empty(self.links)),
         )
 
     def ways(self, cells: Tensor, draw: Tensor, chance: Chance | None = None) -> Ways:
@@ -333,7 +346,7 @@ class Flows:
         """
         # Vehicles arrive at the queue; trips end before it or in it.
         soon = self._along.read(traffic.entered)
-        arriving = soon + self._part * (self._later.read(traffic.entered) - soon)
+        arriving = soon + self._part * (self._along.older(traffic.entered) - soon)
         queue = traffic.queue + arriving + self._started.read(traffic.started)
         ends = self._to_end.read(traffic.ending)
         in_queue = ends * (self._met * traffic.inside / self.storage).clamp(max=1.0)
@@ -421,7 +434,7 @@ class Flows:
     def _room(self, traffic: Traffic) -> Tensor:
         """Return the vehicles R that each link can receive (veh, (B, L))."""
         later = self._backwards.read(traffic.had_left)
-        before = self._before.read(traffic.had_left)
+        before = self._backwards.older(traffic.had_left)
         reached = later + self._earlier * (before - later)
         free = self.storage - traffic.inside - (traffic.left - reached)
         return free.clamp(min=0.0).minimum(self._most_in)
@@ -432,7 +445,7 @@ class Flows:
 
         first = self.sums(traffic.first, self.entry_of_cell, self.entries)
         entries = traffic.queue + first + self._along.younger(traffic.entered)
-        entries = entries + self._part * self._later.read(traffic.entered)
+        entries = entries + self._part * self._along.older(traffic.entered)
         entries = entries + self._started.younger(traffic.started)
         place = self.network.entry_link * regions + self.network.destination
         total = self.sums(entries, self.places(place), self.links * regions)
