@@ -46,8 +46,10 @@ class Bound:
         all_the_time = derivative.abs().amax((0, 2, 3)) * len(derivative)
         self._most = MOST_DELAYED * all_the_time.unsqueeze(1)
 
-    def _held(self, derivative: torch.Tensor) -> torch.Tensor:
-        assert self._most is not None
+    def _held(self, derivative: torch.Tensor | None) -> torch.Tensor | None:
+        # None: nothing depends on this part.
+        if derivative is None or self._most is None:
+            return None
         return derivative.clamp(-self._most, self._most)
 
 

@@ -6,8 +6,6 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils._pytree import tree_flatten, tree_unflatten
-from torch.utils.checkpoint import checkpoint
 
 from nmfd.arrays import PerTurn
 from nmfd.errors import InputError
@@ -15,6 +13,7 @@ from nmfd.model.links.chance import Chance
 from nmfd.model.links.drivers import Drivers
 from nmfd.model.links.flows import LEAST, Flows, Numbers, Traffic, Ways
 from nmfd.model.links.network import LinkNetwork
+from nmfd.model.links.recompute import run_again
 from nmfd.model.links.signals import (
     MAX_PRESSURE,
     Gates,
@@ -143,10 +142,6 @@ class LinkState(NamedTuple):
     realised: Tensor
 
 
-def _has_gradient(part: object) -> bool:
-    return isinstance(part, Tensor) and part.requires_grad
-
-
 class LinkModel:
     """Rollouts of one city: `start`, then `advance` once per control interval."""
 
@@ -237,19 +232,7 @@ class LinkModel:
 
         demand: trips that are due (veh/s, (B, R, R))
         """
-        given, kind = tree_flatten((state, demand, commands))
-        if not torch.is_grad_enabled() or not any(_has_gradient(part) for part in given):
-            return self._advance(state, demand, commands)
-        kinds = []
-
-        def advance(*parts: Any) -> tuple:
-            after, kind_after = tree_flatten(self._advance(*tree_unflatten(parts, kind)))
-            kinds.append(kind_after)
-            return tuple(after)
-
-        # Reentrant: it builds the graph once instead of twice.
-        parts = checkpoint(advance, *given, use_reentrant=True, preserve_rng_state=False)
-        return tree_unflatten(parts, kinds[0])
+        return run_again(self._advance, state, demand, commands)
 
     def _advance(self, state: LinkState, demand: PerPair, commands: Commands) -> LinkState:
         flows = self.flows
