@@ -253,6 +253,11 @@ def test_the_device_is_the_gpu_where_there_is_one(monkeypatch):
         ),
         (
             "dpc-pc",
+            {"demand_high": 0.8},
+            "demand_low: expected at most demand_high, 0.8, got 1; change one of them",
+        ),
+        (
+            "dpc-pc",
             {"from_gating": True, "from_no_control": True},
             "from_gating: a policy cannot begin as a gate and",
         ),

@@ -208,6 +208,19 @@ def test_a_validation_is_perturbed_as_the_training(scenario, chosen):
         assert sums[-2:].mean() > 1.05
 
 
+def test_a_training_above_the_demand_of_the_scenario(scenario, rollout, generator):
+    """Starts and validation have only these levels."""
+    levels = {"demand_low": 1.5, "demand_high": 1.5}
+    quiet = replace(scenario, measurement_std=0.0)
+    higher = replace(quiet, demand=1.5 * quiet.demand)
+    policy = made(scenario)
+    by_levels = training.validate(policy, Rollout(planning_model(quiet)), 0, Dpc(**levels))
+    expected = training.validate(policy, Rollout(planning_model(higher)), 0, Dpc())
+    assert by_levels == pytest.approx(expected, rel=1e-5)
+    _, demand = rollout.random_start(3, 0.0, 0.0, generator, (1.5, 1.5))
+    np.testing.assert_allclose(demand[:, 0], higher.demand)
+
+
 @pytest.fixture
 def steps(monkeypatch):
     """The learning rate of every Adam step, and the gradients it saw (None for what it leaves

@@ -587,7 +587,7 @@ def validate(policy: Policy, rollout: Rollout, seed: int, setup: Dpc) -> float:
     level = torch.linspace(0.0, 1.0, count // 2, dtype=torch.float32).repeat_interleave(2)
     nominal = rollout.demand.unsqueeze(1).expand(-1, count, -1, -1)
     demand = rollout.perturb(nominal, level, setup.noise, generator)
-    if low < high:
+    if (low, high) != (1.0, 1.0):
         factor = low + (high - low) * level[torch.randperm(count, generator=generator)]
         demand = demand * factor.to(demand)[:, None, None]
     start = rollout.start.expand_as(demand[0])

@@ -113,9 +113,9 @@ class Dpc(Options):
         "of Adam; falls to a tenth along a cosine", 1e-3, unit="-", gt=0.0, le=1.0
     )
     demand_low: float = setting(
-        "least factor of all demand, drawn per rollout", 1.0, unit="-", gt=0.0, le=1.0
+        "least factor of all demand, drawn per rollout", 1.0, unit="-", gt=0.0, le=100.0
     )
-    demand_high: float = setting("largest factor of all demand", 1.0, unit="-", ge=1.0, le=100.0)
+    demand_high: float = setting("largest factor of all demand", 1.0, unit="-", gt=0.0, le=100.0)
     noise: Flow = setting(
         "largest standard deviation of Gaussian noise on the demand; drawn per rollout", 0.0
     )
@@ -152,6 +152,9 @@ class Dpc(Options):
 
     @model_validator(mode="after")
     def _fits_together(self) -> "Dpc":
+        if self.demand_low > self.demand_high:
+            problem = f"expected at most demand_high, {self.demand_high:g}, got {self.demand_low:g}"
+            raise Problem("demand_low", f"{problem}; change one of them")
         if self.from_gating and self.from_no_control:
             raise Problem(
                 "from_gating", "a policy cannot begin as a gate and as no control; omit one"

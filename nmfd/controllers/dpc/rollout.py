@@ -137,7 +137,7 @@ class Rollout:
         total = filling * 0.8 * self._nominal.mfd.jam
         x = total.unsqueeze(-1) * weight / weight.sum(-1, keepdim=True).clamp(min=1e-6)
         low, high = levels
-        if low < high:
+        if levels != (1.0, 1.0):
             demand = demand * (low + (high - low) * self._uniform(generator, batch, 1, 1))
         return torch.where(is_random[:, None, None], x, self.start), demand
 
