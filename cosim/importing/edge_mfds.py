@@ -215,7 +215,7 @@ def _outflow(streets: Streets, rows: pd.DataFrame, labels: EdgeNumbers) -> pd.Se
 
 
 def _outflow_samples(samples: pd.DataFrame, network: RegionalModel) -> fit_quality.Samples:
-    """Return the samples of outflow, as `cosim identify` takes them from a run.
+    """Return the samples of outflow that `cosim identify` takes of a run.
 
     samples: of `_samples`
     """
