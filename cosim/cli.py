@@ -526,8 +526,9 @@ def mfd(net: Path, edge_data: tuple[Path, ...], explain: bool, **options: Any) -
     """Fit MFDs to SUMO's own edgeData, without any control.
 
     EDGEDATA is what <edgeData id="all" freq="300" file="edges.xml"/> in an additional file makes
-    SUMO write, one file for each run. Prints critical accumulation, production, speed and
-    hysteresis by region. For tables of detectors: nmfd identify.
+    SUMO write, one file for each run; with withInternal="true", vehicles on junctions count, too.
+    Prints critical accumulation, production, speed and hysteresis by region. For tables of
+    detectors: nmfd identify.
 
     \b
     Example:

@@ -63,6 +63,7 @@ def drive(network, factor, seed):
     left = transfers.sum(axis=2) + completions[:, :, None] * np.eye(7)
     return Observed(
         accumulation=run["accumulation"],
+        inside=0.5 * (run["accumulation"][1:] + run["accumulation"][:-1]),
         demand=demand,
         perimeter=run["perimeter"],
         splits=run["splits"],

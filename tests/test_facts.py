@@ -193,6 +193,12 @@ def test_edges_hold_the_vehicles_of_their_region(run):
     np.testing.assert_allclose(summed, record.mean_accumulation, rtol=2e-3)
 
 
+def test_the_time_inside_is_that_of_all_vehicles(run):
+    """Junctions included."""
+    _, record, running, _ = run
+    assert record.time_inside.sum() == pytest.approx(sum(running), rel=1e-3)
+
+
 def test_queues_before_gateways(run):
     _, record, _, _ = run
     assert (record.gateway_queue <= record.gateway_queue_max).all()

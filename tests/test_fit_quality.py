@@ -86,7 +86,12 @@ def observed(network, states):
     none = np.zeros((len(states) - 1, *network.split_mask.shape))
     pairs = none[..., 0]
     return Observed(
-        accumulation=states, demand=pairs, perimeter=pairs, splits=none, crossings=pairs
+        accumulation=states,
+        inside=pairs,
+        demand=pairs,
+        perimeter=pairs,
+        splits=none,
+        crossings=pairs,
     )
 
 

@@ -35,6 +35,7 @@ def observe(scenario, seed, factor):
     trajectory = api.run(demanded, "probing-pc", seed=seed)
     return Observed(
         accumulation=trajectory["accumulation"],
+        inside=trajectory["accumulation"][1:],
         demand=demanded.demand[: demanded.steps],
         perimeter=trajectory["perimeter"],
         splits=trajectory["splits"],

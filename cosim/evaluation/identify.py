@@ -231,7 +231,8 @@ class Identified:
 
     runs: of both stages
     samples: of the MFD of each region
-    fits: quality of the fit, a row per region
+    fits: quality of the fit, a row per region, and outflow_critical_veh of a curve through the
+        samples alone
     method: COUNTED or FITTED
     held_out: errors of predictions of the held-out runs by a model without them
     verdict: whether perimeter control can help
@@ -240,7 +241,7 @@ class Identified:
     task: Task
     model: RegionalModel
     runs: Sequence[Result]
-    samples: Sequence[dict]
+    samples: fit_quality.Samples
     fits: pd.DataFrame
     method: str
     held_out: pd.DataFrame
@@ -470,6 +471,7 @@ def identified(task: Task) -> Identified:
         seeds=len(task.seeds),
         lane_km=lane_kilometres(static),
     )
+    fits["outflow_critical_veh"] = [fit_quality.outflow_critical(cloud) for cloud in samples]
     model = replace(
         trial.model,
         placeholder=False,

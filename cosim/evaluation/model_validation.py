@@ -15,20 +15,18 @@ import pandas as pd
 from cosim.evaluation.results import Finished
 from cosim.evaluation.simulate import regional_outflow
 from cosim.plant.strategy import of_finished
-from cosim.sumo.arrays import Points
 from nmfd.model.mfd import held_up
 from nmfd.model.regional_model import RegionalModel
 from nmfd.model.scenario import Scenario
 from nmfd.runs import files
 from nmfd.runs.tables import cell, text_table
 from nmfd.studies.benchmark import draw_accumulations
-from nmfd.studies.fit_quality import SITUATIONS, SPILLBACK, predictions
+from nmfd.studies.fit_quality import SITUATIONS, Samples, joined, predictions, samples_of_run
 from nmfd.types import Result
 
 if TYPE_CHECKING:
     from nmfd.model.identification import Observed
 
-FEWEST_VEHICLES = 5.0  # in a region during an interval that counts as a sample
 CAPTION = (
     "RMSE of the accumulation predicted from the start of a run, and from every recorded state, "
     "and most: largest accumulation of any region, as shares of the critical accumulation (where "
@@ -50,12 +48,24 @@ def observed(result: Result) -> "Observed":
     exits[:, own, own] = result["arrivals"]
     return Observed(
         accumulation=result["accumulation"],
+        inside=mean_inside(result),
         demand=result["departures"] / result.step,
         perimeter=result["perimeter"],
         splits=expected_splits(result),
         crossings=crossings.sum(axis=3),
         exits=exits,
     )
+
+
+def mean_inside(result: Result) -> np.ndarray:
+    """Return the mean accumulation of each interval (veh, (T, R, R)).
+
+    Signals that change together fill and empty a region within an interval, so that its ends say
+    too little. They stand for it in older runs, which have no `time_inside`.
+    """
+    if "time_inside" in result:
+        return result["time_inside"] / result.step
+    return 0.5 * (result["accumulation"][1:] + result["accumulation"][:-1])
 
 
 def expected_splits(result: Result) -> np.ndarray:
@@ -187,34 +197,22 @@ def prediction_table(rows: pd.DataFrame) -> str:
     return text_table(lines, CAPTION)
 
 
-def outflow_samples(network: RegionalModel, results: Sequence[Result]) -> list[dict[str, Points]]:
+def outflow_samples(network: RegionalModel, results: Sequence[Result]) -> Samples:
     """Return the MFD samples of each region.
 
-    They are label -> accumulation (veh) and outflow (veh/s), (n, 2). Labels are "loading",
-    "unloading", and SPILLBACK for intervals in which a neighbour's congestion limits the outflow
-    (`held_up`). The outflow of an interval is the one that the model's g gives. It consists of
-    trips that ended in the region, and of transfers divided by u. In the model x_ii leaves at
-    q x_ii and x_ij at u q x_ij, so q = outflow / (x_ii + u x_i,other).
+    They are label -> accumulation (veh) and outflow (veh/s), (n, 2); see `samples_of_run`. The
+    outflow of an interval is the one that the model's g gives. It consists of trips that ended in
+    the region, and of transfers divided by u. In the model x_ii leaves at q x_ii and x_ij at
+    u q x_ij, so q = outflow / (x_ii + u x_i,other).
     """
-    samples: list[dict] = [
-        {"loading": [], "unloading": [], SPILLBACK: []} for _ in range(network.regions)
-    ]
+    runs = []
     for result in results:
-        x = 0.5 * (result["accumulation"][1:] + result["accumulation"][:-1])
+        x = mean_inside(result)
         total = x.sum(axis=2)
         own = np.diagonal(x, axis1=1, axis2=2)
         outflow = regional_outflow(result, result.step)
         weight = own + np.minimum(result["perimeter"].max(axis=2), network.u_max) * (total - own)
-        points = np.stack([total, outflow * total / np.maximum(weight, 1e-9)], axis=2)
-        rising = np.diff(result["accumulation"].sum(axis=2), axis=0) >= 0
-        seen = total >= FEWEST_VEHICLES
+        whole = outflow * total / np.maximum(weight, 1e-9)
         blocked = held_up(total, outflow, network.adjacency)
-        masks = {
-            "loading": seen & ~blocked & rising,
-            "unloading": seen & ~blocked & ~rising,
-            SPILLBACK: seen & blocked,
-        }
-        for region, clouds in enumerate(samples):
-            for label, mask in masks.items():
-                clouds[label].append(points[mask[:, region], region])
-    return [{label: np.concatenate(parts) for label, parts in clouds.items()} for clouds in samples]
+        runs.append(samples_of_run(total, whole, blocked))
+    return joined(runs)

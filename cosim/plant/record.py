@@ -23,6 +23,7 @@ BOOKS = (
     "crossings",
     "jumps",
     "redirected",
+    "time_inside",
 )
 
 

@@ -71,16 +71,14 @@ class Counts:
 
         step: control interval (s)
         """
-        inside = []
         held = []
         for run in runs:
             assert run.exits is not None
-            mean = 0.5 * (run.accumulation[1:] + run.accumulation[:-1])
-            inside.append(mean)
-            held.append(held_up(mean.sum(axis=2), run.exits.sum(axis=2) / step, adjacency))
+            outflow = run.exits.sum(axis=2) / step
+            held.append(held_up(run.inside.sum(axis=2), outflow, adjacency))
         return cls(
             step=step,
-            inside=np.concatenate(inside),
+            inside=np.concatenate([run.inside for run in runs]),
             held_up=np.concatenate(held),
             exits=np.concatenate([run.exits for run in runs]) / step,
             flows=np.concatenate([run.crossings for run in runs]) / step,

@@ -50,7 +50,8 @@ RIDGE = 1e-3  # weight of squared log changes: parameters that the data do not d
 class Observed:
     """One run of T control intervals.
 
-    accumulation: (veh, (T+1, R, R))
+    accumulation: at the ends of intervals (veh, (T+1, R, R))
+    inside: mean over each interval (veh, (T, R, R))
     demand: vehicles that entered (veh/s, (T, R, R))
     perimeter: (-, (T, R, R))
     splits: (-, (T, R, R, R))
@@ -59,6 +60,7 @@ class Observed:
     """
 
     accumulation: StatesOverTime
+    inside: PairsOverTime
     demand: PairsOverTime
     perimeter: PairsOverTime
     splits: TurnsOverTime

@@ -23,6 +23,7 @@ KINK_ROUNDING = 0.005  # of the jam accumulation: width of rounded kinks
 JAM_DENSITY = 80.0  # veh per lane-km: 60 % of the lanes full of standing vehicles
 COLLAPSED_SHARE = 0.7  # of the largest outflow so far, below which a denser region is collapsed
 OverTime = Real[np.ndarray, "T R"]
+Held = Bool[np.ndarray, "T R"]
 
 
 def of_numbers(kind: "type[Mfd]", **numbers: Any) -> Any:
@@ -392,9 +393,7 @@ def _fit_cubic(x: np.ndarray, g: np.ndarray, jam: float, max_rate: float) -> Cub
     return Cubic(a=a / jam**3, b=b / jam**2, c=c / jam, jam=jam)
 
 
-def held_up(
-    accumulation: OverTime, outflow: OverTime, adjacency: Adjacency
-) -> Bool[np.ndarray, "T R"]:
+def held_up(accumulation: OverTime, outflow: OverTime, adjacency: Adjacency) -> Held:
     """Mark intervals in which a neighbour holds up a region's outflow.
 
     The neighbour has collapsed, and did so before the region. A collapsed region holds more

@@ -11,6 +11,7 @@ import pandas as pd
 from nmfd.arrays import PerRegion, Points, StatesOverTime
 from nmfd.metrics import largest_accumulation
 from nmfd.model import mfd
+from nmfd.model.mfd import Held, OverTime
 from nmfd.model.regional_model import Errors, HeldOut, RegionalModel
 from nmfd.runs import files
 from nmfd.runs.tables import cell, text_table, wrapped
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 Samples = Sequence[Mapping[str, Points]]
 States = Sequence[StatesOverTime]  # accumulations of each run
 SPILLBACK = "held up by a neighbour"  # label of samples that the region's own MFD does not explain
+FEWEST_VEHICLES = 5.0  # in a region during an interval that counts as a sample
 SAMPLES = 10  # of a region: with fewer it keeps its MFD
 HYSTERESIS_BINS = 12  # of accumulation
 FEWEST_IN_BIN = 3  # samples of either branch, of several runs
@@ -194,6 +196,51 @@ def _doubts(samples: int, r2: float, above: float, density: float, seeds: int) -
 def own_points(cloud: Mapping[str, Points]) -> Points:
     """Return the samples (n, 2) that the region's own MFD explains."""
     return np.concatenate([points for label, points in cloud.items() if label != SPILLBACK])
+
+
+def samples_of_run(inside: OverTime, outflow: OverTime, held_up: Held) -> Samples:
+    """Return the samples of one run: "loading", "unloading", and SPILLBACK.
+
+    inside, outflow: of T intervals (veh), (veh/s), both (T, R)
+    held_up: True where a neighbour holds up the outflow, `mfd.held_up` (bool, (T, R))
+    """
+    seen = inside >= FEWEST_VEHICLES
+    rising = np.diff(inside, axis=0, prepend=0.0) >= 0
+    masks = {
+        "loading": seen & ~held_up & rising,
+        "unloading": seen & ~held_up & ~rising,
+        SPILLBACK: seen & held_up,
+    }
+    points = np.stack([inside, outflow], axis=2)
+    samples = []
+    for region in range(inside.shape[1]):
+        cloud = {label: points[mask[:, region], region] for label, mask in masks.items()}
+        samples.append(cloud)
+    return samples
+
+
+def joined(runs: Sequence[Samples]) -> Samples:
+    """Return the samples of several runs together."""
+    samples = []
+    for clouds in zip(*runs, strict=True):
+        together = {}
+        for label in clouds[0]:
+            together[label] = np.concatenate([cloud[label] for cloud in clouds])
+        samples.append(together)
+    return samples
+
+
+def outflow_critical(cloud: Mapping[str, Points]) -> float:
+    """Return the critical accumulation of a curve through samples (veh).
+
+    It is NaN if they are fewer than SAMPLES, or do not show that the outflow falls.
+    """
+    points = own_points(cloud)
+    if len(points) >= SAMPLES:
+        curve = mfd.fit(*points.T)
+        if falls(curve, points[:, 0].max()):
+            return curve.critical
+    return float("nan")
 
 
 def nearly_empty(samples: Samples) -> list[int]:
