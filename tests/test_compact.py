@@ -21,8 +21,9 @@ from nmfd.controllers.dpc.single_changes import (
     DOUBLED,
     GATE,
     HALVED,
-    METERED,
+    LOOSER,
     OPEN,
+    STRICTER,
     UNMETERED,
     UNPRICED,
     changed_policies,
@@ -236,7 +237,7 @@ def test_a_kept_number_is_not_changed():
         planning.network, Architecture(guidance=True, compact=(CENTRE,), metering=True)
     )
     names = [name for name, _ in changed_policies(policy, planning)]
-    assert names == [GATE, OPEN, HALVED, DOUBLED, UNPRICED, UNMETERED, METERED]
+    assert names == [LOOSER, STRICTER, UNMETERED, GATE, OPEN, HALVED, DOUBLED, UNPRICED]
     left = [name for name, _ in changed_policies(policy, planning, ["set_point", "metering"])]
     assert left == [HALVED, DOUBLED, UNPRICED]
 

@@ -512,6 +512,7 @@ class TrainingRun:
     def better_change(self) -> Change | None:
         """Return the best single change of the best policy, if it gains enough.
 
+        It is the first one that does if rollouts are rough, and so take long.
         There is none for a cost or a module of the user's own, whose outputs are unknown.
         """
         policy = self._policy
@@ -526,6 +527,8 @@ class TrainingRun:
             if score < least:
                 least = score
                 found = Change(name=name, policy=changed, gain=1.0 - score / self.best)
+                if self._rollout.rough:
+                    break
         return found
 
     def _take(self, change: Change) -> None:

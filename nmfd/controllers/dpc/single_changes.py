@@ -2,7 +2,7 @@
 
 Where a sigmoid is saturated, descent does not move it. So a training looks whether one output,
 replaced as a whole, is better on its own objective: gates at the critical accumulation or open,
-prices halved, doubled or off, no metering, or with a compact policy a strict one.
+prices halved, doubled or off, no metering, or with a compact policy a stricter or looser one.
 """
 
 import copy
@@ -19,14 +19,14 @@ from nmfd.tensors import PerPair, PerRegion
 
 GATE, OPEN = "gates at the critical accumulation", "gates open"
 HALVED, DOUBLED, UNPRICED = "prices halved", "prices doubled", "no prices"
-UNMETERED, METERED = "no metering", "strict metering"
+UNMETERED, STRICTER, LOOSER = "no metering", "stricter metering", "looser metering"
 FACTORS = {HALVED: 0.5, DOUBLED: 2.0, UNPRICED: 0.0}
+METERING_FACTORS = {LOOSER: 1.25, STRICTER: 0.8}
 STEEP = 20.0  # logit of a gate per relative accumulation
 # Numbers of a compact policy, on the flowing side of its sigmoids.
 GATE_NUMBERS = {"set_point": 1.0, "gain": 5.0}
 OPEN_NUMBERS = {"set_point": 2.0, "gain": 2.0}
 UNMETERED_NUMBERS = {"metering": 5.0, "metering_protected": 0.0}
-METERED_NUMBERS = {"metering": 0.7}
 
 
 def changed_policies(
@@ -40,14 +40,16 @@ def changed_policies(
         yield from _with_outputs(policy, planning)
         return
     numbers = Numbers(*policy.numbers.tolist())
-    changes = {GATE: GATE_NUMBERS, OPEN: OPEN_NUMBERS}
+    changes = {}
+    if policy.architecture.metering:
+        for name, factor in METERING_FACTORS.items():
+            changes[name] = {"metering": factor * numbers.metering}
+        changes[UNMETERED] = UNMETERED_NUMBERS
+    changes |= {GATE: GATE_NUMBERS, OPEN: OPEN_NUMBERS}
     if policy.architecture.guidance:
         for name, factor in FACTORS.items():
             prices = {"price": factor * numbers.price, "elsewhere": factor * numbers.elsewhere}
             changes[name] = prices
-    if policy.architecture.metering:
-        changes[UNMETERED] = UNMETERED_NUMBERS
-        changes[METERED] = METERED_NUMBERS
     for name, values in changes.items():
         if not set(values) & set(kept):
             changed = copy.deepcopy(policy)
