@@ -10,6 +10,7 @@ from nmfd.errors import InputError
 from nmfd.model.links.flows import Numbers
 from nmfd.model.links.model import OPEN_SHARE, Commands, LinkModel, choices_of
 from nmfd.model.links.network import FILE, LinkNetwork, read_links
+from nmfd.model.links.signals import FIXED
 from nmfd.model.scenario import Scenario
 from nmfd.types import Controls, Observation, State
 
@@ -55,12 +56,18 @@ class LinkPlant:
                 f"{scenario.where}: step: expected whole seconds, got {scenario.step:g}"
             )
         _check_demand(scenario, network, where)
+        choices = choices_of(scenario)
+        if choices.signals != FIXED and not len(network.stages):
+            raise InputError(
+                f"{scenario.where}: sumo.signals: {choices.signals} needs signals with several "
+                f"green phases, but {where} has none; choose {FIXED}"
+            )
         self.model = LinkModel(
             network,
             scenario.step,
             nominal=scenario.network.nominal_splits,
             numbers=numbers or Numbers(*network.numbers.tolist()),
-            choices=choices_of(scenario),
+            choices=choices,
             dt=1.0 if scenario.step % DT_S else DT_S,
             dtype=torch.float64,
         )
