@@ -309,10 +309,10 @@ def test_a_gate_leaves_its_share_of_green():
 
 
 def test_an_actuated_green_lasts_until_no_vehicle_passes_for_three_seconds():
-    """One leaves in each step of 2 s, the last at 19 s."""
+    """One leaves in each step of 2 s, the last at 19 s; it covers the detector for 0.5 s."""
     model = model_of(**ACTUATED)
     empty = model.start(1).traffic
-    for last, green in ((0, LEAST_S), (10, 19.0 + GAP_S), (30, LONGEST_S)):
+    for last, green in ((0, LEAST_S), (10, np.ceil(19.5 + GAP_S)), (30, LONGEST_S)):
         found = first_green(
             model, lambda n, last=last: empty._replace(left=empty.left + min(n, last))
         )

@@ -6,7 +6,7 @@ derivative; the flows have one while the choices stay.
 
 Actuated signals are SUMO's: the phases of the programme follow each other. A green phase lasts from
 its least to its longest time while vehicles pass the detectors of its lanes, at a distance d before
-the stop line; it ends when none has passed for 3 s. N vehicles of a link have passed until t:
+the stop line. It ends 3 s after the last one has left them. Until t, N vehicles have passed:
 
     N = min(A(t + d / v), N_down(t - d / w) + n d / spacing)
 
@@ -325,7 +325,8 @@ class Actuated:
         time = network.detector / flows.speed
         ahead = np.minimum(time, flows.dt)
         self._ahead = flows.values(ahead / flows.dt)
-        self._later = flows.values(time - ahead)
+        # A gap begins when a vehicle has left the detector.
+        self._added = flows.values(time - ahead - flows.spacing / flows.speed)
         lanes = np.bincount(network.lane_link, minlength=flows.links)
         self._between = flows.values(lanes * network.detector / flows.spacing)
         steps = np.round(network.detector / flows.wave / flows.dt).astype(int)
@@ -378,7 +379,7 @@ class Actuated:
         gap: of the links (s, (B, L))
         """
         signals, most = self._least.shape
-        seen = (gap + self._later).index_select(1, self._detected)
+        seen = (gap + self._added).index_select(1, self._detected)
         none = gap.new_full((len(gap), signals * most), torch.inf)
         place = self._detecting.expand_as(seen)
         return none.scatter_reduce(1, place, seen, "amin").view(-1, signals, most)
