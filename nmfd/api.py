@@ -210,7 +210,7 @@ def run(
     name = type(plant).__name__
     if isinstance(plant, str):
         name = plant
-        plant = plant_of(plant, scenario, strategy.labels)
+        plant = plant_of(plant, scenario, strategy)
     with watched(strategy.name, progress) as show:
         result = closed_loop.run(plant, acting, scenario, seed=seed, progress=show)
     return result.assign(controller=strategy.name, plant=name, demand=float(demand))

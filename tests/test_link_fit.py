@@ -17,7 +17,7 @@ from nmfd.model.links.network import read_links
 def runs(tmp_path_factory):
     """Twelve intervals of the demo, two seeds each; one strategy is not in the link model."""
     out = tmp_path_factory.mktemp("runs")
-    names = ["no-control", "no-control+guided+max-pressure", "no-control+actuated"]
+    names = ["no-control", "no-control+guided+max-pressure", "no-control+metering"]
     api.evaluate("demo", names, seeds=2, steps=12, out=out, progress=False)
     return out
 
@@ -30,7 +30,7 @@ def test_numbers_are_fitted_to_the_first_seed(runs, monkeypatch):
     rows = found.rows
     assert rows["fitted"].tolist() == [True, False, True, False]
     assert rows["difference"].abs().max() < 0.2
-    assert "+actuated is left out" in found.left_out[0]
+    assert "+metering is left out" in found.left_out[0]
     cases, _ = link_fit.cases_of(read(runs))
     fitted = [case for case in cases if case.run.seed == cases[0].run.seed]
 
@@ -55,7 +55,7 @@ def test_the_command_writes_the_numbers(runs, tmp_path, monkeypatch):
 def test_runs_that_the_model_cannot_repeat(runs):
     found = read(runs)
     (level,) = found.levels
-    rows = level.rows[level.rows["controller"].str.contains("actuated")]
+    rows = level.rows[level.rows["controller"].str.contains("metering")]
     alone = replace(found, levels=(replace(level, rows=rows),))
     with pytest.raises(InputError, match="no run that the link model can repeat"):
         link_fit.fit(alone, progress=False)

@@ -1,6 +1,7 @@
 """The link model: mass, derivatives, capacity, spillback, controls, and the plant around it."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,11 @@ import torch
 from commands import error_line, good
 from commands import nmfd as nmfd_command
 
+from cosim.evaluation import link_phases
 from cosim.evaluation.links import link_network, write_links
+from cosim.sumo.net import Connection
+from cosim.sumo.session import Phase
+from cosim.sumo.signals import Signal
 from nmfd import api
 from nmfd.controllers.dpc.numbers import Numbers
 from nmfd.controllers.dpc.policy_file import read_file as read_policy
@@ -20,9 +25,13 @@ from nmfd.model.links.flows import BETWEEN_M, REACTION
 from nmfd.model.links.model import Choices, Commands, LinkModel, choices_of
 from nmfd.model.links.network import LinkNetwork, read_links
 from nmfd.model.links.plant import LinkPlant, links_file
+from nmfd.model.links.signals import GAP_S, Lights
 
 CYCLE_S = 60
 GREEN_S = 30
+LEAST_S = 5.0  # of both phases, if the signal is actuated
+LONGEST_S = 45.0  # of the green one
+ACTUATED = {"signals": "actuated", "gateways_fixed": False}
 ONE_LANE = {"lane_link": np.arange(3), "server": np.array([0, 0, 2])}
 SPEED = 10.0  # m/s on junctions
 SPACING = 7.5
@@ -90,6 +99,13 @@ def triangle(length: float = 300.0) -> LinkNetwork:
         gain_stage=np.array([0]),
         gain_movement=np.array([0]),
         gain=np.array([1.0]),
+        phases=np.array([2]),
+        phase_second=np.array([[0, GREEN_S]]),
+        phase_least=np.full((1, 2), LEAST_S),
+        phase_most=np.array([[LONGEST_S, 15.0]]),
+        detector=np.full(3, 20.0),
+        detected=np.array([0]),
+        detecting=np.array([0]),
     )
 
 
@@ -124,6 +140,19 @@ def vehicles(model, state) -> torch.Tensor:
     return model.accumulation(state).sum() + outside + state.traffic.completed.sum()
 
 
+def first_green(model, traffic_of, steps=40):
+    """Length of the first green of a -> b (s); `traffic_of`: the traffic of a step."""
+    stages = model.start(1).stages
+    programme = Lights(torch.ones(1, 3).double(), torch.zeros(1, 3).double())
+    green = 0.0
+    for n in range(steps):
+        stages, lights = model._signals.step(n, stages, traffic_of(n), programme)
+        if float(lights.light[0, 0]) == 0.0:
+            break
+        green += 2.0 * float(lights.light[0, 0])
+    return green
+
+
 def all_commands(gate=0.4, metering=0.3, share=0.5, price=None):
     gates = torch.ones(1, 3, 3, dtype=torch.float64)
     gates[0, 0, 1] = gate
@@ -137,10 +166,10 @@ def all_commands(gate=0.4, metering=0.3, share=0.5, price=None):
     return Commands(gates, rates, splits, prices)
 
 
-@pytest.mark.parametrize("signals", ["fixed", "max-pressure"])
+@pytest.mark.parametrize("signals", [{}, {"signals": "max-pressure"}, ACTUATED])
 @pytest.mark.parametrize("commands", [None, all_commands(), all_commands(price=2.0)])
 def test_no_vehicle_appears_or_vanishes(signals, commands):
-    model = model_of(signals=signals, guided=commands is None)
+    model = model_of(guided=commands is None, **signals)
     last = rollout(model, 1.2, commands)[-1]
     assert float(vehicles(model, last)) == pytest.approx(1.2 * 6 * STEP_S, abs=1e-9)
     assert float(model.accumulation(last).min()) >= 0.0
@@ -195,10 +224,10 @@ def test_a_vehicle_that_stood_is_late_on_the_next_street():
     assert times[1] - times[0] == pytest.approx(0.5 * 15.0 / (2.0 * 2.5), rel=0.4)
 
 
-@pytest.mark.parametrize("signals", ["fixed", "max-pressure"])
+@pytest.mark.parametrize("signals", [{}, {"signals": "max-pressure"}, ACTUATED])
 def test_chance_keeps_mass_and_its_derivative(signals):
     rate = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
-    model = model_of(signals=signals, guided=True)
+    model = model_of(guided=True, **signals)
     state = model.start(2, [3, 4], chance=True)
     for _ in range(6):
         demand = torch.cat([demand_of(rate), demand_of(rate)])
@@ -243,6 +272,24 @@ def test_a_queue_discharges_at_the_saturation_flow():
     assert float(flow) == pytest.approx(SATURATION * GREEN_S / CYCLE_S, rel=0.05)
 
 
+def test_a_queue_over_two_streets_discharges_at_the_saturation_flow():
+    """All drive by way of d, 20 m long, with the signal at its end; more wait on a."""
+    green = (np.arange(CYCLE_S) < GREEN_S).astype(float)
+    network = replace(
+        triangle(),
+        length=np.array([300.0, 300.0, 20.0]),
+        free_time=np.array([20.0, 20.0, 20.0 / 15.0]),
+        cell_share=np.array([[0.0, 1.0, 1.0]]),
+        cycle=np.array([1, 1, CYCLE_S]),
+        begin=np.array([0, 1, 2]),
+        light=np.concatenate([np.ones(2), green]),
+        yields=np.zeros(CYCLE_S + 2),
+    )
+    states = rollout(model_of(network), 1.0, intervals=16)
+    flow = (states[-1].traffic.left - states[7].traffic.left)[0, 2] / (9 * STEP_S)
+    assert float(flow) == pytest.approx(SATURATION * GREEN_S / CYCLE_S, rel=0.05)
+
+
 def test_a_blocked_turn_blocks_its_link_and_the_trips_that_begin():
     network = triangle()
     light = network.light.copy()
@@ -263,6 +310,46 @@ def test_a_gate_leaves_its_share_of_green():
     green = GREEN_S - 0.8 * (GREEN_S - 5.0)
     assert passed / (9 * STEP_S) == pytest.approx(SATURATION * green / CYCLE_S, rel=0.05)
     assert float(states[-1].realised[0, 0, 1]) == pytest.approx(0.2)
+
+
+def test_an_actuated_green_lasts_until_no_vehicle_passes_for_three_seconds():
+    """One leaves in each step of 2 s, the last at 19 s; it covers the detector for 0.5 s."""
+    model = model_of(**ACTUATED)
+    empty = model.start(1).traffic
+    for last, green in ((0, LEAST_S), (10, np.ceil(19.5 + GAP_S)), (30, LONGEST_S)):
+        found = first_green(
+            model, lambda n, last=last: empty._replace(left=empty.left + min(n, last))
+        )
+        assert found == green
+
+
+def test_vehicles_between_the_detector_and_the_stop_line_extend_no_green():
+    """The third one stands on the detector, 20 m before the line."""
+    model = model_of(replace(triangle(), **ONE_LANE), **ACTUATED)
+    empty = model.start(1).traffic
+    for vehicles, green in ((2.0, LEAST_S), (3.0, LONGEST_S)):
+        queue = torch.tensor([[vehicles, 0.0, 0.0]]).double()
+        assert first_green(model, lambda _, queue=queue: empty._replace(queue=queue)) == green
+
+
+def test_gateways_keep_their_programme_beside_actuated_signals():
+    """The signal of the triangle has a gateway."""
+    fixed, kept, actuated = (
+        rollout(model_of(**choices), 0.4)[-1].spent
+        for choices in ({}, {"signals": "actuated"}, ACTUATED)
+    )
+    assert torch.equal(fixed, kept)
+    assert not torch.equal(fixed, actuated)
+
+
+@pytest.mark.parametrize("gate, green", [(0.2, 10.0 / CYCLE_S), (1.0, LONGEST_S / 50.0)])
+def test_a_gate_of_an_actuated_signal_leaves_green_of_the_programme(gate, green):
+    """An open one takes none of what the signal adds."""
+    network = replace(triangle(), cell_share=np.array([[1.0, 0.0, 1.0]]), **ONE_LANE)
+    model = model_of(network, chain_limit=0.0, **ACTUATED)
+    states = rollout(model, 1.0, all_commands(gate=gate, metering=9.0, share=1.0), intervals=16)
+    passed = float((states[-1].traffic.left - states[7].traffic.left)[0, 0])
+    assert passed / (9 * STEP_S) == pytest.approx(SATURATION * green, rel=0.05)
 
 
 def test_metering_admits_its_rate():
@@ -396,7 +483,7 @@ def test_the_same_seed_gives_the_same_run_and_another_one_other_routes():
 
 
 @pytest.mark.parametrize(
-    "key, value", [("signals", "actuated"), ("metering", 1.2), ("measurement", "estimate")]
+    "key, value", [("signals", "webster"), ("metering", 1.2), ("measurement", "estimate")]
 )
 def test_what_streets_have_not_is_refused(key, value):
     scenario = api.load_scenario("grid7_peak", {f"sumo.{key}": value})
@@ -408,6 +495,9 @@ def test_words_of_a_strategy_change_streets():
     choices = choices_of(api.load_scenario("grid7_peak"), ["max-pressure", "rerouting-30"])
     assert choices.signals == "max-pressure"
     assert choices.rerouting == pytest.approx(0.3)
+    alone = choices_of(api.load_scenario("grid7_peak"), ["actuated"], gated=False)
+    assert alone.signals == "actuated"
+    assert not alone.gateways_fixed
     by_word = api.run("grid7_peak", "no-control+max-pressure", plant="links", steps=4)
     changed = api.load_scenario("grid7_peak", {"sumo.signals": "max-pressure"})
     by_setting = api.run(changed, "no-control", plant="links", steps=4)
@@ -419,6 +509,14 @@ def test_words_of_a_strategy_change_streets():
 def test_a_word_that_streets_do_not_know_is_refused():
     with pytest.raises(InputError, match=r"\+planned: streets .*max-pressure.*rerouting-30"):
         api.run("grid7_peak", "no-control+planned", plant="links")
+
+
+def test_signals_that_choose_need_signals():
+    scenario = api.load_scenario("grid7_peak", {"sumo.signals": "actuated"})
+    network = read_links(links_file(scenario))
+    none = replace(network, stages=network.stages[:0])
+    with pytest.raises(InputError, match="sumo.signals: actuated needs signals"):
+        LinkPlant(scenario, network=none)
 
 
 def test_a_missing_file_names_the_command():
@@ -486,6 +584,35 @@ def test_a_city_is_written_and_read(written):
     again = vars(read_links(path))
     for name, value in vars(network).items():
         assert np.array_equal(value, again[name]), name
+
+
+def test_each_stage_of_an_actuated_city_has_a_detector(written):
+    network, _ = written
+    extended = np.flatnonzero(network.phase_least < network.phase_most)
+    assert set(extended) <= set(network.detecting)
+    assert (network.phase_least.ravel()[extended] == LEAST_S).all()
+    assert (network.phase_most[network.phase_least == 3.0] == 3.0).all()  # yellow
+    assert network.detector[network.detected].max() == pytest.approx((5 / 1.9 + 0.5) * 7.5)
+
+
+def test_a_detector_extends_the_phases_in_which_its_whole_lane_is_green():
+    """Lane a1 turns left; b turns left beside a movement with the right of way; a0 leads to b."""
+    states = ("GgGg", "rGrr", "Grrr")
+    phases = tuple(Phase(duration=20.0, state=state) for state in states)
+    signal = Signal(id="s", offset="0", phases=phases, links=())
+
+    def lane(source, number, target, *links):
+        rest = {"via": None, "signal": "s", "to_lane": 0, "state": "o"}
+        return [
+            Connection(source=source, target=target, link=link, lane=number, **rest)
+            for link in links
+        ]
+
+    lanes = {("a", 0): lane("a", 0, "b", 0), ("a", 1): lane("a", 1, "c", 1)}
+    lanes["b", 0] = lane("b", 0, "d", 2, 3)
+    city = SimpleNamespace(lanes={"a": 2, "b": 2})
+    found = {one: link_phases._extended(signal, one, lanes, city) for one in lanes}
+    assert found == {("a", 0): {0}, ("a", 1): {1}, ("b", 0): {0}}
 
 
 def test_shares_of_a_city_sum_to_one(written):

@@ -32,6 +32,7 @@ class Streets:
     movements: sorted
     connections: of each
     links: street and lanes of each, shortest first
+    number: street and lane -> number of the link
     link_of: movement -> its link
     """
 
@@ -68,19 +69,19 @@ class Streets:
             groups[street] = [*apart, joined]
         links = [(street, group) for street, some in groups.items() for group in some]
         self.links = sorted(links, key=lambda link: (city.length[link[0]], link[0], min(link[1])))
-        self._number = {}
+        self.number: dict[tuple[str, int], int] = {}
         for number, (street, group) in enumerate(self.links):
             for lane in group:
-                self._number[street, lane] = number
+                self.number[street, lane] = number
         self.link_of = {
-            (street, onward): self._number[street, connections[street, onward][0].lane]
+            (street, onward): self.number[street, connections[street, onward][0].lane]
             for street, onward in self.movements
         }
 
     def ends(self, movement: Movement) -> dict[int, float]:
         """Return link -> share of the lanes that a movement leads to."""
         entered = {
-            self._number[movement[1], connection.to_lane]
+            self.number[movement[1], connection.to_lane]
             for connection in self.connections[movement]
         }
         total = sum(len(self.links[link][1]) for link in entered)

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cosim.evaluation.link_phases import clock_at, phase_arrays
 from cosim.evaluation.link_streets import (
     Counts,
     Movement,
@@ -98,11 +99,14 @@ def link_network(scenario: Scenario, seeds: Sequence[int] = PLANNING_SEEDS) -> L
     counts = Counts(streets, together)
     means = means_of(draws[0], files)
     steered, _ = read_signals(city, files, HELD)
+    fixed, _ = read_signals(city, files)
     obeying = {signal.id for signal in steered}.difference(chosen.leave_signals)
     gated = set()
     for gateway in city.gateways:
         if gateway.signal in obeying:
             gated.add((gateway.from_edge, gateway.to_edge))
+    actuated = {signal.id for signal in fixed if signal.id in obeying}
+    cycles = read_cycles(city.net_file, files)
     links = link_arrays(streets)
     return LinkNetwork(
         regions=city.regions,
@@ -112,11 +116,12 @@ def link_network(scenario: Scenario, seeds: Sequence[int] = PLANNING_SEEDS) -> L
         dawdling=0.5 * means["sigma"] * means["accel"],
         acceleration=means["accel"],
         **links,
-        **_movement_arrays(streets, read_cycles(city.net_file, files), chosen.begin, gated),
+        **_movement_arrays(streets, cycles, chosen.begin, gated),
         **vehicle_arrays(
             streets, links["free_time"], counts, [Counts(streets, drives) for drives in by_draw]
         ),
         **_stage_arrays(streets, counts, steered),
+        **phase_arrays(streets, steered, actuated, cycles, chosen.begin),
     )
 
 
@@ -193,10 +198,9 @@ def _shown(connection: Connection, cycles: Mapping[str, Cycle], begin: float) ->
     known = cycles.get(connection.signal or "")
     if known is None:
         return Lights(np.ones(1), np.array([float(connection.state in MINOR)]))
-    offset = begin if known.offset == "begin" else float(known.offset)
     ends = np.cumsum([phase.duration for phase in known.phases])
     cycle = max(round(ends[-1]), 1)
-    clock = (begin - offset + np.arange(cycle) + 0.5) % ends[-1]
+    clock = (clock_at(known, begin) + np.arange(cycle) + 0.5) % ends[-1]
     number = np.searchsorted(ends, clock, side="right")
     states = [known.phases[n].state[connection.link] for n in number]
     light = np.array([CAPACITY.get(state, 0.0) for state in states])

@@ -4,6 +4,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 from xml.etree.ElementTree import Element, ElementTree, SubElement
 from xml.sax.saxutils import quoteattr
 
@@ -36,6 +37,13 @@ from cosim.sumo.signals import (
 from cosim.sumo.xml_files import attribute, read_xml
 from nmfd.errors import InputError
 from nmfd.model.scenario import Scenario
+
+
+class Limits(NamedTuple):
+    """Shortest and longest duration of a phase (s)."""
+
+    least: float
+    most: float
 
 
 def check_strategy(strategy: Strategy, scenario: Scenario, city: City) -> None:
@@ -109,25 +117,33 @@ def _counted(reasons: Iterable[str]) -> str:
     return f" ({', '.join(counts)})" if counts else ""
 
 
+def actuated_limits(signal: Signal) -> list[Limits]:
+    """Return the limits of each phase of an actuated signal.
+
+    A stage lasts up to 1.5 times its fixed time: in congestion, the shares of the green are those
+    of the programme. Between stages, and where pedestrians walk for long, times are fixed.
+    """
+    limits = []
+    for n, (phase, low) in enumerate(zip(signal.phases, least_times(signal.phases), strict=True)):
+        high = low
+        if n in signal.stages:
+            high = max(min(1.5 * phase.duration, MAX_GREEN_S), MIN_GREEN_S, low)
+        limits.append(Limits(low, high))
+    return limits
+
+
 def write_actuated(path: Path, signals: Iterable[Signal]) -> None:
     """Write an additional file that makes fixed-time signals actuated ones.
 
     They are SUMO's, based on gaps.
-
-    A stage lasts up to 1.5 times its fixed time: in congestion, the shares of the green are those
-    of the programme.
     """
     root = Element("additional")
     for signal in signals:
         about = {"type": "actuated", "programID": "plan", "offset": signal.offset}
         logic = SubElement(root, "tlLogic", {"id": signal.id} | about)
-        stages = signal.stages
-        for n, (phase, low) in enumerate(
-            zip(signal.phases, least_times(signal.phases), strict=True)
-        ):
+        for phase, (low, high) in zip(signal.phases, actuated_limits(signal), strict=True):
             row = SubElement(logic, "phase", duration=f"{phase.duration:g}", state=phase.state)
-            high = max(min(1.5 * phase.duration, MAX_GREEN_S), MIN_GREEN_S, low)
-            if n in stages and low != high:
+            if low != high:
                 row.attrib |= {"minDur": f"{low:g}", "maxDur": f"{high:g}"}
     ElementTree(root).write(path)
 

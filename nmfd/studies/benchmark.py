@@ -77,13 +77,14 @@ def compared_with(controllers: Iterable[str]) -> str:
     return REFERENCE if REFERENCE in names else names[0]
 
 
-def plant_of(name: str, scenario: Scenario, labels: Sequence[str] = ()) -> Plant:
-    """Return one of PLANTS; labels: of a strategy, for streets."""
+def plant_of(name: str, scenario: Scenario, strategy: Strategy) -> Plant:
+    """Return one of PLANTS; the labels of the strategy change streets."""
     from nmfd.model.links.plant import LinkPlant  # torch takes two seconds
     from nmfd.model.plant import AcyclicPlant, NmfdPlant
 
     if name == LINKS:
-        return LinkPlant(scenario, labels=labels)
+        gated = strategy.controller.name != REFERENCE
+        return LinkPlant(scenario, labels=strategy.labels, gated=gated)
     if name == "acyclic":
         return AcyclicPlant(scenario)
     return NmfdPlant(scenario)
@@ -106,7 +107,7 @@ def closed_loop_of(
     """
     controller = strategy.make(scenario, policy)
     actual = actual or scenario
-    city = plant_of(plant, actual, strategy.labels)
+    city = plant_of(plant, actual, strategy)
     result = closed_loop.run(city, controller, actual, seed=seed)
     return result.assign(controller=strategy.name, plant=plant, demand=demand)
 
@@ -140,7 +141,7 @@ def key_of(
         strategy.make(scenario, policy)
         own[strategy.name] = strategy.fingerprint(scenario, policy)
         if strategy.labels:
-            plant_of(plant, scenario, strategy.labels)  # or its error before the first run
+            plant_of(plant, scenario, strategy)  # or its error before the first run
             own[strategy.name]["labels"] = strategy.labels
     shared = {
         "scenario": scenario.name,

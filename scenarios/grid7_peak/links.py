@@ -16,9 +16,11 @@ import pandas as pd
 import nmfd
 from cosim.evaluation.link_fit import GUIDING, locks
 from cosim.evaluation.links import link_network
+from cosim.plant.strategy import of_finished
 from nmfd import closed_loop
 from nmfd.api import loaded
 from nmfd.controllers.rules import Constant
+from nmfd.model.links.model import Choices
 
 SEEDS = (0, 1, 2)  # of the link model
 
@@ -35,11 +37,12 @@ def metered(network: nmfd.RegionalModel, rate: float) -> nmfd.Controller:
 
 def in_links(run: nmfd.Result) -> list[nmfd.Result]:
     """Return runs of the link model with the same demand, trips and controls."""
-    name, *words = run.controller.split("+")
-    city = {
-        "sumo.guided": "guided" in words or name == GUIDING,
-        "sumo.signals": "max-pressure" if "max-pressure" in (name, *words) else "fixed",
-    }
+    strategy = of_finished(run.controller)
+    name = strategy.controller.name
+    city = {"sumo.guided": name == GUIDING}
+    for key, value in strategy.changes.items():
+        if key in Choices.model_fields:
+            city[f"sumo.{key}"] = value
     scenario = nmfd.load_scenario(run.data.attrs["scenario"], city)
     scenario = loaded(scenario, demand=run.data.attrs["demand"])
     network = link_network(scenario, [run.seed])
@@ -47,7 +50,7 @@ def in_links(run: nmfd.Result) -> list[nmfd.Result]:
     for seed in SEEDS:
         if name.startswith("rate-"):
             controller = metered(scenario.network, float(name.removeprefix("rate-")))
-        elif name in (GUIDING, "max-pressure"):
+        elif name == GUIDING:
             controller = nmfd.controller("no-control", scenario)
         else:
             controller = nmfd.controller(name, scenario)

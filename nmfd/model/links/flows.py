@@ -209,6 +209,7 @@ class Flows:
         self._movement_of_turn = self.places(network.turn_movement)
         self._link_entered = self.places(network.turn_link)
         self._link_left = self.places(network.movement_link)
+        self._link_of_turn = self.places(network.movement_link[network.turn_movement])
         self._served = self.places(network.served)
         self._server = self.places(network.server)
         self._link_of_lane = self.places(network.lane_link)
@@ -227,7 +228,7 @@ class Flows:
         """Set the times that vehicles and holes take, in steps."""
         network = self.network
         numbers = self.numbers
-        self._spacing = numbers.spacing * network.spacing
+        self.spacing = numbers.spacing * network.spacing
         speed = (network.length + network.behind) / network.free_time
         driven = np.maximum(speed - network.dawdling, 0.5 * speed)
         self.free_time = numbers.time_factor * network.free_time * speed / driven
@@ -235,11 +236,15 @@ class Flows:
         along = np.maximum(np.floor(free_steps), 1).astype(int)
         to_end = np.maximum(np.round(network.last * free_steps), 1).astype(int)
         flow = self._saturation(speed)
-        wave = flow / (1.0 / self._spacing - flow / speed)
-        # A queue discharges at its flow, although its first vehicle is late on the next link.
-        late = np.minimum(START_S + speed / (2.0 * network.acceleration), network.length / wave)
-        # The newest count is that of now. Between two steps counts change evenly.
-        wave_steps = (network.length / wave - late) / self.dt + 1.0
+        self.speed = speed
+        self.wave = wave = flow / (1.0 / self.spacing - flow / speed)
+        # A queue discharges at its flow, although its first vehicle is late on the next link: a
+        # hole comes back earlier by the same time, but not within a step.
+        late = START_S + speed / (2.0 * network.acceleration)
+        late = np.minimum(late, np.maximum(network.length / wave - self.dt, 0.0))
+        # The room at the end of a step follows from the counts until its beginning, the newest.
+        # Between two steps counts change evenly.
+        wave_steps = np.maximum((network.length / wave - late) / self.dt, 1.0)
         backwards = np.floor(wave_steps).astype(int)
         self._earlier = self.values(wave_steps - backwards)
         self._along = Delay(along[network.entry_link], self.device)
@@ -262,7 +267,7 @@ class Flows:
         lanes = np.bincount(network.lane_link, minlength=self.links)
         most_in = INFLOW * self.dt * lanes
         # A shorter link would hold up the flow that its lanes can take within a step.
-        storage = np.maximum(lanes * network.length / self._spacing, 2.0 * most_in)
+        storage = np.maximum(lanes * network.length / self.spacing, 2.0 * most_in)
         self.storage = self.values(storage)
         self._most_in = self.values(most_in)
         saturation = self._saturation(network.speed) * self.dt
@@ -345,9 +350,7 @@ class Flows:
         ways: of the vehicles
         """
         # Vehicles arrive at the queue; trips end before it or in it.
-        soon = self._along.read(traffic.entered)
-        arriving = soon + self._part * (self._along.older(traffic.entered) - soon)
-        queue = traffic.queue + arriving + self._started.read(traffic.started)
+        queue = traffic.queue + self._arriving(traffic)
         ends = self._to_end.read(traffic.ending)
         in_queue = ends * (self._met * traffic.inside / self.storage).clamp(max=1.0)
         stopping = traffic.stopping + in_queue
@@ -413,6 +416,23 @@ class Flows:
             left=traffic.left + left,
             had_left=self._backwards.with_new(traffic.had_left, traffic.left + left),
         )
+
+    def _arriving(self, traffic: Traffic) -> Tensor:
+        """Return those who arrive at the queue in a step, by entry (veh, (B, E))."""
+        soon = self._along.read(traffic.entered)
+        arriving = soon + self._part * (self._along.older(traffic.entered) - soon)
+        return arriving + self._started.read(traffic.started)
+
+    def near(self, traffic: Traffic, share: Tensor) -> Tensor:
+        """Return the vehicles that wait at each stop line, or soon will.
+
+        The result has the shape (B, L).
+
+        share: of the step that comes, in which they arrive (-, (L,))
+        """
+        first = self.sums(traffic.standing, self._link_of_turn, self.links)
+        arriving = self.by_link(self._arriving(traffic))
+        return self.by_link(traffic.queue) + first + share * arriving
 
     def _green(self, traffic: Traffic, stood: Tensor, light: Tensor, yields: Tensor) -> Tensor:
         """Return the share phi of first vehicles that can go (-, (B, T)).

@@ -15,11 +15,16 @@ from nmfd.model.links.flows import LEAST, Flows, Numbers, Traffic, Ways
 from nmfd.model.links.network import LinkNetwork
 from nmfd.model.links.recompute import run_again
 from nmfd.model.links.signals import (
+    ACTUATED,
+    FIXED,
     MAX_PRESSURE,
+    Actuated,
     Gates,
     Lights,
     MaxPressure,
+    Phases,
     Programmes,
+    Responsive,
     Stages,
 )
 from nmfd.model.planning import GUIDED
@@ -33,14 +38,17 @@ from nmfd.tensors import PerTurn as Turns
 OPEN_SHARE = 0.95  # of what a boundary can let through; above it a gate is open
 
 
-Signals = Literal["fixed", "max-pressure"]
+Signals = Literal["fixed", "actuated", "max-pressure"]
 SHARES = ("rerouting", "compliance")  # choices that labels give in percent
 
 
 class Choices(config.Settings):
     """Signals and drivers of the city; other values are not in the link model."""
 
-    signals: Signals = setting("control of the signals", "fixed")
+    signals: Signals = setting("control of the signals", FIXED)
+    gateways_fixed: bool = setting(
+        "signals with gateways stay fixed-time if the others are actuated", True
+    )
     lookahead: float = setting("as of max-pressure in a city", 1.0, unit="s", gt=0.0)
     chain_limit: Share = setting(
         "share of a link's room beyond which no gate holds vehicles there; 0: no limit", 0.6
@@ -52,14 +60,17 @@ class Choices(config.Settings):
     measurement: Literal["exact"] = setting("what controllers see", "exact")
 
 
-def choices_of(scenario: Scenario, labels: Sequence[str] = ()) -> Choices:
+def choices_of(scenario: Scenario, labels: Sequence[str] = (), *, gated: bool = True) -> Choices:
     """Return the choices of the table [sumo].
 
     labels: of a strategy (nmfd.controllers.strategy), which change some
+    gated: its controller commands gates, so that only signals without gateways can be actuated
     Raises: InputError for a value or label that the link model has not
     """
     own = {name: value for name, value in scenario.sumo.items() if name in Choices.model_fields}
     own |= _changes(labels)
+    if ACTUATED in labels:
+        own["gateways_fixed"] = gated
     return config.checked(Choices, own, scenario.where, "sumo.")
 
 
@@ -118,7 +129,7 @@ class LinkState(NamedTuple):
 
     interval: its number
     draw: number of the draw of trips of each rollout (B,)
-    used: of the gates' windows; stages: of max-pressure
+    used: of the gates' windows; stages: of max-pressure or of actuated signals
     chance: of single vehicles, None without
     asked: trips that were due so far on average, by entry (B, E)
     begun: trips that were due so far (veh, (B,))
@@ -132,7 +143,7 @@ class LinkState(NamedTuple):
     draw: Tensor
     traffic: Traffic
     used: Tensor
-    stages: Stages | None
+    stages: Stages | Phases | None
     chance: Chance | None
     asked: Tensor
     begun: Tensor
@@ -166,12 +177,16 @@ class LinkModel:
         self._choices = choices or Choices()
         self.flows = Flows(network, numbers or Numbers(), dt=dt, dtype=dtype, device=device)
         self._steps = round(step / dt)
-        by_pressure = self._choices.signals == MAX_PRESSURE
-        self._gates = Gates(self.flows, by_cycle=by_pressure)
+        self._signals: Responsive | None = None
+        self._gates = Gates(self.flows)
+        if self._choices.signals == MAX_PRESSURE:
+            self._signals = MaxPressure(self.flows, self._choices.lookahead)
+            self._gates = Gates(self.flows, by_cycle=True, of_programme=False)
+        elif self._choices.signals == ACTUATED:
+            fixed = self._choices.gateways_fixed
+            self._signals = Actuated(self.flows, gateways_fixed=fixed)
+            self._gates = Gates(self.flows, by_cycle=not fixed)
         self._programmes = Programmes(self.flows, self._gates.opens)
-        self._pressure = None
-        if by_pressure:
-            self._pressure = MaxPressure(self.flows, self._choices.lookahead)
         self._drivers = Drivers(self.flows, nominal)
         self._number()
 
@@ -217,7 +232,7 @@ class LinkModel:
             draw=flows.places(draw),
             traffic=traffic,
             used=self._gates.start(batch),
-            stages=None if self._pressure is None else self._pressure.start(batch),
+            stages=None if self._signals is None else self._signals.start(batch),
             chance=by_chance,
             asked=torch.zeros_like(traffic.due),
             begun=traffic.inside.new_zeros(batch),
@@ -268,9 +283,9 @@ class LinkModel:
             if commands.metering is not None or n == 0:
                 traffic, released = self._metered(traffic, whole, commands.metering)
             lights = Lights(light[n : n + 1], yields[n : n + 1])
-            if self._pressure is not None and stages is not None:
+            if self._signals is not None:
                 number = state.interval * self._steps + n
-                stages, lights = self._pressure.step(number, stages, traffic.inside, lights)
+                stages, lights = self._signals.step(number, stages, traffic, lights)
             shown = lights.light
             if gates is not None:
                 share = self._gate_shares(gates, traffic.inside)

@@ -59,6 +59,13 @@ class LinkNetwork:
         weight, for the movement (any number of them)
     gain_stage, gain_movement, gain: share of this pressure that the stage serves, a place in
         (S, n) (any number of them)
+    phases: number of phases of each signal (S,), with at most p phases
+    phase_second: second of the programme in which each phase begins (S, p)
+    phase_least, phase_most: limits of each phase where the signal is actuated (s, (S, p)); the
+        signal keeps its programme if all of them are equal
+    detector: distance from the detectors of each link to the stop line (m, (L,))
+    detected, detecting: link on whose detectors a vehicle extends a phase, and the phase, a place
+        in (S, p) (any number of them)
     """
 
     regions: int
@@ -108,6 +115,13 @@ class LinkNetwork:
     gain_stage: np.ndarray
     gain_movement: np.ndarray
     gain: np.ndarray
+    phases: np.ndarray
+    phase_second: np.ndarray
+    phase_least: np.ndarray
+    phase_most: np.ndarray
+    detector: np.ndarray
+    detected: np.ndarray
+    detecting: np.ndarray
 
     def write(self, path: Path) -> None:
         """Write the arrays to the .npz file `path`, whole or not at all."""

@@ -11,6 +11,7 @@ from nmfd.errors import InputError
 from nmfd.model.links.flows import Numbers
 from nmfd.model.links.model import Commands, LinkModel, choices_of, gate_shares
 from nmfd.model.links.network import FILE, LinkNetwork, read_links
+from nmfd.model.links.signals import FIXED
 from nmfd.model.scenario import Scenario
 from nmfd.types import Controls, Observation, State
 
@@ -38,11 +39,12 @@ class LinkPlant:
         network: LinkNetwork | None = None,
         numbers: Numbers | None = None,
         labels: Sequence[str] = (),
+        gated: bool = True,
         chance: bool = True,
     ):
         """network: that of the scenario's file if None
         numbers: those of the network if None
-        labels: of a strategy, such as "max-pressure"
+        labels, gated: of a strategy, as in `choices_of`
         chance: single vehicles draw their turns; without, streams divide
 
         Raises: InputError if the file is missing or does not fit the scenario
@@ -50,7 +52,12 @@ class LinkPlant:
         self._scenario = scenario
         self._chance = chance
         self.model = link_model(
-            scenario, network=network, numbers=numbers, labels=labels, dtype=torch.float64
+            scenario,
+            network=network,
+            numbers=numbers,
+            labels=labels,
+            gated=gated,
+            dtype=torch.float64,
         )
         self._demand = torch.from_numpy(scenario.demand).unsqueeze(1)
 
@@ -110,12 +117,13 @@ def link_model(
     network: LinkNetwork | None = None,
     numbers: Numbers | None = None,
     labels: Sequence[str] = (),
+    gated: bool = True,
     dtype: torch.dtype = torch.float32,
     device: str = "cpu",
 ) -> LinkModel:
     """Return the link model of a scenario.
 
-    network, numbers, labels: as of LinkPlant
+    network, numbers, labels, gated: as of LinkPlant
     Raises: InputError if the file is missing or does not fit the scenario
     """
     where = links_file(scenario)
@@ -125,12 +133,18 @@ def link_model(
     if scenario.step % 1.0:
         raise InputError(f"{scenario.where}: step: expected whole seconds, got {scenario.step:g}")
     _check_demand(scenario, network, where)
+    choices = choices_of(scenario, labels, gated=gated)
+    if choices.signals != FIXED and not len(network.stages):
+        raise InputError(
+            f"{scenario.where}: sumo.signals: {choices.signals} needs signals with several "
+            f"green phases, but {where} has none; choose {FIXED}"
+        )
     return LinkModel(
         network,
         scenario.step,
         nominal=scenario.network.nominal_splits,
         numbers=numbers or Numbers(*network.numbers.tolist()),
-        choices=choices_of(scenario, labels),
+        choices=choices,
         dt=1.0 if scenario.step % DT_S else DT_S,
         dtype=dtype,
         device=device,

@@ -1,30 +1,43 @@
-"""Signals of the link model: programmes, max-pressure and gates.
+"""Signals of the link model: fixed, actuated, max-pressure, and gates.
 
 A stage is a green phase of a programme. Max-pressure (Varaiya, 2013) chooses the stage with the
 highest pressure, as cosim.plant.max_pressure does, with the model's own queues. The choice has no
 derivative; the flows have one while the choices stay.
 
+Actuated signals are SUMO's: the phases of the programme follow each other. A green phase lasts from
+its least to its longest time while vehicles pass the detectors of its lanes, at a distance d before
+the stop line. It ends 3 s after the last one has left them. Until t, N vehicles have passed:
+
+    N = min(A(t + d / v), N_down(t - d / w) + n d / spacing)
+
+A counts those who arrived at the stop line or left, the others are as in nmfd.model.links.flows.
+The second term is the smaller one if a queue covers the detector, which extends the phase, too.
+
 A gate leaves a movement, of each window of green with the capacity W (s), the share u:
 
     W - (1 - u) (G - LEAST_GREEN_S)                     from its beginning; G is its green (s)
 
-as cosim.plant.gates does. Under max-pressure the window is the cycle.
+as cosim.plant.gates does. Under max-pressure the window is the cycle. At actuated signals, W and G
+are those of a cycle of the programme.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from nmfd.model.links.flows import LEAST, Flows
+from nmfd.model.links.flows import EPSILON, LEAST, Flows, Traffic
 
 LEAST_GREEN_S = 5.0  # of a gated movement in each window of green
 DECISION_PERIOD_S = 5.0
 LONGEST_GREEN_S = 50.0  # under max-pressure while others wait
 LONGEST_RED_S = 120.0  # then a stage with vehicles comes first
 CALLED_VEH = 0.2  # vehicles that call a stage
+FIXED = "fixed"
 MAX_PRESSURE = "max-pressure"
+ACTUATED = "actuated"
+GAP_S = 3.0  # SUMO's time without a vehicle on the detectors that ends a green
 
 
 class Lights(NamedTuple):
@@ -54,6 +67,38 @@ class Stages(NamedTuple):
     red: Tensor
 
 
+class Phases(NamedTuple):
+    """State of B rollouts of actuated signals.
+
+    phase: present phase (B, S); since: time since it began (s, (B, S))
+    passed: vehicles that passed the detectors of each link so far (veh, (B, L))
+    gap: time since the last one, or since a queue covered the detector (s, (B, L))
+    had_left: vehicles that had left each link at the last h steps, the newest last (veh, (h, B, L))
+    """
+
+    phase: Tensor
+    since: Tensor
+    passed: Tensor
+    gap: Tensor
+    had_left: Tensor
+
+
+class Responsive(Protocol):
+    """Signals that follow the traffic; their state is Stages or Phases."""
+
+    def start(self, batch: int) -> Any:
+        """Return the state before the first step."""
+
+    def step(
+        self, number: int, state: Any, traffic: Traffic, programme: Lights
+    ) -> tuple[Any, Lights]:
+        """Return the state and the lights of a step.
+
+        number: of the step
+        programme: lights of the signals that keep their programmes
+        """
+
+
 class Gates:
     """Limits of the green of gated movements.
 
@@ -62,10 +107,13 @@ class Gates:
     movements: gated ones; opens: True in seconds of the programmes with which a window begins
     """
 
-    def __init__(self, flows: Flows, *, by_cycle: bool):
-        """by_cycle: the window is the cycle, not a time of green"""
+    def __init__(self, flows: Flows, *, by_cycle: bool = False, of_programme: bool = True):
+        """by_cycle: the window is the cycle, not a time of green
+        of_programme: W and G are those of the programme, not the window
+        """
         network = flows.network
         self._dt = flows.dt
+        self._extended = by_cycle and of_programme
         self.movements = np.flatnonzero(network.gated)
         self.opens = np.zeros(len(network.light))
         whole = np.ones(len(self.movements))
@@ -79,6 +127,7 @@ class Gates:
             green = (light == 1.0).sum()
             if by_cycle:
                 opens[:] = False
+            if not of_programme:
                 capacity = green = cycle
             if not opens.any():
                 opens[0] = True
@@ -88,6 +137,7 @@ class Gates:
         self.places = flows.places(self.movements)
         self._whole = flows.values(whole)
         self._taken = flows.values(taken)
+        self._cycle = flows.values(network.cycle[self.movements])
 
     def start(self, batch: int) -> Tensor:
         """Return the state (B, gates) before the first step."""
@@ -104,6 +154,8 @@ class Gates:
         seconds = light.index_select(1, self.places) * self._dt
         used = used * (1.0 - opens)
         budget = self._whole - (1.0 - share) * self._taken
+        if self._extended:  # an open gate has more green than the programme
+            budget = torch.where(share < 1.0, budget, self._cycle)
         left = ((budget - used) / seconds.clamp(min=LEAST)).clamp(0.0, 1.0)
         factor = torch.ones_like(light).index_copy(1, self.places, left)
         return used + seconds * left, light * factor
@@ -138,6 +190,15 @@ class Programmes:
         return values(light), values(yields), values(opens)
 
 
+def _shown(table: Tensor, stage: Tensor, signal: Tensor) -> Tensor:
+    """Return what the stages (B, S) show, (B, M), from a table (M, n).
+
+    signal: of each movement (M,)
+    """
+    place = stage.index_select(1, signal).unsqueeze(2)
+    return table.expand(len(stage), -1, -1).gather(2, place).squeeze(2)
+
+
 class MaxPressure:
     """Signals that choose their stages."""
 
@@ -170,26 +231,21 @@ class MaxPressure:
         return Stages(stage, stage, zeros, zeros, self._least.new_zeros(batch, signals, most))
 
     def step(
-        self, number: int, stages: Stages, inside: Tensor, programme: Lights
+        self, number: int, stages: Stages, traffic: Traffic, programme: Lights
     ) -> tuple[Stages, Lights]:
-        """Return the state and the lights of a step.
-
-        number: of the step
-        inside: vehicles by link (veh, (B, L))
-        programme: lights of the signals that keep their programmes
-        """
+        """Return the state and the lights of a step, as `Responsive`."""
         if number % self._period == 0:
             with torch.no_grad():
-                stages = self._decide(stages, inside)
+                stages = self._decide(stages, traffic.inside)
         dt = self._flows.dt
-        after = self._shown(self._light, stages.stage)
-        before = self._shown(self._light, stages.before)
+        after = _shown(self._light, stages.stage, self._signal)
+        before = _shown(self._light, stages.before, self._signal)
         # Those who gave way wait on the junction, and go while it clears.
-        last = before * self._shown(self._yields, stages.before)
+        last = before * _shown(self._yields, stages.before, self._signal)
         kept = torch.maximum(torch.minimum(after, before), last)
         waits = (stages.clearing / dt).clamp(max=1.0).index_select(1, self._signal)
         light = waits * kept + (1.0 - waits) * after
-        yields = (1.0 - waits) * self._shown(self._yields, stages.stage)
+        yields = (1.0 - waits) * _shown(self._yields, stages.stage, self._signal)
         begun = (dt - stages.clearing).clamp(min=0.0)
         running = torch.nn.functional.one_hot(stages.stage, self._least.shape[1])
         stages = stages._replace(
@@ -199,11 +255,6 @@ class MaxPressure:
         )
         light = torch.where(self._chooses, light, programme.light)
         return stages, Lights(light, torch.where(self._chooses, yields, programme.yields))
-
-    def _shown(self, table: Tensor, stage: Tensor) -> Tensor:
-        """Return what the stages (B, S) show, (B, M), from a table (M, n)."""
-        place = stage.index_select(1, self._signal).unsqueeze(2)
-        return table.expand(len(stage), -1, -1).gather(2, place).squeeze(2)
 
     def _decide(self, stages: Stages, inside: Tensor) -> Stages:
         """Return the state with the stages that each signal wants now."""
@@ -246,3 +297,105 @@ class MaxPressure:
         gained = weight.index_select(1, self._gain_movement) * self._gain
         signals, most = self._least.shape
         return flows.sums(gained, self._gain_stage, signals * most).view(-1, signals, most)
+
+
+class Actuated:
+    """Signals that extend green while vehicles arrive."""
+
+    def __init__(self, flows: Flows, *, gateways_fixed: bool):
+        """gateways_fixed: signals of gated movements keep their programmes"""
+        network = flows.network
+        self._flows = flows
+        signal = np.maximum(network.signal, 0)
+        responds = (network.phase_least < network.phase_most).any(axis=1)
+        if gateways_fixed:
+            responds[network.signal[network.gated & (network.signal >= 0)]] = False
+        chooses = (network.signal >= 0) & responds[signal]
+        second = np.where(chooses[:, None], network.phase_second[signal], 0)
+        place = network.begin[:, None] + second
+        self._chooses = torch.as_tensor(chooses, device=flows.device)
+        self._signal = flows.places(signal)
+        self._light = flows.values(network.light[place])
+        self._yielding = flows.values(network.light[place] * network.yields[place])
+        self._count = flows.places(network.phases)
+        self._least = flows.values(network.phase_least)
+        self._most = flows.values(network.phase_most)
+        self._detected = flows.places(network.detected)
+        self._detecting = flows.places(network.detecting)
+        time = network.detector / flows.speed
+        ahead = np.minimum(time, flows.dt)
+        self._ahead = flows.values(ahead / flows.dt)
+        # A gap begins when a vehicle has left the detector.
+        self._added = flows.values(time - ahead - flows.spacing / flows.speed)
+        lanes = np.bincount(network.lane_link, minlength=flows.links)
+        self._between = flows.values(lanes * network.detector / flows.spacing)
+        steps = np.round(network.detector / flows.wave / flows.dt).astype(int)
+        self._kept = int(steps.max(initial=0)) + 1
+        self._back = flows.places(self._kept - 1 - steps)
+
+    def start(self, batch: int) -> Phases:
+        """Return the state at first: all signals begin their programmes."""
+        signals = len(self._least)
+        phase = torch.zeros(batch, signals, dtype=torch.long, device=self._flows.device)
+        since = self._least.new_zeros(batch, signals)
+        passed = self._least.new_zeros(batch, self._flows.links)
+        had_left = passed.expand(self._kept, -1, -1)
+        return Phases(phase, since, passed, torch.full_like(passed, GAP_S), had_left)
+
+    def step(
+        self, number: int, phases: Phases, traffic: Traffic, programme: Lights
+    ) -> tuple[Phases, Lights]:
+        """Return the state and the lights of a step, as `Responsive`."""
+        seconds = round(self._flows.dt)
+        with torch.no_grad():
+            phases = self._detect(phases, traffic)
+            gap = self._gap_of_phases(phases.gap)
+        light = torch.zeros_like(programme.light)
+        yielding = torch.zeros_like(light)
+        for second in range(seconds):
+            phases = self._next(phases, gap + second)
+            light = light + _shown(self._light, phases.phase, self._signal) / seconds
+            yielding = yielding + _shown(self._yielding, phases.phase, self._signal) / seconds
+        yields = yielding / light.clamp(min=1e-9)
+        light = torch.where(self._chooses, light, programme.light)
+        return phases, Lights(light, torch.where(self._chooses, yields, programme.yields))
+
+    def _detect(self, phases: Phases, traffic: Traffic) -> Phases:
+        """Return the state with the vehicles that pass a detector in this step."""
+        flows = self._flows
+        near = flows.near(traffic, self._ahead)
+        had_left = torch.cat([phases.had_left[1:], traffic.left.unsqueeze(0)])
+        queue = had_left.gather(0, self._back.expand(1, len(near), -1)).squeeze(0) + self._between
+        passed = torch.minimum(traffic.left + near, queue)
+        last = torch.floor(passed + 0.5) - 0.5
+        ago = flows.dt * (passed - last) / (passed - phases.passed).clamp(min=EPSILON)
+        gap = torch.where(last > phases.passed, ago, phases.gap + flows.dt)
+        gap = torch.where(traffic.left + near > queue, 0.0, gap)
+        return phases._replace(passed=passed, gap=gap, had_left=had_left)
+
+    def _gap_of_phases(self, gap: Tensor) -> Tensor:
+        """Return the least gap of the links that extend each phase (s, (B, S, p)).
+
+        gap: of the links (s, (B, L))
+        """
+        signals, most = self._least.shape
+        seen = (gap + self._added).index_select(1, self._detected)
+        none = gap.new_full((len(gap), signals * most), torch.inf)
+        place = self._detecting.expand_as(seen)
+        return none.scatter_reduce(1, place, seen, "amin").view(-1, signals, most)
+
+    def _next(self, phases: Phases, gap: Tensor) -> Phases:
+        """Return the state in the second that begins.
+
+        gap: of all phases (s, (B, S, p))
+        """
+        phase = phases.phase
+        least = self._least.gather(1, phase.T).T
+        most = self._most.gather(1, phase.T).T
+        gap = gap.gather(2, phase.unsqueeze(2)).squeeze(2)
+        ends = (phases.since >= least) & (gap >= GAP_S)
+        ends = ends | (phases.since >= most)
+        return phases._replace(
+            phase=torch.where(ends, (phase + 1) % self._count, phase),
+            since=torch.where(ends, 0.0, phases.since) + 1.0,
+        )
