@@ -58,6 +58,7 @@ def session(routes: dict[str, tuple[str, ...]], **others: Any) -> SimpleNamespac
     """Return a session of drivers on the first edges of their `routes`, none of whom is near the
     end of a lane."""
     calls = {
+        "arrived": tuple,
         "road": lambda vehicle: routes[vehicle][0],
         "route": routes.get,
         "route_index": lambda vehicle: 0,

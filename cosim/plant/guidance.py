@@ -185,6 +185,8 @@ class Guide:
         if not self._guides:
             return
         self._visits.begin_step()
+        for vehicle in self._session.arrived():
+            self._visits.end(vehicle)
         for event in events:
             self._visits.end(event.vehicle)
             guidable = event.free and event.vehicle not in self._planned
@@ -205,7 +207,7 @@ class Guide:
         event = visit.event
         try:
             here = self._city.number.get(self._session.road(event.vehicle))
-        except REFUSALS:  # the vehicle has arrived
+        except REFUSALS:  # the vehicle was removed, or arrived at once
             self._visits.end(event.vehicle)
             return
         if here is None or self._region[here] != event.region:
