@@ -49,6 +49,7 @@ REGIONAL = "nmfd"  # plant
 DEMAND_SPREAD = 0.2  # every flow is scaled by a factor drawn from 1 - this to 1 + this
 RANDOM_START_SHARE = 0.5  # of the rollouts start from a random state at a random time
 VALIDATION_PERIOD = 20  # Adam steps
+SCORE = "validation_veh_s"  # of a policy in its file
 VALIDATION_ROLLOUTS = 16  # perturbed rollouts in a validation, if training perturbs demand or model
 ROUGH_PERIOD = 4  # as VALIDATION_PERIOD, through streets
 ROUGH_BATCH = 6  # rollouts in an Adam step there, each of which takes some seconds
@@ -251,11 +252,13 @@ def _regional(planning: PlanningModel, setup: Dpc, dtype: torch.dtype, device: s
 class Change(NamedTuple):
     """Single change of a policy that is better on its own objective.
 
+    score: its validation (veh s)
     gain: share of the total time spent that it saves (-)
     """
 
     name: str
     policy: Policy
+    score: float
     gain: float
 
 
@@ -501,13 +504,17 @@ class TrainingRun:
             with torch.no_grad():
                 score = self._loss(fixed, VALIDATION_ROLLOUTS).item()
         else:
-            key = "validation_veh_s"
+            key = SCORE
             score = validate(self._policy, self._rollout, self._seed, self._setup)
         if score < self.best:
-            self.best = score
-            self._best_weights = copy.deepcopy(self._policy.state_dict())
-            self._keeper.keep({key: score})
+            self._keep(key, score)
         return score
+
+    def _keep(self, key: str, score: float) -> None:
+        """Keep the policy as the best so far."""
+        self.best = score
+        self._best_weights = copy.deepcopy(self._policy.state_dict())
+        self._keeper.keep({key: score})
 
     def better_change(self) -> Change | None:
         """Return the best single change of the best policy, if it gains enough.
@@ -526,7 +533,8 @@ class TrainingRun:
             score = validate(changed, self._rollout, self._seed, self._setup)
             if score < least:
                 least = score
-                found = Change(name=name, policy=changed, gain=1.0 - score / self.best)
+                gain = 1.0 - score / self.best
+                found = Change(name=name, policy=changed, score=score, gain=gain)
                 if self._rollout.rough:
                     break
         return found
@@ -534,7 +542,7 @@ class TrainingRun:
     def _take(self, change: Change) -> None:
         """Go on from a single change."""
         self._policy.load_state_dict(change.policy.state_dict())
-        self.validate()
+        self._keep(SCORE, change.score)
 
     def restart(self, change: Change) -> bool:
         """Begin another descent of a compact policy from a single change.
