@@ -227,7 +227,7 @@ def train(
     if resume:
         keeper.resume(run.restore)
     else:
-        run.prepare()
+        run.prepare(progress)
     run.finish(progress)
     if not math.isfinite(run.best):
         raise RunFailed(
@@ -337,7 +337,7 @@ class TrainingRun:
             weight_decay=self._recipe.weight_decay,
         )
 
-    def prepare(self) -> None:
+    def prepare(self, progress: Show) -> None:
         """Begin as the settings say: like a gate, or like no control.
 
         A compact policy begins with the best of its single changes, not in a corner where descent
@@ -345,9 +345,11 @@ class TrainingRun:
         """
         if isinstance(self._policy, CompactPolicy) and not self._task.own:
             self.validate()
+            self._show(progress)
             change = self.better_change()
             while change is not None:
                 self._take(change)
+                self._show(progress)
                 change = self.better_change()
         if self._setup.from_gating:
             begin_as_gate(self._policy, self._rollout, self._generator)
@@ -372,8 +374,7 @@ class TrainingRun:
                 if self._rollout.rough and not score <= self.best * (1.0 + JUMP):
                     self._step_back()
                 self._keeper.save(self.state())
-            if progress:
-                progress(self.done, steps, self._best_text())
+            self._show(progress)
 
     def finish(self, progress: Show) -> None:
         """Descend, and again from a single change that is better."""
@@ -397,12 +398,14 @@ class TrainingRun:
         self._optimizer = self._new_optimizer()
         self._rate *= 0.5
 
-    def _best_text(self) -> str:
-        """Return the best validation so far as text."""
-        if not math.isfinite(self.best):
-            return "no validation yet"
-        unit = "" if self._task.own else " veh s"
-        return f"best {self.best:.4g}{unit}"
+    def _show(self, progress: Show) -> None:
+        """Show the steps that are done, and the best validation so far."""
+        if progress:
+            best = "no validation yet"
+            if math.isfinite(self.best):
+                unit = "" if self._task.own else " veh s"
+                best = f"best {self.best:.4g}{unit}"
+            progress(self.done, self._setup.steps, best)
 
     def step(self) -> None:
         """Take one step of Adam."""
