@@ -237,7 +237,7 @@ def test_a_kept_number_is_not_changed():
         planning.network, Architecture(guidance=True, compact=(CENTRE,), metering=True)
     )
     names = [name for name, _ in changed_policies(policy, planning)]
-    assert names == [LOOSER, STRICTER, UNMETERED, GATE, OPEN, HALVED, DOUBLED, UNPRICED]
+    assert names == [STRICTER, LOOSER, UNMETERED, GATE, OPEN, HALVED, DOUBLED, UNPRICED]
     left = [name for name, _ in changed_policies(policy, planning, ["set_point", "metering"])]
     assert left == [HALVED, DOUBLED, UNPRICED]
 

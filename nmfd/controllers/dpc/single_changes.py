@@ -21,7 +21,7 @@ GATE, OPEN = "gates at the critical accumulation", "gates open"
 HALVED, DOUBLED, UNPRICED = "prices halved", "prices doubled", "no prices"
 UNMETERED, STRICTER, LOOSER = "no metering", "stricter metering", "looser metering"
 FACTORS = {HALVED: 0.5, DOUBLED: 2.0, UNPRICED: 0.0}
-METERING_FACTORS = {LOOSER: 1.25, STRICTER: 0.8}
+METERING_FACTORS = {STRICTER: 0.8, LOOSER: 1.25}  # the first leads out of a lock
 STEEP = 20.0  # logit of a gate per relative accumulation
 # Numbers of a compact policy, on the flowing side of its sigmoids.
 GATE_NUMBERS = {"set_point": 1.0, "gain": 5.0}
