@@ -47,9 +47,10 @@ def in_links(run: nmfd.Result) -> list[nmfd.Result]:
     scenario = loaded(scenario, demand=run.data.attrs["demand"])
     network = link_network(scenario, [run.seed])
     runs = []
+    first = run.controller.partition("+")[0]
     for seed in SEEDS:
-        if name.startswith("rate-"):
-            controller = metered(scenario.network, float(name.removeprefix("rate-")))
+        if first.startswith("rate-"):
+            controller = metered(scenario.network, float(first.removeprefix("rate-")))
         elif name == GUIDING:
             controller = nmfd.controller("no-control", scenario)
         else:
