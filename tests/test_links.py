@@ -272,24 +272,6 @@ def test_a_queue_discharges_at_the_saturation_flow():
     assert float(flow) == pytest.approx(SATURATION * GREEN_S / CYCLE_S, rel=0.05)
 
 
-def test_a_queue_over_two_streets_discharges_at_the_saturation_flow():
-    """All drive by way of d, 20 m long, with the signal at its end; more wait on a."""
-    green = (np.arange(CYCLE_S) < GREEN_S).astype(float)
-    network = replace(
-        triangle(),
-        length=np.array([300.0, 300.0, 20.0]),
-        free_time=np.array([20.0, 20.0, 20.0 / 15.0]),
-        cell_share=np.array([[0.0, 1.0, 1.0]]),
-        cycle=np.array([1, 1, CYCLE_S]),
-        begin=np.array([0, 1, 2]),
-        light=np.concatenate([np.ones(2), green]),
-        yields=np.zeros(CYCLE_S + 2),
-    )
-    states = rollout(model_of(network), 1.0, intervals=16)
-    flow = (states[-1].traffic.left - states[7].traffic.left)[0, 2] / (9 * STEP_S)
-    assert float(flow) == pytest.approx(SATURATION * GREEN_S / CYCLE_S, rel=0.05)
-
-
 def test_a_blocked_turn_blocks_its_link_and_the_trips_that_begin():
     network = triangle()
     light = network.light.copy()

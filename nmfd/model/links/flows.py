@@ -238,13 +238,10 @@ class Flows:
         flow = self._saturation(speed)
         self.speed = speed
         self.wave = wave = flow / (1.0 / self.spacing - flow / speed)
-        # A queue discharges at its flow, although its first vehicle is late on the next link: a
-        # hole comes back earlier by the same time, but not within a step.
-        late = START_S + speed / (2.0 * network.acceleration)
-        late = np.minimum(late, np.maximum(network.length / wave - self.dt, 0.0))
-        # The room at the end of a step follows from the counts until its beginning, the newest.
-        # Between two steps counts change evenly.
-        wave_steps = np.maximum((network.length / wave - late) / self.dt, 1.0)
+        # A queue discharges at its flow, although its first vehicle is late on the next link.
+        late = np.minimum(START_S + speed / (2.0 * network.acceleration), network.length / wave)
+        # The newest count is that of now. Between two steps counts change evenly.
+        wave_steps = (network.length / wave - late) / self.dt + 1.0
         backwards = np.floor(wave_steps).astype(int)
         self._earlier = self.values(wave_steps - backwards)
         self._along = Delay(along[network.entry_link], self.device)
