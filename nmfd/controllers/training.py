@@ -210,6 +210,8 @@ def train(
         assert out is not None
         configuration = _configuration(strategy, planning, setup, task, seed, compiled)
         configuration["plant"] = plant
+        if plant == REGIONAL and planning.network.misleads:
+            configuration["model_warning"] = planning.network.misleads
         policy = first_policy(setup, planning, guidance=setup.guides)
         keeper = FileKeeper(policy, planning.network, configuration, out)
     else:
@@ -275,8 +277,6 @@ def _configuration(
     }
     if task.own:
         configuration["task"] = task.own
-    if planning.network.misleads:
-        configuration["model_warning"] = planning.network.misleads
     return configuration
 
 
