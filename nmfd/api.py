@@ -458,12 +458,12 @@ def train(
     chosen = training.settings(scenario, strategy, steps)
     device = training.available(device)
     file = None if policy is not None else _file(scenario, f"{strategy.name}.pt", out)
+    regional = plant == training.REGIONAL
     believed = strategy.planning(scenario).network
     for region, doubts in zip(believed.region_names, believed.doubts, strict=False):
-        if doubts:
+        if doubts and regional:
             problem = f"the model of region {region} is doubtful: {'; '.join(doubts)}"
             print(f"nmfd: {problem}", file=sys.stderr)
-    regional = plant == training.REGIONAL
     worth = policy is None and regional and chosen.steps >= training.WORTH_COMPILING
     try:
         with watched(strategy.name, progress) as show:
