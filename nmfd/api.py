@@ -331,7 +331,9 @@ def robustness(
     """
     scenario = loaded(scenario, steps=steps, demand=demand)
     strategies: list[Strategy] = [parse(REFERENCE)]
-    for strategy in parse_many(controllers, scenario, partial(_parse_for, "nmfd")):
+    for strategy in parse_many(
+        controllers, scenario, partial(_parse_for, benchmark_study.PERTURBED_PLANT)
+    ):
         if strategy.name != REFERENCE:
             strategies.append(strategy)
     key = key_of(scenario, strategies, benchmark_study.PERTURBED_PLANT, {})

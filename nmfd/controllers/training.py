@@ -493,9 +493,10 @@ class TrainingRun:
             x, demand = rollout.random_start(batch, 0.0, 0.0, generator, levels)
             x = x + largest * torch.rand(x.shape, generator=generator, dtype=torch.float32).to(x)
         else:
-            x, demand = rollout.random_start(
-                batch, DEMAND_SPREAD, RANDOM_START_SHARE, generator, levels
-            )
+            share = RANDOM_START_SHARE
+            if rollout.rough:
+                share = 0.0  # streets begin empty
+            x, demand = rollout.random_start(batch, DEMAND_SPREAD, share, generator, levels)
         noise_level = torch.rand(batch, generator=generator, dtype=torch.float32)
         return x, rollout.perturb(demand, noise_level, setup.noise, generator)
 

@@ -141,7 +141,6 @@ def key_of(
         strategy.make(scenario, policy)
         own[strategy.name] = strategy.fingerprint(scenario, policy)
         if strategy.labels:
-            plant_of(plant, scenario, strategy)  # or its error before the first run
             own[strategy.name]["labels"] = strategy.labels
     shared = {
         "scenario": scenario.name,
@@ -151,9 +150,13 @@ def key_of(
         "plant": plant,
     }
     if plant == LINKS:
+        from nmfd.model.links.model import choices_of
         from nmfd.model.links.plant import LinkPlant, links_file
 
-        LinkPlant(scenario)  # or its error before the first run
+        # Errors before the first run.
+        LinkPlant(scenario)
+        for strategy in strategies:
+            choices_of(scenario, strategy.labels)
         shared["links_hash"] = file_hash(links_file(scenario))
     return lambda name: {**shared, "controller": own[name]}
 

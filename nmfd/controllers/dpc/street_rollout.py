@@ -22,10 +22,10 @@ MOST_DELAYED = 10.0
 
 
 class Bound:
-    """Bound of the costates of vehicles: of derivatives of the loss.
+    """Bound of costates, the derivatives of the loss by vehicles.
 
-    One vehicle more counts for at most MOST_DELAYED vehicles that are there all the time. In a city
-    that locks they would grow without limit.
+    One vehicle more counts for at most MOST_DELAYED vehicles that are there all the time. Costates
+    in a city that locks would grow without limit.
     """
 
     def __init__(self) -> None:
@@ -65,20 +65,6 @@ class StreetRollout(Rollout):
         flows = streets.flows
         super().__init__(planning, flows.dtype, str(flows.device))
         self._streets = streets
-
-    def random_start(
-        self,
-        batch: int,
-        spread: float,
-        share: float,
-        generator: Generator,
-        levels: tuple[float, float] = (1.0, 1.0),
-    ) -> tuple[States, Demands]:
-        """Return empty cities, and demands (veh/s); arguments as Rollout's.
-
-        share: has no effect
-        """
-        return super().random_start(batch, spread, 0.0, generator, levels)
 
     def draw_model(
         self, batch: int, spread: float, generator: Generator, scale: float = 1.0

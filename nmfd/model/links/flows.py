@@ -237,7 +237,8 @@ class Flows:
         to_end = np.maximum(np.round(network.last * free_steps), 1).astype(int)
         flow = self._saturation(speed)
         self.speed = speed
-        self.wave = wave = flow / (1.0 / self.spacing - flow / speed)
+        wave = flow / (1.0 / self.spacing - flow / speed)
+        self.wave = wave
         # A queue discharges at its flow, although its first vehicle is late on the next link.
         late = np.minimum(START_S + speed / (2.0 * network.acceleration), network.length / wave)
         # The newest count is that of now. Between two steps counts change evenly.
