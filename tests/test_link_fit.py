@@ -9,6 +9,7 @@ from commands import cosim, error_line, good
 import cosim.api as api
 from cosim.evaluation import link_fit
 from cosim.evaluation.results import read
+from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.model.links.network import read_links
 
@@ -59,6 +60,16 @@ def test_runs_that_the_model_cannot_repeat(runs):
     alone = replace(found, levels=(replace(level, rows=rows),))
     with pytest.raises(InputError, match="no run that the link model can repeat"):
         link_fit.fit(alone, progress=False)
+
+
+def test_runs_are_repeated_with_the_options_of_their_whole_name():
+    """Two strategies of one controller can have options of their own."""
+    name = "pricing-rule+max-pressure+guidance-period-60+metering"
+    strategy = link_fit.strategy_in_links(name)
+    assert strategy.options(load_scenario("grid7_peak")).metering
+    guided = link_fit.strategy_in_links("route-guidance+max-pressure")
+    assert guided.labels == ("guided", "max-pressure")
+    assert link_fit.strategy_in_links("max-pressure").labels == ("max-pressure",)
 
 
 def test_a_folder_without_runs(tmp_path):

@@ -493,6 +493,13 @@ def test_a_word_that_streets_do_not_know_is_refused():
         api.run("grid7_peak", "no-control+planned", plant="links")
 
 
+def test_streets_meter_as_commanded_only():
+    with pytest.raises(InputError, match="pi-gating commands no rates; omit .metering"):
+        api.run("grid7_peak", "pi-gating+metering", plant="links", steps=1)
+    name = "pricing-rule+max-pressure+guidance-period-60+metering"
+    assert api.run("grid7_peak", name, plant="links", steps=1).controller == name
+
+
 def test_signals_that_choose_need_signals():
     scenario = api.load_scenario("grid7_peak", {"sumo.signals": "actuated"})
     network = read_links(links_file(scenario))

@@ -5,8 +5,8 @@ flows if there are any. Other runs show the error that is left. The model repeat
 controller of the run.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -17,17 +17,18 @@ from scipy.optimize import minimize
 from cosim.evaluation.links import link_network
 from cosim.evaluation.results import Finished
 from cosim.plant.settings import settings
-from cosim.plant.strategy import of_finished
+from cosim.plant.strategy import parse
 from nmfd import closed_loop
 from nmfd.api import loaded
+from nmfd.controllers.strategy import Strategy
 from nmfd.errors import InputError
 from nmfd.model.links.flows import Numbers
-from nmfd.model.links.model import Choices, choices_of
 from nmfd.model.links.network import LinkNetwork
-from nmfd.model.links.plant import LinkPlant
+from nmfd.model.planning import GUIDED
 from nmfd.model.scenario import Scenario
 from nmfd.runs.progress import Progress, watched
 from nmfd.runs.tables import NARROW, text_table, wrapped
+from nmfd.studies.benchmark import REFERENCE, check_labels, streets_of
 from nmfd.types import Result
 
 GUIDING = "route-guidance"  # by travel times, which the model calls guided
@@ -45,25 +46,46 @@ class Case:
     """A run in SUMO, and what repeats it in the link model.
 
     demand: factor
-    scenario: with the demand and the settings of the run
-    controller: name
+    scenario: with the demand of the run
+    strategy: as streets know it
     network: streets with the routes of the run's seed
     """
 
     run: Result
     demand: float
     scenario: Scenario
-    controller: str
+    strategy: Strategy
     network: LinkNetwork
 
     def repeated(self, numbers: Numbers) -> list[Result]:
         """Return the run in the link model, once for each of SEEDS."""
-        runs = []
-        for seed in SEEDS:
-            plant = LinkPlant(self.scenario, network=self.network, numbers=numbers)
-            controller = of_finished(self.controller).make(self.scenario)
-            runs.append(closed_loop.run(plant, controller, self.scenario, seed=seed))
-        return runs
+        return repeated(self.scenario, self.strategy, self.network, numbers, SEEDS)
+
+
+def repeated(
+    scenario: Scenario,
+    strategy: Strategy,
+    network: LinkNetwork,
+    numbers: Numbers | None,
+    seeds: Iterable[int],
+) -> list[Result]:
+    """Return runs of a strategy in the link model.
+
+    numbers: those of the network if None
+    """
+    runs = []
+    for seed in seeds:
+        plant = streets_of(scenario, strategy, network, numbers)
+        runs.append(closed_loop.run(plant, strategy.make(scenario), scenario, seed=seed))
+    return runs
+
+
+def strategy_in_links(name: str) -> Strategy:
+    """Return how streets know a strategy in SUMO. Raises InputError."""
+    strategy = parse(name)
+    if strategy.controller.name == GUIDING:
+        return parse("+".join([REFERENCE, GUIDED, *strategy.labels]))
+    return strategy
 
 
 class Fit(NamedTuple):
@@ -117,21 +139,13 @@ def cases_of(found: Finished) -> tuple[list[Case], list[str]]:
     networks: dict[tuple[float, int] | None, LinkNetwork] = {}
     for level in found.levels:
         for name in level.rows["controller"].unique():
-            strategy = of_finished(name)
-            changes = strategy.changes
-            if strategy.controller.name == GUIDING:
-                changes["guided"] = True
-            own = {key: value for key, value in changes.items() if key in Choices.model_fields}
             runs = level.results(name)
             steps = len(runs[0]["departures"])
             scenario = loaded(found.scenario, steps=steps, demand=level.demand)
-            scenario = replace(scenario, sumo={**scenario.sumo, **own})
-            controller = strategy.controller.name
-            if controller == GUIDING:
-                controller = "no-control"
             try:
-                choices_of(scenario)
-                of_finished(controller).make(scenario)
+                strategy = strategy_in_links(name)
+                check_labels(scenario, strategy)
+                strategy.make(scenario)
             except InputError as error:
                 left_out.append(f"{name} is left out: {error}")
                 continue
@@ -139,7 +153,7 @@ def cases_of(found: Finished) -> tuple[list[Case], list[str]]:
                 trips = None if recorded else (level.demand, run.seed)
                 if trips not in networks:
                     networks[trips] = link_network(scenario, [run.seed])
-                cases.append(Case(run, level.demand, scenario, controller, networks[trips]))
+                cases.append(Case(run, level.demand, scenario, strategy, networks[trips]))
     return cases, left_out
 
 

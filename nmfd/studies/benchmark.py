@@ -31,6 +31,9 @@ from nmfd.types import Plant, Result
 if TYPE_CHECKING:
     import pandas as pd
 
+    from nmfd.model.links.flows import Numbers
+    from nmfd.model.links.network import LinkNetwork
+    from nmfd.model.links.plant import LinkPlant
     from nmfd.runs.frame import Table
 
 PLANTS = ("nmfd", "acyclic", LINKS)
@@ -79,15 +82,49 @@ def compared_with(controllers: Iterable[str]) -> str:
 
 def plant_of(name: str, scenario: Scenario, strategy: Strategy) -> Plant:
     """Return one of PLANTS; the labels of the strategy change streets."""
-    from nmfd.model.links.plant import LinkPlant  # torch takes two seconds
-    from nmfd.model.plant import AcyclicPlant, NmfdPlant
+    from nmfd.model.plant import AcyclicPlant, NmfdPlant  # torch takes two seconds
 
     if name == LINKS:
-        gated = strategy.controller.name != REFERENCE
-        return LinkPlant(scenario, labels=strategy.labels, gated=gated)
+        return streets_of(scenario, strategy)
     if name == "acyclic":
         return AcyclicPlant(scenario)
     return NmfdPlant(scenario)
+
+
+def streets_of(
+    scenario: Scenario,
+    strategy: Strategy,
+    network: "LinkNetwork | None" = None,
+    numbers: "Numbers | None" = None,
+) -> "LinkPlant":
+    """Return the streets of a city under a strategy.
+
+    network, numbers: as of LinkPlant
+    Raises: InputError for labels that streets do not know
+    """
+    from nmfd.model.links.plant import LinkPlant
+
+    check_labels(scenario, strategy)
+    gated = strategy.controller.name != REFERENCE
+    return LinkPlant(
+        scenario, network=network, numbers=numbers, labels=strategy.labels, gated=gated
+    )
+
+
+def check_labels(scenario: Scenario, strategy: Strategy) -> None:
+    """Raise InputError for labels that streets do not know."""
+    from nmfd.model.links.model import METERING, choices_of
+
+    choices_of(scenario, strategy.labels)
+    options = strategy.options(scenario)
+    if METERING not in strategy.labels or options is None:
+        return
+    if not getattr(options, METERING, False):
+        raise InputError(
+            f"{strategy.name}: streets (plant links) meter only as a controller commands, and "
+            f"{strategy.controller.name} commands no rates; omit +{METERING}, or run it in SUMO "
+            "(cosim)"
+        )
 
 
 def closed_loop_of(
@@ -150,13 +187,12 @@ def key_of(
         "plant": plant,
     }
     if plant == LINKS:
-        from nmfd.model.links.model import choices_of
         from nmfd.model.links.plant import LinkPlant, links_file
 
         # Errors before the first run.
         LinkPlant(scenario)
         for strategy in strategies:
-            choices_of(scenario, strategy.labels)
+            check_labels(scenario, strategy)
         shared["links_hash"] = file_hash(links_file(scenario))
     return lambda name: {**shared, "controller": own[name]}
 

@@ -14,13 +14,11 @@ import numpy as np
 import pandas as pd
 
 import nmfd
-from cosim.evaluation.link_fit import GUIDING, locks
+from cosim.evaluation.link_fit import locks, repeated, strategy_in_links
 from cosim.evaluation.links import link_network
-from cosim.plant.strategy import of_finished
-from nmfd import closed_loop
 from nmfd.api import loaded
 from nmfd.controllers.rules import Constant
-from nmfd.model.links.model import Choices
+from nmfd.controllers.strategy import parse
 
 SEEDS = (0, 1, 2)  # of the link model
 
@@ -37,27 +35,14 @@ def metered(network: nmfd.RegionalModel, rate: float) -> nmfd.Controller:
 
 def in_links(run: nmfd.Result) -> list[nmfd.Result]:
     """Return runs of the link model with the same demand, trips and controls."""
-    strategy = of_finished(run.controller)
-    name = strategy.controller.name
-    city = {"sumo.guided": name == GUIDING}
-    for key, value in strategy.changes.items():
-        if key in Choices.model_fields:
-            city[f"sumo.{key}"] = value
-    scenario = nmfd.load_scenario(run.data.attrs["scenario"], city)
+    scenario = nmfd.load_scenario(run.data.attrs["scenario"])
     scenario = loaded(scenario, demand=run.data.attrs["demand"])
     network = link_network(scenario, [run.seed])
-    runs = []
-    first = run.controller.partition("+")[0]
-    for seed in SEEDS:
-        if first.startswith("rate-"):
-            controller = metered(scenario.network, float(first.removeprefix("rate-")))
-        elif name == GUIDING:
-            controller = nmfd.controller("no-control", scenario)
-        else:
-            controller = nmfd.controller(name, scenario)
-        plant = nmfd.LinkPlant(scenario, network=network)
-        runs.append(closed_loop.run(plant, controller, scenario, seed=seed))
-    return runs
+    rate = run.controller.partition("+")[0].removeprefix("rate-")
+    if rate == run.controller.partition("+")[0]:
+        return repeated(scenario, strategy_in_links(run.controller), network, None, SEEDS)
+    strategy = parse(metered(scenario.network, float(rate)))
+    return repeated(scenario, strategy, network, None, SEEDS)
 
 
 @click.command()

@@ -40,6 +40,7 @@ OPEN_SHARE = 0.95  # of what a boundary can let through; above it a gate is open
 
 Signals = Literal["fixed", "actuated", "max-pressure"]
 SHARES = ("rerouting", "compliance")  # choices that labels give in percent
+METERING = "metering"  # label of a controller that commands rates
 
 
 class Choices(config.Settings):
@@ -88,7 +89,7 @@ def _changes(labels: Sequence[str]) -> dict[str, Any]:
             changes["guided"] = True
         elif word in SHARES and number.isdigit():
             changes[word] = int(number) / 100.0
-        elif label != "metering" and word != "guidance-period":
+        elif label != METERING and word != "guidance-period":
             known = ", ".join([*get_args(Signals), GUIDED, *(f"{share}-30" for share in SHARES)])
             raise InputError(
                 f"+{label}: streets (plant links) know {known}, metering and guidance-period-60; "
