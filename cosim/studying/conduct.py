@@ -56,7 +56,7 @@ def conducted(
             skipped = runner.impossible()
             levels = []
             for level in demands:
-                levels.append(_level(runner, level, found.reason, skipped, most_seeds))
+                levels.append(judged_level(runner, level, found.reason, skipped, most_seeds))
             place = str(source)
             if own:
                 place = str(folder / "scenarios" / found.scenario.name)
@@ -75,7 +75,7 @@ def conducted(
     return finished
 
 
-def _level(
+def judged_level(
     runner: Runner, level: float, no_gates: str, impossible: Mapping[str, str], most_seeds: int
 ) -> Level:
     """Judge the strategies that may change something at a demand level."""
