@@ -49,14 +49,7 @@ def conducted(
             found = stages.gates(runner, load, own=own)
             runner = replace(runner, scenario=found.scenario)
             demands = sorted({1.0, load.under})
-            if own and not found.reason:
-                far = [stages.far_from_critical(runner, level) for level in demands]
-                if not all(far):
-                    stages.train_gates(found.scenario)
-            skipped = runner.impossible()
-            levels = []
-            for level in demands:
-                levels.append(judged_level(runner, level, found.reason, skipped, most_seeds))
+            levels = judged_levels(runner, demands, found.reason, most_seeds, trained=own)
             place = str(source)
             if own:
                 place = str(folder / "scenarios" / found.scenario.name)
@@ -75,7 +68,24 @@ def conducted(
     return finished
 
 
-def judged_level(
+def judged_levels(
+    runner: Runner, demands: Sequence[float], no_gates: str, most_seeds: int, *, trained: bool
+) -> list[Level]:
+    """Judge the strategies at demand levels.
+
+    demands: of finished loading runs
+    no_gates: why gates are left out, "" if they are not
+    trained: a policy for the gates is trained, if they may close
+    """
+    if trained and not no_gates:
+        far = [stages.far_from_critical(runner, level) for level in demands]
+        if not all(far):
+            stages.train_gates(runner.scenario)
+    skipped = runner.impossible()
+    return [_level(runner, level, no_gates, skipped, most_seeds) for level in demands]
+
+
+def _level(
     runner: Runner, level: float, no_gates: str, impossible: Mapping[str, str], most_seeds: int
 ) -> Level:
     """Judge the strategies that may change something at a demand level."""

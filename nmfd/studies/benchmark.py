@@ -119,7 +119,8 @@ def check_labels(scenario: Scenario, strategy: Strategy) -> None:
     options = strategy.options(scenario)
     if METERING not in strategy.labels or options is None:
         return
-    if not getattr(options, METERING, False):
+    commands_rates = getattr(options, "metering", False)
+    if not commands_rates:
         raise InputError(
             f"{strategy.name}: streets (plant links) meter only as a controller commands, and "
             f"{strategy.controller.name} commands no rates; omit +{METERING}, or run it in SUMO "

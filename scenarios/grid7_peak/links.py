@@ -21,6 +21,7 @@ from nmfd.controllers.rules import Constant
 from nmfd.controllers.strategy import parse
 
 SEEDS = (0, 1, 2)  # of the link model
+RATE = "rate-"  # how the name of a constant rate of metering begins
 
 
 def metered(network: nmfd.RegionalModel, rate: float) -> nmfd.Controller:
@@ -30,7 +31,7 @@ def metered(network: nmfd.RegionalModel, rate: float) -> nmfd.Controller:
     """
     metering = np.full(network.regions, rate)
     controls = nmfd.Controls(perimeter=network.open_perimeter, metering=metering)
-    return Constant(f"rate-{rate:g}", controls)
+    return Constant(f"{RATE}{rate:g}", controls)
 
 
 def in_links(run: nmfd.Result) -> list[nmfd.Result]:
@@ -38,10 +39,12 @@ def in_links(run: nmfd.Result) -> list[nmfd.Result]:
     scenario = nmfd.load_scenario(run.data.attrs["scenario"])
     scenario = loaded(scenario, demand=run.data.attrs["demand"])
     network = link_network(scenario, [run.seed])
-    rate = run.controller.partition("+")[0].removeprefix("rate-")
-    if rate == run.controller.partition("+")[0]:
-        return repeated(scenario, strategy_in_links(run.controller), network, None, SEEDS)
-    strategy = parse(metered(scenario.network, float(rate)))
+    name = run.controller.partition("+")[0]
+    if name.startswith(RATE):
+        rate = float(name.removeprefix(RATE))
+        strategy = parse(metered(scenario.network, rate))
+    else:
+        strategy = strategy_in_links(run.controller)
     return repeated(scenario, strategy, network, None, SEEDS)
 
 

@@ -1,6 +1,6 @@
 """Compare verdicts of `cosim study` with ten seeds that the study did not see.
 
-    python scenarios/verdicts/verdicts.py hamburg/run_simulation.sumocfg --level 1 --level 1.3
+    python scenarios/verdicts/verdicts.py hamburg/run_simulation.sumocfg
 
 A verdict comes from three seeds or more, as the study stops early; the ten other seeds are judged
 by the same rule. Finished runs are kept: the same command goes on after an interruption.
@@ -12,7 +12,8 @@ from pathlib import Path
 import click
 import pandas as pd
 
-from cosim.studying import conduct, stages
+from cosim.studying import stages
+from cosim.studying.conduct import judged_levels
 from cosim.studying.stages import Level, Runner
 from nmfd.runs.run_many import locked
 from nmfd.studies.benchmark import REFERENCE
@@ -30,14 +31,10 @@ def judged(city: Path, out: Path, levels: list[float], workers: int) -> pd.DataF
         load = stages.loading(runner)
         found = stages.gates(runner, load, own=True)
         runner = replace(runner, scenario=found.scenario)
-        for demand in levels:
-            runner.done([REFERENCE], [demand], [stages.LOADING_SEED])
-            if not (found.reason or stages.far_from_critical(runner, demand)):
-                stages.train_gates(found.scenario)
-            impossible = runner.impossible()
-            level = conduct.judged_level(runner, demand, found.reason, impossible, MOST_SEEDS)
+        runner.done([REFERENCE], levels, [stages.LOADING_SEED])
+        for level in judged_levels(runner, levels, found.reason, MOST_SEEDS, trained=True):
             names = [one.strategy for one in level.outcomes]
-            others = runner.done(names, [demand], OTHER_SEEDS)
+            others = runner.done(names, [level.demand], OTHER_SEEDS)
             rows += compared(city.parent.name, level, others)
     return pd.DataFrame(rows)
 
