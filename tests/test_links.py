@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from nmfd.model.links.flows import BETWEEN_M, REACTION
 from nmfd.model.links.model import Choices, Commands, LinkModel, choices_of
 from nmfd.model.links.network import LinkNetwork, read_links
 from nmfd.model.links.plant import LinkPlant, links_file
+from nmfd.model.links.recompute import Recordings
 from nmfd.model.links.signals import GAP_S, Lights
 
 CYCLE_S = 60
@@ -109,13 +111,14 @@ def triangle(length: float = 300.0) -> LinkNetwork:
     )
 
 
-def model_of(network: LinkNetwork | None = None, **choices) -> LinkModel:
+def model_of(network: LinkNetwork | None = None, device: str = "cpu", **choices) -> LinkModel:
     return LinkModel(
         network or triangle(),
         STEP_S,
         nominal=NOMINAL,
         choices=Choices(**choices),
         dtype=torch.float64,
+        device=device,
     )
 
 
@@ -242,7 +245,7 @@ def test_vehicles_turn_by_chance_as_often_as_on_average():
     model = model_of()
     state = model.start(1, [1], chance=True)
     entry = model.flows.places(np.array([0, 0, 2]))
-    choice = model._ways(state, Commands()).choice
+    choice = model._ways(state, Commands(), state.chance).choice
     taken = [choice.cells(torch.full((1, 3), float(n))).tolist()[0] for n in range(DRAWS)]
     assert sorted(set(np.array(taken).ravel())) == [0.0, 1.0]
     assert np.bincount(entry, taken[0]).tolist() == [1.0, 0.0, 1.0]
@@ -434,6 +437,59 @@ def test_gradients_of_grid7_are_those_of_central_differences():
         up, down = spent(torch.cat([numbers + change, numbers - change])).chunk(2)
     differences = (up - down) / 2e-5
     torch.testing.assert_close(gradient[0], differences, rtol=1e-3, atol=0.0)
+
+
+def spent_and_slope(model, chance):
+    """Time spent by two rollouts under all commands, and its derivative by the demand."""
+    device = model.flows.device
+    rate = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
+    commands = [part.to(device) for part in all_commands(price=2.0)]
+    state = model.start(2, [3, 4], chance=chance)
+    for _ in range(4):
+        demand = torch.cat([demand_of(rate), demand_of(rate)]).to(device)
+        state = model.advance(state, demand, Commands(*commands))
+    spent = state.spent.sum()
+    return spent.cpu(), *torch.autograd.grad(spent, rate)
+
+
+class FakeGraph(NamedTuple):
+    """Stands in for a CUDA graph, by running what it would have recorded."""
+
+    run: Any
+    own: list
+    after: list
+
+    def replay(self):
+        for place, part in zip(self.after, self.run(self.own)[0], strict=True):
+            if isinstance(place, torch.Tensor):
+                place.copy_(part.detach())
+
+    @classmethod
+    def record(cls, run, given):
+        own, after = [
+            [part.detach().clone() if isinstance(part, torch.Tensor) else part for part in parts]
+            for parts in (given, run(given)[0])
+        ]
+        return own, cls(run, own, after), after, run(given)[1]
+
+
+@pytest.mark.parametrize("signals", [{}, {"signals": "max-pressure"}, ACTUATED])
+def test_recordings_give_the_same(signals, monkeypatch):
+    model = model_of(**signals)
+    plain = spent_and_slope(model, chance=True)
+    monkeypatch.setattr(Recordings, "_record", FakeGraph.record)
+    model._play = Recordings().play
+    for _ in range(2):
+        torch.testing.assert_close(spent_and_slope(model, chance=True), plain, rtol=0.0, atol=0.0)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+@pytest.mark.parametrize("signals", [{}, {"signals": "max-pressure"}, ACTUATED])
+def test_a_gpu_gives_the_same(signals):
+    plain = spent_and_slope(model_of(**signals), chance=False)
+    model = model_of(device="cuda", **signals)
+    for _ in range(2):
+        torch.testing.assert_close(spent_and_slope(model, chance=False), plain)
 
 
 def test_a_batch_gives_what_single_rollouts_give():

@@ -52,7 +52,6 @@ VALIDATION_PERIOD = 20  # Adam steps
 SCORE = "validation_veh_s"  # of a policy in its file
 VALIDATION_ROLLOUTS = 16  # perturbed rollouts in a validation, if training perturbs demand or model
 ROUGH_PERIOD = 4  # as VALIDATION_PERIOD, through streets
-ROUGH_BATCH = 6  # rollouts in an Adam step there, each of which takes some seconds
 JUMP = 0.1
 WORTH_COMPILING = 200  # Adam steps
 # A policy that begins as no control must gain WORTH in validation. Otherwise one is kept whose
@@ -217,7 +216,7 @@ def train(
     else:
         keeper = ModuleKeeper(module)
         setup = setup.changed(from_gating=False, from_no_control=False)  # it begins as it is
-    if isinstance(keeper.policy, CompactPolicy):
+    if isinstance(keeper.policy, CompactPolicy) and plant == REGIONAL:
         device = "cpu"  # a few numbers
     dtype = next(keeper.policy.parameters()).dtype
     if plant == LINKS:
@@ -413,7 +412,7 @@ class TrainingRun:
         falling = self._setup.learning_rate * (0.1 + 0.9 * cosine)
         for group in self._optimizer.param_groups:
             group["lr"] = self._rate * (self._recipe.learning_rate or falling)
-        batch = ROUGH_BATCH if self._rollout.rough else self._recipe.batch
+        batch = self._rollout.batch or self._recipe.batch
         loss = self._loss(self._generator, batch, self._advance)
         if not loss.requires_grad:
             raise InputError(
@@ -590,14 +589,15 @@ def validate(policy: Policy, rollout: Rollout, seed: int, setup: Dpc) -> float:
     """Return the total time spent (veh s) of the scenario itself.
 
     It is a geometric mean over two draws of the noise. If training perturbs demand or model, or
-    rollouts are rough, there are VALIDATION_ROLLOUTS more under increasing perturbations.
+    rollouts are rough, there are VALIDATION_ROLLOUTS or a batch more under increasing
+    perturbations.
     """
     generator = Generator().manual_seed(seed)
     low = setup.demand_low
     high = setup.demand_high
     count = 2
     if setup.noise or setup.mfd_spread or low < high or rollout.rough:
-        count += VALIDATION_ROLLOUTS
+        count += max(VALIDATION_ROLLOUTS, rollout.batch or 0)
     rollout.draw_model(count, setup.mfd_spread, generator, setup.mfd_scale)
     level = torch.linspace(0.0, 1.0, count // 2, dtype=torch.float32).repeat_interleave(2)
     nominal = rollout.demand.unsqueeze(1).expand(-1, count, -1, -1)

@@ -136,7 +136,7 @@ class CompactPolicy(Policy):
     def load_state_dict(self, weights: Any, *args: Any, **options: Any) -> Any:
         """Load weights; those of an older file lack the last numbers."""
         given = weights["numbers"]
-        missing = torch.tensor(Numbers()[len(given) :], dtype=given.dtype)
+        missing = given.new_tensor(Numbers()[len(given) :])
         weights = {**weights, "numbers": torch.cat([given, missing])}
         return super().load_state_dict(weights, *args, **options)
 

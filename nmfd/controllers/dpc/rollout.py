@@ -56,9 +56,11 @@ class Rollout:
     Random numbers are drawn on the CPU, so that devices agree.
 
     rough: True if rollouts of the same demand differ, and their total may jump
+    batch: rollouts in an Adam step; None: those of the settings
     """
 
     rough: ClassVar[bool] = False
+    batch: int | None = None
 
     def __init__(
         self,

@@ -41,32 +41,31 @@ class Choice(NamedTuple):
         return taken + (self.shares - self.shares.detach())
 
 
-class Chance:
-    """Draws of B rollouts."""
+class Chance(NamedTuple):
+    """Draws of B rollouts.
 
-    def __init__(self, seeds: Sequence[int], entries: int, entry: Tensor):
-        """seeds: of the rollouts; entries: E; entry: that each cell leaves (C,)"""
-        uniform = []
-        for seed in seeds:
-            generator = torch.Generator().manual_seed(seed)
-            uniform.append(torch.rand(DRAWS, entries, generator=generator))
-        self._draws = torch.stack(uniform).to(entry.device)
-        self._entry = entry
-        self._order = torch.argsort(entry, stable=True)
-        self._place = torch.argsort(self._order)
-        sizes = torch.bincount(entry, minlength=entries)
-        self._first = (torch.cumsum(sizes, 0) - sizes)[entry]
+    draws: of the vehicles of each entry, one after the other (-, (B, DRAWS, E))
+    entry: entry that each cell leaves (C,)
+    order: cells in the order of their entries; place: of each cell in it (C,)
+    first: place of the first cell of the same entry (C,)
+    """
+
+    draws: Tensor
+    entry: Tensor
+    order: Tensor
+    place: Tensor
+    first: Tensor
 
     def choice(self, shares: Tensor) -> Choice:
         """Return how cells with these shares (-, (B, C)) are drawn."""
-        ordered = shares.detach().double().index_select(1, self._order)
+        ordered = shares.detach().double().index_select(1, self.order)
         total = torch.cumsum(ordered, 1)
         before = total - ordered
-        begin = before.index_select(1, self._first)
-        low = before.index_select(1, self._place) - begin
-        high = total.index_select(1, self._place) - begin
-        dtype = self._draws.dtype
-        return Choice(shares, low.to(dtype), high.to(dtype), self._draws, self._entry)
+        begin = before.index_select(1, self.first)
+        low = before.index_select(1, self.place) - begin
+        high = total.index_select(1, self.place) - begin
+        dtype = self.draws.dtype
+        return Choice(shares, low.to(dtype), high.to(dtype), self.draws, self.entry)
 
     def trips(self, before: Tensor, due: Tensor) -> Tensor:
         """Return the whole trips that begin in a step, by entry (veh, (B, E)).
@@ -74,6 +73,21 @@ class Chance:
         before: trips that were due before, on average
         due: those of the step
         """
-        start = before.detach() + self._draws[:, 0]
+        start = before.detach() + self.draws[:, 0]
         whole = (start + due.detach()).floor() - start.floor()
         return whole + (due - due.detach())
+
+
+def chance_of(seeds: Sequence[int], entries: int, entry: Tensor) -> Chance:
+    """Return the draws of rollouts with these seeds.
+
+    entries: E; entry: that each cell leaves (C,)
+    """
+    uniform = []
+    for seed in seeds:
+        generator = torch.Generator().manual_seed(seed)
+        uniform.append(torch.rand(DRAWS, entries, generator=generator))
+    order = torch.argsort(entry, stable=True)
+    sizes = torch.bincount(entry, minlength=entries)
+    first = (torch.cumsum(sizes, 0) - sizes)[entry]
+    return Chance(torch.stack(uniform).to(entry.device), entry, order, torch.argsort(order), first)

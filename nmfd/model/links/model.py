@@ -9,11 +9,11 @@ from torch import Tensor
 
 from nmfd.arrays import PerTurn
 from nmfd.errors import InputError
-from nmfd.model.links.chance import Chance
+from nmfd.model.links.chance import Chance, chance_of
 from nmfd.model.links.drivers import Drivers
 from nmfd.model.links.flows import LEAST, Flows, Numbers, Traffic, Ways
 from nmfd.model.links.network import LinkNetwork
-from nmfd.model.links.recompute import run_again
+from nmfd.model.links.recompute import Recordings, at_once, run_again
 from nmfd.model.links.signals import (
     ACTUATED,
     FIXED,
@@ -188,6 +188,7 @@ class LinkModel:
             self._signals = Actuated(self.flows, gateways_fixed=fixed)
             self._gates = Gates(self.flows, by_cycle=not fixed)
         self._programmes = Programmes(self.flows, self._gates.opens)
+        self._play = Recordings().play if self.flows.device.type == "cuda" else at_once
         self._drivers = Drivers(self.flows, nominal)
         self._number()
 
@@ -213,6 +214,8 @@ class LinkModel:
         lanes = np.bincount(served, minlength=flows.movements)[gated]
         total = np.bincount(boundary, lanes, regions**2)[boundary]
         self._weight_of_gate = flows.values(lanes / total)
+        obeys = np.bincount(boundary, minlength=regions**2) > 0
+        self._obeys = torch.as_tensor(obeys.reshape(regions, regions), device=flows.device)
 
     def start(self, batch: int, draws: Sequence[int] = (0,), *, chance: bool = False) -> LinkState:
         """Return the empty city at the beginning of interval 0.
@@ -227,7 +230,7 @@ class LinkModel:
         traffic = flows.start(batch)
         by_chance = None
         if chance:
-            by_chance = Chance(seeds.tolist(), flows.entries, flows.entry_of_cell)
+            by_chance = chance_of(seeds.tolist(), flows.entries, flows.entry_of_cell)
         return LinkState(
             interval=0,
             draw=flows.places(draw),
@@ -248,9 +251,32 @@ class LinkModel:
 
         demand: trips that are due (veh/s, (B, R, R))
         """
-        return run_again(self._advance, state, demand, commands)
+        gates = commands.gates
+        opened = gates is not None and bool((gates >= OPEN_SHARE).all())
+        if opened:
+            commands = commands._replace(gates=None)
+        programme = self._programmes.read(state.interval * self.step, self._steps)
+        # Intervals are alike but for the steps in which signals decide.
+        period = 1 if self._signals is None else self._signals.period
+        alike = state._replace(interval=state.interval % period, chance=None)
+        after = run_again(
+            self._advance, alike, demand, commands, programme, state.chance, play=self._play
+        )
+        after = after._replace(interval=state.interval + 1, chance=state.chance)
+        return after._replace(realised=gates) if opened else after
 
-    def _advance(self, state: LinkState, demand: PerPair, commands: Commands) -> LinkState:
+    def _advance(
+        self,
+        state: LinkState,
+        demand: PerPair,
+        commands: Commands,
+        programme: tuple[Tensor, Tensor, Tensor],
+        chance: Chance | None,
+    ) -> LinkState:
+        """Return the state by tensors alone, so that a GPU can record it.
+
+        programme: as of Programmes.read
+        """
         flows = self.flows
         dt = flows.dt
         traffic = state.traffic
@@ -258,15 +284,11 @@ class LinkModel:
         stages = state.stages
         origin = self._origin.index_select(0, state.draw)
         due = demand.flatten(1).index_select(1, self._pair_of_entry) * origin * dt
-        light, yields, opens = self._programmes.read(state.interval * self.step, self._steps)
-        opens = opens[:, self._gates.movements]
-        ways = self._ways(state, commands)
+        light, yields, opens = programme
+        opens = opens.index_select(1, self._gates.places)
+        ways = self._ways(state, commands, chance)
         gates = commands.gates
         realised = torch.ones_like(state.realised)
-        if gates is not None:
-            realised = gates
-            if bool((gates >= OPEN_SHARE).all()):
-                gates = None
         mean_share = torch.zeros_like(used)
         present = torch.zeros_like(traffic.inside)
         outside = torch.zeros_like(traffic.inside)
@@ -275,8 +297,8 @@ class LinkModel:
         begun = state.begun
         for n in range(self._steps):
             whole = due
-            if state.chance is not None:
-                whole = state.chance.trips(asked, due)
+            if chance is not None:
+                whole = chance.trips(asked, due)
             asked = asked + due
             begun = begun + whole.sum(1)
             released = whole
@@ -308,7 +330,7 @@ class LinkModel:
             traffic=traffic,
             used=used,
             stages=stages,
-            chance=state.chance,
+            chance=None,
             asked=asked,
             begun=begun,
             spent=state.spent + dt * (present.sum(1) + outside.sum(1) + held.sum(1)),
@@ -317,7 +339,7 @@ class LinkModel:
             realised=realised,
         )
 
-    def _ways(self, state: LinkState, commands: Commands) -> Ways:
+    def _ways(self, state: LinkState, commands: Commands, chance: Chance | None = None) -> Ways:
         """Return the ways of an interval."""
         choices = self._choices
         drivers = self._drivers
@@ -332,7 +354,7 @@ class LinkModel:
         elif compliance > 0.0:
             cells = drivers.by_times(static, state.present, state.gone, commands.prices)
         cells = static + compliance * (cells - static)
-        return self.flows.ways(cells.to(self.flows.dtype), state.draw, state.chance)
+        return self.flows.ways(cells.to(self.flows.dtype), state.draw, chance)
 
     def _metered(
         self, traffic: Traffic, due: Tensor, metering: PerRegion | None
@@ -366,9 +388,7 @@ class LinkModel:
         """
         regions = self.network.regions
         given = self.flows.sums(share * self._weight_of_gate, self._boundary_of_gate, regions**2)
-        obeys = torch.zeros(regions**2, dtype=torch.bool, device=given.device)
-        obeys[self._boundary_of_gate] = True
-        return torch.where(obeys.view(regions, regions), given.view(-1, regions, regions), gates)
+        return torch.where(self._obeys, given.view(-1, regions, regions), gates)
 
     def accumulation(self, state: LinkState) -> PerPair:
         """Return the vehicles in region i bound for j (veh, (B, R, R))."""

@@ -84,7 +84,12 @@ class Phases(NamedTuple):
 
 
 class Responsive(Protocol):
-    """Signals that follow the traffic; their state is Stages or Phases."""
+    """Signals that follow the traffic; their state is Stages or Phases.
+
+    period: steps between their decisions
+    """
+
+    period: int
 
     def start(self, batch: int) -> Any:
         """Return the state before the first step."""
@@ -221,7 +226,7 @@ class MaxPressure:
         self._gain_stage = flows.places(network.gain_stage)
         self._gain_movement = flows.places(network.gain_movement)
         self._gain = flows.values(network.gain)
-        self._period = max(round(DECISION_PERIOD_S / flows.dt), 1)
+        self.period = max(round(DECISION_PERIOD_S / flows.dt), 1)
 
     def start(self, batch: int) -> Stages:
         """Return the state at first: all signals in their first stage."""
@@ -234,7 +239,7 @@ class MaxPressure:
         self, number: int, stages: Stages, traffic: Traffic, programme: Lights
     ) -> tuple[Stages, Lights]:
         """Return the state and the lights of a step, as `Responsive`."""
-        if number % self._period == 0:
+        if number % self.period == 0:
             with torch.no_grad():
                 stages = self._decide(stages, traffic.inside)
         dt = self._flows.dt
@@ -301,6 +306,8 @@ class MaxPressure:
 
 class Actuated:
     """Signals that extend green while vehicles arrive."""
+
+    period = 1
 
     def __init__(self, flows: Flows, *, gateways_fixed: bool):
         """gateways_fixed: signals of gated movements keep their programmes"""
