@@ -12,6 +12,7 @@ from commands import good, last_words, nmfd
 from nmfd import ledger
 from nmfd.api import load_scenario
 from nmfd.model import acyclic, dynamics
+from nmfd.model.integration import counted
 from nmfd.model.plant import AcyclicPlant, NmfdPlant
 
 PLANTS = pytest.mark.parametrize("make", [NmfdPlant, AcyclicPlant])
@@ -49,7 +50,11 @@ def test_what_is_counted_is_missing(scenario, integrator, substeps):
     theta, _ = acyclic.shares(model, scenario.network.nominal_splits)
     state = random.uniform(0.0, 50.0, len(model.region))
     options = {"integrator": integrator, "substeps": substeps}
-    after, ended = acyclic.advance_counted(model, state, demand, perimeter, theta, 30.0, **options)
+
+    def slope(x):
+        return acyclic.derivative(model, x, demand, perimeter, theta)
+
+    after, ended = counted(slope, state, 30.0, **options)
     assert ended == pytest.approx(state.sum() + 30.0 * demand.sum() - after.sum(), abs=1e-9)
 
 

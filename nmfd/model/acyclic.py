@@ -20,13 +20,11 @@ After Tumu et al. (see `dynamics`), with three corrections of the published text
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from nmfd.arrays import PerPair, PerRegion, PerTurn
-from nmfd.model.integration import counted
 from nmfd.model.mfd import Mfd, stacked
 from nmfd.model.regional_model import LEAST_ROOM, RegionalModel, passing_share
 
@@ -200,20 +198,3 @@ def transfers(
     room = np.maximum(1.0 - accumulation / model.storage, LEAST_ROOM)
     share = passing_share(wish_of_boundary, perimeter * model.capacity * room)
     return share[here, model.move_next] * wish
-
-
-def advance_counted(
-    model: Acyclic,
-    x: PerCell,
-    demand: PerPair,
-    perimeter: PerPair,
-    theta: PerMove,
-    step: float,
-    **scheme: Any,
-) -> tuple[PerCell, float]:
-    """Return x after one control interval and the completed trips [veh].
-
-    step: length of the interval, in which all inputs are constant (s)
-    scheme: integrator and substeps (nmfd.model.integration.integrated)
-    """
-    return counted(lambda x: derivative(model, x, demand, perimeter, theta), x, step, **scheme)

@@ -6,6 +6,7 @@ import torch
 from nmfd import ledger
 from nmfd.arrays import PerPair, PerTurn
 from nmfd.model import acyclic, dynamics
+from nmfd.model.integration import counted
 from nmfd.model.scenario import Scenario
 from nmfd.types import Controls, Observation, State
 
@@ -148,7 +149,9 @@ class AcyclicPlant(NmfdPlant):
             passing = acyclic.transfers(model, self._x, leaving, perimeter, theta)
             moved = float(passing[model.fallback[forced]].sum())
             self.forced_moves += self._scenario.step * moved
-        self._x, ended = acyclic.advance_counted(
-            model, self._x, demand, perimeter, theta, **self._scenario.scheme
-        )
+
+        def slope(x: acyclic.PerCell) -> tuple[acyclic.PerCell, float]:
+            return acyclic.derivative(model, x, demand, perimeter, theta)
+
+        self._x, ended = counted(slope, self._x, **self._scenario.scheme)
         return ended
