@@ -60,18 +60,17 @@ class Study:
     def recommended(self) -> tuple[Level, Outcome] | None:
         """The strategy to recommend, and its demand.
 
-        That is the simplest one that is not told apart from the best.
+        That is the simplest one that is not told apart from the best: on the common seeds, the best
+        one is not shown to save more.
         """
         found = self.best
         if found is None:
             return None
         level, best = found
-        simplest_first = list(LABELS)
-        alike = []
-        for one in level.outcomes:
-            if self._sound(one) and not told_apart(best, one):
-                alike.append(one)
-        return level, min(alike, key=lambda one: simplest_first.index(one.strategy))
+        for one in level.outcomes:  # the simplest first
+            if self.sound(one) and compared(best.spent, one.spent).answer is not Answer.GAINS:
+                return level, one
+        return found
 
     @property
     def best(self) -> tuple[Level, Outcome] | None:
@@ -81,56 +80,34 @@ class Study:
         leaves more trips unserved at any demand.
         """
         for level in self.levels:
-            sound = [one for one in level.outcomes if self._sound(one)]
+            sound = [one for one in level.outcomes if self.sound(one)]
             if sound:
                 return level, min(sound, key=_percent)
         return None
 
-    def _sound(self, candidate: Outcome) -> bool:
+    def sound(self, candidate: Outcome) -> bool:
         """Return True if a strategy gains here and does no harm anywhere."""
-        verdict = candidate.verdict
-        if verdict is None or verdict.answer is not Answer.GAINS:
+        if candidate.answer is not Answer.GAINS:
             return False
-        for level in self.levels:
-            for one in level.outcomes:
-                if one.strategy == candidate.strategy and (harmful(one) or not one.serves):
-                    return False
+        for one in self.outcomes:
+            if one.strategy == candidate.strategy and (harmful(one) or not one.serves):
+                return False
         return True
 
     @property
-    def only_today(self) -> Outcome | None:
-        """The strategy that saves most today, but not at other demand.
-
-        There it harms, or leaves trips unserved.
-        """
-        gaining = []
-        for one in self.levels[0].outcomes:
-            gains = one.verdict is not None and one.verdict.answer is Answer.GAINS
-            if gains and one.serves and not self._sound(one):
-                gaining.append(one)
-        return min(gaining, key=_percent, default=None)
+    def outcomes(self) -> list[Outcome]:
+        """Strategies at all demand levels."""
+        return [one for level in self.levels for one in level.outcomes]
 
     @property
-    def undecided(self) -> list[tuple[Level, Outcome]]:
-        """Strategies whose verdict is open, at their demand."""
-        found = []
-        for level in self.levels:
-            for one in level.outcomes:
-                if one.verdict is not None and one.verdict.answer is Answer.UNKNOWN:
-                    found.append((level, one))
-        return found
-
-
-def told_apart(best: Outcome, other: Outcome) -> bool:
-    """Return True if the common seeds show that the best one saves more."""
-    return compared(best.spent, other.spent).answer is Answer.GAINS
+    def undecided(self) -> list[Outcome]:
+        """Strategies whose verdict is open."""
+        return [one for one in self.outcomes if one.answer is Answer.UNKNOWN]
 
 
 def harmful(one: Outcome) -> bool:
     """Return True if harm is the verdict, or likelier than not."""
-    if one.verdict is None:
-        return False
-    return one.verdict.answer is Answer.HARMS or one.verdict.odds.harms > 0.5
+    return one.verdict is not None and one.verdict.odds.harms > 0.5
 
 
 def _percent(one: Outcome) -> float:
@@ -144,34 +121,36 @@ def answer(study: Study) -> str:
     if found is not None:
         level, one = found
         assert one.verdict is not None
-        saved = one.verdict.change.removeprefix("-")
-        chance = f"the odds are {_chance(one.verdict.odds.gains)} that it is more than"
+        chance = f"the odds are {one.verdict.chance} that it is more than"
         begins = "Yes:"
         if level is not study.levels[0]:
             begins = "Not today, but with more traffic:"
             if today:
                 begins = f"{today} With more traffic"
         return (
-            f"{begins} {one.label} would save {saved} of the time spent {_at(level)}; "
+            f"{begins} {one.label} would save {one.saved} of the time spent {_at(level)}; "
             f"{chance} {NOTHING_PERCENT:g} %.{_not_told_apart(study, one)}"
         )
     if today:
         return today
     if study.undecided:
-        labels = dict.fromkeys(one.label for _, one in study.undecided)
+        labels = dict.fromkeys(one.label for one in study.undecided)
         return f"Cannot say yet: {', '.join(labels)} may help or not; nothing else does."
     return "No: nothing that was tried saves time without leaving more trips unserved."
 
 
 def _only_today(study: Study) -> str:
-    """Return a sentence on what helps only today, "" if nothing does."""
-    one = study.only_today
-    if one is None or one.verdict is None:
+    """Return a sentence on what saves most only today, "" if nothing does."""
+    gaining = []
+    for one in study.levels[0].outcomes:
+        if one.answer is Answer.GAINS and one.serves and not study.sound(one):
+            gaining.append(one)
+    if not gaining:
         return ""
-    saved = one.verdict.change.removeprefix("-")
+    best = min(gaining, key=_percent)
     return (
-        f"Today {one.label} would save {saved} of the time spent, but with more traffic harm, or "
-        "leave more trips unserved."
+        f"Today {best.label} would save {best.saved} of the time spent, but with more traffic "
+        "harm, or leave more trips unserved."
     )
 
 
@@ -179,10 +158,9 @@ def _not_told_apart(study: Study, simpler: Outcome) -> str:
     """Return a sentence on the best strategy, "" if it is recommended."""
     assert study.best is not None
     _, best = study.best
-    if best is simpler or best.verdict is None:
+    if best is simpler:
         return ""
-    saved = best.verdict.change.removeprefix("-")
-    return f" With {saved}, {best.label} is not told apart from that, which is simpler."
+    return f" With {best.saved}, {best.label} is not told apart from that, which is simpler."
 
 
 def next_line(study: Study) -> str:
@@ -193,10 +171,12 @@ def next_line(study: Study) -> str:
         demand = "" if level.demand == 1.0 else f" --demand {level.demand:g}"
         command = f"cosim watch {study.place} --controller {one.strategy}"
         return f"Next: {command} --against {REFERENCE}{demand}"
-    needed = [one.verdict.needed for _, one in study.undecided if one.verdict is not None]
-    possible = [seeds for seeds in needed if seeds is not None]
-    if possible:
-        return f"Next: cosim study {study.source} --most-seeds {min(possible)} --out {study.out}"
+    needed = []
+    for one in study.undecided:
+        if one.verdict and one.verdict.needed:
+            needed.append(one.verdict.needed)
+    if needed:
+        return f"Next: cosim study {study.source} --most-seeds {min(needed)} --out {study.out}"
     return "Next: nothing; keep the signals as they are."
 
 
@@ -204,10 +184,7 @@ def details(level: Level) -> list[str]:
     """Return a sentence for every strategy that needs one."""
     lines = []
     for one in level.outcomes:
-        verdict = one.verdict
-        if verdict is None:
-            continue
-        if verdict.answer is Answer.UNKNOWN:
+        if one.answer is Answer.UNKNOWN:
             lines.append(f"{one.label}: {open_verdict(one)}")
         if not one.serves:
             more = one.more_left * one.means["trips"]
@@ -242,7 +219,7 @@ def trust(study: Study) -> list[str]:
     """Return sentences on how far the verdict can be trusted."""
     network = study.scenario.network
     lines = [sameness(study)]
-    seeds = [one.verdict.seeds for level in study.levels for one in level.outcomes if one.verdict]
+    seeds = [one.verdict.seeds for one in study.outcomes if one.verdict]
     number = f"{min(seeds)}" if min(seeds) == max(seeds) else f"{min(seeds)} to {max(seeds)}"
     lines.append(
         f"{number} seeds per strategy; with the same seed all strategies have the same trips. "
@@ -298,10 +275,6 @@ def _title(level: Level) -> str:
     return "Today's demand" if level.demand == 1.0 else f"Demand times {level.demand:g}"
 
 
-def _chance(share: float) -> str:
-    return ">99 %" if share > 0.99 else f"{100.0 * share:.0f} %"
-
-
 def row(one: Outcome) -> dict[str, str]:
     """Return a strategy as a row of text."""
     means = one.means
@@ -310,8 +283,8 @@ def row(one: Outcome) -> dict[str, str]:
     change = ""
     if verdict is not None:
         said = verdict.answer.value
-        if verdict.answer is not Answer.UNKNOWN:
-            said += f" ({_chance(verdict.chance)})"
+        if verdict.chance:
+            said += f" ({verdict.chance})"
         change = verdict.change
     return {
         "strategy": one.label,
@@ -351,10 +324,8 @@ def write(study: Study) -> Path:
     shown = html.map_of(finished, demand=demand, names=names)
     city = finished.map()
     shapes = edge_shapes(city)
-    runs = []  # of every strategy, on their common seeds
-    for of_strategy in statistics.common_runs(finished.level(demand), names):
-        if of_strategy:
-            runs.append(of_strategy)
+    common = statistics.common_runs(finished.level(demand), names)
+    runs = [of_strategy for of_strategy in common if of_strategy]
     text = html.rendered(
         "cosim.studying",
         "study.html.j2",
@@ -463,16 +434,13 @@ def _page_row(one: Outcome) -> dict[str, object]:
     delay = means.get("public_transport_delay_s", math.nan)
     cells["bus"] = "–" if math.isnan(delay) else f"{delay:,.0f}"
     cells["co2"] = f"{means['co2_kg'] / 1000.0:,.2f}"
-    cells["seeds"] = ""
-    cells["answer"] = ""
-    cells["chance"] = ""
+    cells |= dict.fromkeys(("seeds", "answer", "chance"), "")
     tone = ""
     bar: Mapping[str, float] = {}
     if one.verdict is not None:
         cells["seeds"] = str(one.verdict.seeds)
         cells["answer"] = one.verdict.answer.value
-        if one.verdict.answer is not Answer.UNKNOWN:
-            cells["chance"] = _chance(one.verdict.chance)
+        cells["chance"] = one.verdict.chance
         if one.serves:
             tone = one.verdict.answer.name.lower()
         bar = _bar(one.verdict)

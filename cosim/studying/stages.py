@@ -16,7 +16,7 @@ from cosim.evaluation.model_validation import outflow_samples
 from cosim.evaluation.runs import SECONDS_PER_TRIP
 from cosim.importing.importer import CHOICES, COMPARISONS, import_city, reported
 from cosim.plant.strategy import parse
-from cosim.studying.verdict import FEWEST_SEEDS, Verdict, judge
+from cosim.studying.verdict import FEWEST_SEEDS, Answer, Verdict, judge
 from cosim.sumo.net import network_folder
 from nmfd.api import load_scenario, train
 from nmfd.errors import InputError
@@ -310,6 +310,16 @@ class Outcome:
         return LABELS[self.strategy]
 
     @property
+    def answer(self) -> Answer | None:
+        """Answer of the verdict, None for the reference."""
+        return None if self.verdict is None else self.verdict.answer
+
+    @property
+    def saved(self) -> str:
+        """Change of the time spent under a strategy that gains, without its sign."""
+        return "" if self.verdict is None else self.verdict.change.removeprefix("-")
+
+    @property
     def serves(self) -> bool:
         """True unless more trips are left than without control."""
         return self.more_left <= UNSERVED_SHARE
@@ -323,8 +333,9 @@ class Outcome:
 
 @dataclass(frozen=True, kw_only=True)
 class Level:
-    """Strategies at one demand level, the reference first.
+    """Strategies at one demand level.
 
+    outcomes: in the order of LABELS
     skipped: strategy -> why it was not tried
     """
 
@@ -380,10 +391,7 @@ def more_seeds(seeds: int, undecided: Sequence[Verdict | None], most: int) -> in
 
     They are at most twice as many as now, as the spread of a few seeds says little.
     """
-    needed = []
-    for verdict in undecided:
-        if verdict is not None and verdict.needed is not None:
-            needed.append(verdict.needed)
+    needed = [verdict.needed for verdict in undecided if verdict and verdict.needed]
     wanted = min(needed, default=2 * seeds)
     return min(max(seeds + 1, min(wanted, 2 * seeds)), most)
 

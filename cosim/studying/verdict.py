@@ -68,15 +68,12 @@ class Verdict:
         return f"{mean:+.{digits}f}{spread} %"
 
     @property
-    def chance(self) -> float:
-        """Probability of the answer, the largest one if it is UNKNOWN."""
-        if self.answer is Answer.GAINS:
-            return self.odds.gains
-        if self.answer is Answer.NOTHING:
-            return self.odds.nothing
-        if self.answer is Answer.HARMS:
-            return self.odds.harms
-        return max(self.odds)
+    def chance(self) -> str:
+        """Probability of the answer, such as "95 %"; "" if it is UNKNOWN."""
+        if self.answer is Answer.UNKNOWN:
+            return ""
+        share = max(self.odds)  # no answer is less likely than another one
+        return ">99 %" if share > 0.99 else f"{100.0 * share:.0f} %"
 
 
 def judge(changes: Sequence[float]) -> Verdict:
