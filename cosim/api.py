@@ -249,6 +249,8 @@ def evaluate(
         >>> bool(means["pi-gating(kp=0.4)"] < means["no-control"])
         True
     """
+    from cosim.reporting import figures
+
     runs, out = planned(
         scenario,
         controllers,
@@ -264,19 +266,13 @@ def evaluate(
         return evaluation.evaluate(
             runs,
             out,
-            _draw_all,
+            figures.draw_all,
             workers=workers,
             scheduler=scheduler,
             time_limit=time_limit,
             overwrite=overwrite,
             progress=progress,
         )
-
-
-def _draw_all(finished: results.Finished) -> None:
-    from cosim.reporting import figures
-
-    figures.draw_all(finished)
 
 
 def planned(

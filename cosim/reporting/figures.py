@@ -1,7 +1,4 @@
-"""Figures of an evaluation in SUMO.
-
-Functions draw into `ax`; others write the files of one or several demand levels.
-"""
+"""Figures of an evaluation in SUMO, of one or several demand levels."""
 
 from collections import defaultdict
 from collections.abc import Mapping
@@ -9,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 
 from cosim.evaluation import model_validation, statistics
 from cosim.evaluation.results import Finished, Level
@@ -18,17 +14,6 @@ from nmfd.studies.benchmark import draw_accumulations, interval
 
 # Controller -> level -> mean and half of its 95 % interval.
 Points = Mapping[str, Mapping[float, tuple[float, float]]]
-
-
-def over_levels(ax: Axes, values: Points, label: str) -> Axes:
-    """Draw a quantity over the demand level."""
-    plots.with_intervals(ax, values)
-    levels = sorted({level for points in values.values() for level in points})
-    ax.axhline(1.0, color="#777777", linestyle="--", linewidth=1.0)
-    ax.set_xticks(levels, [f"{level:g}" for level in levels])
-    ax.set_ylim(bottom=0.0)
-    ax.set(xlabel="demand, multiple of the scenario's", ylabel=label)
-    return ax
 
 
 def ranked(rows: pd.DataFrame) -> list[str]:
@@ -103,7 +88,12 @@ def _draw_over_levels(file: Path, values: Points, label: str) -> None:
     if not values:
         return
     drawing = plots.figure(7.5, 4.8)
-    ax = over_levels(drawing.subplots(), values, label)
+    ax = plots.with_intervals(drawing.subplots(), values)
+    levels = sorted({level for points in values.values() for level in points})
+    ax.axhline(1.0, color="#777777", linestyle="--", linewidth=1.0)
+    ax.set_xticks(levels, [f"{level:g}" for level in levels])
+    ax.set_ylim(bottom=0.0)
+    ax.set(xlabel="demand, multiple of the scenario's", ylabel=label)
     drawing.suptitle("mean over seeds, 95 % intervals", fontsize="medium")
     plots.legend_below(drawing, [ax])
     plots.save(drawing, file)
