@@ -20,7 +20,6 @@ from cosim.plant.plant import Observer, SumoPlant
 from cosim.plant.record import RECORD, TOTALS, settled
 from cosim.plant.settings import Settings, own_files
 from cosim.plant.strategy import Strategy
-from cosim.sumo.arrays import RegionCounts
 from cosim.sumo.net import City, Gateway, gateway_room_taken
 from nmfd import closed_loop, metrics
 from nmfd.arrays import PerRegion
@@ -146,15 +145,15 @@ def _with_facts(
     return result.add(facts)
 
 
-def regional_outflow(record: Mapping[str, np.ndarray] | Result, step: float) -> RegionCounts:
-    """Return the outflow of every region (veh/s, (T, R)).
+def regional_outflow(record: Mapping[str, np.ndarray] | Result, step: float) -> np.ndarray:
+    """Return the outflow of every region (veh/s, (T, R) or (R,)).
 
     It counts trips that end there and vehicles that leave.
 
-    record: arrays of cosim.plant.record.RECORD
+    record: arrays of cosim.plant.record.RECORD, or their rows of one interval
     step: control interval (s)
     """
-    return (record["arrivals"] + record["crossings"].sum(axis=(2, 3))) / step
+    return (record["arrivals"] + record["crossings"].sum(axis=(-2, -1))) / step
 
 
 def trip_measures(trips: Sequence[Trip], regions: int) -> tuple[dict[str, float], PerRegion]:
@@ -233,8 +232,5 @@ def leaking_share(result: Result, city: City, leaks: Collection[Gateway]) -> flo
     leaks: gateways that nothing controls
     """
     flow = result["gateway_flow"].sum(axis=0)
-    leaking = 0.0
-    for gateway, passed in zip(city.gateways, flow, strict=True):
-        if gateway in leaks:
-            leaking += passed
-    return float(leaking / max(flow.sum(), 1))
+    leaking = flow[[gateway in leaks for gateway in city.gateways]]
+    return float(leaking.sum() / max(flow.sum(), 1))

@@ -23,7 +23,7 @@ from cosim.importing import maps
 from cosim.sumo.arrays import PerEdge, Points
 from cosim.sumo.net import JAM_SPACING
 from cosim.view import colours
-from cosim.view.picture import CityPicture, Frame, Gate
+from cosim.view.picture import CityPicture, Frame, Gate, extent
 
 DENSITY = "density [veh/km and lane]"
 DENSEST = 1000.0 / JAM_SPACING  # veh/km and lane
@@ -99,12 +99,11 @@ class CityMap:
         self._add_numbers()
         for part in near.parts:
             part.visible = False
-        extent = np.ptp(np.concatenate(picture.shapes), axis=0).max()
         code = CustomJS.from_file(
             Path(__file__).with_name("gates.js"),
             far=far.parts,
             near=near.parts,
-            limit=CLOSER * float(extent),
+            limit=CLOSER * extent(picture.shapes),
         )
         self.plot.x_range.js_on_change("end", code)
 
@@ -126,14 +125,9 @@ class CityMap:
 
     def choose(self, region: int) -> None:
         """Highlight a region."""
-        of_rings = self.regions.data["region"]
-        width = np.ones(len(of_rings))
-        line = [colours.FAINT] * len(of_rings)
-        for n, of_ring in enumerate(of_rings):
-            if of_ring == region:
-                width[n] = 2.5
-                line[n] = colours.CHOSEN
-        patch(self.regions, width=width, line=line)
+        chosen = np.array(self.regions.data["region"]) == region
+        line = np.where(chosen, colours.CHOSEN, colours.FAINT).tolist()
+        patch(self.regions, width=np.where(chosen, 2.5, 1.0), line=line)
 
     def _add_regions(self) -> ColumnDataSource:
         outlines = maps.largest_first(self._picture.outlines)

@@ -208,7 +208,6 @@ def with_slider(
     over_time = Film()
     for one in page.maps:
         over_time.add(one.streets, ["density"])
-    for one in page.maps:
         for gates in one.gates:
             over_time.add(gates.source, ["end", "green", "queue", "halo"])
     words = []
@@ -324,11 +323,10 @@ def _maps(
 
 def _busiest(picture: CityPicture) -> int:
     """Return the region with most gates into it or out of it."""
-    gates = [0] * picture.regions
+    ends: list[int] = []
     for gate in picture.gates:
-        gates[gate.source] += 1
-        gates[gate.target] += 1
-    return gates.index(max(gates))
+        ends += [gate.source, gate.target]
+    return int(np.bincount(ends, minlength=1).argmax())
 
 
 def _begin(runs: Sequence[Sequence[Frame]]) -> int:

@@ -100,7 +100,7 @@ class CityPicture:
         between: dict[tuple[int, int], list[Gate]] = defaultdict(list)
         for gate in self.gates:
             between[gate.source, gate.target].append(gate)
-        setback = BOUNDARY_SETBACK * _extent(self.shapes)
+        setback = BOUNDARY_SETBACK * extent(self.shapes)
         merged = []
         for (source, _), gates in between.items():
             controlled = [gate for gate in gates if gate.signal]
@@ -137,7 +137,7 @@ class CityPicture:
             region=region,
             outlines=rings_round(shapes, region, REGION_REACH),
             places=np.stack([middles[region == r].mean(axis=0) for r in range(city.regions)]),
-            gates=_gates(city, dict(zip(city.edges, shapes, strict=True))),
+            gates=_gates(city, shapes),
             protected=scenario.protected,
             critical=network.seen_critical,
             curves=curves,
@@ -229,7 +229,6 @@ def after(
     ungated = row["gateway_original_green"]
     # A gate without any green to take is open.
     green = np.divide(row["gateway_green"], ungated, out=np.ones_like(ungated), where=ungated != 0)
-    flows = {name: row[name][None] for name in ("arrivals", "crossings")}
     removed = 0.0 if state.removed is None else float(state.removed.sum())
     warnings = [text for text in (controls.note, state.problem) if text]
     return Frame(
@@ -237,7 +236,7 @@ def after(
         intervals=state.step,
         density=(row["edge_vehicles"].astype(float) / picture.lane_km).astype(np.float16),
         accumulation=state.accumulation.sum(axis=1),
-        outflow=regional_outflow(flows, picture.step)[0],
+        outflow=regional_outflow(row, picture.step),
         waiting=float(state.backlog.sum()),
         completed=state.completed,
         removed=removed,
@@ -287,27 +286,28 @@ def totals(picture: CityPicture, results: Sequence[Any]) -> dict[str, list[PerEd
     }
 
 
-def _extent(shapes: Sequence[Points]) -> float:
+def extent(shapes: Sequence[Points]) -> float:
     """Return the longer side [m] of the box around all shapes."""
     return float(np.ptp(np.concatenate(shapes), axis=0).max())
 
 
-def _gates(city: City, shapes: Mapping[str, Points]) -> tuple[Gate, ...]:
+def _gates(city: City, shapes: Sequence[Points]) -> tuple[Gate, ...]:
     """Return one gate for every edge that ends at a boundary.
 
     An edge that leads to several regions has a gate for each.
+    shapes: of the edges
     """
     members: dict[tuple[str, int], list[int]] = defaultdict(list)
     for number, gateway in enumerate(city.gateways):
         members[gateway.from_edge, gateway.target].append(number)
-    setback = GATE_SETBACK * _extent(list(shapes.values()))
+    setback = GATE_SETBACK * extent(shapes)
 
     def before_its_end(length: float) -> float:
         return max(length - setback, 0.5 * length)
 
     gates = []
     for (edge, target), numbers in members.items():
-        x, y = points_along(shapes[edge], before_its_end)
+        x, y = points_along(shapes[city.number[edge]], before_its_end)
         gate = Gate(
             source=city.gateways[numbers[0]].source,
             target=target,
