@@ -160,8 +160,7 @@ def run_many(
         minutes = sum(run.expected for run in todo) / max(workers, 1) / 60.0
         said = minutes > 0.5 and scheduler is None
         if said:
-            text = f"{len(todo)} runs take about {minutes:.0f} min, {workers} at a time"
-            print(text, file=sys.stderr)
+            _say(f"{len(todo)} runs take about {minutes:.0f} min, {workers} at a time")
         try:
             with (
                 watched("runs", progress, said=said) as show,
@@ -176,7 +175,7 @@ def run_many(
                         file = out / run.file
                         file.parent.mkdir(parents=True, exist_ok=True)
                         outcome.assign(key=json.dumps(key)).write(file)
-                        kept[run.file] = Kept(row, key, Stamp.of(file))
+                        kept[run.file] = Kept(row, key, _stamp(file))
                     rows[run.file] = row
                     if show:
                         show(done, len(todo), run.name)
@@ -387,17 +386,10 @@ def _manifest(out: Path) -> dict[str, Any]:
     return {"folders": {}, "sessions": []}
 
 
-class Stamp(NamedTuple):
-    """Size and time of the last change (ns) of a file."""
-
-    size: int
-    time: int
-
-    @classmethod
-    def of(cls, file: Path) -> "Stamp":
-        """Return the stamp of a file."""
-        about = file.stat()
-        return cls(about.st_size, about.st_mtime_ns)
+def _stamp(file: Path) -> list[int]:
+    """Return size and time of the last change (ns) of a file."""
+    about = file.stat()
+    return [about.st_size, about.st_mtime_ns]
 
 
 class Kept(NamedTuple):
@@ -405,12 +397,12 @@ class Kept(NamedTuple):
 
     row: its row of the table
     key: everything that it depends on
-    stamp: of its file
+    stamp: `_stamp` of its file
     """
 
     row: dict[str, Any]
     key: dict[str, Any]
-    stamp: Stamp
+    stamp: list[int]
 
 
 def _known_rows(out: Path) -> dict[str, Kept]:
@@ -422,10 +414,7 @@ def _known_rows(out: Path) -> dict[str, Kept]:
         content = json.loads((out / ROWS).read_bytes())
         if content["made_by"] != _made_by():
             return {}
-        found = {}
-        for file, (row, key, stamp) in content["runs"].items():
-            found[file] = Kept(row, key, Stamp(*stamp))
-        return found
+        return {file: Kept(*entry) for file, entry in content["runs"].items()}
     except (OSError, ValueError, TypeError, KeyError):  # missing or damaged
         return {}
 
@@ -459,7 +448,7 @@ def _kept(path: Path, name: str, known: Kept | None) -> Kept | None:
     """
     if not path.is_file() or not RUN_FILE.fullmatch(name):
         return None
-    stamp = Stamp.of(path)
+    stamp = _stamp(path)
     if known is not None and known.stamp == stamp:
         return known
     try:
