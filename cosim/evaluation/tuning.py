@@ -167,13 +167,7 @@ def tune(
     with locked(order.out, JOURNAL):
         study = _study(order)
         try:
-            while True:
-                running = _running(study)  # of an interrupted call
-                if not running:
-                    _ask(order, study)
-                    running = _running(study)
-                if not running:
-                    break
+            while running := _candidates(order, study):
                 runs = _runs(order, running, city, workers)
                 rows = run_many(
                     runs,
@@ -203,26 +197,23 @@ def tune(
         return table
 
 
-def _running(study: optuna.Study) -> list[FrozenTrial]:
-    """Return the candidates that were asked for and have no score yet."""
-    trials = study.get_trials(deepcopy=False)
-    return [trial for trial in trials if trial.state == TrialState.RUNNING]
+def _candidates(order: Tuning, study: optuna.Study) -> list[FrozenTrial]:
+    """Return the candidates to run, none if there are enough.
 
-
-def _ask(order: Tuning, study: optuna.Study) -> None:
-    """Ask for the next generation, of as many candidates as are left at most.
-
-    The first one is a single candidate.
+    They are those of an interrupted call, or else the next generation, of as many as are left at
+    most. The first one is a single candidate.
     """
     states = [trial.state for trial in study.get_trials(deepcopy=False)]
-    left = order.trials - len(states) + states.count(TrialState.WAITING)
-    generation = 1
-    if TrialState.COMPLETE in states:
-        generation = 4 + math.floor(3 * math.log(len(order.options)))
-    for _ in range(min(left, generation)):
-        number = len(study.get_trials(deepcopy=False))
-        study.sampler = _sampler(order, number)
-        study.ask(order.space)
+    if TrialState.RUNNING not in states:
+        left = order.trials - len(states) + states.count(TrialState.WAITING)
+        generation = 1
+        if TrialState.COMPLETE in states:
+            generation = 4 + math.floor(3 * math.log(len(order.options)))
+        for _ in range(min(left, generation)):
+            number = len(study.get_trials(deepcopy=False))
+            study.sampler = _sampler(order, number)
+            study.ask(order.space)
+    return study.get_trials(deepcopy=False, states=[TrialState.RUNNING])
 
 
 def _key_and_index(name: str) -> tuple[str, int | None]:
@@ -378,8 +369,5 @@ def _write(order: Tuning, study: optuna.Study) -> pd.DataFrame:
 def best_of(order: Tuning, table: pd.DataFrame) -> Scenario:
     """Return the scenario with the best options of the table of `tune`."""
     row = table.loc[table[SCORE].idxmin()]
-    values = {}
-    for name, span in order.space.items():
-        value = row[name]
-        values[name] = int(value) if isinstance(span, IntDistribution) else float(value)
-    return order.tuned(values)
+    space = order.space.items()
+    return order.tuned({name: span.to_external_repr(row[name]) for name, span in space})
