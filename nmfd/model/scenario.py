@@ -408,7 +408,7 @@ def read_scenario(folder: Path | str, settings: Mapping[str, Any] | None = None)
     values["demand"] = table.demand_factor * _demand(table, network, folder)
     values["folder"] = folder
     values["controller_options"] = table.controllers
-    values["initial"] = np.array(table.initial) if table.initial else None
+    values["initial"] = None
     if max(table.protected, default=0) >= network.regions:
         allowed = f"a list of distinct whole numbers from 0 to {network.regions - 1}"
         raise config.error(path, "protected", config.got(allowed, list(table.protected)))
@@ -418,6 +418,7 @@ def read_scenario(folder: Path | str, settings: Mapping[str, Any] | None = None)
             allowed = f"{network.regions} lists of {network.regions} numbers from 0 up"
             rows = [list(row) for row in table.initial]
             raise config.error(path, "initial", config.got(allowed, rows))
+        values["initial"] = np.array(table.initial)
     scenario = Scenario(**values)
     _ = scenario.ordered_faults
     return scenario
