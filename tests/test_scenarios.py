@@ -89,7 +89,7 @@ def test_vehicles_at_the_start(base):
     begun = read_scenario(base, {"initial": [[0.0, 100.0], [0.0, 50.0]]})
     assert begun.start.tolist() == [[0.0, 100.0], [0.0, 50.0]]
     assert begun.hash != load_scenario(base).hash
-    for wrong in ([[1.0, 2.0]], [[1.0, -2.0], [0.0, 0.0]]):
+    for wrong in ([[1.0, 2.0]], [[1.0, 2.0], [3.0]], [[1.0, -2.0], [0.0, 0.0]]):
         with pytest.raises(
             InputError, match="scenario.toml: initial: expected 2 lists of 2 numbers"
         ):
