@@ -381,3 +381,14 @@ def test_identification_gives_both_models_and_the_import_takes_the_second_away(
     shutil.rmtree(scenario)
     tiny_city.imported(tmp_path, 2, config)
     assert parse("dpc-pcrg").own_planning(load_scenario(scenario)).network.regions == 2
+
+
+def test_a_part_without_a_name_is_an_error(tmp_path):
+    net = tiny_city.network(tmp_path)
+    added = tmp_path / "added.add.xml"
+    added.write_text("<additional><tlLogic/></additional>")
+    with pytest.raises(InputError, match="added.add.xml: tlLogic: id: missing; add"):
+        read_streets(net, [added])
+    net.write_text(net.read_text().replace('<connection from="', '<connection was="', 1))
+    with pytest.raises(InputError, match="not a SUMO network .connection: from: missing"):
+        read_streets(net)

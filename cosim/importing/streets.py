@@ -185,6 +185,8 @@ def read_streets(net: Path, additional: Iterable[Path] = ()) -> Streets:
             elif element.tag == "edge" and element.get("function") == "internal":
                 internal[attribute(element, "id")] = size(next(element.iter("lane")), "length")
             elif element.tag == "connection":
+                for name in ("from", "to", "fromLane", "toLane"):
+                    attribute(element, name)
                 links.append(element.attrib)
             elif element.tag == "roundabout":
                 roundabouts.append(element.get("edges", "").split())
@@ -192,6 +194,8 @@ def read_streets(net: Path, additional: Iterable[Path] = ()) -> Streets:
                 logics[attribute(element, "id")] = _logic(element, net)
     for path in additional:
         for element in read_xml(path).iter("tlLogic"):
+            if "id" not in element.attrib:
+                raise InputError(f"{path}: tlLogic: id: missing; add that of a signal")
             logics[attribute(element, "id")] = _logic(element, path)
     if not any(row.cars for row in rows.values()):
         raise InputError(f"{net}: has no edge that cars may use; give a road network")
