@@ -86,7 +86,7 @@ def plan(
     scenarios: Planned,
     strategies: Sequence[Strategy],
     seeds: Sequence[int],
-    policies: Mapping[str, Path] = {},
+    policies: Mapping[str, Path] | None = None,
 ) -> list[Run]:
     """Return all runs of an evaluation, seed by seed.
 
@@ -107,7 +107,7 @@ def plan(
                 policies=policies,
                 folder=folder,
             )
-    return sorted(runs, key=lambda run: seeds.index(run.place.seed))
+    return sorted(runs, key=lambda run: seeds.index(int(run.name.rpartition("-")[2])))
 
 
 def report(rows: pd.DataFrame, scenarios: Mapping[str, results.Finished]) -> str:

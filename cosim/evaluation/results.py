@@ -121,7 +121,7 @@ def read(path: Path, scenario: str | None = None) -> Finished:
     manifest = read_manifest(path)
     rows = rows[rows["scenario"] == (scenario or rows["scenario"].iloc[0])]
     levels = []
-    for demand, part in rows.groupby("demand"):
+    for demand, part in rows.groupby("demand", sort=True):
         folder = part["folder"].iloc[0]
         about = manifest["folders"][folder]
         own = part.reset_index(drop=True)
@@ -171,7 +171,8 @@ def read_run(
     folder = Path(folder)
     name = controller if isinstance(controller, str) else parse(controller).name
     file = f"{run_name(name, seed)}.nc"
-    places = sorted(folder.rglob(file))
+    candidates = [folder / file, *sorted(folder.rglob(f"*/{file}"))]
+    places = [path for path in candidates if path.is_file()]
     if demand is not None:
         places = [path for path in places if path.parent.name == f"demand-{demand:g}"]
     if scenario is not None:

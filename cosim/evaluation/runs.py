@@ -30,7 +30,7 @@ def runs_of(
     *,
     city: Mapping[str, object] | None = None,
     demand: float = 1.0,
-    policies: Mapping[str, Path] = {},
+    policies: Mapping[str, Path] | None = None,
     folder: str = "",
 ) -> list[Run]:
     """Return the runs of strategies x seeds at one demand level, seed by seed.
@@ -42,7 +42,8 @@ def runs_of(
     """
     if city is None:
         city = city_key(scenario, strategies)
-
+    if policies is None:
+        policies = {}
     flows = np.ascontiguousarray(with_demand(scenario, factor=demand).demand)
     shared = {
         **city,

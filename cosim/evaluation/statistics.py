@@ -106,7 +106,7 @@ def statistics(rows: pd.DataFrame) -> pd.DataFrame:
     rows: of one scenario, one per run
     """
     out = []
-    for level, here in rows.groupby("demand"):
+    for level, here in rows.groupby("demand", sort=True):
         against = compared_with(here)
         for name, part in here.groupby("controller", sort=False):
             reference = by_seed(rows, level, against) if name != against else {}
@@ -200,7 +200,7 @@ def pairs(rows: pd.DataFrame) -> pd.DataFrame:
     There is a row for each pair at each demand level.
     """
     out = []
-    for level, here in rows.groupby("demand"):
+    for level, here in rows.groupby("demand", sort=True):
         for name, other in permutations(here["controller"].unique(), 2):
             pair = paired(by_seed(rows, level, name), by_seed(rows, level, other))
             out.append((level, name, other, *pair, pair.significant))
@@ -306,7 +306,7 @@ def text(rows: pd.DataFrame, *, explain: bool = False) -> str:
     """
     lines = []
     headings: dict[str, None] = {}
-    for level, table in statistics(rows).groupby("demand"):
+    for level, table in statistics(rows).groupby("demand", sort=True):
         part = brief(table)
         lines += [f"Demand times {level:g}", text_table(part.to_dict("records")), ""]
         for note in notes(table):
@@ -323,7 +323,7 @@ def text(rows: pd.DataFrame, *, explain: bool = False) -> str:
 def markdown(rows: pd.DataFrame) -> str:
     """Return the tables of one scenario as markdown."""
     parts = []
-    for level, table in statistics(rows).groupby("demand"):
+    for level, table in statistics(rows).groupby("demand", sort=True):
         parts.append(f"## Demand times {level:g}")
         for part in shown(table):
             parts.append(markdown_table(list(part), part.to_numpy().tolist()))

@@ -71,7 +71,7 @@ def draw_levels(out: Path, rows: pd.DataFrame) -> None:
     against = statistics.compared_with(rows)
     ratios: dict[str, dict] = defaultdict(dict)
     shares: dict[str, dict] = defaultdict(dict)
-    for level, here in rows.groupby("demand"):
+    for level, here in rows.groupby("demand", sort=True):
         reference = statistics.by_seed(rows, level, against)
         for name, part in here.groupby("controller", sort=False):
             served = part["completed_veh"] / part["trips"].clip(lower=1)

@@ -201,19 +201,24 @@ def card(rows: pd.DataFrame) -> tuple[str, list[Figure], str]:
         figure = Figure(label, form.format(value), meaning)
         if name != against and not math.isnan(pair.percent):
             reference = mean(before[seed] for seed in common) / unit
-            figure = _judged(figure, pair, good)
-            figure = figure._replace(before=f"{form.format(reference)} {than}")
+            change, verdict, better = _judged(pair, good)
+            figure = figure._replace(
+                before=f"{form.format(reference)} {than}",
+                change=change,
+                verdict=verdict,
+                better=better,
+            )
             if column == statistics.TTS:
                 comparison = f"{name} compared with {against.replace('-', ' ')}"
-                heading = f"{comparison}: {figure.change} time spent, {figure.verdict}."
+                heading = f"{comparison}: {change} time spent, {verdict}."
                 saved = form.format(reference - value)
                 figure = figure._replace(label="Vehicle hours saved", value=saved)
         shown.append(figure)
     return heading, shown, name
 
 
-def _judged(figure: Figure, pair: statistics.Paired, good: int) -> Figure:
-    """Return a figure with its change and the verdict on it.
+def _judged(pair: statistics.Paired, good: int) -> tuple[str, str, bool | None]:
+    """Return change, verdict and better of a figure.
 
     good: sign of an improvement
     """
@@ -224,15 +229,12 @@ def _judged(figure: Figure, pair: statistics.Paired, good: int) -> Figure:
     change = f"{abs(pair.percent):.{digits}f}{spread} % {direction}"
     if not pair.percent and not pair.percent_half:
         change = "no change"
-    plural = "" if one_seed else "s"
-    verdict = f"no proof ({pair.seeds} seed{plural})"
-    better = None
     if pair.significant:
-        verdict = "significant"
-        better = pair.percent * good > 0
-    elif pair.seeds >= statistics.FEWEST_SEEDS:
-        verdict = "not significant"
-    return figure._replace(change=change, verdict=verdict, better=better)
+        return change, "significant", pair.percent * good > 0
+    if pair.seeds >= statistics.FEWEST_SEEDS:
+        return change, "not significant", None
+    plural = "" if one_seed else "s"
+    return change, f"no proof ({pair.seeds} seed{plural})", None
 
 
 def _level(run: Finished, level: Level) -> dict:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from cosim.studying import page, stages
 from cosim.studying.page import Study
-from cosim.studying.stages import AT_CRITICAL, Level, Runner
+from cosim.studying.stages import AT_CRITICAL, EVERYWHERE, Level, Runner
 from nmfd.api import load_scenario
 from nmfd.errors import InputError
 from nmfd.runs.files import file_name, write_text
@@ -77,17 +77,24 @@ def judged_levels(
     no_gates: why gates are left out, "" if they are not
     trained: a policy for the gates is trained, if they may close
     """
-    reasons = [no_gates or stages.far_from_critical(runner, level) for level in demands]
-    if trained and not all(reasons):
-        stages.train_gates(runner.scenario)
-    impossible = runner.impossible()
-    levels = []
-    for level, reason in zip(demands, reasons, strict=True):
-        skipped = dict(impossible)
-        if reason:
-            skipped |= dict.fromkeys(AT_CRITICAL, reason)
-        levels.append(stages.level_of(runner, level, skipped, most_seeds))
-    return levels
+    if trained and not no_gates:
+        far = [stages.far_from_critical(runner, level) for level in demands]
+        if not all(far):
+            stages.train_gates(runner.scenario)
+    skipped = runner.impossible()
+    return [_level(runner, level, no_gates, skipped, most_seeds) for level in demands]
+
+
+def _level(
+    runner: Runner, level: float, no_gates: str, impossible: Mapping[str, str], most_seeds: int
+) -> Level:
+    """Judge the strategies that may change something at a demand level."""
+    skipped = dict(impossible)
+    reason = no_gates or stages.far_from_critical(runner, level)
+    if reason:
+        skipped |= dict.fromkeys(AT_CRITICAL, reason)
+    names = [name for name in (*EVERYWHERE, *AT_CRITICAL) if name not in skipped]
+    return stages.level_of(runner, level, names, skipped, most_seeds)
 
 
 def _check_folder(folder: Path, about: Mapping[str, str]) -> None:

@@ -344,15 +344,15 @@ class Level:
     skipped: Mapping[str, str] = field(default_factory=dict)
 
 
-def level_of(runner: Runner, level: float, skipped: Mapping[str, str], most: int) -> Level:
+def level_of(
+    runner: Runner, level: float, names: Sequence[str], skipped: Mapping[str, str], most: int
+) -> Level:
     """Judge strategies at one demand level.
 
     Each has three seeds first, and more only while its interval contains 2 % either way.
 
-    skipped: strategy -> why it is not tried
     most: seeds of a strategy
     """
-    names = [name for name in LABELS if name not in (REFERENCE, *skipped)]
     seeds = FEWEST_SEEDS
     say(
         f"Strategies at demand times {level:g}: no control and {len(names)} others, "

@@ -113,7 +113,7 @@ def odds(mean: float, half: float, seeds: int) -> Odds:
 
     mean, half: of the change, and half of its 95 % interval (%)
     """
-    if math.isnan(half):
+    if seeds < 2 or math.isnan(half):
         return Odds(math.nan, math.nan, math.nan)
     if half == 0.0:
         return Odds(
