@@ -249,8 +249,6 @@ def evaluate(
         >>> bool(means["pi-gating(kp=0.4)"] < means["no-control"])
         True
     """
-    from cosim.reporting import figures
-
     runs, out = planned(
         scenario,
         controllers,
@@ -266,13 +264,19 @@ def evaluate(
         return evaluation.evaluate(
             runs,
             out,
-            figures.draw_all,
+            _draw_all,
             workers=workers,
             scheduler=scheduler,
             time_limit=time_limit,
             overwrite=overwrite,
             progress=progress,
         )
+
+
+def _draw_all(finished: results.Finished) -> None:
+    from cosim.reporting import figures  # after the runs: matplotlib takes a second
+
+    figures.draw_all(finished)
 
 
 def planned(

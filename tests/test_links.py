@@ -452,6 +452,11 @@ def spent_and_slope(model, chance):
     return spent.cpu(), *torch.autograd.grad(spent, rate)
 
 
+def copied(parts):
+    """Tensors as copies, and all others."""
+    return [part.detach().clone() if isinstance(part, torch.Tensor) else part for part in parts]
+
+
 class FakeGraph(NamedTuple):
     """Stands in for a CUDA graph, by running what it would have recorded."""
 
@@ -466,11 +471,10 @@ class FakeGraph(NamedTuple):
 
     @classmethod
     def record(cls, run, given):
-        own, after = [
-            [part.detach().clone() if isinstance(part, torch.Tensor) else part for part in parts]
-            for parts in (given, run(given)[0])
-        ]
-        return own, cls(run, own, after), after, run(given)[1]
+        own = copied(given)
+        after, kind = run(own)
+        after = copied(after)
+        return own, cls(run, own, after), after, kind
 
 
 @pytest.mark.parametrize("signals", [{}, {"signals": "max-pressure"}, ACTUATED])

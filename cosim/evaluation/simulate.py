@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from cosim.evaluation.signal_proof import SHEET, VIOLATIONS, proof_sheet
@@ -145,7 +146,9 @@ def _with_facts(
     return result.add(facts)
 
 
-def regional_outflow(record: Mapping[str, np.ndarray] | Result, step: float) -> np.ndarray:
+def regional_outflow(
+    record: Mapping[str, np.ndarray] | Result, step: float
+) -> Float[np.ndarray, "*T R"]:
     """Return the outflow of every region (veh/s, (T, R) or (R,)).
 
     It counts trips that end there and vehicles that leave.

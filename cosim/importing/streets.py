@@ -194,9 +194,10 @@ def read_streets(net: Path, additional: Iterable[Path] = ()) -> Streets:
                 logics[attribute(element, "id")] = _logic(element, net)
     for path in additional:
         for element in read_xml(path).iter("tlLogic"):
-            if "id" not in element.attrib:
+            signal = element.get("id")
+            if signal is None:
                 raise InputError(f"{path}: tlLogic: id: missing; add that of a signal")
-            logics[attribute(element, "id")] = _logic(element, path)
+            logics[signal] = _logic(element, path)
     if not any(row.cars for row in rows.values()):
         raise InputError(f"{net}: has no edge that cars may use; give a road network")
     left_hand = root.get("lefthand") == "true"

@@ -589,8 +589,8 @@ def validate(policy: Policy, rollout: Rollout, seed: int, setup: Dpc) -> float:
     """Return the total time spent (veh s) of the scenario itself.
 
     It is a geometric mean over two draws of the noise. If training perturbs demand or model, or
-    rollouts are rough, there are VALIDATION_ROLLOUTS or a batch more under increasing
-    perturbations.
+    rollouts are rough, there are VALIDATION_ROLLOUTS more under increasing perturbations, or a
+    batch if that is larger.
     """
     generator = Generator().manual_seed(seed)
     low = setup.demand_low

@@ -18,7 +18,7 @@ from nmfd.model.planning import PlanningModel
 from nmfd.tensors import PerPair
 
 DRAWS = 2**31  # of trips and turns
-# Rollouts in an Adam step. Each takes seconds of a processor; on a GPU all take as long as one.
+# Rollouts in an Adam step. Each takes seconds of a processor; 64 take a GPU little longer than one.
 BATCH = {"cpu": 6, "cuda": 64}
 MOST_DELAYED = 10.0
 

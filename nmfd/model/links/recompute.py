@@ -24,7 +24,7 @@ def at_once(name: Hashable, run: Run, given: Parts) -> tuple[list, Any]:
 class Recordings:
     """Functions of tensors that a GPU ran once, and plays (CUDA graphs).
 
-    Python takes longer to name thousands of small operations than a GPU to do them.
+    Python takes longer to launch thousands of small operations than a GPU to do them.
     """
 
     def __init__(self) -> None:
@@ -34,7 +34,7 @@ class Recordings:
     def play(self, name: Hashable, run: Run, given: Parts) -> tuple[list, Any]:
         """Return run(given), as `at_once`.
 
-        `run` is that of the first call with this name, the same shapes, and the same others.
+        A call with the name, shapes and other parts of an earlier one plays what that one ran.
         """
         shapes = [(part.shape, part.dtype) if isinstance(part, Tensor) else part for part in given]
         key = (name, *shapes)
