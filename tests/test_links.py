@@ -111,7 +111,9 @@ def triangle(length: float = 300.0) -> LinkNetwork:
     )
 
 
-def model_of(network: LinkNetwork | None = None, device: str = "cpu", **choices) -> LinkModel:
+def model_of(
+    network: LinkNetwork | None = None, device: str = "cpu", compiled: bool = True, **choices
+) -> LinkModel:
     return LinkModel(
         network or triangle(),
         STEP_S,
@@ -119,6 +121,7 @@ def model_of(network: LinkNetwork | None = None, device: str = "cpu", **choices)
         choices=Choices(**choices),
         dtype=torch.float64,
         device=device,
+        compiled=compiled,
     )
 
 
@@ -478,8 +481,34 @@ class FakeGraph(NamedTuple):
 
 
 @pytest.mark.parametrize("signals", [{}, {"signals": "max-pressure"}, ACTUATED])
+@pytest.mark.parametrize("chance", [False, True])
+def test_machine_code_gives_what_the_reference_gives(signals, chance):
+    """Time spent by two rollouts, accumulations and backlog, and derivatives by all commands."""
+    plain, machine = (
+        judged_with_derivatives(model_of(compiled=compiled, **signals), chance)
+        for compiled in (False, True)
+    )
+    torch.testing.assert_close(machine, plain, rtol=1e-9, atol=1e-9)
+
+
+def judged_with_derivatives(model, chance):
+    """Numbers of a busy city (5,), and the derivatives of their weighted sum by the commands."""
+    commands = Commands(*(part.requires_grad_() for part in all_commands(price=2.0)))
+    state = model.start(2, [3, 4], chance=chance)
+    rate = torch.tensor(0.7, dtype=torch.float64, requires_grad=True)
+    for _ in range(5):
+        state = model.advance(state, torch.cat([demand_of(rate)] * 2), commands)
+    parts = [state.spent, model.accumulation(state), model.backlog(state), state.realised]
+    parts.append(state.gone)
+    judged = torch.stack([part.square().sum() for part in parts])
+    weights = torch.tensor([1e-6, 1.0, 1.0, 1.0, 1.0], dtype=torch.float64)
+    by = (rate, commands.gates, commands.metering, commands.prices)
+    return judged.detach(), *torch.autograd.grad((weights * judged).sum(), by)
+
+
+@pytest.mark.parametrize("signals", [{}, {"signals": "max-pressure"}, ACTUATED])
 def test_recordings_give_the_same(signals, monkeypatch):
-    model = model_of(**signals)
+    model = model_of(compiled=False, **signals)
     plain = spent_and_slope(model, chance=True)
     monkeypatch.setattr(Recordings, "_record", FakeGraph.record)
     model._play = Recordings().play

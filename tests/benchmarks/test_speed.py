@@ -17,7 +17,7 @@ from nmfd.api import controller as make_controller
 from nmfd.api import load_scenario
 from nmfd.controllers.dpc.policy_file import load_policy
 from nmfd.controllers.mpc.ipopt import Ipopt
-from nmfd.model.links.model import Commands, LinkModel
+from nmfd.model.links.model import Choices, Commands, LinkModel
 from nmfd.model.links.network import read_links
 from nmfd.model.links.plant import links_file
 from nmfd.model.planning import planning_model
@@ -153,17 +153,40 @@ class TestMpc:
         benchmark(decide)
 
 
-@pytest.mark.benchmark(group="Streets, rollouts of grid7 over 64 control intervals")
-@pytest.mark.parametrize("batch", [1, 10])
-def test_rollouts_of_streets(benchmark, batch):
+def streets_of(compiled):
+    """Streets of grid7 under max-pressure, and the trips that are due (veh/s)."""
     grid = api.load_scenario("grid7_peak")
-    model = LinkModel(read_links(links_file(grid)), grid.step)
-    demand = torch.as_tensor(grid.demand, dtype=torch.float32)
+    choices = Choices(signals="max-pressure")
+    network = read_links(links_file(grid))
+    model = LinkModel(network, grid.step, choices=choices, dt=3.0, compiled=compiled)
+    return model, torch.as_tensor(grid.demand, dtype=torch.float32)
+
+
+@pytest.mark.benchmark(group="Streets, rollouts of grid7 over 1,920 steps")
+@pytest.mark.parametrize("batch", [1, 10])
+@pytest.mark.parametrize("compiled", [False, True], ids=["reference", "compiled"])
+def test_rollouts_of_streets(benchmark, compiled, batch):
+    model, demand = streets_of(compiled)
 
     def rollout():
-        state = model.start(batch, range(4))
+        state = model.start(batch, range(batch), chance=True)
         with torch.inference_mode():
-            for k in range(grid.steps):
-                state = model.advance(state, demand[k].expand(batch, 7, 7), Commands())
+            for due in demand:
+                state = model.advance(state, due.expand(batch, 7, 7), Commands())
 
-    benchmark.pedantic(rollout, rounds=3)
+    benchmark.pedantic(rollout, rounds=2, warmup_rounds=1)
+
+
+@pytest.mark.benchmark(group="Streets, eight rollouts of grid7 with derivatives over 240 steps")
+@pytest.mark.parametrize("compiled", [False, True], ids=["reference", "compiled"])
+def test_derivatives_of_streets(benchmark, compiled):
+    model, demand = streets_of(compiled)
+    rate = torch.full((8, 7), 1.0, requires_grad=True)
+
+    def derive():
+        state = model.start(8, range(8), chance=True)
+        for due in demand[20:28]:
+            state = model.advance(state, due.expand(8, 7, 7), Commands(metering=rate))
+        torch.autograd.grad(state.spent.sum(), rate)
+
+    benchmark.pedantic(derive, rounds=2, warmup_rounds=1)

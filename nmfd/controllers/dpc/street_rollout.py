@@ -46,13 +46,14 @@ class Bound:
 
     def _measured(self, derivative: Demands) -> None:
         all_the_time = derivative.abs().amax((0, 2, 3)) * len(derivative)
-        self._most = MOST_DELAYED * all_the_time.unsqueeze(1)
+        self._most = MOST_DELAYED * all_the_time
 
     def _held(self, derivative: torch.Tensor | None) -> torch.Tensor | None:
         # None: nothing depends on this part.
         if derivative is None or self._most is None:
             return None
-        return derivative.clamp(-self._most, self._most)
+        most = self._most.view(-1, *[1] * (derivative.dim() - 1))
+        return derivative.clamp(-most, most)
 
 
 class StreetRollout(Rollout):

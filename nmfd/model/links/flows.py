@@ -178,6 +178,8 @@ class Delay:
 class Flows:
     """Equations of one city; `step` advances B rollouts by `dt` seconds."""
 
+    delay = Delay
+
     def __init__(
         self,
         network: LinkNetwork,
@@ -203,6 +205,7 @@ class Flows:
         """Set which count belongs to which other one."""
         network = self.network
         self.link_of_entry = self.places(network.entry_link)
+        self.region_of_entry = self.places(network.region[network.entry_link])
         self.entry_of_cell = self.places(network.cell_entry)
         self.onward = self.places(network.cell_onward)
         self._turn_of_cell = self.places(network.cell_turn)
@@ -245,13 +248,13 @@ class Flows:
         wave_steps = (network.length / wave - late) / self.dt + 1.0
         backwards = np.floor(wave_steps).astype(int)
         self._earlier = self.values(wave_steps - backwards)
-        self._along = Delay(along[network.entry_link], self.device)
+        self._along = self.delay(along[network.entry_link], self.device)
         part = np.maximum(free_steps - along, 0.0)
         self._part = self.values(part[network.entry_link])
         started = np.maximum(np.round(free_steps + late / self.dt), 1).astype(int)
-        self._started = Delay(started[network.entry_link], self.device)
-        self._to_end = Delay(to_end, self.device)
-        self._backwards = Delay(backwards, self.device)
+        self._started = self.delay(started[network.entry_link], self.device)
+        self._to_end = self.delay(to_end, self.device)
+        self._backwards = self.delay(backwards, self.device)
 
     def _saturation(self, speed: np.ndarray) -> np.ndarray:
         """Return the flow of a lane at green (veh/s); speed: of cars (m/s)."""
@@ -281,7 +284,7 @@ class Flows:
         self._lane_share = self.values(1.0 / lanes_of_turn[network.served])
         self._pace = self.values(saturation / of_movement)
         self._per_step = self.values(saturation)
-        self._smoothing = min(self.dt / self.numbers.gap, 1.0)
+        self.smoothing = min(self.dt / self.numbers.gap, 1.0)
 
     def values(self, numbers: np.ndarray) -> Tensor:
         """Return an array of numbers as a tensor of this model."""
@@ -403,7 +406,7 @@ class Flows:
             standing=by_turn - flow,
             stopping=stopping - stopped,
             inside=traffic.inside + coming - left - completed,
-            recent=traffic.recent + self._smoothing * (passed / self.dt - traffic.recent),
+            recent=traffic.recent + self.smoothing * (passed / self.dt - traffic.recent),
             completed=traffic.completed + completed,
             entered=self._along.with_new(traffic.entered, passing),
             started=self._started.with_new(traffic.started, starting),

@@ -11,7 +11,8 @@ from nmfd.arrays import PerTurn
 from nmfd.errors import InputError
 from nmfd.model.links.chance import Chance, chance_of
 from nmfd.model.links.drivers import Drivers
-from nmfd.model.links.flows import LEAST, Flows, Numbers, Traffic, Ways
+from nmfd.model.links.flows import Flows, Numbers, Ways
+from nmfd.model.links.interval import Interval, LinkState, Steps
 from nmfd.model.links.network import LinkNetwork
 from nmfd.model.links.recompute import Recordings, at_once, run_again
 from nmfd.model.links.signals import (
@@ -20,12 +21,9 @@ from nmfd.model.links.signals import (
     MAX_PRESSURE,
     Actuated,
     Gates,
-    Lights,
     MaxPressure,
-    Phases,
     Programmes,
     Responsive,
-    Stages,
 )
 from nmfd.model.planning import GUIDED
 from nmfd.model.regional_model import RegionalModel
@@ -125,35 +123,6 @@ class Commands(NamedTuple):
     prices: PerRegion | None = None
 
 
-class LinkState(NamedTuple):
-    """State of B rollouts at the beginning of a control interval.
-
-    interval: its number
-    draw: number of the draw of trips of each rollout (B,)
-    used: of the gates' windows; stages: of max-pressure or of actuated signals
-    chance: of single vehicles, None without
-    asked: trips that were due so far on average, by entry (B, E)
-    begun: trips that were due so far (veh, (B,))
-    spent: time spent so far (veh s, (B,))
-    present: vehicles on each link, summed over the last interval (veh s, (B, L))
-    gone: vehicles that left each link in it (veh, (B, L))
-    realised: share of green that each boundary was given in it (-, (B, R, R))
-    """
-
-    interval: int
-    draw: Tensor
-    traffic: Traffic
-    used: Tensor
-    stages: Stages | Phases | None
-    chance: Chance | None
-    asked: Tensor
-    begun: Tensor
-    spent: Tensor
-    present: Tensor
-    gone: Tensor
-    realised: Tensor
-
-
 class LinkModel:
     """Rollouts of one city: `start`, then `advance` once per control interval."""
 
@@ -168,29 +137,45 @@ class LinkModel:
         dt: float = 2.0,
         dtype: torch.dtype = torch.float32,
         device: str = "cpu",
+        compiled: bool = True,
     ):
         """step: control interval (s), a multiple of dt
         dt: time step, a whole number (s)
         nominal: split ratios without guidance (-, (R, R, R))
+        compiled: machine code on a processor; False, and always on a GPU: the reference
         """
         self.network = network
         self.step = step
         self._choices = choices or Choices()
-        self.flows = Flows(network, numbers or Numbers(), dt=dt, dtype=dtype, device=device)
+        on_gpu = torch.device(device).type == "cuda"
+        kinds: tuple[type[Flows], type[MaxPressure], type[Steps]] = (Flows, MaxPressure, Steps)
+        if compiled and not on_gpu:
+            from nmfd.model.links import processor  # loads a compiler
+
+            kinds = (
+                processor.ProcessorFlows,
+                processor.CompiledMaxPressure,
+                processor.CompiledSteps,
+            )
+        of_flows, of_signals, of_steps = kinds
+        self.flows = of_flows(network, numbers or Numbers(), dt=dt, dtype=dtype, device=device)
         self._steps = round(step / dt)
         self._signals: Responsive | None = None
         self._gates = Gates(self.flows)
         if self._choices.signals == MAX_PRESSURE:
-            self._signals = MaxPressure(self.flows, self._choices.lookahead)
+            self._signals = of_signals(self.flows, self._choices.lookahead)
             self._gates = Gates(self.flows, by_cycle=True, of_programme=False)
         elif self._choices.signals == ACTUATED:
             fixed = self._choices.gateways_fixed
             self._signals = Actuated(self.flows, gateways_fixed=fixed)
             self._gates = Gates(self.flows, by_cycle=not fixed)
         self._programmes = Programmes(self.flows, self._gates.opens)
-        self._play = Recordings().play if self.flows.device.type == "cuda" else at_once
+        self._play = Recordings().play if on_gpu else at_once
         self._drivers = Drivers(self.flows, nominal)
         self._number()
+        self._passing = of_steps(
+            self.flows, self._gates, self._signals, self._choices.chain_limit, self._steps
+        )
 
     def _number(self) -> None:
         """Set regions and boundaries of entries, links and gates."""
@@ -201,7 +186,6 @@ class LinkModel:
         self._origin = flows.values(network.origin)
         entry_region = region[network.entry_link]
         self._pair_of_entry = flows.places(entry_region * regions + network.destination)
-        self._region_of_entry = flows.places(entry_region)
         self._region_of_link = flows.places(region)
         entered = np.zeros(flows.movements, dtype=int)
         entered[network.turn_movement] = region[network.turn_link]
@@ -209,7 +193,6 @@ class LinkModel:
         link = network.movement_link[gated]
         boundary = region[link] * regions + entered[gated]
         self._boundary_of_gate = flows.places(boundary)
-        self._link_of_gate = flows.places(link)
         served = network.turn_movement[network.served]
         lanes = np.bincount(served, minlength=flows.movements)[gated]
         total = np.bincount(boundary, lanes, regions**2)[boundary]
@@ -279,62 +262,43 @@ class LinkModel:
         """
         flows = self.flows
         dt = flows.dt
-        traffic = state.traffic
-        used = state.used
-        stages = state.stages
         origin = self._origin.index_select(0, state.draw)
         due = demand.flatten(1).index_select(1, self._pair_of_entry) * origin * dt
         light, yields, opens = programme
-        opens = opens.index_select(1, self._gates.places)
-        ways = self._ways(state, commands, chance)
         gates = commands.gates
-        realised = torch.ones_like(state.realised)
-        mean_share = torch.zeros_like(used)
-        present = torch.zeros_like(traffic.inside)
-        outside = torch.zeros_like(traffic.inside)
-        held = torch.zeros_like(traffic.held)
-        asked = state.asked
-        begun = state.begun
-        for n in range(self._steps):
-            whole = due
-            if chance is not None:
-                whole = chance.trips(asked, due)
-            asked = asked + due
-            begun = begun + whole.sum(1)
-            released = whole
-            # Without metering, trips that were held begin in the first step.
-            if commands.metering is not None or n == 0:
-                traffic, released = self._metered(traffic, whole, commands.metering)
-            lights = Lights(light[n : n + 1], yields[n : n + 1])
-            if self._signals is not None:
-                number = state.interval * self._steps + n
-                stages, lights = self._signals.step(number, stages, traffic, lights)
-            shown = lights.light
-            if gates is not None:
-                share = self._gate_shares(gates, traffic.inside)
-                mean_share = mean_share + share / self._steps
-                shown = shown.expand(len(used), -1)
-                used, shown = self._gates.limit(used, shown, opens[n], share)
-            traffic = flows.step(traffic, released, shown, lights.yields, ways)
-            present = present + traffic.inside
-            outside = outside + traffic.outside
-            if commands.metering is not None:
-                held = held + traffic.held
+        shares = None
         if gates is not None:
-            realised = self._realised(gates, mean_share)
+            shares = gates.flatten(1).index_select(1, self._boundary_of_gate)
+            shares = torch.where(shares >= OPEN_SHARE, 1.0, shares)
+        interval = Interval(
+            due=due,
+            ways=self._ways(state, commands, chance),
+            chance=chance,
+            metering=commands.metering,
+            gates=shares,
+            light=light,
+            yields=yields,
+            opens=opens.index_select(1, self._gates.movement),
+        )
+        passed = self._passing(state, interval)
+        traffic = passed.traffic
+        realised = torch.ones_like(state.realised)
+        if gates is not None:
+            realised = self._realised(gates, passed.share)
         before = state.traffic
         gone = traffic.left - before.left + traffic.completed - before.completed
+        everywhere = passed.present.sum(1) + passed.outside + passed.held
         return LinkState(
             interval=state.interval + 1,
             draw=state.draw,
             traffic=traffic,
-            used=used,
-            stages=stages,
+            used=passed.used,
+            stages=passed.stages,
             chance=None,
-            asked=asked,
-            begun=begun,
-            spent=state.spent + dt * (present.sum(1) + outside.sum(1) + held.sum(1)),
-            present=dt * present,
+            asked=passed.asked,
+            begun=state.begun + passed.begun,
+            spent=state.spent + dt * everywhere,
+            present=dt * passed.present,
             gone=gone,
             realised=realised,
         )
@@ -355,31 +319,6 @@ class LinkModel:
             cells = drivers.by_times(static, state.present, state.gone, commands.prices)
         cells = static + compliance * (cells - static)
         return self.flows.ways(cells.to(self.flows.dtype), state.draw, chance)
-
-    def _metered(
-        self, traffic: Traffic, due: Tensor, metering: PerRegion | None
-    ) -> tuple[Traffic, Tensor]:
-        """Return the state, and the trips that may begin, by entry (veh, (B, E))."""
-        held = traffic.held + due
-        if metering is None:
-            return traffic._replace(held=torch.zeros_like(held)), held
-        by_region = self.flows.sums(held, self._region_of_entry, self.network.regions)
-        share = (metering * self.flows.dt / by_region.clamp(min=LEAST)).clamp(max=1.0)
-        released = held * share.index_select(1, self._region_of_entry)
-        return traffic._replace(held=held - released), released
-
-    def _gate_shares(self, gates: PerPair, inside: Tensor) -> Tensor:
-        """Return the share of green of each gate (-, (B, gates)).
-
-        As in cosim.plant.room, a gate opens while its street fills: from half the limit on.
-        """
-        share = gates.flatten(1).index_select(1, self._boundary_of_gate)
-        share = torch.where(share >= OPEN_SHARE, 1.0, share)
-        limit = self._choices.chain_limit
-        if limit:
-            full = (inside / self.flows.storage).index_select(1, self._link_of_gate)
-            share = torch.maximum(share, (2.0 * full / limit - 1.0).clamp(0.0, 1.0))
-        return share
 
     def _realised(self, gates: PerPair, share: Tensor) -> PerPair:
         """Return the mean share of green of each boundary.

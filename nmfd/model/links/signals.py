@@ -118,7 +118,7 @@ class Gates:
         """
         network = flows.network
         self._dt = flows.dt
-        self._extended = by_cycle and of_programme
+        self.extended = by_cycle and of_programme
         self.movements = np.flatnonzero(network.gated)
         self.opens = np.zeros(len(network.light))
         whole = np.ones(len(self.movements))
@@ -139,14 +139,15 @@ class Gates:
             self.opens[begin : begin + cycle] = opens
             whole[number] = capacity / opens.sum()
             taken[number] = max(green / opens.sum() - LEAST_GREEN_S, 0.0)
-        self.places = flows.places(self.movements)
-        self._whole = flows.values(whole)
-        self._taken = flows.values(taken)
-        self._cycle = flows.values(network.cycle[self.movements])
+        self.movement = flows.places(self.movements)
+        self.link = flows.places(network.movement_link[self.movements])
+        self.whole = flows.values(whole)
+        self.taken = flows.values(taken)
+        self.cycle = flows.values(network.cycle[self.movements])
 
     def start(self, batch: int) -> Tensor:
         """Return the state (B, gates) before the first step."""
-        return self._whole.new_zeros(batch, len(self._whole))
+        return self.whole.new_zeros(batch, len(self.whole))
 
     def limit(
         self, used: Tensor, light: Tensor, opens: Tensor, share: Tensor
@@ -156,13 +157,13 @@ class Gates:
         opens: 1 where a window begins with this step, else 0 (gates,)
         share: of the commands (-, (B, gates))
         """
-        seconds = light.index_select(1, self.places) * self._dt
+        seconds = light.index_select(1, self.movement) * self._dt
         used = used * (1.0 - opens)
-        budget = self._whole - (1.0 - share) * self._taken
-        if self._extended:  # an open gate has more green than the programme
-            budget = torch.where(share < 1.0, budget, self._cycle)
+        budget = self.whole - (1.0 - share) * self.taken
+        if self.extended:  # an open gate has more green than the programme
+            budget = torch.where(share < 1.0, budget, self.cycle)
         left = ((budget - used) / seconds.clamp(min=LEAST)).clamp(0.0, 1.0)
-        factor = torch.ones_like(light).index_copy(1, self.places, left)
+        factor = torch.ones_like(light).index_copy(1, self.movement, left)
         return used + seconds * left, light * factor
 
 
