@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-DRAWS = 128  # of an entry; then they come again
+DRAWS = 128  # of an entry, a power of 2; then they come again
 
 
 class Choice(NamedTuple):
