@@ -36,7 +36,7 @@ PICTURE = Path(__file__).with_name("house.svg")
 # together, plans of routes, MFDs of edgeData and trips from counts 6,000, chance, vehicles and a
 # fit in the plant of streets 4,000, its recordings for a GPU 700, and its steps with derivatives in
 # machine code 13,000: names and steps were not cut to come under it.
-TOKENS = 264_500
+TOKENS = 264_000
 TEST_TOKENS = 172_500
 TOKENS_PER_LINE = 9.5
 DECISIONS_IN_EXPRESSIONS = 0.65

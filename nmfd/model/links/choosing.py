@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from nmfd.model.links.compiled import compiled
+from nmfd.model.links.compiled import compiled, inner
 from nmfd.model.links.signals import Lights, Stages
 
 
@@ -74,7 +74,7 @@ def choose(signals: Choosing, inside: np.ndarray, stages: Stages) -> None:
                 stages.green[b, s] = zero
 
 
-@compiled
+@inner
 def _wanted(
     signals: Choosing,
     stages: Stages,

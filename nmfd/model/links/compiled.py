@@ -168,6 +168,8 @@ class _Work(NamedTuple):
     Names are those of the reference.
 
     number: of the draw of the next vehicle of each entry
+    left: share of a gate's green before it is limited to what there is
+    free: room on each link before it is limited
     """
 
     trips: Any
@@ -177,6 +179,7 @@ class _Work(NamedTuple):
     rate: Any
     light: Any
     share: Any
+    left: Any
     opened: Any
     arrived: Any
     up: Any
@@ -201,6 +204,7 @@ class _Work(NamedTuple):
     waiting: Any
     put: Any
     wanted: Any
+    free: Any
     receives: Any
     rho: Any
     entered: Any
@@ -228,6 +232,7 @@ def _work_of(city: City, given: Given) -> _Work:
         rate=np.empty(given.metering.shape[1], kind),
         light=np.empty(movements, kind),
         share=np.empty(gates, kind),
+        left=np.empty(gates, kind),
         opened=np.empty(gates, kind),
         arrived=np.empty(entries, kind),
         up=np.empty(entries, kind),
@@ -252,6 +257,7 @@ def _work_of(city: City, given: Given) -> _Work:
         waiting=np.empty(links, kind),
         put=np.empty(links, kind),
         wanted=np.empty(links, kind),
+        free=np.empty(links, kind),
         receives=np.empty(links, kind),
         rho=np.empty(links, kind),
         entered=np.empty(entries, kind),
@@ -364,6 +370,7 @@ def _gate(city: City, given: Given, counts: Counts, b: int, now: int, k: int, wo
         used = counts.used[now, b, g] * (one - given.opens[k, g])
         left = (budget - used) / max(seconds, city.least)
         work.share[g] = share
+        work.left[g] = left
         work.opened[g] = min(max(left, zero), one)
         work.light[m] *= work.opened[g]
 
@@ -496,6 +503,7 @@ def _receive(
         free = city.storage[i] - counts.inside[now, b, i] - (left - reached)
         put = min(city.most_in[i] / max(work.waiting[i], city.least), one)
         work.put[i] = put
+        work.free[i] = free
         work.receives[i] = min(max(free, city.zero), city.most_in[i])
         work.wanted[i] += work.waiting[i] * put
         work.rho[i] = min(work.receives[i] / max(work.wanted[i], city.least), one)
@@ -624,68 +632,6 @@ def _count_gates(
         sums.share[b, g] += work.share[g] / len(given.light)
 
 
-class _Slopes(NamedTuple):
-    """Derivatives by the intermediate numbers of a step (_Work).
-
-    put: by the product of put and rho
-    """
-
-    entered: Any
-    started: Any
-    up: Any
-    begin: Any
-    first: Any
-    by_turn: Any
-    going: Any
-    stood: Any
-    standing: Any
-    passed: Any
-    open_share: Any
-    light: Any
-    inside: Any
-    room: Any
-    queued: Any
-    moving_up: Any
-    waiting: Any
-    put: Any
-    wanted: Any
-    rho: Any
-    rate: Any
-
-
-@inner
-def _slopes_of(city: City, given: Given) -> _Slopes:
-    """Return room for the derivatives of a rollout."""
-    kind = given.cells.dtype
-    entries = len(city.link_of_entry)
-    turns = len(city.link_entered)
-    movements = len(city.link_left)
-    links = len(city.storage)
-    return _Slopes(
-        entered=np.empty(entries, kind),
-        started=np.empty(entries, kind),
-        up=np.empty(entries, kind),
-        begin=np.empty(entries, kind),
-        first=np.empty(len(city.onward), kind),
-        by_turn=np.empty(turns, kind),
-        going=np.empty(turns, kind),
-        stood=np.empty(turns, kind),
-        standing=np.empty(turns, kind),
-        passed=np.empty(movements, kind),
-        open_share=np.empty(movements, kind),
-        light=np.empty(movements, kind),
-        inside=np.empty(links, kind),
-        room=np.empty(links, kind),
-        queued=np.empty(links, kind),
-        moving_up=np.empty(links, kind),
-        waiting=np.empty(links, kind),
-        put=np.empty(links, kind),
-        wanted=np.empty(links, kind),
-        rho=np.empty(links, kind),
-        rate=np.empty(given.metering.shape[1], kind),
-    )
-
-
 @compiled
 def derive(
     city: City,
@@ -705,17 +651,15 @@ def derive(
     d_sums: by the sums
     """
     work = _work_of(city, given)
-    d = _slopes_of(city, given)
+    d = _work_of(city, given)  # derivatives by what has these names
     for b in range(len(given.due)):
         work.number[:] = -1
         for k in range(len(given.light) - 1, -1, -1):
             _flow(city, given, counts, histories, b, k, k, work)
             _leave_back(city, given, counts, d_counts, d_histories, d_sums, b, k, work, d)
-            _receive_back(
-                city, given, counts, histories, d_counts, d_histories, d_sums, b, k, work, d
-            )
+            _receive_back(city, given, d_counts, d_histories, d_sums, b, k, work, d)
             _see_green_back(city, given, counts, d_counts, b, k, work, d)
-            _gate_back(city, given, counts, d_given, d_counts, d_sums, b, k, work, d)
+            _gate_back(city, given, d_given, d_counts, d_sums, b, k, work, d)
             _move_up_back(
                 city, given, counts, histories, d_given, d_counts, d_histories, b, k, work, d
             )
@@ -734,15 +678,15 @@ def _leave_back(
     b: int,
     k: int,
     work: _Work,
-    d: _Slopes,
+    d: _Work,
 ) -> None:
     """4. Flows: entries that vehicles enter, then the cells that they leave."""
     entered = _row(d_histories.entered, given, k)
     started = _row(d_histories.started, given, k)
     ending = _row(d_histories.ending, given, k)
     had_left = _row(d_histories.had_left, given, k)
-    for i in range(len(d.inside)):
-        d.inside[i] = d_counts.inside[b, i] + d_sums.present[b, i]
+    for i in range(len(d.coming)):
+        d.coming[i] = d_counts.inside[b, i] + d_sums.present[b, i]
         d_counts.left[b, i] += d_histories.had_left[b, had_left, i]
     d.put[:] = city.zero
     for e in range(len(d.entered)):
@@ -763,11 +707,11 @@ def _leave_back(
     for m in range(len(d.passed)):
         i = city.link_left[m]
         d_recent = d_counts.recent[b, m]
-        d.passed[m] = d_counts.left[b, i] - d.inside[i]
+        d.passed[m] = d_counts.left[b, i] - d.coming[i]
         d.passed[m] += d_recent * city.smoothing / city.dt
         d_counts.recent[b, m] = d_recent - d_recent * city.smoothing
     for t in range(len(d.going)):
-        d_flow = d.inside[city.link_entered[t]] - d_counts.standing[b, t]
+        d_flow = d.coming[city.link_entered[t]] - d_counts.standing[b, t]
         d_flow += d.passed[city.movement_of_turn[t]]
         d.by_turn[t] = d_counts.standing[b, t] + d_flow * work.going[t]
         d.going[t] = d_flow * work.by_turn[t]
@@ -785,20 +729,18 @@ def _leave_back(
 def _receive_back(
     city: City,
     given: Given,
-    counts: Counts,
-    histories: Histories,
     d_counts: Counts,
     d_histories: Histories,
     d_sums: Sums,
     b: int,
     k: int,
     work: _Work,
-    d: _Slopes,
+    d: _Work,
 ) -> None:
     """3. Room on the next link."""
     one = city.one
     least = city.least
-    had_left = _row(histories.had_left, given, k)
+    had_left = _row(d_histories.had_left, given, k)
     d.rho[:] = city.zero
     for t in range(len(d.going)):
         d.rho[city.link_entered[t]] += d.going[t] * work.green[t]
@@ -806,7 +748,7 @@ def _receive_back(
         waiting = work.waiting[i]
         put = work.put[i]
         rho = work.rho[i]
-        d_coming = d.inside[i] - d_sums.outside[b]
+        d_coming = d.coming[i] - d_sums.outside[b]
         d_both = d.put[i] + d_coming * waiting
         d_rho = d.rho[i] + d_both * put
         d_waiting = d_sums.outside[b] + d_coming * (put * rho)
@@ -821,15 +763,12 @@ def _receive_back(
             d_waiting -= d_put * ratio / waiting
         d.waiting[i] = d_waiting
         later = had_left - city.backwards[i]
-        reached = histories.had_left[b, later, i]
-        reached += city.earlier[i] * (histories.had_left[b, later - 1, i] - reached)
-        free = city.storage[i] - counts.inside[k, b, i] - (counts.left[k, b, i] - reached)
-        if free < city.zero or free > city.most_in[i]:
+        if work.free[i] < city.zero or work.free[i] > city.most_in[i]:
             d_receives = city.zero
         d_histories.had_left[b, later, i] += d_receives * (one - city.earlier[i])
         d_histories.had_left[b, later - 1, i] += d_receives * city.earlier[i]
         d_counts.left[b, i] -= d_receives
-        d_counts.inside[b, i] = d.inside[i] - d_receives
+        d_counts.inside[b, i] = d.coming[i] - d_receives
 
 
 @inner
@@ -841,7 +780,7 @@ def _see_green_back(
     b: int,
     k: int,
     work: _Work,
-    d: _Slopes,
+    d: _Work,
 ) -> None:
     """2. Vehicles that can go."""
     one = city.one
@@ -860,15 +799,14 @@ def _see_green_back(
         below = max(standing, least)
         most = city.per_step[m] * work.open_share[m] * city.lanes_of_turn[t]
         ratio = most / below
-        d.standing[t] = city.zero
+        d_standing = d.stood[t] / max(work.by_turn[t], city.epsilon)
         if ratio <= one:
             d.open_share[m] += d_leader / below * city.per_step[m] * city.lanes_of_turn[t]
             if standing >= least:
-                d.standing[t] = -d_leader * ratio / below
-        below = max(work.by_turn[t], city.epsilon)
-        d.standing[t] += d.stood[t] / below
+                d_standing -= d_leader * ratio / below
         if work.by_turn[t] >= city.epsilon:
-            d.by_turn[t] -= d.stood[t] * stood / below
+            d.by_turn[t] -= d.stood[t] * stood / work.by_turn[t]
+        d_counts.standing[b, t] = d_standing
     for m in range(len(d.light)):
         gap = work.gap[m]
         yields = given.yields[k, b, m]
@@ -882,14 +820,13 @@ def _see_green_back(
 def _gate_back(
     city: City,
     given: Given,
-    counts: Counts,
     d_given: Given,
     d_counts: Counts,
     d_sums: Sums,
     b: int,
     k: int,
     work: _Work,
-    d: _Slopes,
+    d: _Work,
 ) -> None:
     """Lights under the gates."""
     one = city.one
@@ -900,18 +837,13 @@ def _gate_back(
         light = given.light[k, b, city.movement[g]]
         seconds = light * city.dt
         share = work.share[g]
-        extended = city.extended and share >= one
-        budget = city.whole[g] - (one - share) * city.taken[g]
-        if extended:
-            budget = city.cycle[g]
         kept = one - given.opens[k, g]
         below = max(seconds, city.least)
-        left = (budget - counts.used[k, b, g] * kept) / below
         d_left = d.light[city.movement[g]] * light + d_counts.used[b, g] * seconds
-        if left < zero or left > one:
+        if work.left[g] < zero or work.left[g] > one:
             d_left = zero
         d_share = d_sums.share[b, g] / len(given.light)
-        if not extended:
+        if share < one or not city.extended:
             d_share += d_left / below * city.taken[g]
         d_counts.used[b, g] = (d_counts.used[b, g] - d_left / below) * kept
         if share == given.gates[b, g]:
@@ -934,7 +866,7 @@ def _move_up_back(
     b: int,
     k: int,
     work: _Work,
-    d: _Slopes,
+    d: _Work,
 ) -> None:
     """1. The first vehicles."""
     one = city.one
@@ -950,7 +882,7 @@ def _move_up_back(
     for e in range(len(d.up)):
         d.moving_up[city.link_of_entry[e]] += d.up[e] * work.arrived[e]
     for i in range(len(d.room)):
-        d_completed = d_counts.completed[b, i] - d.inside[i]
+        d_completed = d_counts.completed[b, i] - d.coming[i]
         d_stopped = d_completed - d_counts.stopping[b, i]
         d_moving_up = d.moving_up[i]
         speed = city.pace_to_end[i] * work.moving_up[i]
@@ -972,8 +904,7 @@ def _move_up_back(
         n = city.server[p]
         if work.in_lane[n] <= one:
             d_in_lane = -d.room[city.link_of_lane[n]] * city.first_of_lane[n]
-            d.standing[city.served[p]] += d_in_lane * city.lane_share[p]
-    d_counts.standing[b] = d.standing
+            d_counts.standing[b, city.served[p]] += d_in_lane * city.lane_share[p]
 
 
 @inner
@@ -985,7 +916,7 @@ def _arrive_back(
     b: int,
     k: int,
     work: _Work,
-    d: _Slopes,
+    d: _Work,
 ) -> None:
     """Vehicles that arrive at the queue."""
     entered = _row(d_histories.entered, given, k)
@@ -1012,7 +943,7 @@ def _begin_back(
     b: int,
     k: int,
     work: _Work,
-    d: _Slopes,
+    d: _Work,
 ) -> None:
     """Trips that may begin."""
     metered = len(given.metering) > 0

@@ -178,7 +178,7 @@ class Delay:
 class Flows:
     """Equations of one city; `step` advances B rollouts by `dt` seconds."""
 
-    delay = Delay
+    delay = Delay  # kind of the histories
 
     def __init__(
         self,

@@ -175,6 +175,7 @@ class CompiledSteps(Steps):
 class _Run:
     """The steps of one interval.
 
+    count: their number
     varied: tensors that have derivatives: OF_GIVEN, then those of Counts but `asked`, Histories
     """
 
@@ -190,7 +191,8 @@ class _Run:
             state.used,
             *(getattr(traffic, name) for name in Histories._fields),
         ]
-        self.steps = steps
+        self.count = steps.steps
+        self._steps = steps
         self._state = state
         self._interval = interval
         self._stages = state.stages
@@ -201,7 +203,7 @@ class _Run:
 
         rows: of the counts, as Counts
         """
-        steps = self.steps.steps
+        count = self.count
         begin = _arrays(self.varied[len(OF_GIVEN) :])
         asked = _arrays([self._state.asked])
         counts = []
@@ -212,7 +214,7 @@ class _Run:
         histories = []
         for values in begin[-len(Histories._fields) :]:
             batch, first, columns = values.shape
-            kept = np.empty((batch, first + steps, columns), values.dtype)
+            kept = np.empty((batch, first + count, columns), values.dtype)
             kept[:, :first] = values
             histories.append(kept)
         self._counts = Counts(*counts)
@@ -222,13 +224,13 @@ class _Run:
         numbers = [np.zeros(len(used)) for _ in range(3)]  # sums of many: in float64
         sums = Sums(*numbers, *(np.zeros_like(values) for values in (inside, inside, used)))
         now = 0
-        while now < steps:
+        while now < count:
             then = self._show(now, rows)
-            city = self.steps.city
+            city = self._steps.city
             advance(city, self._given, self._counts, self._histories, sums, now, then)
             now = then
-        after = [values[steps % rows].copy() for values in counts]
-        after += [values[:, steps:].copy() for values in histories]
+        after = [values[count % rows].copy() for values in counts]
+        after += [values[:, count:].copy() for values in histories]
         after += [values.astype(used.dtype) for values in sums]
         return tuple(map(torch.from_numpy, after))
 
@@ -244,12 +246,12 @@ class _Run:
         histories = []
         for values, last in zip(self._histories, by[len(counts) :], strict=False):
             found = np.zeros_like(values)
-            found[:, self.steps.steps :] = last
+            found[:, self.count :] = last
             histories.append(found)
         sums = Sums(*by[-len(Sums._fields) :])
         given = [np.zeros_like(getattr(self._given, name)) for name in OF_GIVEN]
         derive(
-            self.steps.city,
+            self._steps.city,
             self._given,
             self._counts,
             self._histories,
@@ -259,7 +261,7 @@ class _Run:
             sums,
         )
         for number, found in enumerate(histories):
-            histories[number] = found[:, : -self.steps.steps]
+            histories[number] = found[:, : -self.count]
         return [torch.from_numpy(array) for array in (*given, *counts[1:], *histories)]
 
     def passed(self, after: Sequence[Tensor]) -> Passed:
@@ -301,18 +303,18 @@ class _Run:
 
         Return the step of that decision.
         """
-        signals = self.steps.signals
-        steps = self.steps.steps
+        signals = self._steps.signals
+        count = self.count
         if signals is None:
-            return steps
+            return count
         counts = {}
         for name in OF_TRAFFIC:
             counts[name] = torch.from_numpy(getattr(self._counts, name)[now % rows])
         for name, values in self._histories._asdict().items():
-            counts[name] = torch.from_numpy(values[:, now : values.shape[1] - steps + now])
+            counts[name] = torch.from_numpy(values[:, now : values.shape[1] - count + now])
         traffic = Traffic(**counts, outside=self._state.traffic.outside)
         interval = self._interval
-        first = self._state.interval * steps
+        first = self._state.interval * count
         with torch.no_grad():
             while True:
                 programme = Lights(interval.light[now : now + 1], interval.yields[now : now + 1])
@@ -320,7 +322,7 @@ class _Run:
                 self._given.light[now] = lights.light
                 self._given.yields[now] = lights.yields
                 now += 1
-                if now == steps or (first + now) % signals.period == 0:
+                if now == count or (first + now) % signals.period == 0:
                     return now
 
 
@@ -328,7 +330,7 @@ class _Differentiable(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, run: _Run, *varied: Tensor) -> tuple[Tensor, ...]:
         ctx.run = run
-        return run.advanced(rows=run.steps.steps + 1)
+        return run.advanced(rows=run.count + 1)
 
     @staticmethod
     def backward(ctx: Any, *weights: Tensor) -> tuple[Tensor | None, ...]:
