@@ -123,17 +123,32 @@ def test_outflow_samples_lie_on_the_mfd(scenario, result):
 
 
 def test_held_up_is_who_collapsed_later():
-    """Regions 0-1-2 in a row; 1 collapses at k = 2, 0 at k = 3, and 2 never; then 1 recovers."""
+    """Regions 0-1-2 in a row; 1 collapses at k = 2, 0 at k = 3, and 2 never; then 1 recovers.
+
+    Each k is three intervals long, as outflows are means of three.
+    """
     adjacency = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]], dtype=bool)
     accumulation = np.array(
         [[10, 10, 10], [20, 20, 20], [30, 30, 20], [40, 30, 20], [50, 20, 20]], dtype=float
     )
     outflow = np.array([[1, 1, 1], [2, 2, 2], [2, 1, 2], [1, 1, 2], [1, 2, 2]], dtype=float)
-    found = held_up(accumulation, outflow, adjacency)
-    assert found.T.tolist() == [
+    found = held_up(accumulation.repeat(3, axis=0), outflow.repeat(3, axis=0), adjacency)
+    assert found[1::3].T.tolist() == [
         [False, False, True, True, False],
-        [False] * 5,
+        [False, False, False, False, True],  # held up by 0 now
         [False, False, True, True, False],
+    ]
+
+
+def test_an_earlier_collapse_that_is_over_does_not_count():
+    """Regions 0-1; 0 collapses at k = 2, and recovers; at k = 5 region 1 does, and at 6 also 0."""
+    adjacency = ~np.eye(2, dtype=bool)
+    accumulation = np.array([[1, 1], [2, 2], [3, 2], [1, 2], [2, 2], [2, 3], [3, 4]], dtype=float)
+    outflow = np.array([[1, 1], [2, 2], [1, 2], [1, 2], [2, 2], [2, 1], [1, 1]], dtype=float)
+    found = held_up(accumulation.repeat(3, axis=0), outflow.repeat(3, axis=0), adjacency)
+    assert found[1::3].T.tolist() == [
+        [False, False, False, False, False, True, True],
+        [False, False, True, False, False, False, False],
     ]
 
 

@@ -124,6 +124,14 @@ def test_one_step_by_hand():
     assert gate(controller.act(seen(3600.0, 1))) == pytest.approx(by_hand, rel=1e-12)
 
 
+def test_a_gate_moves_by_at_most_max_change():
+    options = with_options(set_point=[3000.0], kp=5.0, max_change=0.2)
+    controller = api.controller("pi-gating", options)
+    controller.act(seen(3000.0))
+    gates = [gate(controller.act(seen(n, k))) for k, n in enumerate((5000.0, 7000.0, 5000.0), 1)]
+    assert gates == pytest.approx([0.7, 0.5, 0.7])
+
+
 def test_reset_forgets():
     controller = api.controller("pi-gating", SCENARIO)
     for step in range(5):

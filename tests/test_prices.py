@@ -128,3 +128,19 @@ def test_a_price_that_is_the_same_everywhere_changes_no_way():
     assert torch.allclose(answer(x, torch.full_like(centre, 19.0)), answer.own, atol=1e-6)
     assert torch.allclose(answer(x, 2.0 * centre + 1.0), answer(x, centre), atol=1e-6)
     assert not torch.allclose(answer(x, centre), answer.own, atol=0.05)
+
+
+def test_the_longest_delay_bounds_how_many_a_price_diverts():
+    network = parse("dpc-pcrg+max-pressure").own_planning(load_scenario("grid7_peak")).network
+    network = replace(network, dispersion=60.0)
+    centre = torch.zeros(network.regions)
+    centre[3] = 50.0
+    x = 20.0 * torch.ones(network.regions, network.regions)
+    plain = Answer(replace(network, longest_delay=np.inf))
+    bounded = Answer(replace(network, longest_delay=30.0))
+    own = plain.own[2, 3, 4]  # from west to east through the centre; others go around it
+    assert plain(x, centre)[2, 3, 4] < 1e-6
+    odds = np.exp(-30.0 / 60.0) * own  # if no other way were delayed
+    assert odds / (odds + 1.0 - own) <= bounded(x, centre)[2, 3, 4] < own
+    small = 1e-4 * centre
+    torch.testing.assert_close(bounded(x, small), plain(x, small), atol=1e-3, rtol=0.0)

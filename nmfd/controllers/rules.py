@@ -102,6 +102,9 @@ class PiGating(SetPoint):
     ki: float | None = setting(
         "integral gain, per relative error; by default from the city", None, unit="1/s", gt=0.0
     )
+    max_change: float = setting(
+        "largest change of a gate from one interval to the next", 1.0, unit="-", gt=0.0, le=1.0
+    )
 
     def make(self, planning: PlanningModel) -> "PiGate":
         """Return the controller. Raise InputError without a protected region."""
@@ -168,8 +171,9 @@ class PiGate:
 
     n_p is the accumulation of the protected region p. All entries h -> p have the same opening:
 
-        u_hp(k) = clip(u_hp(k-1) + kp (n_p(k-1) - n_p(k)) / n_cr
-                       + ki dt (n_set - n_p(k)) / n_cr,  u_min, u_max)
+        u_hp(k) = clip(u_hp(k-1) + c(k),  u_min, u_max)
+        c(k) = clip(kp (n_p(k-1) - n_p(k)) / n_cr + ki dt (n_set - n_p(k)) / n_cr,
+                    -max_change, max_change)
 
     n_cr is the critical accumulation of p, dt the control interval, n_set the option set_point or
     the accumulation of outflow_share. u_hp(k-1) is the clipped value or, if the city reports it,
@@ -203,6 +207,7 @@ class PiGate:
         self._ki = INTEGRAL_SHARE / fill
         if options.ki is not None:
             self._ki = np.full(len(fill), options.ki * planning.step)
+        self._most = options.max_change
         self._open = network.open_perimeter
         self._entries = network.adjacency[:, self.regions]
         self._bounds = network.u_min, network.u_max
@@ -218,8 +223,9 @@ class PiGate:
         if observation.realised is not None:
             realised = observation.realised[:, self.regions]
             self._gate = np.average(realised, axis=0, weights=self._entries)
-        change = self._kp * (before - now) + self._ki * (self.set_point - now)
-        self._gate = np.clip(self._gate + change / self.critical, *self._bounds)
+        wish = self._kp * (before - now) + self._ki * (self.set_point - now)
+        change = np.clip(wish / self.critical, -self._most, self._most)
+        self._gate = np.clip(self._gate + change, *self._bounds)
         self._before = now
         perimeter = self._open.copy()
         perimeter[:, self.regions] = np.where(self._entries, self._gate, 0.0)

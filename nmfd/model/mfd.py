@@ -398,15 +398,20 @@ def held_up(accumulation: OverTime, outflow: OverTime, adjacency: Adjacency) -> 
 
     The neighbour has collapsed, and did so before the region. A collapsed region holds more
     vehicles than when its outflow was largest so far, and lets out less than COLLAPSED_SHARE of
-    that. Its queues spill back and lower the outflow of the region behind.
+    that. Its queues spill back and lower the outflow of the region behind. Outflows are means of
+    three intervals here, so that chance in one of them is no collapse.
 
     accumulation, outflow: (veh), (veh/s), both (T, R)
     """
+    from scipy.ndimage import uniform_filter1d  # slow to import
+
+    outflow = uniform_filter1d(np.asarray(outflow, dtype=float), 3, axis=0, mode="nearest")
     largest = np.maximum.accumulate(outflow)
     interval = np.arange(len(outflow))[:, None]
     best = np.maximum.accumulate(np.where(outflow == largest, interval, 0))
     fuller = accumulation > np.take_along_axis(accumulation, best, axis=0)
     collapsed = fuller & (outflow < COLLAPSED_SHARE * largest)
-    onset = np.where(collapsed.any(axis=0), collapsed.argmax(axis=0), len(outflow))
-    earlier = adjacency & (onset[None, :] < onset[:, None])
-    return (collapsed[:, None, :] & earlier[None]).any(axis=2)
+    flowed = np.maximum.accumulate(np.where(collapsed, -1, interval))
+    onset = np.where(collapsed, flowed, len(outflow))
+    earlier = onset[:, None, :] < onset[:, :, None]
+    return (adjacency & earlier).any(axis=2)

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -98,6 +99,8 @@ class RegionalModel:
     equal_ways: ways in use take the same time in free flow, whichever region comes next (see
         `detours`); False: the time in a region does not depend on the next one
     dispersion: of the logit by which guided drivers answer prices, see nmfd.model.answer (s)
+    longest_delay: beyond which guided drivers hardly see a difference between ways (s); infinite: a
+        plain logit
     placeholder: the MFDs are guesses that no run has measured
     doubts: warnings about the fit of each region; () if unknown
     held_out: errors in runs that the model has not seen; None if unknown
@@ -121,6 +124,7 @@ class RegionalModel:
     critical_above: Mapping[int, float] = field(default_factory=dict)
     equal_ways: bool = False
     dispersion: float = DISPERSION_S
+    longest_delay: float = math.inf
     placeholder: bool = False
     doubts: tuple[tuple[str, ...], ...] = ()
     held_out: HeldOut | None = None
@@ -281,6 +285,8 @@ class RegionalModel:
             content.append("equal_ways")
         if self.dispersion != DISPERSION_S:
             content.append(["dispersion", self.dispersion])
+        if math.isfinite(self.longest_delay):
+            content.append(["longest_delay", self.longest_delay])
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
 
@@ -444,6 +450,9 @@ class NetworkTable(Settings):
         ge=1.0,
         le=1e4,
     )
+    longest_delay: float | None = setting(
+        "delay by prices beyond which guided drivers see no difference", None, unit="s", gt=0.0
+    )
     mfd: MfdTable | None = setting("MFD of every region without one of its own", None)
     held_out: HeldOutTable | None = setting(
         "errors in runs that the model has not seen, by cosim identify; nmfd train and MPC refuse "
@@ -558,6 +567,7 @@ def _network(table: NetworkTable, folder: Path) -> RegionalModel:
         critical_above=critical_above,
         equal_ways=table.equal_ways,
         dispersion=table.dispersion,
+        longest_delay=math.inf if table.longest_delay is None else table.longest_delay,
         placeholder=table.placeholder,
         doubts=doubts,
         held_out=None if table.held_out is None else table.held_out.held_out,

@@ -1,13 +1,14 @@
-"""Identify how guided drivers answer prices: the dispersion of the logit in nmfd.model.answer.
+"""Identify how guided drivers answer prices: dispersion and longest delay in nmfd.model.answer.
 
     python scenarios/grid7_peak/price_response.py runs/price-response
 
-Prices of every region are drawn at random every six minutes. The dispersion is the one with the
+Prices of every region are drawn at random every six minutes. Both numbers are those with the
 largest likelihood of the next regions that vehicles took (crossings of boundaries by destination),
 given the state at the beginning of each interval. Printed beside it: the gain in likelihood over
 nominal split ratios, relative to that of the best constants.
 """
 
+import math
 import sys
 from pathlib import Path
 
@@ -64,7 +65,7 @@ def likelihood(runs: list[Result], answer: Answer, dispersion: float) -> tuple[f
 
 
 def main(folder: Path) -> None:
-    """Do the runs that are not in `folder` yet, and print the likelihood of several dispersions."""
+    """Do the runs that are not in `folder` yet, and print likelihoods of an answer."""
     scenario = nmfd.load_scenario("grid7_peak")
     table = "dpc-pcrg+max-pressure+guidance-period-60+metering"
     answer = Answer(parse(table).own_planning(scenario).network)
@@ -72,10 +73,12 @@ def main(folder: Path) -> None:
     cosim.evaluate("grid7_peak", [strategy], seeds=SEEDS, demand=LEVELS, workers=1, out=folder)
     runs = [Result.read(file) for file in sorted(folder.glob("**/*.nc"))]
     nominal, constant = likelihood(runs, answer, 1e6)
-    for dispersion in (30, 60, 100, 150, 200, 300, 400, 500, 700, 1000):
-        value, _ = likelihood(runs, answer, dispersion)
-        gain = (value - nominal) / (constant - nominal)
-        print(f"{dispersion:5} s: {value:.4f} per crossing, {gain:.2f} of the gain")
+    print("dispersion, longest delay: share of the gain of the best constants")
+    for answer.longest_delay in (30.0, 60.0, 120.0, 240.0, math.inf):
+        for dispersion in (30, 60, 80, 100, 150, 200, 300, 400, 500, 700):
+            value, _ = likelihood(runs, answer, dispersion)
+            gain = (value - nominal) / (constant - nominal)
+            print(f"{dispersion:5} s, {answer.longest_delay:5g} s: {gain:5.2f}")
 
 
 if __name__ == "__main__":
