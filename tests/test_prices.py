@@ -136,7 +136,7 @@ def test_the_longest_delay_bounds_how_many_a_price_diverts():
     centre = torch.zeros(network.regions)
     centre[3] = 50.0
     x = 20.0 * torch.ones(network.regions, network.regions)
-    plain = Answer(replace(network, longest_delay=np.inf))
+    plain = Answer(replace(network, longest_delay=None))
     bounded = Answer(replace(network, longest_delay=30.0))
     own = plain.own[2, 3, 4]  # from west to east through the centre; others go around it
     assert plain(x, centre)[2, 3, 4] < 1e-6

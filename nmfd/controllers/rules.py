@@ -207,7 +207,7 @@ class PiGate:
         self._ki = INTEGRAL_SHARE / fill
         if options.ki is not None:
             self._ki = np.full(len(fill), options.ki * planning.step)
-        self._most = options.max_change
+        self._max_change = options.max_change
         self._open = network.open_perimeter
         self._entries = network.adjacency[:, self.regions]
         self._bounds = network.u_min, network.u_max
@@ -224,7 +224,7 @@ class PiGate:
             realised = observation.realised[:, self.regions]
             self._gate = np.average(realised, axis=0, weights=self._entries)
         wish = self._kp * (before - now) + self._ki * (self.set_point - now)
-        change = np.clip(wish / self.critical, -self._most, self._most)
+        change = np.clip(wish / self.critical, -self._max_change, self._max_change)
         self._gate = np.clip(self._gate + change, *self._bounds)
         self._before = now
         perimeter = self._open.copy()

@@ -15,12 +15,10 @@ Where the time in a region depends on the next one (RegionalModel.detours), so d
     theta_ihj ~ theta0_ihj exp(-(e_hj + c_i t_ij detour_ihj) / s)
     e_hj = c_h t_hj (1 + sum_g theta0_hgj detour_hgj) + sum_g theta0_hgj e_gj
 
-With a `longest_delay` L of the network, what a way takes more than the least one for drivers to j,
-d = e_hj - min_g e_gj, counts as L (1 - exp(-d / L)): an alternative is either taken or not, so that
-higher and higher prices change little. The answer is differentiable.
+With a `longest_delay` L of the network, a way whose price adds d more than the least one counts as
+delayed by L (1 - exp(-d / L)): who can go another way does so at a small price already, and a
+larger one diverts few others. The answer is differentiable.
 """
-
-import math
 
 import torch
 from torch import nn
@@ -78,7 +76,7 @@ class Answer(nn.Module):
         least = torch.where(self.own > 0, costs, torch.inf).amin(-2, keepdim=True)
         least = torch.where(least.isfinite(), least, 0.0)
         more = (costs - least).clamp(min=0.0)
-        if math.isfinite(self.longest_delay):
+        if self.longest_delay is not None:
             more = self.longest_delay * -torch.expm1(-more / self.longest_delay)
         weight = self.own * torch.exp(-more / self.dispersion)
         return weight / weight.sum(-2, keepdim=True).clamp(min=1e-9)

@@ -405,13 +405,13 @@ def held_up(accumulation: OverTime, outflow: OverTime, adjacency: Adjacency) -> 
     """
     from scipy.ndimage import uniform_filter1d  # slow to import
 
-    outflow = uniform_filter1d(np.asarray(outflow, dtype=float), 3, axis=0, mode="nearest")
-    largest = np.maximum.accumulate(outflow)
+    mean = uniform_filter1d(outflow, 3, axis=0, output=float, mode="nearest")
+    largest = np.maximum.accumulate(mean)
     interval = np.arange(len(outflow))[:, None]
-    best = np.maximum.accumulate(np.where(outflow == largest, interval, 0))
+    best = np.maximum.accumulate(np.where(mean == largest, interval, 0))
     fuller = accumulation > np.take_along_axis(accumulation, best, axis=0)
-    collapsed = fuller & (outflow < COLLAPSED_SHARE * largest)
-    flowed = np.maximum.accumulate(np.where(collapsed, -1, interval))
-    onset = np.where(collapsed, flowed, len(outflow))
+    collapsed = fuller & (mean < COLLAPSED_SHARE * largest)
+    last_flowing = np.maximum.accumulate(np.where(collapsed, -1, interval))
+    onset = np.where(collapsed, last_flowing, len(mean))  # of the collapse that lasts
     earlier = onset[:, None, :] < onset[:, :, None]
     return (adjacency & earlier).any(axis=2)

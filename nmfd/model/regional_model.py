@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -99,8 +98,8 @@ class RegionalModel:
     equal_ways: ways in use take the same time in free flow, whichever region comes next (see
         `detours`); False: the time in a region does not depend on the next one
     dispersion: of the logit by which guided drivers answer prices, see nmfd.model.answer (s)
-    longest_delay: beyond which guided drivers hardly see a difference between ways (s); infinite: a
-        plain logit
+    longest_delay: by prices, beyond which guided drivers hardly tell ways apart (s); None: a plain
+        logit
     placeholder: the MFDs are guesses that no run has measured
     doubts: warnings about the fit of each region; () if unknown
     held_out: errors in runs that the model has not seen; None if unknown
@@ -124,7 +123,7 @@ class RegionalModel:
     critical_above: Mapping[int, float] = field(default_factory=dict)
     equal_ways: bool = False
     dispersion: float = DISPERSION_S
-    longest_delay: float = math.inf
+    longest_delay: float | None = None
     placeholder: bool = False
     doubts: tuple[tuple[str, ...], ...] = ()
     held_out: HeldOut | None = None
@@ -285,7 +284,7 @@ class RegionalModel:
             content.append("equal_ways")
         if self.dispersion != DISPERSION_S:
             content.append(["dispersion", self.dispersion])
-        if math.isfinite(self.longest_delay):
+        if self.longest_delay is not None:
             content.append(["longest_delay", self.longest_delay])
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
@@ -451,7 +450,11 @@ class NetworkTable(Settings):
         le=1e4,
     )
     longest_delay: float | None = setting(
-        "delay by prices beyond which guided drivers see no difference", None, unit="s", gt=0.0
+        "delay by prices beyond which guided drivers hardly tell ways apart",
+        None,
+        unit="s",
+        gt=0.0,
+        le=1e4,
     )
     mfd: MfdTable | None = setting("MFD of every region without one of its own", None)
     held_out: HeldOutTable | None = setting(
@@ -567,7 +570,7 @@ def _network(table: NetworkTable, folder: Path) -> RegionalModel:
         critical_above=critical_above,
         equal_ways=table.equal_ways,
         dispersion=table.dispersion,
-        longest_delay=math.inf if table.longest_delay is None else table.longest_delay,
+        longest_delay=table.longest_delay,
         placeholder=table.placeholder,
         doubts=doubts,
         held_out=None if table.held_out is None else table.held_out.held_out,
