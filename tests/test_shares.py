@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from cosim.plant.routes import Choice
+from cosim.plant.routes import Choices
 from cosim.plant.shares import MEMORY, SHARE_PENALTY_S, Shares, assigned, shifted
 
 HALF = (0.5, 0.5)
@@ -65,7 +65,7 @@ def shares_of(theta):
 
 
 def next_region(shares, *times, exists=(True, True), limit=math.inf):
-    choices = [Choice(time, there, list) for time, there in zip(times, exists, strict=True)]
+    choices = Choices(list(times), list(exists), route=lambda n: [])
     return shares.next_region(0, [1, 2], 3, choices, limit)
 
 

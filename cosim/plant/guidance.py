@@ -22,7 +22,7 @@ import numpy as np
 
 from cosim.plant.drivers import Drivers, Present
 from cosim.plant.meter import Event
-from cosim.plant.routes import Choice, RegionRoutes, TravelTimes, Ways
+from cosim.plant.routes import Choices, RegionRoutes, TravelTimes, Ways
 from cosim.plant.sampling import StreetMeans
 from cosim.plant.shares import Shares
 from cosim.plant.stuck import QUEUE_END_M, Lanes
@@ -291,7 +291,7 @@ class Guide:
         ways = self._routes.ways(trip.region, trip.driver_class, free)
         present = self._present(trip, free)
         choices = ways.choices(trip.here, trip.target, present.longest, self._most_detour)
-        fastest = min((choice.time for choice in choices), default=math.inf)
+        fastest = min(choices.times, default=math.inf)
         if fastest == math.inf:
             return None
         if free != self._routes.regions:
@@ -300,10 +300,10 @@ class Guide:
         n = self._next_region(trip, ways, choices, limit)
         if n is None:
             return None
-        return self._change(present, choices[n].time, choices[n], ways.exits.neighbours[n])
+        return self._change(present, choices.times[n], choices, n, ways)
 
     def _plan_priced(
-        self, trip: _Trip, ways: Ways, present: Present, choices: list[Choice]
+        self, trip: _Trip, ways: Ways, present: Present, choices: Choices
     ) -> _Plan | None:
         """Return the plan of a driver who sees prices.
 
@@ -315,34 +315,36 @@ class Guide:
         present_unpriced = self._present(trip, all_free)
         longest = present_unpriced.longest
         shortest = unpriced.choices(trip.here, trip.target, longest, self._most_detour)
-        limit = min(choice.time for choice in shortest) + self._most_detour
-        within = []
-        for choice, short in zip(choices, shortest, strict=True):
-            route = self._shortened(trip, choice, short, limit)
-            time = self._time(trip, route, free) if route else math.inf
-            within.append(Choice(time, choice.exists or short.exists, route.copy))
+        limit = min(shortest.times) + self._most_detour
+        numbers = range(len(choices.times))
+        routes = [self._shortened(trip, choices, shortest, n, limit) for n in numbers]
+        times = [self._time(trip, route, free) if route else math.inf for route in routes]
+        exist = [choices.exist[n] or shortest.exist[n] for n in numbers]
+        within = Choices(times, exist, routes.__getitem__)
         n = self._next_region(trip, ways, within, math.inf)
         if n is None:
             return None
-        time = within[n].time
+        time = times[n]
         if present_unpriced.time > limit:
             # Prices do not justify so long a detour: the present route is judged without them.
             present = present_unpriced
-            time = self._time(trip, within[n].route(), all_free)
-        return self._change(present, time, within[n], ways.exits.neighbours[n])
+            time = self._time(trip, routes[n], all_free)
+        return self._change(present, time, within, n, ways)
 
-    def _shortened(self, trip: _Trip, choice: Choice, shortest: Choice, limit: float) -> list[int]:
-        """Return a route within the limit; [] if there is none.
+    def _shortened(
+        self, trip: _Trip, choices: Choices, shortest: Choices, n: int, limit: float
+    ) -> list[int]:
+        """Return the n-th route, or the shortest, within the limit; [] without.
 
-        choice: the fastest route with prices; shortest: without prices
+        choices: the fastest routes with prices; shortest: without prices
         limit: of the time without prices (s)
         """
-        if choice.time < math.inf:
-            route = choice.route()
+        if choices.times[n] < math.inf:
+            route = choices.route(n)
             if self._time(trip, route, self._routes.regions) <= limit:
                 return route
-        if shortest.time <= limit < math.inf:
-            return shortest.route()
+        if shortest.times[n] <= limit < math.inf:
+            return shortest.route(n)
         return []
 
     def _present(self, trip: _Trip, free: tuple[int, ...]) -> Present:
@@ -360,21 +362,20 @@ class Guide:
         """
         return self._drivers.time(route, self._routes.time(trip.driver_class, free))
 
-    def _next_region(
-        self, trip: _Trip, ways: Ways, choices: list[Choice], limit: float
-    ) -> int | None:
+    def _next_region(self, trip: _Trip, ways: Ways, choices: Choices, limit: float) -> int | None:
         """Return which choice a driver gets; None if no share is left."""
         neighbours = ways.exits.neighbours
         return self._shares.next_region(trip.region, neighbours, trip.destination, choices, limit)
 
-    def _change(self, present: Present, time: float, choice: Choice, following: int) -> _Plan:
-        """Return the plan to change to a choice that takes `time` (s).
+    def _change(self, present: Present, time: float, choices: Choices, n: int, ways: Ways) -> _Plan:
+        """Return the plan to change to the n-th choice, which takes `time` (s).
 
         The driver keeps the present route if it is about as good.
         """
+        following = ways.exits.neighbours[n]
         if self._drivers.keeps(present, time, following):
-            return _Plan(None, int(following))
-        return _Plan(choice.route(), int(following))
+            return _Plan(None, following)
+        return _Plan(choices.route(n), following)
 
 
 def _steps(seconds: float, session: Session) -> int:

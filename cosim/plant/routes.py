@@ -9,7 +9,8 @@ interval counts half.
 import math
 from bisect import bisect_right
 from collections.abc import Callable, Iterable, Sequence
-from functools import cache, cached_property, partial
+from functools import cache, cached_property
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -295,14 +296,15 @@ class Trees:
 
     def _tree(self, node: int, most: float) -> _Tree:
         """Return the search from a node, at least up to `most` (s)."""
-        self.asked.add(node)
-        row = self._row.get(node)
-        if row is None:
-            return self._searches.tree(self._owner, node, most, self._search)
-        if node not in self._found:
+        tree = self._found.get(node)
+        if tree is None:
+            self.asked.add(node)
+            row = self._row.get(node)
+            if row is None:
+                return self._searches.tree(self._owner, node, most, self._search)
             costs, before = self._searched_together
-            self._found[node] = self._as_tree(node, math.inf, costs[row], before[row])
-        return self._found[node]
+            tree = self._found[node] = self._as_tree(node, math.inf, costs[row], before[row])
+        return tree
 
     def _search(self, node: int, most: float) -> _Tree:
         """Return a new search from a node up to `most` (s)."""
@@ -323,23 +325,23 @@ class Trees:
         return _Tree(most, costs, before, times.tolist())
 
 
-class Choice(NamedTuple):
-    """A next region for a driver.
+class Choices(NamedTuple):
+    """The fastest routes of a driver by each next region.
 
-    time: of the fastest route by it (s), infinite if too long
-    exists: True if there is a route, however long
-    route: returns its edges
+    times: (s), infinite if too long
+    exist: True if there is a route, however long
+    route: returns the edges of one of them
     """
 
-    time: float
-    exists: bool
-    route: Callable[[], list[int]]
+    times: list[float]
+    exist: list[bool]
+    route: Callable[[int], list[int]]
 
 
 class Exits:
     """Gateways out of one region, with the moves that lead there and on.
 
-    Gateway g leads from edge first[g] to second[g]. Gateways begins[n] to ends[n] - 1 lead into
+    Gateway g leads from edge first[g] to second[g]. Gateways parts[n], from begins[n] on, lead into
     region neighbours[n].
 
     first, second, move: edges of each gateway, and move from one to the other (G,)
@@ -353,7 +355,9 @@ class Exits:
         neighbours, begins = np.unique(next_region, return_index=True)
         self.neighbours: list[int] = neighbours.tolist()
         self.begins: list[int] = begins.tolist()
-        self.ends = [*self.begins[1:], len(next_region)]
+        self.parts = [slice(*part) for part in pairwise([*self.begins, len(next_region)])]
+        numbers = range(len(next_region))
+        self._bits = [sum(1 << gate for gate in numbers[part]) for part in self.parts]
         self.inside = inside
         self.outside = outside
         self.first_nodes = inside.number[self.first]
@@ -362,17 +366,17 @@ class Exits:
     def exist(self, here: int, target: int) -> list[bool]:
         """Return by which `neighbours` a way from `here` to `target` exists."""
         through = self._leading[self.inside.node[here]] & self._reached[self.outside.node[target]]
-        return np.logical_or.reduceat(through, self.begins).tolist()
+        return [through & gateways != 0 for gateways in self._bits]
 
     @cached_property
-    def _leading(self) -> Bool[np.ndarray, "inside G"]:
-        """Return which edges inside lead to each gateway."""
-        return self.inside.leading_to(self.first_nodes)
+    def _leading(self) -> list[int]:
+        """Return to which gateways each edge inside leads, a bit for each."""
+        return _as_bits(self.inside.leading_to(self.first_nodes))
 
     @cached_property
-    def _reached(self) -> Bool[np.ndarray, "outside G"]:
-        """Return which edges outside each gateway leads to."""
-        return self.outside.leading_to(self.second_nodes)
+    def _reached(self) -> list[int]:
+        """Return from which gateways each edge outside is reached, a bit for each."""
+        return _as_bits(self.outside.leading_to(self.second_nodes))
 
 
 class Returning(NamedTuple):
@@ -381,12 +385,14 @@ class Returning(NamedTuple):
     nodes: of first[g] (G,)
     entering: time from the end of first[g] to that of second[g] (s)
     back: no more than the time from behind the nearest gateway back to first[g] (s)
+    soonest: the least sum of both of a gateway (s)
     """
 
     trees: Trees
     nodes: GatewayNumbers
     entering: Sequence[float]
     back: Sequence[float]
+    soonest: float
 
 
 class Ways:
@@ -417,29 +423,32 @@ class Ways:
         self._ahead = ahead.tolist()
         self._everywhere = everywhere
 
-    def choices(self, here: int, target: int, longest: float, detour: float) -> list[Choice]:
+    def choices(self, here: int, target: int, longest: float, detour: float) -> Choices:
         """Return the fastest routes from `here` to `target` by each next region.
 
         longest: no less than the fastest of all takes (s), infinite if unknown
         detour: beyond this, routes that take longer are left out (s)
         """
         cost = self.cost(here, target, detour + longest)
-        fastest = min(cost, default=math.inf)
-        exist: list[bool] = []
-        choices = []
-        for n, begin in enumerate(self.exits.begins):
-            costs = cost[begin : self.exits.ends[n]]
-            time = min(costs)
-            if time == math.inf and not exist:
-                exist = self.exits.exist(here, target)
-            route = partial(self.route, here, begin + costs.index(time), target)
-            choices.append(Choice(time, time < math.inf or exist[n], route))
+        parts = self.exits.parts
+        times = [min(cost[part]) for part in parts]
+        exist = [True] * len(times)
+        if math.inf in times:
+            exist = self.exits.exist(here, target)
+        fastest = min(times, default=math.inf)
+        back = None
         time, gateway = self.returning(here, target, min(fastest, longest))
         if time < fastest:
-            n = bisect_right(self.exits.begins, gateway) - 1
-            route = partial(self.route, here, gateway, target, returning=True)
-            choices[n] = Choice(time, True, route)
-        return choices
+            back = bisect_right(self.exits.begins, gateway) - 1
+            times[back] = time
+            exist[back] = True
+
+        def route(n: int) -> list[int]:
+            if n == back:
+                return self.route(here, gateway, target, returning=True)
+            return self.route(here, cost.index(times[n], parts[n].start), target)
+
+        return Choices(times, exist, route)
 
     def cost(self, here: int, target: int, most: float) -> list[float]:
         """Return times from the end of `here` to that of `target` by gateway (s).
@@ -463,12 +472,11 @@ class Ways:
         if self._everywhere is None:
             return math.inf, 0
         everywhere = self._everywhere
-        ends = _sums(everywhere.entering, self._onward.times(target, 0.0))
         # By then it has left, and come back, which alone takes too long for most drivers.
         left = min(self._there.times(here, 0.0), default=math.inf)
-        back_soonest = min(everywhere.back, default=math.inf)
-        if left + back_soonest + min(ends, default=math.inf) >= most:
+        if left + everywhere.soonest + self._ahead[self._onward.node[target]] >= most:
             return math.inf, 0
+        ends = _sums(everywhere.entering, self._onward.times(target, 0.0))
         for gateway, back in enumerate(everywhere.back):
             if left + back + ends[gateway] >= most:
                 ends[gateway] = math.inf
@@ -489,6 +497,12 @@ class Ways:
             trees = self._everywhere.trees
         inside = trees.back(here, int(self.exits.first[gateway]))
         return inside[::-1] + self._onward.back(target, int(self.exits.second[gateway]))
+
+
+def _as_bits(rows: Bool[np.ndarray, "rows G"]) -> list[int]:
+    """Return each row as a number with a bit for each of its entries."""
+    packed = np.packbits(rows, axis=1, bitorder="little")
+    return [int.from_bytes(row, "little") for row in packed]
 
 
 def _sums(first: Sequence[float], second: Sequence[float]) -> list[float]:
@@ -606,7 +620,8 @@ class RegionRoutes:
             trees = self._trees(self._everywhere, driver_class, free)
             back = self._ahead(self._homeward[region], region, driver_class)[exits.first]
             nodes = self._everywhere.number[exits.first]
-            everywhere = Returning(trees, nodes, over.tolist(), back.tolist())
+            soonest = float((over + back).min(initial=math.inf))
+            everywhere = Returning(trees, nodes, over.tolist(), back.tolist(), soonest)
         there = self._trees_of(
             exits.inside,
             driver_class,

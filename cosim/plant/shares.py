@@ -14,7 +14,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from cosim.plant.routes import Choice
+from cosim.plant.routes import Choices
 from nmfd.arrays import PerTurn
 
 SHARE_PENALTY_S = 30.0  # per vehicle that a region is behind its share
@@ -52,7 +52,7 @@ class Shares:
         region: int,
         neighbours: Sequence[int],
         destination: int,
-        choices: Sequence[Choice],
+        choices: Choices,
         limit: float,
     ) -> int | None:
         """Return which of `neighbours` a driver in `region` gets.
@@ -61,7 +61,7 @@ class Shares:
 
         choices: by each of them; limit: time beyond which a route is too long (s)
         """
-        times = [choice.time if choice.time <= limit else math.inf for choice in choices]
+        times = [time if time <= limit else math.inf for time in choices.times]
         fastest = neighbours[times.index(min(times))]
         self._wished[region][destination][fastest] += 1.0
         wish = _picked(self._wished[region][destination], neighbours)
@@ -70,9 +70,7 @@ class Shares:
         given = _picked(self._given[region][destination], neighbours)
         wishes = sum(wish)
         shares = shifted([w / wishes for w in wish], own, theta)
-        for n, choice in enumerate(choices):
-            if not choice.exists:
-                shares[n] = 0.0
+        shares = [s if there else 0.0 for s, there in zip(shares, choices.exist, strict=True)]
         total = sum(shares)
         if total <= 0.0:
             return None
