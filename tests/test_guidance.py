@@ -58,8 +58,7 @@ def ways(city, request):
     there = Trees(inside, time, turn, searches, together=together, **to_gates)
     onward = Trees(outside, time, turn, searches, ahead, together, aims=exits.second_nodes)
     back = back_to(gate, entry, city)
-    soonest = (over + back).min()
-    returning = Returning(everywhere, gate, over.tolist(), back.tolist(), soonest)
+    returning = Returning(everywhere, gate, over.tolist(), back.tolist())
     found = Ways(exits, there=there, onward=onward, ahead=ahead, everywhere=returning)
     return found, gate, entry
 

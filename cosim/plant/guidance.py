@@ -316,10 +316,14 @@ class Guide:
         longest = present_unpriced.longest
         shortest = unpriced.choices(trip.here, trip.target, longest, self._most_detour)
         limit = min(shortest.times) + self._most_detour
-        numbers = range(len(choices.times))
-        routes = [self._shortened(trip, choices, shortest, n, limit) for n in numbers]
-        times = [self._time(trip, route, free) if route else math.inf for route in routes]
-        exist = [choices.exist[n] or shortest.exist[n] for n in numbers]
+        routes = []
+        times = []
+        exist = []
+        for way in range(len(choices.times)):
+            route = self._shortened(trip, choices, shortest, way, limit)
+            routes.append(route)
+            times.append(self._time(trip, route, free) if route else math.inf)
+            exist.append(choices.exist[way] or shortest.exist[way])
         within = Choices(times, exist, routes.__getitem__)
         n = self._next_region(trip, ways, within, math.inf)
         if n is None:
@@ -334,7 +338,7 @@ class Guide:
     def _shortened(
         self, trip: _Trip, choices: Choices, shortest: Choices, n: int, limit: float
     ) -> list[int]:
-        """Return the n-th route, or the shortest, within the limit; [] without.
+        """Return the n-th route within the limit; [] if there is none.
 
         choices: the fastest routes with prices; shortest: without prices
         limit: of the time without prices (s)

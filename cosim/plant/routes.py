@@ -303,7 +303,8 @@ class Trees:
             if row is None:
                 return self._searches.tree(self._owner, node, most, self._search)
             costs, before = self._searched_together
-            tree = self._found[node] = self._as_tree(node, math.inf, costs[row], before[row])
+            tree = self._as_tree(node, math.inf, costs[row], before[row])
+            self._found[node] = tree
         return tree
 
     def _search(self, node: int, most: float) -> _Tree:
@@ -330,7 +331,7 @@ class Choices(NamedTuple):
 
     times: (s), infinite if too long
     exist: True if there is a route, however long
-    route: returns the edges of one of them
+    route: returns the edges of the n-th
     """
 
     times: list[float]
@@ -356,8 +357,7 @@ class Exits:
         self.neighbours: list[int] = neighbours.tolist()
         self.begins: list[int] = begins.tolist()
         self.parts = [slice(*part) for part in pairwise([*self.begins, len(next_region)])]
-        numbers = range(len(next_region))
-        self._bits = [sum(1 << gate for gate in numbers[part]) for part in self.parts]
+        self._bits = [(1 << part.stop) - (1 << part.start) for part in self.parts]
         self.inside = inside
         self.outside = outside
         self.first_nodes = inside.number[self.first]
@@ -385,14 +385,12 @@ class Returning(NamedTuple):
     nodes: of first[g] (G,)
     entering: time from the end of first[g] to that of second[g] (s)
     back: no more than the time from behind the nearest gateway back to first[g] (s)
-    soonest: the least sum of both of a gateway (s)
     """
 
     trees: Trees
     nodes: GatewayNumbers
     entering: Sequence[float]
     back: Sequence[float]
-    soonest: float
 
 
 class Ways:
@@ -422,6 +420,11 @@ class Ways:
         self._onward = onward
         self._ahead = ahead.tolist()
         self._everywhere = everywhere
+        # Least time from a gateway back to one and over it (s).
+        self._back_soonest = math.inf
+        if everywhere:
+            around = _sums(everywhere.back, everywhere.entering)
+            self._back_soonest = min(around, default=math.inf)
 
     def choices(self, here: int, target: int, longest: float, detour: float) -> Choices:
         """Return the fastest routes from `here` to `target` by each next region.
@@ -474,7 +477,7 @@ class Ways:
         everywhere = self._everywhere
         # By then it has left, and come back, which alone takes too long for most drivers.
         left = min(self._there.times(here, 0.0), default=math.inf)
-        if left + everywhere.soonest + self._ahead[self._onward.node[target]] >= most:
+        if left + self._back_soonest + self._ahead[self._onward.node[target]] >= most:
             return math.inf, 0
         ends = _sums(everywhere.entering, self._onward.times(target, 0.0))
         for gateway, back in enumerate(everywhere.back):
@@ -620,8 +623,7 @@ class RegionRoutes:
             trees = self._trees(self._everywhere, driver_class, free)
             back = self._ahead(self._homeward[region], region, driver_class)[exits.first]
             nodes = self._everywhere.number[exits.first]
-            soonest = float((over + back).min(initial=math.inf))
-            everywhere = Returning(trees, nodes, over.tolist(), back.tolist(), soonest)
+            everywhere = Returning(trees, nodes, over.tolist(), back.tolist())
         there = self._trees_of(
             exits.inside,
             driver_class,

@@ -70,7 +70,9 @@ class Shares:
         given = _picked(self._given[region][destination], neighbours)
         wishes = sum(wish)
         shares = shifted([w / wishes for w in wish], own, theta)
-        shares = [s if there else 0.0 for s, there in zip(shares, choices.exist, strict=True)]
+        for n, exists in enumerate(choices.exist):
+            if not exists:
+                shares[n] = 0.0
         total = sum(shares)
         if total <= 0.0:
             return None
