@@ -138,3 +138,11 @@ def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
     """No check of annotations: for tests of what users are told who give something of a wrong
     type."""
     monkeypatch.setattr(config, "jaxtyping_disable", True)
+
+
+@pytest.fixture(scope="module")
+def city(scenario):
+    """The streets of the scenario of the module."""
+    from cosim.sumo.net import city_of  # after the hook of `pytest_configure`
+
+    return city_of(scenario.network)

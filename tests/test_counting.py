@@ -144,10 +144,13 @@ def test_a_plateau_ends_only_where_locked_states_were_seen(locks):
 
 
 def test_a_counted_model_comes_back_from_its_file(found, tmp_path):
-    found = replace(found, held_out=WORSE)
+    dispersion = np.arange(20.0, 69.0).reshape(7, 7)
+    found = replace(found, held_out=WORSE, dispersion=dispersion, longest_delay=1.5)
     (tmp_path / "network.toml").write_text(network_toml(found, {}, "a test"))
     again = load_network(tmp_path)
     assert again.held_out == WORSE
+    assert again.longest_delay == 1.5
+    assert again.dispersion.tolist() == dispersion.tolist()
     for here, there in zip(found.mfds, again.mfds, strict=True):
         assert isinstance(there, RoundedLinear)
         np.testing.assert_allclose(there.accumulations, here.accumulations, rtol=1e-5)

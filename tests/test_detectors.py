@@ -13,7 +13,6 @@ from cosim.plant.detectors import instruments, lay_out, probes
 from cosim.plant.plant import SumoPlant
 from cosim.plant.settings import Settings, settings
 from cosim.plant.strategy import parse
-from cosim.sumo.net import city_of
 from nmfd import api, closed_loop
 from nmfd.api import controller as make_controller
 from nmfd.api import load_scenario
@@ -27,11 +26,6 @@ SCENARIO = "grid7_peak"
 def scenario():
     """The peak from its middle on: the forecast is right, and the city fills."""
     return tiny.part(load_scenario(SCENARIO), 14, 2)
-
-
-@pytest.fixture(scope="module")
-def city(scenario):
-    return city_of(scenario.network)
 
 
 def drive(scenario, controller=None, planning=None, settings=None, **overrides):

@@ -11,7 +11,6 @@ import tiny
 from signal_rules import watched
 
 from cosim.plant.pressure import Roads
-from cosim.sumo.net import city_of
 from cosim.sumo.signals import read_signals
 from cosim.sumo.trips import make_trips, turning_flows
 from nmfd.api import load_scenario
@@ -24,11 +23,6 @@ SCENARIO = "grid7_peak"
 def scenario():
     """The beginning of the peak, where the demand already flows."""
     return tiny.part(load_scenario(SCENARIO), 14, 3)
-
-
-@pytest.fixture(scope="module")
-def city(scenario):
-    return city_of(scenario.network)
 
 
 def test_signals_of_the_city(city):

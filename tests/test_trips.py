@@ -6,7 +6,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from cosim.sumo.net import city_of
 from cosim.sumo.recorded_trips import as_recorded, draw, write_recorded_trips
 from cosim.sumo.trips import make_trips
 from nmfd.api import load_scenario
@@ -17,11 +16,6 @@ SCENARIO = "grid7_peak"
 @pytest.fixture(scope="module")
 def scenario():
     return load_scenario(SCENARIO)
-
-
-@pytest.fixture(scope="module")
-def city(scenario):
-    return city_of(scenario.network)
 
 
 @pytest.fixture(scope="module")

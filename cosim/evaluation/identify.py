@@ -116,7 +116,7 @@ class Task:
         states = [run["accumulation"] for run in runs]
         seen = self.observed(static, runs)
         lane_km = lane_kilometres(static)
-        fastest = self.fastest(static)
+        fastest = fastest_rates(self.scenario, static)
         if method == COUNTED:
             model = counting.counted(
                 static,
@@ -150,12 +150,6 @@ class Task:
             splits = shifted(run["splits"], commanded, static.nominal_splits)
             found.append(observed(run.assign(splits=splits)))
         return found
-
-    def fastest(self, network: RegionalModel) -> PerRegion:
-        """Return one region crossing in free flow as a rate (1/s, (R,))."""
-        scenario = self.scenario
-        crossing = np.maximum(crossing_times(city_of(network)), scenario.step / scenario.substeps)
-        return 1.0 / crossing
 
     def held_out(self, runs: Sequence[Result]) -> list[Result]:
         """Return the runs of the last seed, or the last run, to test a model."""
@@ -570,6 +564,12 @@ def lane_kilometres(network: RegionalModel) -> PerRegion:
     """Return the lane-kilometres of each region (km, (R,))."""
     city = city_of(network)
     return np.bincount(city.edge_region, city.lane_metres, city.regions) / 1000.0
+
+
+def fastest_rates(scenario: Scenario, network: RegionalModel) -> PerRegion:
+    """Return one region crossing in free flow as a rate (1/s, (R,))."""
+    crossing = np.maximum(crossing_times(city_of(network)), scenario.step / scenario.substeps)
+    return 1.0 / crossing
 
 
 def saturation_flows(network: RegionalModel, runs: Sequence[Result]) -> PerPair:

@@ -580,7 +580,10 @@ class RegionRoutes:
         self._asked = {key: sorted(trees.asked) for key, trees in self._unpriced.items()}
         self._unpriced.clear()
         self._searches = Searches()
-        self._free = [self._free_regions(destination) for destination in self.regions]
+        self._free = []
+        for destination in self.regions:
+            free = [r for r in self.regions if r == destination or not self._prices[r]]
+            self._free.append(tuple(free))
         self._trees.cache_clear()
         self._seen.cache_clear()
         self.time.cache_clear()
@@ -590,10 +593,6 @@ class RegionRoutes:
     def free(self, destination: int) -> tuple[int, ...]:
         """Return the regions without a price for drivers to `destination`."""
         return self._free[destination]
-
-    def _free_regions(self, destination: int) -> tuple[int, ...]:
-        free = [r for r in self.regions if r == destination or not self._prices[r]]
-        return tuple(free)
 
     def _seen_by(self, driver_class: int, free: tuple[int, ...]) -> PerEdge:
         """Return the times of edges that a class of drivers sees (s, (E,))."""

@@ -223,7 +223,14 @@ def train(
         streets = link_model(scenario, labels=strategy.labels, dtype=dtype, device=device)
         rollout: Rollout = StreetRollout(planning, streets)
     else:
-        rollout = _regional(planning, setup, dtype, device)
+        rollout = Rollout(
+            planning,
+            dtype,
+            device,
+            detour_cost=setup.detour_cost,
+            holding_cost=setup.holding_cost,
+            process_std=setup.recipe.process_std,
+        )
     run = TrainingRun(keeper, rollout, setup, task, seed, compiled)
     if resume:
         keeper.resume(run.restore)
@@ -236,18 +243,6 @@ def train(
             "lower the learning rate"
         )
     return keeper.finish()
-
-
-def _regional(planning: PlanningModel, setup: Dpc, dtype: torch.dtype, device: str) -> Rollout:
-    """Return rollouts of the regional model with the costs of the settings."""
-    return Rollout(
-        planning,
-        dtype,
-        device,
-        detour_cost=setup.detour_cost,
-        holding_cost=setup.holding_cost,
-        process_std=setup.recipe.process_std,
-    )
 
 
 class Change(NamedTuple):

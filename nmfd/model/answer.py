@@ -15,9 +15,10 @@ Where the time in a region depends on the next one (RegionalModel.detours), so d
     theta_ihj ~ theta0_ihj exp(-(e_hj + c_i t_ij detour_ihj) / s)
     e_hj = c_h t_hj (1 + sum_g theta0_hgj detour_hgj) + sum_g theta0_hgj e_gj
 
-With a `longest_delay` L of the network, a way whose price adds d more than the least one counts as
-delayed by L (1 - exp(-d / L)): who can go another way does so at a small price already, and a
-larger one diverts few others. The answer is differentiable.
+The dispersion may be that of vehicles in i bound for j. With a `longest_delay` L of the network, a
+way whose price adds d more than the least one counts as delayed by L (1 - exp(-d / L)): who can go
+another way does so at a small price already, and a larger one diverts few others. The answer is
+differentiable.
 """
 
 import torch
@@ -35,10 +36,12 @@ class Answer(nn.Module):
 
     def __init__(self, network: RegionalModel):
         super().__init__()
-        self.dispersion = network.dispersion
-        self.longest_delay = network.longest_delay
         nominal = torch.tensor(network.nominal_splits, dtype=torch.float32)
         self.register_buffer("own", nominal, persistent=False)
+        spread = torch.as_tensor(network.dispersion, dtype=torch.float32)
+        spread = spread.expand(network.adjacency.shape).unsqueeze(-2)
+        self.register_buffer("dispersion", spread, persistent=False)
+        self.longest_delay = network.longest_delay
         self._network = network
         self._hops = int(network.hops.max())
         self._model = dynamics.parameters(network, dtype=torch.float32)
@@ -48,6 +51,15 @@ class Answer(nn.Module):
 
         x: accumulations (veh, (..., R, R))
         prices: (-, (..., R))
+        """
+        delay = saturated(self.delays(x, prices), self.longest_delay)
+        weight = self.own * torch.exp(-delay / self.dispersion)
+        return weight / weight.sum(-2, keepdim=True).clamp(min=1e-9)
+
+    def delays(self, x: PerPair, prices: PerRegion) -> PerTurn:
+        """Return what prices add to each way (s, (..., R, R, R)).
+
+        It is beyond the least of all ways of a vehicle. Arguments as of `forward`.
         """
         device = self.own.device  # to which the module was moved
         if self._model.adjacency.device != device:
@@ -75,8 +87,14 @@ class Answer(nn.Module):
         # Only differences matter: from the least one no exponential is too small.
         least = torch.where(self.own > 0, costs, torch.inf).amin(-2, keepdim=True)
         least = torch.where(least.isfinite(), least, 0.0)
-        more = (costs - least).clamp(min=0.0)
-        if self.longest_delay is not None:
-            more = self.longest_delay * -torch.expm1(-more / self.longest_delay)
-        weight = self.own * torch.exp(-more / self.dispersion)
-        return weight / weight.sum(-2, keepdim=True).clamp(min=1e-9)
+        return (costs - least).clamp(min=0.0)
+
+
+def saturated(delay: PerTurn, longest: torch.Tensor | float | None) -> PerTurn:
+    """Return what delays by prices count as (s).
+
+    longest: of the network (s), None for no limit
+    """
+    if longest is None:
+        return delay
+    return longest * -torch.expm1(-delay / longest)

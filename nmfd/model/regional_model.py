@@ -27,7 +27,8 @@ LEAST_LIMIT = 1e-6  # veh/s, against a division by zero
 
 MOST_VEHICLES = 1e9  # in a region
 DISPERSION_S = 60.0  # of the travel times that drivers perceive; assumed
-FOR_ALL = ("exit_rates", "capacity", "storage", "controllable")  # for every region or for none
+# For every region or for none.
+FOR_ALL = ("exit_rates", "dispersions", "capacity", "storage", "controllable")
 
 
 def passing_share(wish: Any, limit: Any) -> Any:
@@ -97,7 +98,8 @@ class RegionalModel:
         is a guess beyond
     equal_ways: ways in use take the same time in free flow, whichever region comes next (see
         `detours`); False: the time in a region does not depend on the next one
-    dispersion: of the logit by which guided drivers answer prices, see nmfd.model.answer (s)
+    dispersion: of the logit by which guided drivers in i bound for j answer prices, see
+        nmfd.model.answer (s, (R, R) or one number)
     longest_delay: by prices, beyond which guided drivers hardly tell ways apart (s); None: a plain
         logit
     placeholder: the MFDs are guesses that no run has measured
@@ -122,7 +124,7 @@ class RegionalModel:
     controllable: PerPair | None = None
     critical_above: Mapping[int, float] = field(default_factory=dict)
     equal_ways: bool = False
-    dispersion: float = DISPERSION_S
+    dispersion: PerPair | float = DISPERSION_S
     longest_delay: float | None = None
     placeholder: bool = False
     doubts: tuple[tuple[str, ...], ...] = ()
@@ -282,8 +284,8 @@ class RegionalModel:
                 content.append([name, numbers.tolist()])
         if self.equal_ways:
             content.append("equal_ways")
-        if self.dispersion != DISPERSION_S:
-            content.append(["dispersion", self.dispersion])
+        if np.any(self.dispersion != DISPERSION_S):
+            content.append(["dispersion", np.asarray(self.dispersion).tolist()])
         if self.longest_delay is not None:
             content.append(["longest_delay", self.longest_delay])
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
@@ -398,6 +400,11 @@ class RegionTable(Settings):
         None,
         unit="-",
     )
+    dispersions: config.PositiveNumbers | None = setting(
+        "own dispersion instead of that of the city, per destination; for all regions or none",
+        None,
+        unit="s",
+    )
     capacity: config.PositiveNumbers | None = setting(
         "largest flow into each adjacent region while that is empty, at the largest u, in the "
         "order of adjacent; with storage, for all regions or none",
@@ -495,7 +502,8 @@ class NetworkTable(Settings):
             if any(given) and not given[i]:
                 raise Problem(f"{where}.{key}", "missing; give it for every region or for none")
         neighbours = len(row.adjacent)
-        lengths = {"exit_rates": count, "capacity": neighbours, "controllable": neighbours}
+        lengths = dict.fromkeys(("exit_rates", "dispersions"), count)
+        lengths |= dict.fromkeys(("capacity", "controllable"), neighbours)
         for key, length in lengths.items():
             values = getattr(row, key)
             if values is not None and len(values) != length:
@@ -550,6 +558,7 @@ def _network(table: NetworkTable, folder: Path) -> RegionalModel:
             ratios[i, int(j)] = {int(h): share for h, share in shares.items()}
         if row.critical_above is not None:
             critical_above[i] = row.critical_above
+    dispersions = _by_region(rows, "dispersions")
     curves = [row.piecewise_mfd or row.mfd or table.mfd for row in rows]
     doubts = tuple(row.doubts for row in rows)
     if not any(doubts):
@@ -569,7 +578,7 @@ def _network(table: NetworkTable, folder: Path) -> RegionalModel:
         controllable=_by_boundary(rows, "controllable"),
         critical_above=critical_above,
         equal_ways=table.equal_ways,
-        dispersion=table.dispersion,
+        dispersion=table.dispersion if dispersions is None else dispersions,
         longest_delay=table.longest_delay,
         placeholder=table.placeholder,
         doubts=doubts,

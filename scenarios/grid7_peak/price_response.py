@@ -1,39 +1,63 @@
-"""Identify how guided drivers answer prices: dispersion and longest delay in nmfd.model.answer.
+"""Count the regional model of grid7 whose guided drivers answer prices.
 
-    python scenarios/grid7_peak/price_response.py runs/price-response
+    python scenarios/grid7_peak/price_response.py runs/prices networks/grid7_max_pressure_3
 
-Prices of every region are drawn at random every six minutes. Both numbers are those with the
-largest likelihood of the next regions that vehicles took (crossings of boundaries by destination),
-given the state at the beginning of each interval. Printed beside it: the gain in likelihood over
-nominal split ratios, relative to that of the best constants.
+Gates are open, and prices change every HOLD control intervals. At 1 and 1.3 times the demand, some
+are drawn at random; the protected region always has one. At 1.6, where random prices lock the city,
+they are those of a first policy, each times a random factor; it also meters. That policy was
+trained through networks/grid7_max_pressure_2.
+Split ratios without prices, dispersions and the longest delay (nmfd.model.answer) are the most
+likely ones of the next regions that vehicles took. The first SETTLED intervals of new prices do not
+count: drivers answer when they are guided next, and are under way before they cross a boundary.
+Rates and MFDs are counted as by cosim identify, but from means of three intervals, as an outflow
+follows the accumulation late. The runs of the last seed are held out, to test a model without them.
 """
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.ndimage import uniform_filter1d
 
 import cosim
 import nmfd
-from nmfd import Controls, Observation, Result
+from cosim.evaluation import identify
+from cosim.evaluation.model_validation import observed, outflow_samples
+from nmfd import Controls, Observation, Result, Scenario
 from nmfd.controllers.strategy import parse
-from nmfd.model.answer import Answer
+from nmfd.model import counting
+from nmfd.model.answer import Answer, saturated
 from nmfd.model.planning import PlanningModel
+from nmfd.model.regional_model import RegionalModel
+from nmfd.studies import fit_quality
 
-MOST_PRICE, HOLD = 4.0, 4  # -, control intervals
-CITY = "max-pressure+guidance-period-60+metering"
-SEEDS, LEVELS = (1120, 1121), (1.0, 1.3)
+PRICES = 0.1, 4.0  # -, the least and the largest that are drawn
+PRICED = 0.4  # probability of a region that is not protected
+FACTOR = 4.0  # of prices of the first policy, or its inverse, at most
+HOLD, SETTLED = 6, 2  # control intervals
+CITY = "max-pressure+guidance-period-60"
+FIRST = f"dpc-pcrg+{CITY}+metering"
+FIRST_MODEL = {f"controllers.{FIRST}.model": "../../networks/grid7_max_pressure_2"}
+LOADING = (("RandomPrices", CITY, (1.0, 1.3)), ("OfFirstPolicy", f"{CITY}+metering", (1.6,)))
+SEEDS = (1120, 1121, 1122)
+ROUNDS = 3  # of answer and rates after each other
+STEPS = 400  # of descent to the most likely answer
+PRIOR_VEH = 20.0  # of each region and destination, which took the ways of all runs
+PRIOR_DISPERSION_S = 100.0  # the logarithm has a standard deviation of 1
+COUNTED = ("inside", "exits", "crossings", "perimeter", "splits")
 
 
 class RandomPrices:
-    """Prices of half of the regions, from 0 to MOST_PRICE, drawn anew every HOLD control
+    """Prices of some regions, small ones as often as large ones, drawn anew every HOLD control
     intervals."""
 
     name = "random-prices"
 
     def __init__(self, planning: PlanningModel):
         self._network = planning.network
+        self._protected = list(planning.protected)
         self.reset()
 
     def reset(self, seed: int = 0) -> None:
@@ -41,44 +65,154 @@ class RandomPrices:
 
     def act(self, observation: Observation) -> Controls:
         if observation.step % HOLD == 0:
-            priced = self._random.random(self._network.regions) < 0.5
-            self._prices = priced * self._random.uniform(0.0, MOST_PRICE, self._network.regions)
+            priced = self._random.random(self._network.regions) < PRICED
+            priced[self._protected] = True
+            logarithm = self._random.uniform(*np.log(PRICES), self._network.regions)
+            self._prices = priced * np.exp(logarithm)
         return Controls(perimeter=self._network.open_perimeter, splits=None, prices=self._prices)
 
 
-def likelihood(runs: list[Result], answer: Answer, dispersion: float) -> tuple[float, float]:
-    """Return the mean log-likelihood of a crossing under the answer, and under the best constant
-    split ratios (-)."""
-    answer.dispersion = dispersion
-    total, taken = 0.0, np.zeros(answer.own.shape)
+class OfFirstPolicy:
+    """Commands of the first policy, its prices times factors drawn anew every HOLD control
+    intervals."""
+
+    name = "of-first-policy"
+
+    def __init__(self, planning: PlanningModel):
+        scenario = nmfd.load_scenario("grid7_peak", FIRST_MODEL)
+        file = Path(__file__).with_name("reference") / "first-policy" / "policy.pt"
+        self._policy = parse(FIRST).make(scenario, file)
+        self._regions = planning.network.regions
+        self.reset()
+
+    def reset(self, seed: int = 0) -> None:
+        self._policy.reset(seed)
+        self._random, self._factors = np.random.default_rng(seed), np.ones(self._regions)
+
+    def act(self, observation: Observation) -> Controls:
+        if observation.step % HOLD == 0:
+            most = np.log(FACTOR)
+            self._factors = np.exp(self._random.uniform(-most, most, self._regions))
+        controls = self._policy.act(observation)
+        return replace(controls, prices=controls.prices * self._factors)
+
+
+def state_and_prices(run: Result) -> list[torch.Tensor]:
+    """Return accumulations (veh, (T, R, R)) and prices (-, (T, R)) of a run."""
+    both = (run["accumulation"][:-1], run["prices"])
+    return [torch.tensor(values, dtype=torch.float32) for values in both]
+
+
+def with_answer(network: RegionalModel, runs: list[Result]) -> RegionalModel:
+    """Return `network` with the most likely split ratios, dispersions and longest delay."""
+    answer, own = Answer(network), torch.tensor(network.nominal_splits)
+    used = own > 0
+    delays, taken = [], []
     for run in runs:
-        x, prices = (
-            torch.tensor(run.data[name].values, dtype=torch.float32)
-            for name in ("accumulation", "prices")
+        settled = np.arange(len(run["prices"])) % HOLD >= SETTLED
+        delays.append(answer.delays(*state_and_prices(run))[settled].double())
+        taken.append(torch.tensor(run["crossings"][settled].astype(float)) * used)
+    delay, veh = torch.cat(delays), torch.cat(taken)
+    liking = torch.log(own.clamp(min=1e-3)).requires_grad_()
+    prior = torch.tensor(np.log(PRIOR_DISPERSION_S)).double()
+    spread = prior.expand(own[:, 0].shape).clone().requires_grad_()
+    longest = prior.clone().requires_grad_()
+    descent = torch.optim.Adam([liking, spread, longest], lr=0.05)
+
+    def likelihood(worth: torch.Tensor, vehicles: torch.Tensor) -> torch.Tensor:
+        shares = torch.log_softmax(worth.masked_fill(~used, -1e9), -2)
+        return (vehicles * torch.where(used, shares, 0.0)).sum()
+
+    for _ in range(STEPS):
+        descent.zero_grad()
+        counts_as = saturated(delay, longest.exp()) / spread.exp().unsqueeze(-2)
+        unlikely = 0.5 * ((spread - prior) ** 2).sum()
+        unlikely = unlikely - likelihood(liking, PRIOR_VEH * own)
+        unlikely = unlikely - likelihood(liking - counts_as, veh)
+        (unlikely / veh.sum()).backward()
+        descent.step()
+    shares = torch.softmax(liking.detach().masked_fill(~used, -1e9), -2).numpy()
+    ratios = {}
+    for i, j in np.argwhere(used.any(1).numpy()).tolist():
+        ways = np.flatnonzero(used[i, :, j].numpy()).tolist()
+        ratios[i, j] = {h: float(shares[i, h, j]) for h in ways}
+    return replace(
+        network,
+        observed_split_ratios=ratios,
+        dispersion=spread.detach().exp().numpy(),
+        longest_delay=float(longest.detach().exp()),
+    )
+
+
+def answered(model: RegionalModel, runs: list[Result]) -> list[Result]:
+    """Return runs with the split ratios that a model expects."""
+    answer = Answer(model)
+    return [run.assign(expected_splits=answer(*state_and_prices(run)).numpy()) for run in runs]
+
+
+def counted(scenario: Scenario, runs: list[Result]) -> RegionalModel:
+    """Return the model of runs."""
+    model = static = identify.static_model(scenario, runs)
+    for _ in range(ROUNDS):
+        model = with_answer(model, runs)
+        seen = []
+        for run in map(observed, answered(model, runs)):
+            means = {}
+            for name in COUNTED:
+                values = getattr(run, name).astype(float)
+                means[name] = uniform_filter1d(values, 3, axis=0, mode="nearest")
+            seen.append(replace(run, **means))
+        answer = ("observed_split_ratios", "dispersion", "longest_delay")
+        model = counting.counted(
+            replace(static, **{name: getattr(model, name) for name in answer}),
+            seen,
+            scheme=scenario.scheme,
+            fastest=identify.fastest_rates(scenario, static),
+            saturation=identify.saturation_flows(static, runs),
+            lane_km=identify.lane_kilometres(static),
         )
-        splits = answer(x[:-1], prices).double().clamp(min=1e-3).numpy()
-        crossings = run.data["crossings"].values * (answer.own.numpy() > 0)
-        total, taken = total + (crossings * np.log(splits)).sum(), taken + crossings.sum(0)
-    best = np.clip(taken / np.maximum(taken.sum(1, keepdims=True), 1.0), 1e-3, None)
-    return total / taken.sum(), (taken * np.log(best)).sum() / taken.sum()
+    return model
 
 
-def main(folder: Path) -> None:
-    """Do the runs that are not in `folder` yet, and print likelihoods of an answer."""
+def main(folder: Path, target: Path) -> None:
+    """Do the runs that are not in `folder` yet, and write the model to `target`."""
     scenario = nmfd.load_scenario("grid7_peak")
-    table = "dpc-pcrg+max-pressure+guidance-period-60+metering"
-    answer = Answer(parse(table).own_planning(scenario).network)
-    strategy = f"{__file__}:RandomPrices+{CITY}"
-    cosim.evaluate("grid7_peak", [strategy], seeds=SEEDS, demand=LEVELS, workers=1, out=folder)
-    runs = [Result.read(file) for file in sorted(folder.glob("**/*.nc"))]
-    nominal, constant = likelihood(runs, answer, 1e6)
-    print("dispersion, longest delay: share of the gain of the best constants")
-    for answer.longest_delay in (30.0, 60.0, 120.0, 240.0, None):
-        for dispersion in (30, 60, 80, 100, 150, 200, 300, 400, 500, 700):
-            value, _ = likelihood(runs, answer, dispersion)
-            gain = (value - nominal) / (constant - nominal)
-            print(f"{dispersion:5} s, {answer.longest_delay} s: {gain:5.2f}")
+    runs = []
+    for controller, city, levels in LOADING:
+        strategy = f"{__file__}:{controller}+{city}"
+        out = folder / controller
+        cosim.evaluate("grid7_peak", [strategy], seeds=SEEDS, demand=levels, workers=2, out=out)
+        runs += [Result.read(file) for file in sorted(out.glob("**/*.nc"))]
+    unseen = [run for run in runs if run.seed == SEEDS[-1]]
+    without = counted(scenario, [run for run in runs if run not in unseen])
+    model = counted(scenario, runs)
+    seen = [observed(run) for run in answered(without, unseen)]
+    errors = fit_quality.predictions(without, seen, scenario.scheme, model.known_critical)
+    fits = fit_quality.region_fits(
+        model,
+        outflow_samples(model, runs),
+        [run["accumulation"] for run in runs],
+        seeds=len(SEEDS),
+        lane_km=identify.lane_kilometres(model),
+    )
+    model = replace(
+        model,
+        placeholder=False,
+        doubts=tuple(fits["doubts"]),
+        held_out=fit_quality.held_out(errors),
+        controllable=scenario.network.controllable,
+    )
+    print(fit_quality.fit_table(model, fits))
+    print(fit_quality.ahead_table(errors, model.titles))
+    identify.write_model(
+        model,
+        Path("networks/grid7"),
+        target,
+        "The city of grid7 with guided drivers who see prices, and max-pressure signals.\n"
+        "# DPC is trained on it. Written by scenarios/grid7_peak/price_response.py from "
+        f"{len(runs)} runs, seeds {SEEDS[0]} to {SEEDS[-1]}.",
+    )
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(Path(sys.argv[1]), Path(sys.argv[2]))
