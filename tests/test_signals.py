@@ -16,13 +16,11 @@ from cosim.sumo.trips import make_trips, turning_flows
 from nmfd.api import load_scenario
 from nmfd.types import Controls
 
-SCENARIO = "grid7_peak"
-
 
 @pytest.fixture(scope="module")
 def scenario():
     """The beginning of the peak, where the demand already flows."""
-    return tiny.part(load_scenario(SCENARIO), 14, 3)
+    return tiny.part(load_scenario("grid7_peak"), 14, 3)
 
 
 def test_signals_of_the_city(city):

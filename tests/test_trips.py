@@ -10,12 +10,10 @@ from cosim.sumo.recorded_trips import as_recorded, draw, write_recorded_trips
 from cosim.sumo.trips import make_trips
 from nmfd.api import load_scenario
 
-SCENARIO = "grid7_peak"
-
 
 @pytest.fixture(scope="module")
 def scenario():
-    return load_scenario(SCENARIO)
+    return load_scenario("grid7_peak")
 
 
 @pytest.fixture(scope="module")
