@@ -150,7 +150,7 @@ def test_a_counted_model_comes_back_from_its_file(found, tmp_path):
     again = load_network(tmp_path)
     assert again.held_out == WORSE
     assert again.longest_delay == 1.5
-    assert again.dispersion.tolist() == dispersion.tolist()
+    assert (again.dispersion == dispersion).all()
     for here, there in zip(found.mfds, again.mfds, strict=True):
         assert isinstance(there, RoundedLinear)
         np.testing.assert_allclose(there.accumulations, here.accumulations, rtol=1e-5)

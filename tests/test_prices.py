@@ -121,17 +121,17 @@ def test_expected_splits_are_written_as_commanded_only_where_they_are_obeyed():
 
 @pytest.fixture
 def priced():
-    """Return grid7, its accumulations, and a price of 1 for its centre."""
+    """Return grid7, its accumulations, and a price of 5 for its centre."""
     network = parse("dpc-pcrg+max-pressure").own_planning(load_scenario("grid7_peak")).network
-    return network, torch.full((7, 7), 20.0), torch.eye(7)[3]
+    return network, torch.full((7, 7), 20.0), 5.0 * torch.eye(7)[3]
 
 
 def test_a_price_that_is_the_same_everywhere_changes_no_way(priced):
     network, x, centre = priced
     answer = Answer(network)
     assert torch.allclose(answer(x, torch.full_like(centre, 19.0)), answer.own, atol=1e-6)
-    assert torch.allclose(answer(x, 10.0 * centre + 1.0), answer(x, 5.0 * centre), atol=1e-6)
-    assert not torch.allclose(answer(x, 5.0 * centre), answer.own, atol=0.05)
+    assert torch.allclose(answer(x, 2.0 * centre + 1.0), answer(x, centre), atol=1e-6)
+    assert not torch.allclose(answer(x, centre), answer.own, atol=0.05)
 
 
 def test_the_longest_delay_bounds_how_many_a_price_diverts(priced):
@@ -140,10 +140,10 @@ def test_the_longest_delay_bounds_how_many_a_price_diverts(priced):
     plain = Answer(replace(network, longest_delay=None))
     bounded = Answer(replace(network, longest_delay=30.0))
     own = plain.own[2, 3, 4]  # from west to east through the centre; others go around it
-    assert plain(x, 50.0 * centre)[2, 3, 4] < 1e-6
+    assert plain(x, 10.0 * centre)[2, 3, 4] < 1e-6
     odds = np.exp(-30.0 / 60.0) * own  # if no other way were delayed
-    assert odds / (odds + 1.0 - own) <= bounded(x, 50.0 * centre)[2, 3, 4] < own
-    small = 5e-3 * centre
+    assert odds / (odds + 1.0 - own) <= bounded(x, 10.0 * centre)[2, 3, 4] < own
+    small = 1e-3 * centre
     torch.testing.assert_close(bounded(x, small), plain(x, small), atol=1e-3, rtol=0.0)
 
 
@@ -152,6 +152,6 @@ def test_drivers_answer_prices_by_the_dispersion_of_their_destination(priced):
     dispersion = np.full((7, 7), 1e4)
     dispersion[2, 4] = 60.0
     answer = Answer(replace(network, dispersion=dispersion))
-    through_centre = (answer(x, 2.0 * centre) / answer.own)[:, 3]
+    through_centre = (answer(x, centre) / answer.own)[:, 3]
     assert through_centre[2, 4] < 0.5
     assert through_centre[4, 2] > 0.9
