@@ -59,7 +59,8 @@ class Answer(nn.Module):
     def delays(self, x: PerPair, prices: PerRegion) -> PerTurn:
         """Return what prices add to each way (s, (..., R, R, R)).
 
-        It is beyond the least of all ways of a vehicle. Arguments as of `forward`.
+        Only differences count: it is 0 for the way to which they add least. Arguments as of
+        `forward`.
         """
         device = self.own.device  # to which the module was moved
         if self._model.adjacency.device != device:
