@@ -143,6 +143,6 @@ def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="module")
 def city(scenario):
     """The streets of the scenario of the module."""
-    from cosim.sumo.net import city_of  # after the hook of `pytest_configure`
+    from cosim.sumo.net import city_of  # not before annotations are checked
 
     return city_of(scenario.network)
