@@ -26,6 +26,7 @@ from nmfd.controllers.dpc.single_changes import (
     STRICTER,
     UNMETERED,
     UNPRICED,
+    UNPRICED_ELSEWHERE,
     changed_policies,
 )
 from nmfd.controllers.rules import scenario_gate
@@ -212,6 +213,16 @@ def test_it_is_trained_and_kept_in_a_file(tmp_path):
     good(nmfd("benchmark", scenario, "--controllers dpc-pcrg,gating-rule --out", tmp_path / "out"))
 
 
+def test_prices_that_gain_nothing_are_left_out(tmp_path):
+    scenario = tiny.write(tmp_path)
+    priced = TABLE.replace("0.0, 0.6, 0.0, 0.6, 1.5]\nkept", "1.0, 0.0, 1.0, 0.0, 1.5]\nkept")
+    (scenario / "scenario.toml").write_text((scenario / "scenario.toml").read_text() + priced)
+    good(nmfd("train", scenario, "--controller dpc-pcrg"))
+    trained, _ = load_policy(scenario / "dpc-pcrg.pt", load_scenario(scenario).network)
+    numbers = Numbers(*trained.numbers.tolist())
+    assert (numbers.price, numbers.elsewhere) == (0.0, 0.0)
+
+
 def test_descent_from_a_saturated_gate_takes_the_single_change_that_gains(tmp_path):
     """A gate far above the critical accumulation has no gradient, and one there would gain."""
     scenario = load_scenario("economic_mpc")
@@ -237,9 +248,10 @@ def test_a_kept_number_is_not_changed():
         planning.network, Architecture(guidance=True, compact=(CENTRE,), metering=True)
     )
     names = [name for name, _ in changed_policies(policy, planning)]
-    assert names == [STRICTER, LOOSER, UNMETERED, GATE, OPEN, HALVED, DOUBLED, UNPRICED]
+    prices = [UNPRICED, UNPRICED_ELSEWHERE]
+    assert names == [STRICTER, LOOSER, UNMETERED, GATE, OPEN, HALVED, DOUBLED, *prices]
     left = [name for name, _ in changed_policies(policy, planning, ["set_point", "metering"])]
-    assert left == [HALVED, DOUBLED, UNPRICED]
+    assert left == [HALVED, DOUBLED, *prices]
 
 
 def test_constant_control_measures_nothing():

@@ -29,7 +29,7 @@ from nmfd.controllers.dpc.numbers import Numbers
 from nmfd.controllers.dpc.options import Dpc
 from nmfd.controllers.dpc.policy import ModuleController, Policy
 from nmfd.controllers.dpc.rollout import Demands, Rollout, States, Trajectories, compiled_step
-from nmfd.controllers.dpc.single_changes import changed_policies
+from nmfd.controllers.dpc.single_changes import SIMPLER, changed_policies
 from nmfd.controllers.dpc.street_rollout import StreetRollout
 from nmfd.controllers.strategy import Strategy
 from nmfd.errors import InputError, RunFailed
@@ -59,7 +59,7 @@ WORTH_COMPILING = 200  # Adam steps
 WORTH = 0.03
 OPEN_LOGIT = 12.0
 # A single change that is better by CHANGE_WORTH after training begins another descent of a compact
-# policy.
+# policy. In the end, simpler ones are taken that are together not worse by as much.
 CHANGE_WORTH = 0.005
 RESTARTS = 2
 
@@ -385,6 +385,22 @@ class TrainingRun:
                 problem = f"{change.name} would take {change.gain:.1%} less time on the model"
                 print(f"nmfd: the policy misses a single change: {problem}", file=sys.stderr)
                 break
+        if not self._task.own and self.best != self.bar:
+            self._simplify()
+
+    def _simplify(self) -> None:
+        """Leave out what gains next to nothing in a compact policy."""
+        policy, setup = self._policy, self._setup
+        if not isinstance(policy, CompactPolicy):
+            return
+        policy.load_state_dict(self._best_weights)
+        most = self.best * (1.0 + CHANGE_WORTH)
+        for name in SIMPLER:
+            changed = dict(changed_policies(policy, self._rollout.planning, setup.kept)).get(name)
+            if changed:
+                score = validate(changed, self._rollout, self._seed, setup)
+                if score < most:
+                    self._take(Change(name=name, policy=changed, score=score, gain=0.0))
 
     def _step_back(self) -> None:
         """Return to the best weights, with half the learning rate."""

@@ -265,13 +265,13 @@ def _fall(
     levels: list[float] = []
     last = float(n[0])
     for share in FALLS:
-        level = max(share * capacity, float(outflow[-1]))
+        level = min(max(share * capacity, float(outflow[-1])), capacity)
         place = float(np.interp(-level, -outflow, n))
-        if share * capacity < outflow[-1] and levels and levels[-1] == level:
+        if share * capacity < level and levels and levels[-1] == level:
             place = 0.5 * (last + jam)
         last = max(place, 1.001 * last)
         points.append(last)
-        levels.append(min(level, capacity))
+        levels.append(level)
     return points, levels
 
 

@@ -3,6 +3,10 @@
 Where a sigmoid is saturated, descent does not move it. So a training looks whether one output,
 replaced as a whole, is better on its own objective: gates at the critical accumulation or open,
 prices halved, doubled or off, no metering, or with a compact policy a stricter or looser one.
+
+What an output of a compact policy gains on the model is worth less in a city, which is not quite
+the model. So where it gains next to nothing, training leaves it out in the end: the changes of
+SIMPLER.
 """
 
 import copy
@@ -19,7 +23,9 @@ from nmfd.tensors import PerPair, PerRegion
 
 GATE, OPEN = "gates at the critical accumulation", "gates open"
 HALVED, DOUBLED, UNPRICED = "prices halved", "prices doubled", "no prices"
+UNPRICED_ELSEWHERE = "no prices elsewhere"
 UNMETERED, STRICTER, LOOSER = "no metering", "stricter metering", "looser metering"
+SIMPLER = (OPEN, UNPRICED_ELSEWHERE, UNMETERED, UNPRICED)
 FACTORS = {HALVED: 0.5, DOUBLED: 2.0, UNPRICED: 0.0}
 METERING_FACTORS = {STRICTER: 0.8, LOOSER: 1.25}  # the first leads out of a lock
 STEEP = 20.0  # logit of a gate per relative accumulation
@@ -50,6 +56,7 @@ def changed_policies(
         for name, factor in FACTORS.items():
             prices = {"price": factor * numbers.price, "elsewhere": factor * numbers.elsewhere}
             changes[name] = prices
+        changes[UNPRICED_ELSEWHERE] = {"elsewhere": 0.0}
     for name, values in changes.items():
         if not set(values) & set(kept):
             changed = copy.deepcopy(policy)
