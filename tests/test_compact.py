@@ -193,8 +193,7 @@ def test_every_number_has_a_gradient_and_perimeter_control_alone_has_no_prices(n
 
 
 def test_it_is_trained_and_kept_in_a_file(tmp_path):
-    scenario = tiny.write(tmp_path)
-    (scenario / "scenario.toml").write_text((scenario / "scenario.toml").read_text() + TABLE)
+    scenario = tiny.write(tmp_path, scenario=tiny.SCENARIO + TABLE)
     good(nmfd("train", scenario, "--controller dpc-pcrg"))
     loaded = load_scenario(scenario)
     trained, content = load_policy(scenario / "dpc-pcrg.pt", loaded.network)
@@ -214,9 +213,8 @@ def test_it_is_trained_and_kept_in_a_file(tmp_path):
 
 
 def test_prices_that_gain_nothing_are_left_out(tmp_path):
-    scenario = tiny.write(tmp_path)
     priced = TABLE.replace("0.0, 0.6, 0.0, 0.6, 1.5]\nkept", "1.0, 0.0, 1.0, 0.0, 1.5]\nkept")
-    (scenario / "scenario.toml").write_text((scenario / "scenario.toml").read_text() + priced)
+    scenario = tiny.write(tmp_path, scenario=tiny.SCENARIO + priced)
     good(nmfd("train", scenario, "--controller dpc-pcrg"))
     trained, _ = load_policy(scenario / "dpc-pcrg.pt", load_scenario(scenario).network)
     numbers = Numbers(*trained.numbers.tolist())

@@ -126,7 +126,7 @@ def test_what_was_not_seen_is_a_guess_above(truth):
 @pytest.mark.parametrize("locks", [False, True])
 def test_a_plateau_ends_only_where_locked_states_were_seen(locks):
     n = np.linspace(10.0, 1000.0, 200)
-    exits = np.minimum(0.01 * n, 3.01)  # whose mean is another float
+    exits = np.minimum(0.01 * n, 3.01)  # the mean of many such floats is another one
     if locks:
         n = np.concatenate([n, np.linspace(1000.0, 1200.0, 50)])
         exits = np.concatenate([exits, np.linspace(3.01, 0.05, 50)])

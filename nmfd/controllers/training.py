@@ -59,7 +59,7 @@ WORTH_COMPILING = 200  # Adam steps
 WORTH = 0.03
 OPEN_LOGIT = 12.0
 # A single change that is better by CHANGE_WORTH after training begins another descent of a compact
-# policy. In the end, simpler ones are taken that are together not worse by as much.
+# policy. At the end it takes those of SIMPLER that together lose less than this.
 CHANGE_WORTH = 0.005
 RESTARTS = 2
 
@@ -342,7 +342,7 @@ class TrainingRun:
             self._show(progress)
             change = self.better_change()
             while change is not None:
-                self._take(change)
+                self._take(change.policy, change.score)
                 self._show(progress)
                 change = self.better_change()
         if self._setup.from_gating:
@@ -377,7 +377,7 @@ class TrainingRun:
             if self.best == self.bar:
                 problem = f"no policy gained {WORTH:.0%} on the model: its gates stay open"
                 print(f"nmfd: {problem}", file=sys.stderr)
-                break
+                return
             change = self.better_change()
             if change is None:
                 break
@@ -385,13 +385,12 @@ class TrainingRun:
                 problem = f"{change.name} would take {change.gain:.1%} less time on the model"
                 print(f"nmfd: the policy misses a single change: {problem}", file=sys.stderr)
                 break
-        if not self._task.own and self.best != self.bar:
-            self._simplify()
+        self._simplify()
 
     def _simplify(self) -> None:
-        """Leave out what gains next to nothing in a compact policy."""
+        """Leave out the outputs of a compact policy that gain next to nothing."""
         policy, setup = self._policy, self._setup
-        if not isinstance(policy, CompactPolicy):
+        if self._task.own or not isinstance(policy, CompactPolicy):
             return
         policy.load_state_dict(self._best_weights)
         most = self.best * (1.0 + CHANGE_WORTH)
@@ -400,7 +399,7 @@ class TrainingRun:
             if changed:
                 score = validate(changed, self._rollout, self._seed, setup)
                 if score < most:
-                    self._take(Change(name=name, policy=changed, score=score, gain=0.0))
+                    self._take(changed, score)
 
     def _step_back(self) -> None:
         """Return to the best weights, with half the learning rate."""
@@ -553,10 +552,13 @@ class TrainingRun:
                     break
         return found
 
-    def _take(self, change: Change) -> None:
-        """Go on from a single change."""
-        self._policy.load_state_dict(change.policy.state_dict())
-        self._keep(SCORE, change.score)
+    def _take(self, policy: Policy, score: float) -> None:
+        """Go on from another policy.
+
+        score: its validation (veh s)
+        """
+        self._policy.load_state_dict(policy.state_dict())
+        self._keep(SCORE, score)
 
     def restart(self, change: Change) -> bool:
         """Begin another descent of a compact policy from a single change.
@@ -566,7 +568,7 @@ class TrainingRun:
         if not isinstance(self._policy, CompactPolicy) or self._restarts == RESTARTS:
             return False
         self._restarts += 1
-        self._take(change)
+        self._take(change.policy, change.score)
         self._optimizer = self._new_optimizer()
         self.done = 0
         return True

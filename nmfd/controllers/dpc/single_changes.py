@@ -5,7 +5,7 @@ replaced as a whole, is better on its own objective: gates at the critical accum
 prices halved, doubled or off, no metering, or with a compact policy a stricter or looser one.
 
 What an output of a compact policy gains on the model is worth less in a city, which is not quite
-the model. So where it gains next to nothing, training leaves it out in the end: the changes of
+the model. So where it gains next to nothing, training leaves it out at the end, by the changes of
 SIMPLER.
 """
 
