@@ -31,7 +31,7 @@ from nmfd.controllers.dpc.single_changes import (
 )
 from nmfd.controllers.rules import scenario_gate
 from nmfd.controllers.strategy import parse
-from nmfd.errors import InputError
+from nmfd.errors import InputError, RunFailed
 from nmfd.model.planning import planning_model
 from nmfd.types import Observation
 
@@ -219,6 +219,13 @@ def test_prices_that_gain_nothing_are_left_out(tmp_path):
     trained, _ = load_policy(scenario / "dpc-pcrg.pt", load_scenario(scenario).network)
     numbers = Numbers(*trained.numbers.tolist())
     assert (numbers.price, numbers.elsewhere) == (0.0, 0.0)
+
+
+def test_a_compact_policy_that_diverges_is_an_error(tmp_path, monkeypatch):
+    scenario = load_scenario(tiny.write(tmp_path, scenario=tiny.SCENARIO + TABLE))
+    monkeypatch.setattr(training, "validate", lambda *_: np.nan)
+    with pytest.raises(RunFailed, match="lower the learning rate"):
+        training.train(scenario, parse("dpc-pcrg"), seed=0, out=tmp_path / "p.pt")
 
 
 def test_descent_from_a_saturated_gate_takes_the_single_change_that_gains(tmp_path):

@@ -390,7 +390,7 @@ class TrainingRun:
     def _simplify(self) -> None:
         """Leave out the outputs of a compact policy that gain next to nothing."""
         policy, setup = self._policy, self._setup
-        if self._task.own or not isinstance(policy, CompactPolicy):
+        if self._task.own or not isinstance(policy, CompactPolicy) or not self._best_weights:
             return
         policy.load_state_dict(self._best_weights)
         most = self.best * (1.0 + CHANGE_WORTH)
