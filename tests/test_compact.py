@@ -212,6 +212,29 @@ def test_it_is_trained_and_kept_in_a_file(tmp_path):
     good(nmfd("benchmark", scenario, "--controllers dpc-pcrg,gating-rule --out", tmp_path / "out"))
 
 
+def test_each_region_has_its_own_accumulation_that_counts_as_full(network):
+    seen = replace(network, critical_above={0: 100.0})
+    shape = Architecture(guidance=True, compact=(CENTRE,), per_region=True, metering=True)
+    own = CompactPolicy(seen, shape)
+    with torch.no_grad():
+        own.numbers.copy_(torch.tensor(NUMBERS))
+        own.log_full[1] = np.log(2.0)
+    full = network.critical
+    full[:2] = 100.0, 2.0 * full[1]
+    state = crowded(network)
+    rates = full * np.maximum(NUMBERS.metering - state.sum(axis=1) / full, 0.0) / FILL_TIME_S
+    assert own.metering(torch.tensor(state)).detach().numpy() == pytest.approx(rates, rel=1e-4)
+
+
+def test_training_finds_what_counts_as_full(tmp_path):
+    table = TABLE.replace("compact = true", "compact = true\nper_region = true")
+    scenario = tiny.write(tmp_path, scenario=tiny.SCENARIO + table)
+    good(nmfd("train", scenario, "--controller dpc-pcrg"))
+    loaded = load_scenario(scenario)
+    trained, _ = load_policy(scenario / "dpc-pcrg.pt", loaded.network)
+    assert (trained.log_full[list(loaded.protected)] != 0.0).all()
+
+
 def test_prices_that_gain_nothing_are_left_out(tmp_path):
     priced = TABLE.replace("0.0, 0.6, 0.0, 0.6, 1.5]\nkept", "1.0, 0.0, 1.0, 0.0, 1.5]\nkept")
     scenario = tiny.write(tmp_path, scenario=tiny.SCENARIO + priced)

@@ -144,6 +144,15 @@ def test_a_plateau_ends_only_where_locked_states_were_seen(locks):
         assert flowing.all()
 
 
+@pytest.mark.parametrize("fallen", [5, 20])
+def test_a_fall_in_few_intervals_may_be_chance(fallen):
+    n = np.concatenate([np.linspace(10.0, 500.0, 200), np.linspace(505.0, 520.0, fallen)])
+    exits = np.where(n <= 500.0, 0.006 * n, 2.5)
+    curve, _, seen = mfd_of(n, exits, n, jam=2000.0)
+    assert seen == (fallen == 20)
+    assert (curve.critical < 510.0) == seen
+
+
 def test_a_counted_model_comes_back_from_its_file(found, tmp_path):
     dispersion = np.arange(20.0, 69.0).reshape(7, 7)
     found = replace(found, held_out=WORSE, dispersion=dispersion, longest_delay=1.5)

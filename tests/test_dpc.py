@@ -275,6 +275,7 @@ def test_the_device_is_the_gpu_where_there_is_one(monkeypatch):
             {"local": True, "metering": True},
             "metering: a local policy controls gates only",
         ),
+        ("dpc-pc", {"per_region": True}, "per_region: is for a compact policy"),
         ("dpc-pc", {"prices": True}, "prices: prices guide drivers"),
         (
             "dpc-pcrg",

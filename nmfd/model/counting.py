@@ -34,8 +34,10 @@ BINS = 24  # of accumulation
 FEWEST_INTERVALS = 3  # of a bin
 FEW_VEHICLES = 10.0  # that leave as the average vehicle does, added to the counts
 FLOWING = 0.6  # of the largest outflow: a fuller region with less is locked
-PLATEAU = 0.95  # of the largest outflow, where the plateau begins
-SEEN_BEYOND = 1.3  # times the critical accumulation, which must be seen to know it
+LARGEST = 0.995  # of the largest outflow: it is as large
+PLATEAU = 0.95  # of the largest accumulation, from which on its outflow is a mean
+SEEN_BEYOND = 1.3  # times the critical accumulation, which must be seen to know a plateau
+FEWEST_FALLEN = 10  # intervals with less outflow that tell a fall from chance
 RISE = (0.2, 0.4, 0.6, 0.8, 1.0)  # of the critical accumulation, points of the rising branch
 FALLS = (0.95, 0.5, 0.1, 0.01)  # of the largest outflow: points of the branch of locked states
 LIMITS = np.geomspace(1.0, 0.02, 60)  # of the capacity of a boundary, of which one is chosen
@@ -214,28 +216,27 @@ def mfd_of(
 ) -> tuple[RoundedLinear, np.ndarray, bool]:
     """Return an MFD, its flowing intervals, and True if a plateau was seen.
 
-    The outflow rises to a plateau, which ends with the largest accumulation that flowed. Beyond,
-    it is that of locked intervals, or if there are none the same. If no plateau was seen, a guess
-    goes on from the largest accumulation.
+    The outflow rises to its largest value, and does not rise beyond. It goes on from the largest
+    accumulation as it was there; or as a guess if neither a plateau nor a fall was seen.
 
     n: accumulations (veh, (N,))
     exits: vehicles that left (veh/s, (N,))
     ready: vehicles that leave at the rate q; the others wait before a boundary (veh, (N,))
     jam: jam accumulation of the lanes (veh)
     """
-    middle, level = _pooled(n, exits, ready)
-    top = int(np.argmax(level >= PLATEAU * level.max()))
-    critical = middle[top]
-    end = middle[-1]
-    falling = np.minimum.accumulate(level[top:])
-    seen = end >= SEEN_BEYOND * critical or falling[-1] < FALLS[0] * level[top]
-    if seen:
-        capacity = float(falling[middle[top:] <= SEEN_BEYOND * critical].mean())
-    else:
+    middle, level, intervals = _pooled(n, exits, ready)
+    nearest = _unimodal(level, intervals)
+    top = int(np.argmax(nearest >= LARGEST * nearest.max()))
+    critical, end = middle[top], middle[-1]
+    capacity = float(nearest[top])
+    falling = np.minimum.accumulate(nearest[top:])
+    fallen = intervals[top:][falling < FALLS[0] * capacity].sum()
+    seen = end >= SEEN_BEYOND * critical or fallen >= FEWEST_FALLEN
+    if not seen:
         critical = end
         capacity = float(level[middle >= PLATEAU * end].mean())
     rise = np.array(RISE) * critical
-    outflows = [*np.interp(rise[:-1], [0.0, *middle], [0.0, *level]), capacity]
+    outflows = [*np.interp(rise[:-1], [0.0, *middle], [0.0, *nearest]), capacity]
     if seen:
         beyond, further = _fall(middle[top:], falling, capacity, max(jam, 1.1 * end))
     else:
@@ -275,8 +276,8 @@ def _fall(
     return points, levels
 
 
-def _pooled(n: np.ndarray, exits: np.ndarray, ready: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return accumulations [veh] of bins, and their outflows [veh/s].
+def _pooled(n: np.ndarray, exits: np.ndarray, ready: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return accumulations (veh), outflows (veh/s) and sizes of bins.
 
     Vehicles leave a bin at the ratio of sums; it falls with the accumulation.
     """
@@ -289,7 +290,20 @@ def _pooled(n: np.ndarray, exits: np.ndarray, ready: np.ndarray) -> tuple[np.nda
     middle = np.bincount(bins, n)[used] / sizes[used]
     rates = np.bincount(bins, exits)[used] / weight
     falling = isotonic_regression(rates, weights=weight, increasing=False).x
-    return middle, middle * falling
+    return middle, middle * falling, sizes[used].astype(float)
+
+
+def _unimodal(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the nearest values that rise to a largest one, and then fall."""
+    from scipy.optimize import isotonic_regression  # slow to import
+
+    found = []
+    for top in range(len(values)):
+        rise = isotonic_regression(values[: top + 1], weights=weights[: top + 1]).x
+        fall = isotonic_regression(values[top:], weights=weights[top:], increasing=False).x
+        found.append([*rise[:-1], max(rise[-1], fall[0]), *fall[1:]])
+    misfit = (weights * (np.array(found) - values) ** 2).sum(axis=1)
+    return np.array(found[int(misfit.argmin())])
 
 
 def _with_rates(

@@ -1,11 +1,11 @@
 """Count the regional model of grid7 whose guided drivers answer prices.
 
-    python scenarios/grid7_peak/price_response.py runs/prices networks/grid7_max_pressure_3
+    python scenarios/grid7_peak/price_response.py runs/prices networks/grid7_max_pressure_4
 
 Gates are open, and prices change every HOLD control intervals. At 1 and 1.3 times the demand, some
-are drawn at random; the protected region always has one. At 1.6, where random prices lock the city,
-they are those of a first policy, each times a random factor; it also meters. That policy was
-trained through networks/grid7_max_pressure_2.
+are drawn at random; the protected region always has one. At 1.6 and 2, where random prices lock the
+city, they are those of earlier policies, each times a random factor; trips wait as these policies
+say, at 2 as if regions held a random factor more or less (reference/README.md).
 Split ratios without prices, dispersions and the longest delay (nmfd.model.answer) are the most
 likely ones of the next regions that vehicles took. The first SETTLED intervals of new prices do not
 count: drivers answer when they are guided next, and are under way before they cross a boundary.
@@ -35,13 +35,19 @@ from nmfd.studies import fit_quality
 
 PRICES = 0.1, 4.0  # -, the least and the largest that are drawn
 PRICED = 0.4  # probability of a region that is not protected
-FACTOR = 4.0  # of prices of the first policy, or its inverse, at most
 HOLD, SETTLED = 6, 2  # control intervals
 CITY = "max-pressure+guidance-period-60"
-FIRST = f"dpc-pcrg+{CITY}+metering"
-FIRST_MODEL = {f"controllers.{FIRST}.model": "../../networks/grid7_max_pressure_2"}
-LOADING = (("RandomPrices", CITY, (1.0, 1.3)), ("OfFirstPolicy", f"{CITY}+metering", (1.6,)))
+DPC = f"dpc-pcrg+{CITY}+metering"
 SEEDS = (1120, 1121, 1122)
+LOADING = (
+    ("RandomPrices", CITY, (1.0, 1.3), SEEDS),
+    ("OfFirstPolicy", f"{CITY}+metering", (1.6,), SEEDS),
+    ("OfSecondPolicy", f"{CITY}+metering", (2.0,), SEEDS),
+    ("OfThirdPolicy", f"{CITY}+metering", (2.0,), SEEDS),
+    ("OfFourthPolicy", f"{CITY}+metering", (2.0,), SEEDS),
+    ("OfFifthPolicy", f"{CITY}+metering", (2.0,), SEEDS),
+    ("FifthPolicy", f"{CITY}+metering", (2.0,), (1102,)),  # locks
+)
 ROUNDS = 3  # of answer and rates after each other
 STEPS = 400  # of descent to the most likely answer
 PRIOR_VEH = 20.0  # of each region and destination, which took the ways of all runs
@@ -72,29 +78,93 @@ class RandomPrices:
         return Controls(perimeter=self._network.open_perimeter, splits=None, prices=self._prices)
 
 
-class OfFirstPolicy:
-    """Commands of the first policy, its prices times factors drawn anew every HOLD control
-    intervals."""
+class OfPolicy:
+    """Commands of an earlier policy, with factors that are drawn anew every HOLD control intervals.
 
-    name = "of-first-policy"
+    file: policy, in reference/
+    model: network that it was trained through, from this folder
+    elsewhere: its prices of regions that are not protected are left
+    prices, fuller: least and largest factors of prices, and of the accumulations that metering sees
+    """
+
+    file: str
+    model = "../../networks/grid7_max_pressure_3"
+    elsewhere = False
+    prices = 0.25, 1.0
+    fuller = 0.85, 1.15
 
     def __init__(self, planning: PlanningModel):
-        scenario = nmfd.load_scenario("grid7_peak", FIRST_MODEL)
-        file = Path(__file__).with_name("reference") / "first-policy" / "policy.pt"
-        self._policy = parse(FIRST).make(scenario, file)
-        self._regions = planning.network.regions
+        here = Path(__file__).parent
+        self.name = type(self).__name__
+        scenario = nmfd.load_scenario(here, {f"controllers.{DPC}.model": self.model})
+        self._policy = parse(DPC).make(scenario, here / "reference" / self.file)
+        self._priced = np.full(planning.network.regions, self.elsewhere)
+        self._priced[list(planning.protected)] = True
         self.reset()
 
     def reset(self, seed: int = 0) -> None:
         self._policy.reset(seed)
-        self._random, self._factors = np.random.default_rng(seed), np.ones(self._regions)
+        self._random = np.random.default_rng(seed), np.random.default_rng([seed, 1])
+        self._factors = np.ones((2, len(self._priced)))
 
     def act(self, observation: Observation) -> Controls:
         if observation.step % HOLD == 0:
-            most = np.log(FACTOR)
-            self._factors = np.exp(self._random.uniform(-most, most, self._regions))
+            bounds = np.log([self.prices, self.fuller])
+            pairs = zip(self._random, bounds, strict=True)
+            drawn = [random.uniform(*both, len(self._priced)) for random, both in pairs]
+            self._factors = np.exp(drawn)
+        prices, fuller = self._factors
         controls = self._policy.act(observation)
-        return replace(controls, prices=controls.prices * self._factors)
+        seen = replace(observation, accumulation=observation.accumulation * fuller[:, None])
+        return replace(
+            controls,
+            prices=controls.prices * prices * self._priced,
+            metering=self._policy.act(seen).metering,
+        )
+
+
+class OfFirstPolicy(OfPolicy):
+    """The policy that was trained through networks/grid7_max_pressure_2."""
+
+    file = "first-policy/policy.pt"
+    model = "../../networks/grid7_max_pressure_2"
+    elsewhere = True
+    prices = 0.25, 4.0
+    fuller = 1.0, 1.0
+
+
+class OfSecondPolicy(OfPolicy):
+    """The one that was trained through the model of the runs so far."""
+
+    file = "loading/second/policy.pt"
+
+
+class OfThirdPolicy(OfPolicy):
+    """The same, with critical accumulations that were seen instead of guesses."""
+
+    file = "loading/third/policy.pt"
+
+
+class OfFourthPolicy(OfPolicy):
+    """The first with thresholds per region, through the model of the runs so far."""
+
+    file = "loading/fourth/policy.pt"
+    model = "reference/loading/fourth"
+    prices = 0.5, 2.0
+
+
+class OfFifthPolicy(OfPolicy):
+    """The next one, through the model of the runs so far."""
+
+    file = "loading/fifth/policy.pt"
+    model = "reference/loading/fifth"
+    prices = 0.5, 2.0
+
+
+class FifthPolicy(OfFifthPolicy):
+    """The fifth policy as it is: the centre locks."""
+
+    prices = fuller = 1.0, 1.0
 
 
 def state_and_prices(run: Result) -> list[torch.Tensor]:
@@ -178,11 +248,16 @@ def main(folder: Path, target: Path) -> None:
     """Do the runs that are not in `folder` yet, and write the model to `target`."""
     scenario = nmfd.load_scenario("grid7_peak")
     runs = []
-    for controller, city, levels in LOADING:
+    for controller, city, levels, seeds in LOADING:
         strategy = f"{__file__}:{controller}+{city}"
         out = folder / controller
-        cosim.evaluate("grid7_peak", [strategy], seeds=SEEDS, demand=levels, workers=2, out=out)
+        cosim.evaluate("grid7_peak", [strategy], seeds=seeds, demand=levels, workers=2, out=out)
         runs += [Result.read(file) for file in sorted(out.glob("**/*.nc"))]
+    write(scenario, runs, target)
+
+
+def write(scenario: Scenario, runs: list[Result], target: Path) -> None:
+    """Write the model of runs to `target`, and print how well it fits."""
     unseen = [run for run in runs if run.seed == SEEDS[-1]]
     without = counted(scenario, [run for run in runs if run not in unseen])
     model = counted(scenario, runs)
@@ -210,7 +285,7 @@ def main(folder: Path, target: Path) -> None:
         target,
         "The city of grid7 with guided drivers who see prices, and max-pressure signals.\n"
         "# DPC is trained on it. Written by scenarios/grid7_peak/price_response.py from "
-        f"{len(runs)} runs, seeds {SEEDS[0]} to {SEEDS[-1]}.",
+        f"{len(runs)} runs, seeds {', '.join(map(str, sorted({run.seed for run in runs})))}.",
     )
 
 

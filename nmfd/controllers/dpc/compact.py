@@ -33,6 +33,10 @@ It corrects errors of the regional model, so rollouts of that model do not use i
 tuned in SUMO (`cosim tune`), not trained. The straight line closes earlier than s as the region
 fills.
 
+With `per_region` n_cr,i is replaced by the accumulation of region i that counts as full. It is
+trained for each region, so that trips wait where that pays; it begins at the critical accumulation,
+or the largest that was seen.
+
 The regional model answers prices by a logit (nmfd.model.answer). The policy is trained like a
 network.
 """
@@ -64,11 +68,17 @@ class CompactPolicy(Policy):
     """Policy with a few numbers for its protected regions.
 
     numbers: a tensor of Numbers (12,)
+    log_full: with `per_region`, logarithm of the accumulation that counts as full, relative to
+        `scale` (-, (R,))
     held: True for a protected region (R,)
     """
 
     def _build(self, network: RegionalModel) -> None:
         self.numbers = nn.Parameter(torch.tensor(Numbers(), dtype=DTYPE))
+        if self.architecture.per_region:
+            known = torch.tensor(network.known_critical, dtype=DTYPE)
+            self.scale.copy_(known.unsqueeze(-1))
+            self.log_full = nn.Parameter(torch.zeros_like(known))
         held = np.isin(np.arange(network.regions), self.architecture.compact)
         self.register_buffer("held", torch.tensor(held), persistent=False)
 
@@ -126,7 +136,7 @@ class CompactPolicy(Policy):
             fullest = torch.where(self.held, full, torch.zeros_like(full)).amax(-1, keepdim=True)
             left = numbers.metering_gain * (numbers.metering_protected - fullest)
             room = torch.minimum(room, left)
-        return self.scale.squeeze(-1) * room.clamp(min=0.0) / FILL_TIME_S
+        return self._counts_as_full() * room.clamp(min=0.0) / FILL_TIME_S
 
     def bound(self) -> None:
         """Set negative numbers to 0."""
@@ -139,6 +149,14 @@ class CompactPolicy(Policy):
         missing = given.new_tensor(Numbers()[len(given) :])
         weights = {**weights, "numbers": torch.cat([given, missing])}
         return super().load_state_dict(weights, *args, **options)
+
+    def _counts_as_full(self) -> PerRegion:
+        """Return the accumulation of each region for which z_i is 1 (veh, (R,))."""
+        full = self.scale.squeeze(-1)
+        return full * self.log_full.exp() if self.architecture.per_region else full
+
+    def _full(self, x: PerPair) -> PerRegion:
+        return x.to(self.scale.dtype).sum(-1) / self._counts_as_full()
 
     def _read(self) -> Numbers:
         return Numbers(*self.numbers.clamp(min=0.0))

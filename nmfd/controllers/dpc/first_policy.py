@@ -34,6 +34,7 @@ def first_policy(setup: Dpc, planning: PlanningModel, *, guidance: bool) -> Poli
         guidance=guidance,
         local=setup.local,
         compact=planning.protected if setup.compact else (),
+        per_region=setup.per_region,
         metering=setup.metering,
         prices=setup.prices,
         soft_exponential=setup.recipe.activation != "gelu",

@@ -102,6 +102,9 @@ class Dpc(Options):
         f"initial numbers of a compact policy: {MEANING}", None, unit="-"
     )
     kept: Texts = setting("numbers of a compact policy that training leaves as they are", ())
+    per_region: bool = setting(
+        "a compact policy finds for each region the accumulation that counts as full", False
+    )
     prices: bool = setting(
         "a network chooses prices of the ways through regions instead of split ratios", False
     )
@@ -172,6 +175,8 @@ class Dpc(Options):
                 f"numbers of a compact policy, of {', '.join(Numbers._fields)}", list(self.kept)
             )
             raise Problem("kept", f"{names}; correct them or add compact = true")
+        if self.per_region and not self.compact:
+            raise Problem("per_region", "is for a compact policy; omit it or add compact = true")
         if self.local and self.metering:
             raise Problem("metering", "a local policy controls gates only; omit it")
         if self.compact and self.prices:

@@ -51,6 +51,7 @@ class Architecture:
     local: one small network with FEATURES inputs serves every boundary, and fits every city; only
         perimeter control
     compact: protected regions of a compact policy (nmfd.controllers.dpc.compact); () for a network
+    per_region: training finds for each region the accumulation that counts as full; compact only
     metering: the policy limits departures
     prices: it chooses prices of regions instead of split ratios; not for a compact policy
     soft_exponential: activation SoftExponential instead of GELU
@@ -63,6 +64,7 @@ class Architecture:
     sparse: bool = False
     local: bool = False
     compact: tuple[int, ...] = ()
+    per_region: bool = False
     metering: bool = False
     prices: bool = False
     soft_exponential: bool = False
