@@ -1,6 +1,6 @@
 """Regional model counted from runs.
 
-It has exit rates by destination, and MFDs with a plateau. In an interval with accumulations x_ij
+It has exit rates by destination, and MFDs with one peak. In an interval with accumulations x_ij
 the regional model lets
 
     k_ij q_i x_ij s_ij / D_ij,    s_ij: share that boundaries let pass,
@@ -35,7 +35,7 @@ FEWEST_INTERVALS = 3  # of a bin
 FEW_VEHICLES = 10.0  # that leave as the average vehicle does, added to the counts
 FLOWING = 0.6  # of the largest outflow: a fuller region with less is locked
 LARGEST = 0.995  # of the largest outflow: it is as large
-PLATEAU = 0.95  # of the largest accumulation, from which on its outflow is a mean
+LAST = 0.95  # of the largest accumulation, from which on its outflow is a mean
 SEEN_BEYOND = 1.3  # times the critical accumulation, which must be seen to know a plateau
 FEWEST_FALLEN = 10  # intervals with less outflow that tell a fall from chance
 RISE = (0.2, 0.4, 0.6, 0.8, 1.0)  # of the critical accumulation, points of the rising branch
@@ -214,10 +214,10 @@ def _with_mfds(
 def mfd_of(
     n: np.ndarray, exits: np.ndarray, ready: np.ndarray, jam: float
 ) -> tuple[RoundedLinear, np.ndarray, bool]:
-    """Return an MFD, its flowing intervals, and True if a plateau was seen.
+    """Return an MFD, its flowing intervals, and True if its end was seen.
 
-    The outflow rises to its largest value, and does not rise beyond. It goes on from the largest
-    accumulation as it was there; or as a guess if neither a plateau nor a fall was seen.
+    The outflow rises to its largest value, and does not rise beyond. After the largest accumulation
+    it stays; but if neither a plateau nor a fall was seen, a guess goes on from there.
 
     n: accumulations (veh, (N,))
     exits: vehicles that left (veh/s, (N,))
@@ -234,7 +234,7 @@ def mfd_of(
     seen = end >= SEEN_BEYOND * critical or fallen >= FEWEST_FALLEN
     if not seen:
         critical = end
-        capacity = float(level[middle >= PLATEAU * end].mean())
+        capacity = float(level[middle >= LAST * end].mean())
     rise = np.array(RISE) * critical
     outflows = [*np.interp(rise[:-1], [0.0, *middle], [0.0, *nearest]), capacity]
     if seen:
@@ -255,7 +255,7 @@ def mfd_of(
 def _fall(
     n: np.ndarray, outflow: np.ndarray, capacity: float, jam: float
 ) -> tuple[list[float], list[float]]:
-    """Return points beyond the plateau (veh), (veh/s).
+    """Return points beyond the largest outflow (veh), (veh/s).
 
     There the outflow falls to each of FALLS. Where it was not seen to fall so far, it stays.
 
