@@ -34,7 +34,7 @@ BINS = 24  # of accumulation
 FEWEST_INTERVALS = 3  # of a bin
 FEW_VEHICLES = 10.0  # that leave as the average vehicle does, added to the counts
 FLOWING = 0.6  # of the largest outflow: a fuller region with less is locked
-LARGEST = 0.995  # of the largest outflow: it is as large
+PEAK = 0.995  # of the largest outflow, where the peak begins
 LAST = 0.95  # of the largest accumulation, from which on its outflow is a mean
 SEEN_BEYOND = 1.3  # times the critical accumulation, which must be seen to know a plateau
 FEWEST_FALLEN = 10  # intervals with less outflow that tell a fall from chance
@@ -226,8 +226,9 @@ def mfd_of(
     """
     middle, level, intervals = _pooled(n, exits, ready)
     nearest = _unimodal(level, intervals)
-    top = int(np.argmax(nearest >= LARGEST * nearest.max()))
-    critical, end = middle[top], middle[-1]
+    top = int(np.argmax(nearest >= PEAK * nearest.max()))
+    critical = middle[top]
+    end = middle[-1]
     capacity = float(nearest[top])
     falling = np.minimum.accumulate(nearest[top:])
     fallen = intervals[top:][falling < FALLS[0] * capacity].sum()

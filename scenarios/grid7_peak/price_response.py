@@ -279,13 +279,14 @@ def write(scenario: Scenario, runs: list[Result], target: Path) -> None:
     )
     print(fit_quality.fit_table(model, fits))
     print(fit_quality.ahead_table(errors, model.titles))
+    seeds = sorted({run.seed for run in runs})
     identify.write_model(
         model,
         Path("networks/grid7"),
         target,
         "The city of grid7 with guided drivers who see prices, and max-pressure signals.\n"
         "# DPC is trained on it. Written by scenarios/grid7_peak/price_response.py from "
-        f"{len(runs)} runs, seeds {', '.join(map(str, sorted({run.seed for run in runs})))}.",
+        f"{len(runs)} runs, seeds {', '.join(map(str, seeds))}.",
     )
 
 
