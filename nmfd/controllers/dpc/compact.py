@@ -152,13 +152,10 @@ class CompactPolicy(Policy):
 
     def _counts_as_full(self) -> PerRegion:
         """Return the accumulation of each region for which z_i is 1 (veh, (R,))."""
-        full = self.scale.squeeze(-1)
+        full = super()._counts_as_full()
         if self.architecture.per_region:
             full = full * self.log_full.exp()
         return full
-
-    def _full(self, x: PerPair) -> PerRegion:
-        return x.to(self.scale.dtype).sum(-1) / self._counts_as_full()
 
     def _read(self) -> Numbers:
         return Numbers(*self.numbers.clamp(min=0.0))

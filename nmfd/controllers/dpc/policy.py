@@ -281,8 +281,12 @@ class Policy(nn.Module):
         return self.backbone((x / self.scale).flatten(-2))
 
     def _full(self, x: PerPair) -> PerRegion:
-        """Return the accumulations relative to the critical ones (-, (..., R))."""
-        return x.to(self.scale.dtype).sum(-1) / self.scale.squeeze(-1)
+        """Return z_i, the share of what counts as full (-, (..., R))."""
+        return x.to(self.scale.dtype).sum(-1) / self._counts_as_full()
+
+    def _counts_as_full(self) -> PerRegion:
+        """Return the accumulations that count as full (veh, (R,))."""
+        return self.scale.squeeze(-1)
 
 
 def _hidden_layers(architecture: Architecture, inputs: int, count: int) -> list[nn.Module]:
