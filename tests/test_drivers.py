@@ -22,14 +22,17 @@ def drivers_of(*, ways_return=True, lanes=True):
 
 
 def numbers(route):
-    return [CITY.number[edge] for edge in route]
+    return np.array([CITY.number[edge] for edge in route])
 
 
 def test_the_present_route_takes_the_time_after_its_first_edge():
     drivers, time = drivers_of()
     late = time + 5.0
-    present = drivers.present(tuple("ambt"), CITY.number["a"], late)
-    assert present == Present(numbers("ambt"), 45.0, 15.0, found=True)
+    itinerary = drivers.itinerary("whole", tuple("?ambt"))
+    present = drivers.present(itinerary, 1, CITY.number["a"], late)
+    assert present.route.tolist() == numbers("ambt").tolist()
+    assert present[1:] == Present(None, 45.0, 15.0, found=True)[1:]
+    assert drivers.present(itinerary, 0, CITY.number["a"], late).route is None
     assert present.longest == 46.0
     assert drivers.time(numbers("ambt"), late) == 45.0
 
@@ -47,7 +50,8 @@ def test_the_present_route_takes_the_time_after_its_first_edge():
 )
 def test_routes_that_no_search_finds(route, here, found, route_known):
     drivers, time = drivers_of(ways_return=False)
-    present = drivers.present(tuple(route), CITY.number[here], time)
+    itinerary = drivers.itinerary("whole", tuple(route))
+    present = drivers.present(itinerary, 0, CITY.number[here], time)
     assert present.found is found
     assert (present.route is not None) is route_known
     assert (present.longest == math.inf) is not found
@@ -74,7 +78,9 @@ def test_another_route_must_save_a_share_of_the_delay():
 
 def test_in_the_mesoscopic_model_another_route_must_save_a_share_of_its_own_time():
     drivers, _ = drivers_of(lanes=False)
-    assert drivers.worth(Present([0], time=130.0, delay=1.0)) == 130.0 / (1.0 + MESO_THRESHOLD)
+    assert drivers.worth(Present(np.array([0]), time=130.0, delay=1.0)) == 130.0 / (
+        1.0 + MESO_THRESHOLD
+    )
 
 
 def test_routes_closed_to_cars_are_kept_and_unknown_ones_left():

@@ -11,10 +11,10 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from streets import seen
 
-from cosim.plant import guidance
+from cosim.plant import guidance, routes
 from cosim.plant.guidance import Guide
 from cosim.plant.meter import Event
-from cosim.plant.routes import MOST_NODES, Exits, Moves, Returning, Searches, Trees, Ways
+from cosim.plant.routes import MOST_NODES, Exits, Moves, Returning, Trees, Ways
 
 EDGES, REGION = 40, np.repeat([0, 1, 2, 3], 10)
 
@@ -30,10 +30,10 @@ def city():
     return first, second, random.uniform(0.0, 3.0, len(pairs)), random.uniform(5.0, 60.0, EDGES)
 
 
-@pytest.fixture(params=[(MOST_NODES, ()), (1, ()), (1, (0, 2, 5))])
-def ways(city, request):
-    """Out of region 0, with all trees kept or hardly any, or some searched together."""
-    kept, together = request.param
+@pytest.fixture(params=[MOST_NODES, 1])
+def ways(city, request, monkeypatch):
+    """Out of region 0, with all searches kept or hardly any."""
+    monkeypatch.setattr(routes, "MOST_NODES", request.param)
     first, second, turn, time = city
     inside, outside = (
         Moves(first, second, allowed=(REGION == 0) ^ outside, reverse=outside)
@@ -47,18 +47,14 @@ def ways(city, request):
         }
     )
     following, gate, entry, move = np.array(gates).T
-    searches = Searches(kept)
     ahead = outside.ahead(outside.number[entry], 0.8 * time, 0.7 * turn)
-    everywhere = Trees(
-        Moves(first, second, allowed=np.full(EDGES, True), reverse=False), time, turn, searches
-    )
+    moves = Moves(first, second, allowed=np.full(EDGES, True), reverse=False)
+    everywhere = Trees(moves, time, turn, aims=gate)
     exits = Exits(np.array([gate, entry, move, following]).T, inside=inside, outside=outside)
     over = turn[move] + time[entry]
-    to_gates = {"aims": exits.first_nodes, "beyond": over}
-    there = Trees(inside, time, turn, searches, together=together, **to_gates)
-    onward = Trees(outside, time, turn, searches, ahead, together, aims=exits.second_nodes)
-    back = back_to(gate, entry, city)
-    returning = Returning(everywhere, gate, over.tolist(), back.tolist())
+    there = Trees(inside, time, turn, aims=exits.first_nodes, beyond=over)
+    onward = Trees(outside, time, turn, ahead, aims=exits.second_nodes)
+    returning = Returning(everywhere, over, back_to(gate, entry, city))
     found = Ways(exits, there=there, onward=onward, ahead=ahead, everywhere=returning)
     return found, gate, entry
 
@@ -88,70 +84,56 @@ def back_to(gate, entry, city):
     return 0.8 * least(city, np.full(EDGES, True))[np.ix_(entry, gate)].min(axis=0)
 
 
-def test_the_searches_find_the_least_times_up_to_a_limit(city, ways):
+@pytest.mark.parametrize("detour", [0.0, 40.0])
+def test_the_fastest_ways_are_found_up_to_a_limit(city, ways, detour):
+    """By each next region, and those that come back where they are the fastest of all."""
     found, gate, entry = ways
     inside, outside = least(city, REGION == 0), least(city, REGION != 0)
-    over, cut = [takes(move, city) for move in zip(gate.tolist(), entry.tolist(), strict=True)], 0
-    for most in (60.0, np.inf, 150.0):  # a wider search may come later, a narrower one may use it
-        for here in range(10):
-            for target in range(10, EDGES):
-                exact = inside[here, gate] + over + outside[entry, target]
-                cost = np.array(found.cost(here, target, most))
-                by_region = np.logical_or.reduceat(np.isfinite(exact), found.exits.begins)
-                assert found.exits.exist(here, target) == by_region.tolist()
-                np.testing.assert_allclose(cost[exact <= most], exact[exact <= most])
-                assert (cost[exact > most] >= exact[exact > most] - 1e-9).all()
-                cut += int((np.isinf(cost) & np.isfinite(exact)).sum())
-                for g in np.flatnonzero(np.isfinite(exact) & (exact <= most)):
-                    way = found.route(here, int(g), target)
-                    assert way[0] == here
-                    assert way[-1] == target
-                    crossing = way.index(int(entry[g]))
-                    assert way[crossing - 1] == gate[g]
-                    assert (REGION[way[crossing:]] != 0).all()
-                    assert takes(way, city) == pytest.approx(exact[g])
-    assert cut > 100
-
-
-def test_ways_that_come_back_are_found_where_they_are_the_fastest_of_all(city, ways):
-    found, gate, entry = ways
-    exact, back = least(city, np.full(EDGES, True)), 0
-    for most in (60.0, np.inf, 150.0):
-        for here in range(10):
-            for target in range(10, EDGES):
-                cost = np.array(found.cost(here, target, most))
-                returning, gateway = found.returning(here, target, most)
-                if exact[here, target] < most:
-                    assert min(returning, cost.min()) == pytest.approx(exact[here, target])
-                if returning >= min(most, cost.min() - 1e-9):
+    fastest_of_all = least(city, np.full(EDGES, True))
+    over = [takes(move, city) for move in zip(gate.tolist(), entry.tolist(), strict=True)]
+    begins = found.exits.begins[:-1]
+    cut = back = 0
+    for longest in (60.0, np.inf, 150.0):  # a wider search may come later, or was made before
+        for here, target in product(range(10), range(10, EDGES)):
+            exact = inside[here, gate] + over + outside[entry, target]
+            by_region = np.minimum.reduceat(exact, begins)
+            choices = found.choices(here, target, longest, detour)
+            assert choices.fastest == choices.times.min()
+            for n, time in enumerate(choices.times):
+                assert choices.exist[n] or by_region[n] == np.inf
+                if time == np.inf:
+                    cut += by_region[n] < np.inf
+                    assert by_region[n] >= longest + detour
                     continue
-                way = found.route(here, gateway, target, returning=True)
+                way = choices.route(n).tolist()
                 assert (way[0], way[-1]) == (here, target)
-                assert takes(way, city) == pytest.approx(returning)
-                crossing = max(n for n, edge in enumerate(way) if REGION[edge] == 0)
-                assert (way[crossing], way[crossing + 1]) == (gate[gateway], entry[gateway])
-                assert (REGION[way[:crossing]] != 0).any()
-                back += 1
+                assert takes(way, city) == pytest.approx(time)
+                leaves = max(place for place, edge in enumerate(way) if REGION[edge] == 0)
+                assert REGION[way[leaves + 1]] == found.exits.neighbours[n]
+                if (REGION[way[:leaves]] == 0).all():
+                    assert time > longest + detour or time == pytest.approx(by_region[n])
+                else:
+                    back += 1
+                    assert time > longest or time == pytest.approx(fastest_of_all[here, target])
+            if fastest_of_all[here, target] < longest:
+                assert choices.fastest == pytest.approx(fastest_of_all[here, target])
+    assert cut > 50
     assert back > 10
 
 
-@pytest.mark.parametrize("kept", [MOST_NODES, 1])
-def test_ways_home_are_the_fastest_up_to_a_limit(city, kept):
+def test_ways_home_are_the_fastest_up_to_a_limit(city):
     first, second, turn, time = city
     exact = least(city, np.full(EDGES, True))
-    home = Trees(
-        Moves(first, second, allowed=np.full(EDGES, True), reverse=True), time, turn, Searches(kept)
-    )
-    for most in (60.0, np.inf, 100.0):
-        for here in range(EDGES):
-            for target in range(EDGES):
-                cost = home.costs(target, most)[here]
-                if exact[here, target] > most:
-                    assert cost > most
-                elif np.isfinite(exact[here, target]):
-                    way = home.back(target, here)
-                    assert (way[0], way[-1]) == (here, target)
-                    assert cost == pytest.approx(exact[here, target]) == takes(way, city)
+    moves = Moves(first, second, allowed=np.full(EDGES, True), reverse=True)
+    home = Trees(moves, time, turn)
+    for most, here, target in product((60.0, np.inf), range(EDGES), range(EDGES)):
+        cost, before = home.time(target, here, most)
+        if exact[here, target] > most:
+            assert cost == np.inf
+        elif np.isfinite(exact[here, target]):
+            way = home.back(before, target, here).tolist()
+            assert (way[0], way[-1]) == (here, target)
+            assert cost == pytest.approx(exact[here, target]) == takes(way, city)
 
 
 DRIVER = Event(vehicle="driver", source=None, region=0, destination=2, edge="t")

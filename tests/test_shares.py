@@ -5,8 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from cosim.plant.fastest import assigned, shifted
 from cosim.plant.routes import Choices
-from cosim.plant.shares import MEMORY, SHARE_PENALTY_S, Shares, assigned, shifted
+from cosim.plant.shares import MEMORY, SHARE_PENALTY_S, Shares
 
 HALF = (0.5, 0.5)
 
@@ -22,7 +23,7 @@ HALF = (0.5, 0.5)
     ids=["as they are", "half of them", "all of them", "freed by how much theta raises"],
 )
 def test_theta_shifts_wishes(wish, own, theta, expected):
-    assert shifted(wish, own, theta) == pytest.approx(expected)
+    assert shifted(*map(np.array, (wish, own, theta))) == pytest.approx(np.array(expected))
 
 
 @pytest.mark.parametrize(
@@ -47,7 +48,8 @@ def test_theta_shifts_wishes(wish, own, theta, expected):
     ],
 )
 def test_the_cheapest_next_region_is_assigned(times, shares, given, expected):
-    assert assigned(times, shares, given) == expected
+    arrays = map(np.array, (times, shares, given))
+    assert assigned(*arrays, SHARE_PENALTY_S) == expected
 
 
 def splits_of(shares):
@@ -65,8 +67,8 @@ def shares_of(theta):
 
 
 def next_region(shares, *times, exists=(True, True), limit=math.inf):
-    choices = Choices(list(times), list(exists), route=lambda n: [])
-    return shares.next_region(0, [1, 2], 3, choices, limit)
+    choices = Choices(np.array(times), min(times), np.array(exists), route=lambda n: np.zeros(0))
+    return shares.next_region(0, np.array([1, 2]), 3, choices, limit)
 
 
 def test_a_region_without_a_route_leaves_its_share_to_others():

@@ -11,7 +11,7 @@ controllers. It leaves out signals whose states are no phases (NEMA), and those 
 timetable changes.
 """
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -217,10 +217,8 @@ class Rules:
             clearances.append(gap[others & walks].min(initial=np.inf))
 
         conflicts = 0
-        for on, first in zip(green, lights == "G", strict=True):
-            together = self.apart & np.outer(on, on)
-            unclear = self.yielding & np.outer(first, first)
-            conflicts += np.count_nonzero(np.triu(together | unclear, 1))
+        for state, times in Counter(state for _, state in states).items():
+            conflicts += times * self._conflicts(state)
 
         short_yellows = np.count_nonzero(yellow_over & (lasted < self.yellow))
         return {
@@ -234,6 +232,15 @@ class Rules:
             "short_clearances": short_clearances,
             "conflicts": conflicts,
         }
+
+    def _conflicts(self, state: str) -> int:
+        """Return how many pairs of links a state should not serve together."""
+        lights = np.array(list(state))
+        first = lights == "G"
+        on = first | (lights == "g")
+        together = self.apart & np.outer(on, on)
+        unclear = self.yielding & np.outer(first, first)
+        return int(np.count_nonzero(np.triu(together | unclear, 1)))
 
 
 def _programme(logic: Element) -> _Programme:

@@ -6,17 +6,34 @@ for others.
 
 import math
 from collections.abc import Sequence
-from itertools import groupby, pairwise
 from typing import NamedTuple
 
-from cosim.plant.routes import TravelTimes
+import numpy as np
+
+from cosim.plant import fastest
+from cosim.plant.fastest import UNKNOWN
+from cosim.plant.routes import Route, TravelTimes
+from cosim.sumo.arrays import PerEdge
 from cosim.sumo.net import City
 
 # Drivers keep their route if another one saves less than this share of its delay, times the delay's
 # share of its time.
 SWITCHING_THRESHOLD = 0.6
 MESO_THRESHOLD = 0.3  # in the mesoscopic model: less than this share of the other's own time
-UNKNOWN = -1  # number of an edge closed to cars, or of a move that the city does not have
+
+
+class Itinerary(NamedTuple):
+    """A route as SUMO has it.
+
+    name: of the route
+    edges, moves: by number, UNKNOWN on roads closed to cars
+    known_from: place of the first edge after these roads
+    """
+
+    name: str
+    edges: Route
+    moves: Route
+    known_from: int
 
 
 class Present(NamedTuple):
@@ -27,7 +44,7 @@ class Present(NamedTuple):
     found: a search would find the route
     """
 
-    route: list[int] | None
+    route: Route | None
     time: float = math.inf
     delay: float = math.inf
     found: bool = False
@@ -39,52 +56,53 @@ class Present(NamedTuple):
 
 
 class Drivers:
-    """Judgement of drivers in one city.
-
-    Routes are short, so lists of times take less time than arrays.
-    """
+    """Judgement of drivers in one city."""
 
     def __init__(self, city: City, times: TravelTimes, *, ways_return: bool, lanes: bool):
         """ways_return: routes may come back into a region
         lanes: False in the mesoscopic model
         """
         self._number = city.number
-        self._region = city.edge_region.tolist()
+        self._region = city.edge_region
         self._times = times
-        self._free = times.free.tolist()
-        self._free_turns = times.free_turns.tolist()
         self._ways_return = ways_return
         self._lanes = lanes
 
-    def present(self, edges: Sequence[str], here: int, time: Sequence[float]) -> Present:
+    def itinerary(self, name: str, edges: Sequence[str]) -> Itinerary:
+        """Return a route with these edges, by name."""
+        route = np.array([self._number.get(edge, UNKNOWN) for edge in edges], dtype=int)
+        closed = np.flatnonzero(route == UNKNOWN)
+        known_from = int(closed[-1]) + 1 if len(closed) else 0
+        return Itinerary(name, route, self._times.moves(route), known_from)
+
+    def present(self, itinerary: Itinerary, place: int, here: int, time: PerEdge) -> Present:
         """Return the present route of a driver on edge `here`.
 
-        edges: names, from the present one on; time: of every edge (s)
+        place: of the present edge in the itinerary; time: of every edge (s, (E,))
         """
-        route = [self._number.get(edge, UNKNOWN) for edge in edges]
-        if UNKNOWN in route:
+        if place < itinerary.known_from:
             return Present(None)
+        route = itinerary.edges[place:]
         if route[0] != here:
             return Present(route)
-        times = self._times
-        ahead = route[1:]
-        moves = [times.move.get(pair, UNKNOWN) for pair in pairwise(route)]
-        known = [move for move in moves if move != UNKNOWN]
-        found = len(known) == len(moves)
-        takes = _total(time, ahead) + _total(times.turn_list, known)
-        free = _total(self._free, ahead) + _total(self._free_turns, known)
+        moves = itinerary.moves[place:]
+        takes, free, found = fastest.times_of(
+            route, moves, time, self._times.turns, self._times.free, self._times.free_turns
+        )
         if found and not self._ways_return:
-            regions = self._regions(route)
-            found = regions.count(regions[0]) == 1
+            found = fastest.leaves_once(route, self._region)
         return Present(route, takes, max(takes - free, 0.0), found)
 
-    def time(self, route: list[int], time: Sequence[float]) -> float:
+    def time(self, route: Route, time: PerEdge) -> float:
         """Return the time of a route from the end of its first edge (s).
 
-        time: of every edge (s)
+        time: of every edge (s, (E,))
         """
-        moves = [self._times.move[pair] for pair in pairwise(route)]
-        return _total(time, route[1:]) + _total(self._times.turn_list, moves)
+        moves = self._times.moves(route)
+        takes, *_ = fastest.times_of(
+            route, moves, time, self._times.turns, self._times.free, self._times.free_turns
+        )
+        return takes
 
     def keeps(self, present: Present, time: float, following: int | None = None) -> bool:
         """Return True if a driver keeps the present route.
@@ -105,23 +123,9 @@ class Drivers:
             return present.time / (1.0 + MESO_THRESHOLD)
         return present.time - SWITCHING_THRESHOLD * present.delay**2 / max(present.time, 1e-9)
 
-    def next_region(self, route: list[int]) -> int:
+    def next_region(self, route: Route) -> int:
         """Return the next region of a route.
 
         It is the first other region, or with `ways_return` the region after its last exit.
         """
-        regions = self._regions(route)
-        left = 0
-        if self._ways_return:
-            for n, region in enumerate(regions):
-                if region == regions[0]:
-                    left = n
-        return regions[min(left + 1, len(regions) - 1)]
-
-    def _regions(self, route: list[int]) -> list[int]:
-        return [region for region, _ in groupby(map(self._region.__getitem__, route))]
-
-
-def _total(times: Sequence[float], numbers: Sequence[int]) -> float:
-    """Return the sum of the times with these numbers (s)."""
-    return sum([times[number] for number in numbers])
+        return fastest.next_region(route, self._region, self._ways_return)

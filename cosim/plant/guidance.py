@@ -20,9 +20,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosim.plant.drivers import Drivers, Present
+from cosim.plant.drivers import Drivers, Itinerary, Present
 from cosim.plant.meter import Event
-from cosim.plant.routes import Choices, RegionRoutes, TravelTimes, Ways
+from cosim.plant.routes import Choices, RegionRoutes, Route, TravelTimes, Ways
 from cosim.plant.sampling import StreetMeans
 from cosim.plant.shares import Shares
 from cosim.plant.stuck import QUEUE_END_M, Lanes
@@ -53,7 +53,7 @@ class _Visit:
 class _Trip(NamedTuple):
     """The rest of a driver's trip.
 
-    here, target: present and last edge, by number; edges: present route, by name
+    here, target: present and last edge, by number; place: of the present edge in the itinerary
     """
 
     region: int
@@ -61,7 +61,8 @@ class _Trip(NamedTuple):
     driver_class: int
     here: int
     target: int
-    edges: tuple[str, ...]
+    itinerary: Itinerary
+    place: int
 
 
 class _Plan(NamedTuple):
@@ -71,7 +72,7 @@ class _Plan(NamedTuple):
     following: next region; None in the region of destination
     """
 
-    route: list[int] | None
+    route: Route | None
     following: int | None = None
 
 
@@ -154,6 +155,7 @@ class Guide:
         self._routes = RegionRoutes(city, self._times, taste, ways_return=ways_return, lanes=lanes)
         self._drivers = Drivers(city, self._times, ways_return=ways_return, lanes=lanes)
         self._visits = _Visits()
+        self._itineraries: dict[str, Itinerary] = {}  # of drivers when they were guided last
         self._shares = Shares(own)
         self.realised = self._shares.realised
         self._guides = False
@@ -187,6 +189,7 @@ class Guide:
         self._visits.begin_step()
         for vehicle in self._session.arrived():
             self._visits.end(vehicle)
+            self._itineraries.pop(vehicle, None)
         for event in events:
             self._visits.end(event.vehicle)
             guidable = event.free and event.vehicle not in self._planned
@@ -229,7 +232,7 @@ class Guide:
         """Give a driver a plan; return False if it is too late to change lanes."""
         event = visit.event
         if plan.route is not None:
-            edges = [self._city.edges[n] for n in plan.route]
+            edges = [self._city.edges[n] for n in plan.route.tolist()]
             if self._lanes and self._lanes.too_late(event.vehicle, edges):
                 return False
             if not self._session.set_route(event.vehicle, edges):
@@ -249,18 +252,28 @@ class Guide:
         here: present edge
         """
         event = visit.event
-        route = self._session.route(event.vehicle)
         trip = _Trip(
             region=event.region,
             destination=event.destination,
             driver_class=visit.driver_class,
             here=here,
             target=self._city.number[event.edge],
-            edges=route[self._session.route_index(event.vehicle) :],
+            itinerary=self._itinerary(event.vehicle),
+            place=self._session.route_index(event.vehicle),
         )
         if event.region == event.destination:
             return self._plan_home(trip)
         return self._plan_on(trip)
+
+    def _itinerary(self, vehicle: str) -> Itinerary:
+        """Return the present route of a driver."""
+        # SUMO gives every new route of a vehicle another name.
+        name = self._session.route_name(vehicle)
+        known = self._itineraries.get(vehicle)
+        if known is None or known.name != name:
+            known = self._drivers.itinerary(name, self._session.route(vehicle))
+            self._itineraries[vehicle] = known
+        return known
 
     def _plan_home(self, trip: _Trip) -> _Plan | None:
         """Return the fastest route inside the region of destination.
@@ -273,16 +286,16 @@ class Guide:
         seen = self._routes.home(trip.region, trip.driver_class, free)
         present = self._present(trip, free)
         longest = self._drivers.worth(present) + 1.0
-        time = float(seen.costs(target, longest)[seen.node[here]])
+        time, before = seen.time(target, here, longest)
         if here == target or math.isinf(time) or self._drivers.keeps(present, time):
             return None
-        route = seen.back(target, here)
+        route = seen.back(before, target, here)
         if free != self._routes.regions:  # prices may have made the route a long detour
             unpriced = self._routes.home(trip.region, trip.driver_class, self._routes.regions)
             takes = self._time(trip, route, self._routes.regions)
-            fastest = unpriced.costs(target, takes)[unpriced.node[here]]
+            fastest, before = unpriced.time(target, here, takes)
             if fastest < takes - self._most_detour:
-                route = unpriced.back(target, here)
+                route = unpriced.back(before, target, here)
         return _Plan(route)
 
     def _plan_on(self, trip: _Trip) -> _Plan | None:
@@ -291,12 +304,11 @@ class Guide:
         ways = self._routes.ways(trip.region, trip.driver_class, free)
         present = self._present(trip, free)
         choices = ways.choices(trip.here, trip.target, present.longest, self._most_detour)
-        fastest = min(choices.times, default=math.inf)
-        if fastest == math.inf:
+        if choices.fastest == math.inf:
             return None
         if free != self._routes.regions:
             return self._plan_priced(trip, ways, present, choices)
-        limit = fastest + self._most_detour
+        limit = choices.fastest + self._most_detour
         n = self._next_region(trip, ways, choices, limit)
         if n is None:
             return None
@@ -315,16 +327,16 @@ class Guide:
         present_unpriced = self._present(trip, all_free)
         longest = present_unpriced.longest
         shortest = unpriced.choices(trip.here, trip.target, longest, self._most_detour)
-        limit = min(shortest.times) + self._most_detour
+        limit = shortest.fastest + self._most_detour
         routes = []
-        times = []
-        exist = []
-        for way in range(len(choices.times)):
+        times = np.full(len(choices.times), math.inf)
+        for way in range(len(times)):
             route = self._shortened(trip, choices, shortest, way, limit)
             routes.append(route)
-            times.append(self._time(trip, route, free) if route else math.inf)
-            exist.append(choices.exist[way] or shortest.exist[way])
-        within = Choices(times, exist, routes.__getitem__)
+            if route is not None:
+                times[way] = self._time(trip, route, free)
+        exist = choices.exist | shortest.exist
+        within = Choices(times, float(times.min()), exist, routes.__getitem__)
         n = self._next_region(trip, ways, within, math.inf)
         if n is None:
             return None
@@ -337,8 +349,8 @@ class Guide:
 
     def _shortened(
         self, trip: _Trip, choices: Choices, shortest: Choices, n: int, limit: float
-    ) -> list[int]:
-        """Return the n-th route within the limit; [] if there is none.
+    ) -> Route | None:
+        """Return the n-th route within the limit; None if there is none.
 
         choices: the fastest routes with prices; shortest: without prices
         limit: of the time without prices (s)
@@ -349,22 +361,22 @@ class Guide:
                 return route
         if shortest.times[n] <= limit < math.inf:
             return shortest.route(n)
-        return []
+        return None
 
     def _present(self, trip: _Trip, free: tuple[int, ...]) -> Present:
         """Return the present route of a driver.
 
         free: regions without a price
         """
-        time = self._routes.time(trip.driver_class, free)
-        return self._drivers.present(trip.edges, trip.here, time)
+        time = self._routes.seen(trip.driver_class, free)
+        return self._drivers.present(trip.itinerary, trip.place, trip.here, time)
 
-    def _time(self, trip: _Trip, route: list[int], free: tuple[int, ...]) -> float:
+    def _time(self, trip: _Trip, route: Route, free: tuple[int, ...]) -> float:
         """Return the time of a route for a driver (s).
 
         free: regions without a price
         """
-        return self._drivers.time(route, self._routes.time(trip.driver_class, free))
+        return self._drivers.time(route, self._routes.seen(trip.driver_class, free))
 
     def _next_region(self, trip: _Trip, ways: Ways, choices: Choices, limit: float) -> int | None:
         """Return which choice a driver gets; None if no share is left."""
@@ -376,7 +388,7 @@ class Guide:
 
         The driver keeps the present route if it is about as good.
         """
-        following = ways.exits.neighbours[n]
+        following = int(ways.exits.neighbours[n])
         if self._drivers.keeps(present, time, following):
             return _Plan(None, following)
         return _Plan(choices.route(n), following)

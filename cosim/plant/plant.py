@@ -3,15 +3,15 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from cosim.plant.actuation import Actuation
 from cosim.plant.detectors import READING_PERIOD_S, Estimation, instruments, lay_out, probes
-from cosim.plant.guidance import Guide
 from cosim.plant.incidents import Incidents
 from cosim.plant.launch import Launch
-from cosim.plant.meter import Meter
+from cosim.plant.meter import Event, Meter
 from cosim.plant.metering import Metering
 from cosim.plant.programmes import city_signals, scenario_city
 from cosim.plant.record import Recorder
@@ -29,6 +29,9 @@ from nmfd.arrays import Arrays
 from nmfd.model.planning import PlanningModel, planning_model
 from nmfd.model.scenario import Scenario
 from nmfd.types import Controls, Observation, State
+
+if TYPE_CHECKING:  # loads a compiler, which takes 0.4 s and 100 MB
+    from cosim.plant.guidance import Guide
 
 # Keeps the random numbers of the guided drivers apart from others of the same seed.
 GUIDANCE = 0x67756964
@@ -51,6 +54,21 @@ class Observer:
 
     def recorded(self, controls: Controls, state: State, row: Mapping[str, np.ndarray]) -> None:
         """Take controls, new state and row of the record of an interval."""
+
+
+class _Unguided:
+    """Guidance of a run without commands to drivers so far."""
+
+    led_on = 0
+
+    def __init__(self, regions: int):
+        self.realised = np.zeros((regions,) * 3, dtype=int)
+
+    def command(self, *_: object) -> None:
+        """Let all drivers keep their routes."""
+
+    def apply(self, events: list[Event]) -> None:
+        """Guide nobody."""
 
 
 class SumoPlant:
@@ -138,18 +156,8 @@ class SumoPlant:
             )
         self._sampler = StreetSampler(session, city, known if estimated else None)
         self._streets: StreetMeans | None = None
-        self._guide = Guide(
-            session,
-            city,
-            self._planning.network.nominal_splits,
-            compliance=settings.compliance,
-            planned=self._launch.planned,
-            ways_return=settings.ways_return,
-            period=settings.guidance_period,
-            lanes=not settings.mesoscopic,
-            turn_late=not settings.signals_from_outside,
-            random=np.random.default_rng([seed, GUIDANCE]),
-        )
+        self._guide: Guide | _Unguided = _Unguided(city.regions)
+        self._seed = seed
         flows = self._launch.turning_flows() if settings.signals_from_outside else None
         self.actuation = Actuation(
             session,
@@ -167,7 +175,7 @@ class SumoPlant:
             self._junctions = Junctions(session, city)
             self._waits = Waits(session, read_files(city.net_file).links, self.actuation.states)
         self._state = meter.state(0, 0.0)
-        self._recorder = Recorder(meter, self._guide, self.actuation)
+        self._recorder = Recorder(meter, lambda: self._guide.realised, self.actuation)
         self._observer.began(city, self._state)
         return self._state
 
@@ -183,7 +191,7 @@ class SumoPlant:
         sampling = self._period(SAMPLE_PERIOD_S, steps)
         self._incidents.begin(self._k)
         self.actuation.command(controls.perimeter, self._sampler.last[0])
-        self._guide.command(self._splits(controls), self._streets, controls.prices)
+        self._command_guide(controls)
         if self._metering:
             self._metering.command(controls.metering, self._state.accumulation.sum(axis=1))
         if self._junctions:
@@ -299,6 +307,30 @@ class SumoPlant:
         if self._session is None:
             raise RuntimeError("no simulation is running; call reset(seed) first")
         return self._session
+
+    def _command_guide(self, controls: Controls) -> None:
+        """Command the drivers, if there is a command."""
+        splits = self._splits(controls)
+        if splits is not None and isinstance(self._guide, _Unguided):
+            self._guide = self._new_guide()
+        self._guide.command(splits, self._streets, controls.prices)
+
+    def _new_guide(self) -> "Guide":
+        from cosim.plant.guidance import Guide
+
+        settings = self._settings
+        return Guide(
+            self.session,
+            self.city,
+            self._planning.network.nominal_splits,
+            compliance=settings.compliance,
+            planned=self._launch.planned,
+            ways_return=settings.ways_return,
+            period=settings.guidance_period,
+            lanes=not settings.mesoscopic,
+            turn_late=not settings.signals_from_outside,
+            random=np.random.default_rng([self._seed, GUIDANCE]),
+        )
 
     def _period(self, seconds: float, steps: int) -> int:
         """Return a period in simulation steps, from 1 to `steps`."""

@@ -1,12 +1,11 @@
 """The record of a run in SUMO per control interval."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
 
 from cosim.plant.actuation import Actuation
-from cosim.plant.guidance import Guide
 from cosim.plant.meter import Meter
 from cosim.plant.sampling import StreetMeans
 from nmfd.arrays import Arrays
@@ -67,10 +66,13 @@ def _since_start(counts: np.ndarray) -> np.ndarray:
 class Recorder:
     """Rows of a record: `add` one at the end of every control interval."""
 
-    def __init__(self, meter: Meter, guide: Guide, actuation: Actuation):
-        """Their counts so far belong to no interval."""
+    def __init__(self, meter: Meter, guided: Callable[[], np.ndarray], actuation: Actuation):
+        """Their counts so far belong to no interval.
+
+        guided: returns drivers by region, next region and destination (veh, (R, R, R))
+        """
         self._meter = meter
-        self._guide = guide
+        self._guided = guided
         self._actuation = actuation
         self._rows: list[Arrays] = []
         self._before = self._totals()
@@ -122,7 +124,7 @@ class Recorder:
         """Return everything that is counted from the beginning."""
         totals = self._booked()
         totals["teleports"] = np.array(self._meter.teleports)
-        totals["guided"] = self._guide.realised.copy()
+        totals["guided"] = self._guided().copy()
         totals["gateway_flow"] = self._meter.gateway_flow()
         totals["gateway_green"], totals["gateway_original_green"] = self._actuation.green_time()
         return totals

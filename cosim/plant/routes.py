@@ -7,10 +7,8 @@ interval counts half.
 """
 
 import math
-from bisect import bisect_right
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from functools import cache, cached_property
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
+from cosim.plant import fastest
 from cosim.plant.sampling import STANDING_M_S, StreetMeans
 from cosim.sumo.arrays import EdgeMask, MoveEnds, PerEdge, PerGateway, PerMove
 from cosim.sumo.net import City
@@ -28,36 +27,38 @@ WINDOW_S = 300.0  # after which an observation counts a third
 EMPTY_WEIGHT = 0.5  # of earlier observations after a control interval without vehicles
 PRIOR_VEH_S = 3.0  # at the speed limit, which count besides
 FAR_S = 1e9  # longer than any way
-MOST_NODES = 20_000_000  # of the searches that are kept, of 12 bytes each
-MOST_TOGETHER = 1000  # nodes of a graph with searches in one call: in larger ones, limits save more
-MOST_WHOLE = 120  # nodes of a graph with searches from all of them
-FEWEST_TREES = 8  # that are kept, however large the city: one decision needs as many
+MOST_NODES = 2_000_000  # of the searches that are kept by one kind of aims, of 4 bytes each
 PerNode = Float[np.ndarray, " nodes"]  # of a graph of moves
 Nodes = Int[np.ndarray, " nodes"]
+PerNeighbour = Float[np.ndarray, " N"]
+NeighbourMask = Bool[np.ndarray, " N"]
+PerKept = Float[np.ndarray, " kept"]  # moves of a graph
 GatewayNumbers = Int[np.ndarray, " G"]
+Route = Int[np.ndarray, " route"]  # edges
 
 
 class TravelTimes:
     """Travel times of one run.
 
-    first, second: numbers of the edges that each move joins (M,); move: these two -> its number
+    first, second: numbers of the edges that each move joins (M,)
     free, free_turns: in free flow, along edges (s, (E,)) and of moves over junctions (s, (M,))
-    edges, turns: the same at present; turn_list: `turns` as a list
+    edges, turns: the same at present
     """
 
     def __init__(self, city: City, *, lanes: bool = True):
         """lanes: False in the mesoscopic model"""
         self._lanes = lanes
         self.first, self.second = city.move_edges.T
-        pairs = zip(self.first.tolist(), self.second.tolist(), strict=True)
-        self.move = {pair: n for n, pair in enumerate(pairs)}
+        self._order = np.lexsort((self.second, self.first))
+        edges = np.arange(len(city.edges) + 1)
+        self._begins = np.searchsorted(self.first[self._order], edges)
+        self._ends = self.second[self._order]
         self._length = np.array([city.length[edge] for edge in city.edges])
         self._limit = np.array([city.speed[edge] for edge in city.edges])
         self.free = city.free_time
         self.free_turns = city.move_time
         self.edges = self.free.copy()
         self.turns = self.free_turns.copy()
-        self.turn_list = self.turns.tolist()
         self._longest = np.array(list(city.inside.values())) / STANDING_M_S
         # Pairs of moves and internal edges that they lead over, which several moves may share.
         inside = {edge: n for n, edge in enumerate(city.inside)}
@@ -71,6 +72,10 @@ class TravelTimes:
         # The same on internal edges: time [veh s] and vehicles that got over them [veh].
         self._crossing = np.zeros(len(inside))
         self._crossed = np.zeros(len(inside))
+
+    def moves(self, route: Route) -> Route:
+        """Return the moves of a route, UNKNOWN where the city has none."""
+        return fastest.moves_of(route, self._begins, self._ends, self._order)
 
     def learn(self, seen: StreetMeans) -> None:
         """Update the times from the means of a control interval."""
@@ -109,13 +114,13 @@ class TravelTimes:
         takes = np.divide(self._crossing, self._crossed, out=standing, where=self._crossed > 0.0)
         over = np.minimum(takes, self._longest)[self._via]
         self.turns = np.maximum(np.bincount(self._move, over, len(self.turns)), self.free_turns)
-        self.turn_list = self.turns.tolist()
 
 
 class Moves:
     """Moves between allowed edges as a graph whose nodes are these edges.
 
     number, node: edge -> its node, -1 for edges that are not allowed, as an array (E,) and a list
+    edges: of each node (nodes,); begins, columns: of rows as in csr_array
     """
 
     def __init__(self, first: MoveEnds, second: MoveEnds, *, allowed: EdgeMask, reverse: bool):
@@ -134,14 +139,11 @@ class Moves:
         nodes = np.arange(len(self.edges) + 1)
         self._kept = kept
         self._second = second[kept]
-        self._columns = columns[kept].astype(np.int32)
-        self._begins = np.searchsorted(rows[kept], nodes).astype(np.int32)
-        self._ids = self.edges.tolist()
+        self.columns = columns[kept].astype(np.int32)
+        self.begins = np.searchsorted(rows[kept], nodes).astype(np.int32)
 
-    def costing(self, time: PerEdge, turns: PerMove, ahead: PerNode | None = None) -> csr_array:
-        """Return the graph with costs (s).
-
-        They are the times of each move and of the edge that it leads to.
+    def costs(self, time: PerEdge, turns: PerMove, ahead: PerNode | None = None) -> PerKept:
+        """Return times of moves, and of the edges that they lead to (s).
 
         time: of edges (s, (E,)); turns: of moves (s, (M,))
         ahead: lower bound of the time from each node to the nearest aim (s, (nodes,)), for an A*
@@ -150,12 +152,12 @@ class Moves:
         """
         cost = np.maximum(time[self._second] + turns[self._kept], 1e-3)
         if ahead is not None:
-            cost += ahead[self._columns] - np.repeat(ahead, np.diff(self._begins))
-        return self._graph(cost)
+            cost += ahead[self.columns] - np.repeat(ahead, np.diff(self.begins))
+        return cost
 
     def leading_to(self, nodes: GatewayNumbers) -> Bool[np.ndarray, "nodes G"]:
         """Return which nodes lead to each of `nodes` (bool, (all nodes, G))."""
-        moves = self._graph(np.ones(len(self._columns)))
+        moves = self._graph(np.ones(len(self.columns)))
         # Nodes that lead to each other are reached from the same ones: in most cities nearly all.
         _, part = connected_components(moves, connection="strong")
         _, once, which = np.unique(part[nodes], return_index=True, return_inverse=True)
@@ -169,78 +171,36 @@ class Moves:
 
         time: of edges (s, (E,)); turns: of moves (s, (M,))
         """
-        least = dijkstra(self.costing(time, turns).T.tocsr(), indices=nodes, min_only=True)
+        moves = self._graph(self.costs(time, turns))
+        least = dijkstra(moves.T.tocsr(), indices=nodes, min_only=True)
         # Just below the least time, because no move may cost nothing.
         return np.where(np.isfinite(least), (1.0 - 1e-6) * least, FAR_S)
 
-    def path(self, before: Nodes, first: int, last: int) -> list[int]:
-        """Return the edges from node `first` to node `last`.
-
-        before: predecessors of a search from `last`
-        """
-        way = [self._ids[first]]
-        while first != last:
-            first = before[first]
-            way.append(self._ids[first])
-        return way
-
-    def _graph(self, cost: Float[np.ndarray, " kept"]) -> csr_array:
+    def _graph(self, cost: PerKept) -> csr_array:
         """Return the moves as a graph with these costs."""
-        return csr_array((cost, self._columns, self._begins), shape=(len(self.edges),) * 2)
+        return csr_array((cost, self.columns, self.begins), shape=(len(self.edges),) * 2)
 
 
-class _Tree(NamedTuple):
+class Tree(NamedTuple):
     """One search.
 
-    most: its limit (s); costs: of every node (s, (nodes,)); before: predecessors (nodes,)
-    times: to each aim (s)
+    most: its limit (s), infinite if all aims were reached
+    times: to each aim and beyond (s), infinite above the limit; nearest: the least of them
+    before: predecessors (nodes,)
     """
 
     most: float
-    costs: PerNode
+    times: PerGateway
+    nearest: float
     before: Nodes
-    times: list[float]
-
-
-class Searches:
-    """Cache of searches by owner and beginning.
-
-    The least recently used go first.
-    """
-
-    def __init__(self, most: int = MOST_NODES):
-        """most: nodes of all searches that are kept"""
-        self._most = most
-        self._nodes = 0
-        self._trees: dict[tuple[object, int], _Tree] = {}
-
-    def tree(
-        self, owner: object, begin: int, most: float, search: Callable[[int, float], _Tree]
-    ) -> _Tree:
-        """Return the search of `owner` from a node.
-
-        most: limit that the search has at least (s); search: does it
-        """
-        tree = self._trees.pop((owner, begin), None)
-        if tree is None:
-            tree = search(begin, most)
-            self._nodes += len(tree.costs)
-        elif tree.most < most:
-            tree = search(begin, most)
-        while self._nodes > self._most and len(self._trees) >= FEWEST_TREES:
-            oldest = next(iter(self._trees))
-            self._nodes -= len(self._trees.pop(oldest).costs)
-        self._trees[owner, begin] = tree
-        return tree
 
 
 class Trees:
-    """Fastest routes by `moves` from single edges.
+    """Fastest routes by `moves` from single edges to some aims.
 
     They are searched on demand and no further than needed.
 
     node: edge -> its node, as in `Moves`
-    asked: nodes from which searches were needed
     """
 
     def __init__(
@@ -248,102 +208,81 @@ class Trees:
         moves: Moves,
         time: PerEdge,
         turns: PerMove,
-        searches: Searches,
         ahead: PerNode | None = None,
-        together: Iterable[int] = (),
         *,
-        aims: Nodes | Sequence[int] = (),
+        aims: Nodes | tuple[()] = (),
         beyond: PerGateway | float = 0.0,
     ):
         """time: of edges (s, (E,)); turns: of moves (s, (M,))
-        ahead: see `Moves.costing` (s, (nodes,))
-        together: different nodes to search from in one call, when the first of them is needed
-        aims: nodes that `times` are for; beyond: time from each aim on (s)
+        ahead: see `Moves.costs` (s, (nodes,))
+        aims: nodes (G,); beyond: time from each aim on (s, (G,))
         """
         self.node = moves.node
         self._moves = moves
-        self._costs = moves.costing(time, turns, ahead)
-        self._searches = searches
-        # Not this object itself: `searches` would hold it, and both would stay until the garbage is
-        # collected.
-        self._owner = object()
+        self._costs = moves.costs(time, turns, ahead)
+        self._searches: dict[int, Tree] = {}
         self._ahead = ahead
         self._aims = np.array(aims, dtype=int)
         self._beyond = beyond
-        self._row = {node: row for row, node in enumerate(together)}
-        self._found: dict[int, _Tree] = {}  # of the searches done together
-        self.asked: set[int] = set()
 
-    def costs(self, begin: int, most: float) -> PerNode:
-        """Return the times from edge `begin` (s, (nodes,)).
-
-        Times above `most` may be infinite. They are less by the drop of `ahead`.
-        """
-        return self._tree(self.node[begin], most).costs
-
-    def times(self, begin: int, most: float) -> list[float]:
-        """Return the times from edge `begin` to each aim and beyond (s).
-
-        Times above `most` may be infinite.
-        """
-        return self._tree(self.node[begin], most).times
-
-    def back(self, begin: int, end: int) -> list[int]:
-        """Return the edges from `end` back to `begin`, after its search."""
-        first = self.node[end]
-        last = self.node[begin]
-        return self._moves.path(self._tree(last, 0.0).before, first, last)
-
-    def _tree(self, node: int, most: float) -> _Tree:
-        """Return the search from a node, at least up to `most` (s)."""
-        tree = self._found.get(node)
-        if tree is None:
-            self.asked.add(node)
-            row = self._row.get(node)
-            if row is None:
-                return self._searches.tree(self._owner, node, most, self._search)
-            costs, before = self._searched_together
-            tree = self._as_tree(node, math.inf, costs[row], before[row])
-            self._found[node] = tree
+    def tree(self, begin: int, most: float) -> Tree:
+        """Return the search from edge `begin`, at least up to `most` (s)."""
+        node = self.node[begin]
+        tree = self._searches.get(node)
+        if tree is None or tree.most < most:
+            if len(self._searches) * len(self._moves.edges) > MOST_NODES:
+                self._searches.clear()
+            tree = self._search(node, most)
+            self._searches[node] = tree
         return tree
 
-    def _search(self, node: int, most: float) -> _Tree:
+    def time(self, begin: int, end: int, most: float) -> tuple[float, Nodes]:
+        """Return the time from edge `begin` to `end` (s), and predecessors.
+
+        The time is infinite above `most`. Aims and `ahead` do not count.
+        """
+        aims = np.array([self.node[end]])
+        times, before, _ = self._found(self.node[begin], most, aims)
+        return float(times[0]), before
+
+    def back(self, before: Nodes, begin: int, end: int) -> Route:
+        """Return the edges from `end` back to `begin`, by predecessors."""
+        return fastest.path(before, self._moves.edges, self.node[end], self.node[begin])
+
+    def _search(self, node: int, most: float) -> Tree:
         """Return a new search from a node up to `most` (s)."""
-        found = dijkstra(self._costs, indices=node, return_predecessors=True, limit=most)
-        return self._as_tree(node, most, *found)
-
-    @cached_property
-    def _searched_together(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return costs and predecessors from all nodes of `together`."""
-        return dijkstra(self._costs, indices=[*self._row], return_predecessors=True)
-
-    def _as_tree(self, node: int, most: float, costs: PerNode, before: Nodes) -> _Tree:
-        """Return a search from a node up to `most` (s) with the times to the aims."""
-        times = costs[self._aims]
+        times, before, complete = self._found(node, most, self._aims)
         if self._ahead is not None:
-            times = times + self._ahead[node]
-        times = times + self._beyond
-        return _Tree(most, costs, before, times.tolist())
+            times += self._ahead[node]
+        times += self._beyond
+        nearest = float(times.min(initial=math.inf))
+        return Tree(math.inf if complete else most, times, nearest, before)
+
+    def _found(self, node: int, most: float, aims: Nodes) -> tuple[PerGateway, Nodes, bool]:
+        """Return times, predecessors and completeness of `fastest.search`."""
+        moves = self._moves
+        return fastest.search(moves.begins, moves.columns, self._costs, node, most, aims)
 
 
 class Choices(NamedTuple):
     """The fastest routes of a driver by each next region.
 
-    times: (s), infinite if too long
-    exist: True if there is a route, however long
+    times: (s, (N,)), infinite if too long; fastest: the least of them
+    exist: True if there is a route, however long (N,)
     route: returns the edges of the n-th
     """
 
-    times: list[float]
-    exist: list[bool]
-    route: Callable[[int], list[int]]
+    times: PerNeighbour
+    fastest: float
+    exist: NeighbourMask
+    route: Callable[[int], Route]
 
 
 class Exits:
     """Gateways out of one region, with the moves that lead there and on.
 
-    Gateway g leads from edge first[g] to second[g]. Gateways parts[n], from begins[n] on, lead into
-    region neighbours[n].
+    Gateway g leads from edge first[g] to second[g]. Gateways from begins[n] to begins[n + 1] lead
+    into region neighbours[n] (N + 1,), (N,).
 
     first, second, move: edges of each gateway, and move from one to the other (G,)
     inside: moves in the region; outside: reversed moves elsewhere
@@ -353,52 +292,55 @@ class Exits:
     def __init__(self, gateways: Int[np.ndarray, "G 4"], *, inside: Moves, outside: Moves):
         """gateways: first, second, move and next region, which rises"""
         self.first, self.second, self.move, next_region = gateways.T.copy()
-        neighbours, begins = np.unique(next_region, return_index=True)
-        self.neighbours: list[int] = neighbours.tolist()
-        self.begins: list[int] = begins.tolist()
-        self.parts = [slice(*part) for part in pairwise([*self.begins, len(next_region)])]
-        self._bits = [(1 << part.stop) - (1 << part.start) for part in self.parts]
+        self.neighbours, begins = np.unique(next_region, return_index=True)
+        self.begins = np.append(begins, len(next_region))
         self.inside = inside
         self.outside = outside
         self.first_nodes = inside.number[self.first]
         self.second_nodes = outside.number[self.second]
 
-    def exist(self, here: int, target: int) -> list[bool]:
-        """Return by which `neighbours` a way from `here` to `target` exists."""
-        through = self._leading[self.inside.node[here]] & self._reached[self.outside.node[target]]
-        return [through & gateways != 0 for gateways in self._bits]
+    @cached_property
+    def leading(self) -> Bool[np.ndarray, "nodes G"]:
+        """Return to which gateways each edge inside leads."""
+        return self.inside.leading_to(self.first_nodes)
 
     @cached_property
-    def _leading(self) -> list[int]:
-        """Return to which gateways each edge inside leads, a bit for each."""
-        return _as_bits(self.inside.leading_to(self.first_nodes))
-
-    @cached_property
-    def _reached(self) -> list[int]:
-        """Return from which gateways each edge outside is reached, a bit for each."""
-        return _as_bits(self.outside.leading_to(self.second_nodes))
+    def reached(self) -> Bool[np.ndarray, "nodes G"]:
+        """Return from which gateways each edge outside is reached."""
+        return self.outside.leading_to(self.second_nodes)
 
 
 class Returning(NamedTuple):
     """Fastest routes by all moves, for those that come back into a region.
 
-    nodes: of first[g] (G,)
-    entering: time from the end of first[g] to that of second[g] (s)
-    back: no more than the time from behind the nearest gateway back to first[g] (s)
+    trees: to first[g]
+    entering: time from the end of first[g] to that of second[g] (s, (G,))
+    back: no more than the time from behind the nearest gateway back to first[g] (s, (G,))
     """
 
     trees: Trees
-    nodes: GatewayNumbers
-    entering: Sequence[float]
-    back: Sequence[float]
+    entering: PerGateway
+    back: PerGateway
+
+
+class _Way(NamedTuple):
+    """A fastest route of a driver as far as its last gateway.
+
+    time: of the whole route (s); before: predecessors in `trees` (nodes,)
+    """
+
+    time: float
+    gateway: int
+    trees: Trees
+    before: Nodes
 
 
 class Ways:
     """Fastest routes out of one region by each of its G gateways.
 
     Searches start where drivers are and where they go, on demand and no further than needed. A
-    route that comes back into the region before it leaves for good (`returning`) has the same end,
-    from the last gateway on.
+    route that comes back into the region before it leaves for good has the same end, from the last
+    gateway on.
     """
 
     def __init__(
@@ -423,8 +365,8 @@ class Ways:
         # Least time from a gateway back to one and over it (s).
         self._back_soonest = math.inf
         if everywhere:
-            around = _sums(everywhere.back, everywhere.entering)
-            self._back_soonest = min(around, default=math.inf)
+            around = everywhere.back + everywhere.entering
+            self._back_soonest = float(around.min(initial=math.inf))
 
     def choices(self, here: int, target: int, longest: float, detour: float) -> Choices:
         """Return the fastest routes from `here` to `target` by each next region.
@@ -432,84 +374,60 @@ class Ways:
         longest: no less than the fastest of all takes (s), infinite if unknown
         detour: beyond this, routes that take longer are left out (s)
         """
-        cost = self.cost(here, target, detour + longest)
-        parts = self.exits.parts
-        times = [min(cost[part]) for part in parts]
-        exist = [True] * len(times)
-        if math.inf in times:
-            exist = self.exits.exist(here, target)
-        fastest = min(times, default=math.inf)
-        back = None
-        time, gateway = self.returning(here, target, min(fastest, longest))
-        if time < fastest:
-            back = bisect_right(self.exits.begins, gateway) - 1
-            times[back] = time
-            exist[back] = True
-
-        def route(n: int) -> list[int]:
-            if n == back:
-                return self.route(here, gateway, target, returning=True)
-            return self.route(here, cost.index(times[n], parts[n].start), target)
-
-        return Choices(times, exist, route)
-
-    def cost(self, here: int, target: int, most: float) -> list[float]:
-        """Return times from the end of `here` to that of `target` by gateway (s).
-
-        They are infinite above `most`.
-        """
+        exits = self.exits
         ahead = self._ahead[self._onward.node[target]]
-        there = self._there.times(here, max(most - ahead, 0.0))
-        nearest = min(there, default=math.inf)
-        if nearest == math.inf:
-            return there
-        left = max(most - min(nearest, most) - ahead, 0.0)
-        return _sums(there, self._onward.times(target, left))
+        most = detour + longest
+        there = self._there.tree(here, max(most - ahead, 0.0))
+        left = 0.0
+        if there.nearest < math.inf:
+            left = max(most - min(there.nearest, most) - ahead, 0.0)
+        onward = self._onward.tree(target, left)
+        times, gateways, exist, soonest = fastest.by_region(
+            there.times,
+            onward.times,
+            exits.begins,
+            exits.leading[self._there.node[here]],
+            exits.reached[self._onward.node[target]],
+        )
+        back = self._returning(here, there, onward, min(soonest, longest), ahead)
+        by_return = None
+        if back is not None and back.time < soonest:
+            by_return = int(np.searchsorted(exits.begins, back.gateway, side="right")) - 1
+            soonest = back.time
+            times[by_return] = soonest
+            exist[by_return] = True
 
-    def returning(self, here: int, target: int, most: float) -> tuple[float, int]:
-        """Return the time of the fastest route of all (s), and its last gateway.
+        def route(n: int) -> Route:
+            way = _Way(times[n], gateways[n], self._there, there.before)
+            if back is not None and n == by_return:
+                way = back
+            inside = way.trees.back(way.before, here, exits.first[way.gateway])
+            outside = self._onward.back(onward.before, target, exits.second[way.gateway])
+            return np.concatenate((inside[::-1], outside))
 
-        The time is infinite if it is `most` or longer, or if the route does not come back into the
-        region. Call it after `cost`.
+        return Choices(times, soonest, exist, route)
+
+    def _returning(
+        self, here: int, there: Tree, onward: Tree, most: float, ahead: float
+    ) -> _Way | None:
+        """Return the fastest route that comes back; None if it is too long.
+
+        most: time that it has to be below (s)
+        ahead: least time from the nearest second[g] on (s)
         """
-        if self._everywhere is None:
-            return math.inf, 0
         everywhere = self._everywhere
-        # By then it has left, and come back, which alone takes too long for most drivers.
-        left = min(self._there.times(here, 0.0), default=math.inf)
-        if left + self._back_soonest + self._ahead[self._onward.node[target]] >= most:
-            return math.inf, 0
-        ends = _sums(everywhere.entering, self._onward.times(target, 0.0))
-        for gateway, back in enumerate(everywhere.back):
-            if left + back + ends[gateway] >= most:
-                ends[gateway] = math.inf
-        nearest = min(ends)
+        # It has left, and come back, which alone takes too long for most drivers.
+        if everywhere is None or there.nearest + self._back_soonest + ahead >= most:
+            return None
+        ends, nearest = fastest.ends_of_returns(
+            there.nearest, everywhere.back, everywhere.entering, onward.times, most
+        )
         if nearest == math.inf:
-            return math.inf, 0
-        costs = everywhere.trees.costs(here, most - nearest)[everywhere.nodes] + ends
-        gateway = int(costs.argmin())
-        return float(costs[gateway]), gateway
-
-    def route(self, here: int, gateway: int, target: int, *, returning: bool = False) -> list[int]:
-        """Return the edges from `here` to `target` through a gateway.
-
-        Call it after `cost`, or after `returning` for a route that comes back.
-        """
-        trees = self._there
-        if returning and self._everywhere:
-            trees = self._everywhere.trees
-        inside = trees.back(here, int(self.exits.first[gateway]))
-        return inside[::-1] + self._onward.back(target, int(self.exits.second[gateway]))
-
-
-def _as_bits(rows: Bool[np.ndarray, "rows G"]) -> list[int]:
-    """Return each row as a number with a bit for each of its entries."""
-    packed = np.packbits(rows, axis=1, bitorder="little")
-    return [int.from_bytes(row, "little") for row in packed]
-
-
-def _sums(first: Sequence[float], second: Sequence[float]) -> list[float]:
-    return [a + b for a, b in zip(first, second, strict=True)]
+            return None
+        tree = everywhere.trees.tree(here, most - nearest)
+        times = tree.times + ends
+        gateway = int(times.argmin())
+        return _Way(float(times[gateway]), gateway, everywhere.trees, tree.before)
 
 
 class RegionRoutes:
@@ -549,8 +467,9 @@ class RegionRoutes:
             rows = []
             for gateway in city.gateways:
                 if gateway.source == region:
-                    pair = city.number[gateway.from_edge], city.number[gateway.to_edge]
-                    rows.append((*pair, times.move[pair], gateway.target))
+                    pair = [city.number[gateway.from_edge], city.number[gateway.to_edge]]
+                    (move,) = times.moves(np.array(pair))
+                    rows.append((*pair, move, gateway.target))
             gateways = np.array(rows, dtype=int).reshape(-1, 4)
             self._exits.append(Exits(gateways, inside=inside, outside=outside))
         self._everywhere = None
@@ -561,13 +480,9 @@ class RegionRoutes:
             self._homeward = [back] * city.regions
         self._ahead = cache(self._ahead_of)
         # Results of one control interval.
-        self._trees = cache(self._trees_of)
-        self._seen = cache(self._seen_by)
-        self.time = cache(self._time)
+        self.seen = cache(self._seen_by)
         self.home = cache(self._home)
         self.ways = cache(self._ways)
-        # Moves and class of drivers -> searches without prices.
-        self._unpriced: dict[tuple[Moves, int], Trees] = {}
         self.command(None)
 
     def command(self, prices: PerRegion | None) -> None:
@@ -576,17 +491,11 @@ class RegionRoutes:
         prices: of the regions (-, (R,)); None: no prices
         """
         self._prices = np.zeros(len(self.regions)) if prices is None else prices
-        # Many drivers are where others were, or go where others went.
-        self._asked = {key: sorted(trees.asked) for key, trees in self._unpriced.items()}
-        self._unpriced.clear()
-        self._searches = Searches()
         self._free = []
         for destination in self.regions:
             free = [r for r in self.regions if r == destination or not self._prices[r]]
             self._free.append(tuple(free))
-        self._trees.cache_clear()
-        self._seen.cache_clear()
-        self.time.cache_clear()
+        self.seen.cache_clear()
         self.home.cache_clear()
         self.ways.cache_clear()
 
@@ -600,10 +509,6 @@ class RegionRoutes:
         prices[list(free)] = 0.0
         return self._times.edges * (1.0 + prices)[self._edge_region] * self._taste[driver_class]
 
-    def _time(self, driver_class: int, free: tuple[int, ...]) -> list[float]:
-        """Return the times of `_seen_by` as a list, for single edges."""
-        return self._seen(driver_class, free).tolist()
-
     def _home(self, region: int, driver_class: int, free: tuple[int, ...]) -> Trees:
         """Return routes to edges of a region.
 
@@ -614,23 +519,23 @@ class RegionRoutes:
     def _ways(self, region: int, driver_class: int, free: tuple[int, ...]) -> Ways:
         """Return routes out of a region to edges of others."""
         exits = self._exits[region]
-        second = self._seen(driver_class, free)[exits.second]
+        second = self.seen(driver_class, free)[exits.second]
         over = self._times.turns[exits.move] + second
         ahead = self._ahead(exits.outside, region, driver_class)
         everywhere = None
         if self._everywhere:
-            trees = self._trees(self._everywhere, driver_class, free)
-            back = self._ahead(self._homeward[region], region, driver_class)[exits.first]
             nodes = self._everywhere.number[exits.first]
-            everywhere = Returning(trees, nodes, over.tolist(), back.tolist())
-        there = self._trees_of(
+            trees = self._trees(self._everywhere, driver_class, free, aims=nodes)
+            back = self._ahead(self._homeward[region], region, driver_class)[exits.first]
+            everywhere = Returning(trees, over, back)
+        there = self._trees(
             exits.inside,
             driver_class,
             free,
             aims=exits.first_nodes,
             beyond=over if self._lanes else second,
         )
-        onward = self._trees_of(
+        onward = self._trees(
             exits.outside, driver_class, free, ahead=ahead, aims=exits.second_nodes
         )
         return Ways(
@@ -641,7 +546,7 @@ class RegionRoutes:
             everywhere=everywhere,
         )
 
-    def _trees_of(
+    def _trees(
         self,
         moves: Moves,
         driver_class: int,
@@ -652,20 +557,8 @@ class RegionRoutes:
 
         others: arguments of `Trees`
         """
-        seen = self._seen(driver_class, free)
-        turns = self._times.turns
-        # With prices, results depend on how far searches go.
-        if free != self.regions:
-            return Trees(moves, seen, turns, self._searches, **others)
-        key = (moves, driver_class)
-        together: Iterable[int] = ()
-        nodes = len(moves.edges)
-        if nodes <= MOST_WHOLE:
-            together = range(nodes)
-        elif nodes <= MOST_TOGETHER:
-            together = self._asked.get(key, ())
-        self._unpriced[key] = Trees(moves, seen, turns, self._searches, together=together, **others)
-        return self._unpriced[key]
+        seen = self.seen(driver_class, free)
+        return Trees(moves, seen, self._times.turns, **others)
 
     def _ahead_of(self, back: Moves, region: int, driver_class: int) -> np.ndarray:
         """Return the time from behind the nearest gateway (s, (nodes,)).

@@ -43,6 +43,24 @@ class Trips:
     arrival: PerTrip
 
 
+class _Drawn(NamedTuple):
+    """N trips without routes.
+
+    depart, origin, destination: as in Trips; first, last: edges (N,)
+    tastes: classes of drivers (N,); positions: drawn from 0 to 1, of their ends (-, (N,))
+    noise: as in `fastest_routes`
+    """
+
+    depart: PerTrip
+    origin: TripNumbers
+    destination: TripNumbers
+    first: TripNumbers
+    last: TripNumbers
+    tastes: TripNumbers
+    positions: PerTrip
+    noise: Noise
+
+
 def turning_flows(
     city: City, demand: PairsOverTime, step: float
 ) -> Mapping[tuple[str, str], float]:
@@ -56,8 +74,8 @@ def turning_flows(
     window = min(PEAK_S, step * len(demand))
     turns: Counter[tuple[str, str]] = Counter()
     for seed in PLANNING_SEEDS:
-        trips = make_trips(city, demand, step, seed)
-        for route in trips.routes[busiest(trips.depart, window)]:
+        drawn = _drawn(city, demand, step, seed)
+        for route in _routes(city, drawn, busiest(drawn.depart, window)):
             turns.update(pairwise(route))
     return {turn: count / (window * len(PLANNING_SEEDS)) for turn, count in turns.items()}
 
@@ -83,6 +101,27 @@ def make_trips(city: City, demand: PairsOverTime, step: float, seed: int) -> Tri
     times lanes. Each route is the fastest one in free flow as one of `DRIVER_CLASSES` groups of
     drivers sees it. Raises InputError if no way leads from i to j.
     """
+    drawn = _drawn(city, demand, step, seed)
+    routes = _routes(city, drawn, slice(None))
+    for n, route in enumerate(routes):
+        if len(route) < 2:
+            begin, end = city.edges[drawn.first[n]], city.edges[drawn.last[n]]
+            raise InputError(
+                f"{city.net_file}: no way leads from edge {begin} (region {drawn.origin[n]}) to "
+                f"{end} (region {drawn.destination[n]}); leave out edges that are not connected"
+            )
+    lengths = np.array([city.length[route[-1]] for route in routes])
+    return Trips(
+        depart=drawn.depart,
+        origin=drawn.origin,
+        destination=drawn.destination,
+        routes=tuple(routes),
+        arrival=lengths * (0.1 + 0.8 * drawn.positions),
+    )
+
+
+def _drawn(city: City, demand: PairsOverTime, step: float, seed: int) -> _Drawn:
+    """Return the trips of `make_trips` before they have routes."""
     if demand.shape[1:] != (city.regions, city.regions):
         raise InputError(
             f"{city.net_file}: demand for {demand.shape[1]} regions, but the city has "
@@ -104,22 +143,13 @@ def make_trips(city: City, demand: PairsOverTime, step: float, seed: int) -> Tri
         edges = goals[destination[n]].edges
         place = edges.index(city.edges[first[n]])
         last[n] = city.number[edges[(place + 1) % len(edges)]]
-    routes = routes_in(city, (first, last), tastes, noise)
-    for n, route in enumerate(routes):
-        if len(route) < 2:
-            begin, end = city.edges[first[n]], city.edges[last[n]]
-            raise InputError(
-                f"{city.net_file}: no way leads from edge {begin} (region {origin[n]}) to {end} "
-                f"(region {destination[n]}); leave out edges that are not connected"
-            )
-    lengths = np.array([city.length[route[-1]] for route in routes])
-    return Trips(
-        depart=depart,
-        origin=origin,
-        destination=destination,
-        routes=tuple(routes),
-        arrival=lengths * (0.1 + 0.8 * positions),
-    )
+    return _Drawn(depart, origin, destination, first, last, tastes, positions, noise)
+
+
+def _routes(city: City, drawn: _Drawn, part: slice) -> list[tuple[str, ...]]:
+    """Return the fastest routes of some trips, () where there is none."""
+    ends = drawn.first[part], drawn.last[part]
+    return routes_in(city, ends, drawn.tastes[part], drawn.noise)
 
 
 def _departures(
