@@ -108,6 +108,18 @@ def test_a_long_stage_is_announced_once_from_the_time_of_its_first_steps(
     assert capsys.readouterr().err.splitlines() == lines
 
 
+def test_the_time_of_an_earlier_stage_or_of_the_first_step_is_not_that_of_the_others(
+    monkeypatch, capsys
+):
+    """Two runs of 300 s, then 61 steps: the first compiles for 200 s, others take 4 s."""
+    clock = iter((0.0, 300.0, 600.0, 800.0, 804.0, 808.0))
+    monkeypatch.setattr(progress.time, "monotonic", lambda: next(clock))
+    with progress.watched("identify") as show:
+        for step in ((0, 2), (1, 2), (2, 2), (1, 61), (2, 61), (3, 61)):
+            show(*step)
+    assert capsys.readouterr().err.splitlines() == ["identify: about 4 min left"]
+
+
 @pytest.fixture(scope="module")
 def city():
     return cosim.City("grid7_peak")

@@ -34,17 +34,21 @@ def watched(label: str, progress: Progress = None, *, said: bool = False) -> Ite
     else:
         with tqdm(desc=label, leave=False, dynamic_ncols=True, smoothing=0.0, disable=None) as bar:
             first = math.inf
+            latest = 0
             begun = math.nan  # NaN: nothing is to be said
 
             def show(done: int, total: int, note: str = "") -> None:
-                nonlocal first, begun
+                nonlocal first, latest, begun
+                now = time.monotonic()
+                other_stage = total != bar.total or done < latest
+                # The first step may load or compile what others only use.
+                if other_stage or done <= max(first, 1):
+                    first = done
+                    begun = math.nan if said else now
+                latest = done
                 bar.total = total
                 bar.set_postfix_str(note, refresh=False)
                 bar.update(done - bar.n)
-                now = time.monotonic()
-                if done <= first:
-                    first = done
-                    begun = math.nan if said else now
                 left = (total - done) * (now - begun) / max(done - first, 1)
                 if now - begun > MEASURED_S and left > LONG_S:
                     begun = math.nan
