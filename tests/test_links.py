@@ -22,6 +22,7 @@ from nmfd.controllers.dpc.policy_file import read_file as read_policy
 from nmfd.controllers.dpc.street_rollout import MOST_DELAYED, Bound
 from nmfd.errors import InputError
 from nmfd.model.links.chance import DRAWS
+from nmfd.model.links.compiled import compiled
 from nmfd.model.links.flows import BETWEEN_M, REACTION
 from nmfd.model.links.model import Choices, Commands, LinkModel, choices_of
 from nmfd.model.links.network import LinkNetwork, read_links
@@ -704,3 +705,9 @@ def test_each_street_has_room_and_a_lane(written):
     network, _ = written
     assert np.array_equal(np.unique(network.lane_link), np.arange(len(network.length)))
     assert (network.free_time > 0.0).all()
+
+
+def test_machine_code_that_cannot_be_kept_is_made_anew(monkeypatch):
+    """As where no folder may be written."""
+    monkeypatch.setattr("numba.core.caching.CacheImpl._locator_classes", [])
+    assert compiled(lambda number: 2 * number)(21) == 42

@@ -22,15 +22,20 @@ F = TypeVar("F", bound=Callable)
 
 def compiled(function: F) -> F:
     """Return a function as machine code, which is kept beside its file."""
-    code: Any = njit(cache=True, nogil=True, error_model="numpy")(function)
-    return code
+    return _compiled(function)
 
 
 def inner(function: F) -> F:
     """Return a function as machine code that only machine code calls."""
-    code: Any = njit(
-        cache=True, nogil=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True
-    )(function)
+    return _compiled(function, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+
+
+def _compiled(function: F, **others: bool) -> F:
+    options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+    try:
+        code: Any = njit(cache=True, **options, **others)(function)
+    except RuntimeError:  # no folder to keep it in may be written: every process compiles anew
+        code = njit(**options, **others)(function)
     return code
 
 
