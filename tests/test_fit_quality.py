@@ -68,6 +68,15 @@ def test_good_fits_have_no_warning_and_bad_ones_say_what_is_wrong(network):
     )
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_region_without_vehicles_has_no_largest_share(network):
+    empty = replace(network, critical_above={1: 0.0})
+    some = 10.0 * np.eye(3)
+    some[1] = 0.0
+    shares = region_fits(empty, [cloud([1.0], [1.0])] * 3, [some[None]])["most_share"]
+    assert np.isnan(shares).tolist() == [False, True, False]
+
+
 def test_warnings_are_in_the_table_and_the_file(network, tmp_path):
     network = replace(network, critical_above=dict.fromkeys(range(3), 1.0))
     fits = region_fits(network, [cloud([1.0], [1.0])] * 3, seeds=1)
@@ -95,6 +104,7 @@ def observed(network, states):
     )
 
 
+@pytest.mark.filterwarnings("error")
 def test_persistence_is_what_it_says(network):
     """A region that gains 10 vehicles in every interval: 10 after one, 40 after four."""
     run, critical = observed(network, GROWING), network.mfds[0].critical
@@ -105,9 +115,10 @@ def test_persistence_is_what_it_says(network):
     ].to_numpy()
     assert shares[0] * critical == pytest.approx([10.0, 40.0])
     assert (shares[1:] == 0.0).all()
-    unseen = replace(network, critical_above={0: 0.5 * critical})
+    unseen = replace(network, critical_above={0: 0.5 * critical, 1: 0.0})
     twice = predictions(unseen, [run, run], {"step": 225.0, "substeps": 8, "integrator": "euler"})
     assert twice["ahead_persistence_rmse_share"][0] == pytest.approx(2.0 * shares[0, 1])
+    assert np.isnan(twice["ahead_persistence_rmse_share"][1])  # nobody was ever there
     text = prediction_text(errors, 225.0)
     assert f"225 s ahead (unchanged: {100 * shares[:, 0].mean():.1f} %)" in text
     assert "900 s ahead (unchanged: " in text

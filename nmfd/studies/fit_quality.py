@@ -141,6 +141,8 @@ def region_fits(
     most = _largest(samples, accumulations)
     critical = network.seen_critical
     density = critical / lane_km
+    # NaN where no vehicle was ever seen.
+    most_share = np.divide(most, critical, out=np.full_like(critical, np.nan), where=critical > 0.0)
     rows = []
     for region, (curve, cloud) in enumerate(zip(network.mfds, samples, strict=True)):
         points = own_points(cloud)
@@ -165,7 +167,7 @@ def region_fits(
             "r2": r2,
             "spread": spread,
             "hysteresis": hysteresis(cloud),
-            "most_share": most[region] / critical[region],
+            "most_share": most_share[region],
             "doubts": _doubts(len(points), r2, above, density[region], seeds),
         }
         rows.append(row)
@@ -378,6 +380,7 @@ def predictions(
 
     if critical is None:
         critical = network.known_critical
+    whole = np.where(critical > 0.0, critical, np.nan)  # 0 where no vehicle was ever seen
     longest = max(len(run.demand) for run in runs)
     ahead = min(max(1, round(AHEAD_S / scheme["step"])), longest)
     columns = {}
@@ -385,8 +388,8 @@ def predictions(
         errors = identification.prediction_errors(network, runs, intervals, **scheme)
         states = identification.windows(runs, intervals).states.sum(-1).numpy()
         unchanged = states[:, 0] - states[:, -1]
-        columns[f"{when}_rmse_share"] = _rmse(errors) / critical
-        columns[f"{when}_persistence_rmse_share"] = _rmse(unchanged) / critical
+        columns[f"{when}_rmse_share"] = _rmse(errors) / whole
+        columns[f"{when}_persistence_rmse_share"] = _rmse(unchanged) / whole
     flowing = (states <= critical).all(axis=(1, 2))
     for name, chosen in zip(SITUATIONS, (flowing, ~flowing), strict=True):
         columns[f"{name}_states"] = int(chosen.sum())
