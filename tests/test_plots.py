@@ -152,3 +152,11 @@ def test_names_look_as_matplotlib_draws_escaped_ones():
     usual = Figure(figsize=(5, 4), layout="constrained")
     expected = pixels(usual, DOLLARS.replace("$", r"\$"))
     np.testing.assert_array_equal(pixels(plots.figure(5, 4), DOLLARS), expected)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_region_without_vehicles_has_an_axis(ax, scenario):
+    unseen = replace(scenario.network, critical_above={3: 0.0})
+    (run,) = runs_of(scenario)
+    run = run.assign(accumulation=np.zeros_like(run["accumulation"]))
+    assert plots.region_accumulation(ax, unseen, 3, [run]).get_ylim()[1] > 1.0

@@ -170,7 +170,8 @@ def region_accumulation(
     ax.hlines(critical, 0.0, 1.0, transform=ax.get_yaxis_transform(), label=CRITICAL, **style)
     _curves(ax, trajectories, accumulation, seed)
     highest = max((accumulation(one).max() for one in trajectories), default=0.0)
-    top = np.nanmax([highest, 1.25 * critical])  # no critical accumulation was seen: NaN
+    # One vehicle if nobody was there. NaN: no critical accumulation was seen.
+    top = np.nanmax([highest, 1.25 * critical, 1.0])
     ax.set(ylabel="accumulation [veh]", ylim=(0.0, 1.06 * top))
     ax.set_title(network.titles[region], fontsize="medium")
     return ax
