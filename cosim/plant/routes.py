@@ -27,7 +27,7 @@ WINDOW_S = 300.0  # after which an observation counts a third
 EMPTY_WEIGHT = 0.5  # of earlier observations after a control interval without vehicles
 PRIOR_VEH_S = 3.0  # at the speed limit, which count besides
 FAR_S = 1e9  # longer than any way
-MOST_NODES = 2_000_000  # of the searches that are kept by one kind of aims, of 4 bytes each
+MOST_NODES = 500_000  # of all searches to the same aims that are kept, of 4 bytes each
 PerNode = Float[np.ndarray, " nodes"]  # of a graph of moves
 Nodes = Int[np.ndarray, " nodes"]
 PerNeighbour = Float[np.ndarray, " N"]
@@ -281,8 +281,8 @@ class Choices(NamedTuple):
 class Exits:
     """Gateways out of one region, with the moves that lead there and on.
 
-    Gateway g leads from edge first[g] to second[g]. Gateways from begins[n] to begins[n + 1] lead
-    into region neighbours[n] (N + 1,), (N,).
+    Gateway g leads from edge first[g] to second[g]. Gateways from begins[n] on, up to begins[n + 1],
+    lead into region neighbours[n].
 
     first, second, move: edges of each gateway, and move from one to the other (G,)
     inside: moves in the region; outside: reversed moves elsewhere
