@@ -281,7 +281,7 @@ class Choices(NamedTuple):
 class Exits:
     """Gateways out of one region, with the moves that lead there and on.
 
-    Gateway g leads from edge first[g] to second[g]. Gateways from begins[n] on, up to begins[n + 1],
+    Gateway g leads from edge first[g] to second[g]. Gateways from begins[n] up to begins[n + 1]
     lead into region neighbours[n].
 
     first, second, move: edges of each gateway, and move from one to the other (G,)
