@@ -12,6 +12,7 @@ from commands import good, nmfd
 from nmfd.api import load_scenario
 from nmfd.controllers import training
 from nmfd.controllers.dpc.compact import FILL_TIME_S, CompactPolicy
+from nmfd.controllers.dpc.first_policy import first_policy
 from nmfd.controllers.dpc.numbers import Numbers
 from nmfd.controllers.dpc.options import ConstantControl
 from nmfd.controllers.dpc.policy import Architecture, DpcController
@@ -233,6 +234,19 @@ def test_training_finds_what_counts_as_full(tmp_path):
     loaded = load_scenario(scenario)
     trained, _ = load_policy(scenario / "dpc-pcrg.pt", loaded.network)
     assert (trained.log_full[list(loaded.protected)] != 0.0).all()
+
+
+def test_training_begins_with_the_policy_of_a_file(tmp_path):
+    scenario = load_scenario(tiny.write(tmp_path, scenario=tiny.SCENARIO + TABLE))
+    strategy = parse("dpc-pcrg")
+    file = training.train(scenario, strategy, seed=0, out=tmp_path / "first.pt")
+    setup = training.settings(scenario, strategy).changed(numbers=None, start=file)
+    planning = strategy.own_planning(scenario)
+    begun = first_policy(setup, planning, guidance=True)
+    trained, _ = load_policy(file, scenario.network)
+    assert begun.numbers.tolist() == trained.numbers.tolist()
+    with pytest.raises(InputError, match="first.pt: per_region: is False, but the settings train"):
+        first_policy(setup.changed(per_region=True), planning, guidance=True)
 
 
 def test_prices_that_gain_nothing_are_left_out(tmp_path):

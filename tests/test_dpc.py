@@ -276,6 +276,7 @@ def test_the_device_is_the_gpu_where_there_is_one(monkeypatch):
             "metering: a local policy controls gates only",
         ),
         ("dpc-pc", {"per_region": True}, "per_region: is for a compact policy"),
+        ("dpc-pc", {"start": "p.pt", "from_gating": True}, "start: a trained policy begins as"),
         ("dpc-pc", {"prices": True}, "prices: prices guide drivers"),
         (
             "dpc-pcrg",

@@ -1,4 +1,7 @@
-"""First policies of a training: random, like no control, like a gate."""
+"""First policies of a training: random, or like something known."""
+
+from dataclasses import asdict
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -9,11 +12,13 @@ from nmfd.controllers.dpc.compact import CompactPolicy
 from nmfd.controllers.dpc.numbers import Numbers
 from nmfd.controllers.dpc.options import Dpc
 from nmfd.controllers.dpc.policy import Architecture, Policy
-from nmfd.controllers.dpc.policy_file import new_policy
+from nmfd.controllers.dpc.policy_file import load_policy, new_policy
 from nmfd.controllers.dpc.rollout import Rollout
 from nmfd.controllers.rules import scenario_gate
+from nmfd.errors import InputError
 from nmfd.model.planning import PlanningModel
 from nmfd.model.regional_model import RegionalModel
+from nmfd.runs import shipped
 
 # Like a gate.
 GATE_STEPS = 1000  # Adam steps
@@ -29,7 +34,10 @@ NO_CONTROL_SPLIT = 1e-3  # least theta
 
 
 def first_policy(setup: Dpc, planning: PlanningModel, *, guidance: bool) -> Policy:
-    """Return the untrained policy that the settings describe."""
+    """Return the policy with which the settings begin a training.
+
+    Raises: InputError if that of a file is of another kind
+    """
     architecture = Architecture(
         guidance=guidance,
         local=setup.local,
@@ -40,11 +48,26 @@ def first_policy(setup: Dpc, planning: PlanningModel, *, guidance: bool) -> Poli
         soft_exponential=setup.recipe.activation != "gelu",
         decoder_layers=setup.recipe.decoder_layers,
     )
+    if setup.start:
+        return _trained(shipped.found(setup.start, shipped.SCENARIO), planning, architecture)
     policy = new_policy(planning.network, architecture)
     if setup.numbers and isinstance(policy, CompactPolicy):
         policy.numbers.data.copy_(torch.tensor(Numbers(*setup.numbers)))
     if setup.from_no_control:
         begin_as_no_control(policy, planning.network)
+    return policy
+
+
+def _trained(file: Path, planning: PlanningModel, wanted: Architecture) -> Policy:
+    """Return the policy in a file. Raises: InputError if it is of another kind"""
+    policy, _ = load_policy(file, planning.network)
+    own = asdict(policy.architecture)
+    for name, value in asdict(wanted).items():
+        if own[name] != value:
+            raise InputError(
+                f"{file}: {name}: is {own[name]!r}, but the settings train a policy with "
+                f"{value!r}; set the options of its training, or start from another file"
+            )
     return policy
 
 

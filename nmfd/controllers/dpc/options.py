@@ -101,6 +101,9 @@ class Dpc(Options):
     numbers: NumbersOption | None = setting(
         f"initial numbers of a compact policy: {MEANING}", None, unit="-"
     )
+    start: Text | Path | None = setting(
+        "policy file that training begins with; by default an untrained policy", None
+    )
     kept: Texts = setting("numbers of a compact policy that training leaves as they are", ())
     per_region: bool = setting(
         "a compact policy finds for each region the accumulation that counts as full", False
@@ -169,6 +172,11 @@ class Dpc(Options):
         if self.numbers and not (self.compact and min(self.numbers) >= 0.0):
             raise Problem(
                 "numbers", "expected 8 to 12 numbers >= 0 of a compact policy; add compact = true"
+            )
+        if self.start and (self.numbers or self.from_gating or self.from_no_control):
+            raise Problem(
+                "start",
+                "a trained policy begins as it is; omit numbers, from_gating, from_no_control",
             )
         if self.kept and not (self.compact and set(self.kept) <= set(Numbers._fields)):
             names = got(
