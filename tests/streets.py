@@ -61,7 +61,6 @@ def session(routes: dict[str, tuple[str, ...]], **others: Any) -> SimpleNamespac
         "arrived": tuple,
         "road": lambda vehicle: routes[vehicle][0],
         "route": routes.get,
-        "route_name": lambda vehicle: " ".join(routes[vehicle]),
         "route_index": lambda vehicle: 0,
         "step_length": 1.0,
         "set_route": lambda vehicle, way: routes.update({vehicle: tuple(way)}) or True,

@@ -28,7 +28,7 @@ def numbers(route):
 def test_the_present_route_takes_the_time_after_its_first_edge():
     drivers, time = drivers_of()
     late = time + 5.0
-    itinerary = drivers.itinerary("whole", tuple("?ambt"))
+    itinerary = drivers.itinerary(tuple("?ambt"))
     present = drivers.present(itinerary, 1, CITY.number["a"], late)
     assert present.route.tolist() == numbers("ambt").tolist()
     assert present[1:] == Present(None, 45.0, 15.0, found=True)[1:]
@@ -50,7 +50,7 @@ def test_the_present_route_takes_the_time_after_its_first_edge():
 )
 def test_routes_that_no_search_finds(route, here, found, route_known):
     drivers, time = drivers_of(ways_return=False)
-    itinerary = drivers.itinerary("whole", tuple(route))
+    itinerary = drivers.itinerary(tuple(route))
     present = drivers.present(itinerary, 0, CITY.number[here], time)
     assert present.found is found
     assert (present.route is not None) is route_known

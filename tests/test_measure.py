@@ -49,9 +49,6 @@ class Streets:
     def route(self, vehicle):
         return self.routes[vehicle]
 
-    def route_name(self, vehicle):
-        return " ".join(self.routes[vehicle])
-
     def departure(self, vehicle):
         return self.time, self.time - self.due.get(vehicle, self.time)
 

@@ -5,7 +5,6 @@ for others.
 """
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -25,12 +24,12 @@ MESO_THRESHOLD = 0.3  # in the mesoscopic model: less than this share of the oth
 class Itinerary(NamedTuple):
     """A route as SUMO has it.
 
-    name: of the route
+    names: of its edges
     edges, moves: by number, UNKNOWN on roads closed to cars
     known_from: place of the first edge after these roads
     """
 
-    name: str
+    names: tuple[str, ...]
     edges: Route
     moves: Route
     known_from: int
@@ -68,12 +67,12 @@ class Drivers:
         self._ways_return = ways_return
         self._lanes = lanes
 
-    def itinerary(self, name: str, edges: Sequence[str]) -> Itinerary:
-        """Return a route with these edges, by name."""
-        route = np.array([self._number.get(edge, UNKNOWN) for edge in edges], dtype=int)
+    def itinerary(self, names: tuple[str, ...]) -> Itinerary:
+        """Return the route with edges of these names."""
+        route = np.array([self._number.get(edge, UNKNOWN) for edge in names], dtype=int)
         closed = np.flatnonzero(route == UNKNOWN)
         known_from = int(closed[-1]) + 1 if len(closed) else 0
-        return Itinerary(name, route, self._times.moves(route), known_from)
+        return Itinerary(names, route, self._times.moves(route), known_from)
 
     def present(self, itinerary: Itinerary, place: int, here: int, time: PerEdge) -> Present:
         """Return the present route of a driver on edge `here`.

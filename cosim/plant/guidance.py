@@ -267,11 +267,10 @@ class Guide:
 
     def _itinerary(self, vehicle: str) -> Itinerary:
         """Return the present route of a driver."""
-        # SUMO gives every new route of a vehicle another name.
-        name = self._session.route_name(vehicle)
+        names = self._session.route(vehicle)
         known = self._itineraries.get(vehicle)
-        if known is None or known.name != name:
-            known = self._drivers.itinerary(name, self._session.route(vehicle))
+        if known is None or known.names != names:
+            known = self._drivers.itinerary(names)
             self._itineraries[vehicle] = known
         return known
 

@@ -39,7 +39,6 @@ class _Vehicle:
     origin: int
     destination: int
     edge: str  # last one of its route
-    route: str  # its name
     free: bool  # guidance may reroute it
     private: bool  # a trip of the demand
     public: bool  # `Session.is_public`
@@ -435,7 +434,6 @@ class Meter:
                 origin=region_of.get(route[0], 0),
                 destination=region_of.get(route[-1], 0),
                 edge=route[-1],
-                route=session.route_name(vehicle),
                 free=session.is_free(vehicle),
                 private=private,
                 public=not private and session.is_public(vehicle),
@@ -485,10 +483,6 @@ class Meter:
 
     def _follow(self, vehicle: str, known: _Vehicle) -> None:
         """Book a change of the destination."""
-        route = self._session.route_name(vehicle)
-        if route == known.route:
-            return
-        known.route = route
         edge = self._session.route(vehicle)[-1]
         if edge == known.edge:
             return

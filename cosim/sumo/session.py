@@ -158,11 +158,10 @@ class Session:
         self.running = _compiled(vehicle.getIDList)
         self.known = _compiled(vehicle.getLoadedIDList)
         self.pending = _compiled(simulation.getPendingVehicles)
-        # One vehicle: edge, normal or internal; route, and its name, which changes with it; place
-        # on it; speed (m/s); time since it stopped (s); length (m).
+        # One vehicle: edge, normal or internal; route; place on it; speed (m/s); time since it
+        # stopped (s); length (m).
         self.road = _compiled(vehicle.getRoadID)
         self.route = _compiled(vehicle.getRoute)
-        self.route_name = _compiled(vehicle.getRouteID)
         self.route_index = _compiled(vehicle.getRouteIndex)
         self.vehicle_speed = _compiled(vehicle.getSpeed)
         self.standing_time = _compiled(vehicle.getWaitingTime)
