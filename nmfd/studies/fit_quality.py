@@ -141,8 +141,6 @@ def region_fits(
     most = _largest(samples, accumulations)
     critical = network.seen_critical
     density = critical / lane_km
-    # NaN where no vehicle was ever seen.
-    most_share = np.divide(most, critical, out=np.full_like(critical, np.nan), where=critical > 0.0)
     rows = []
     for region, (curve, cloud) in enumerate(zip(network.mfds, samples, strict=True)):
         points = own_points(cloud)
@@ -167,7 +165,7 @@ def region_fits(
             "r2": r2,
             "spread": spread,
             "hysteresis": hysteresis(cloud),
-            "most_share": most_share[region],
+            "most_share": most[region] / critical[region],
             "doubts": _doubts(len(points), r2, above, density[region], seeds),
         }
         rows.append(row)
