@@ -6,8 +6,8 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from cosim.evaluation.link_vehicles import CAR, drives_of, means_of
-from cosim.evaluation.links import link_network
+from cosim.evaluation.link_vehicles import CAR, Drive, drives_of, means_of
+from cosim.evaluation.links import PERIOD_S, by_period, link_network
 from cosim.sumo.net import city_of
 from cosim.sumo.recorded_trips import RecordedTrips
 from nmfd import api
@@ -45,7 +45,16 @@ def test_trips_begin_and_end_along_their_streets(places, first, last):
     route = f'<route edges="{" ".join(move)}"/>'
     given = trips(f'<vehicle id="v" depart="0" {places}>{route}</vehicle>')
     (drive,) = drives_of(given, {}, [], city)
-    assert drive == (move, pytest.approx(first), pytest.approx(last))
+    assert drive == (0.0, move, pytest.approx(first), pytest.approx(last))
+
+
+def test_trips_are_parted_by_the_time_they_are_due():
+    """Those before the first period, or after the last one, count in these."""
+    due = [-1.0, 0.0, PERIOD_S - 1.0, PERIOD_S, 5.0 * PERIOD_S]
+    drives = [Drive(100.0 + time, ("a", "b"), 1.0, 1.0) for time in due]
+    parts = by_period(drives, 100.0, 2)
+    assert [len(part) for part in parts] == [3, 2]
+    assert parts[1] == drives[3:]
 
 
 def test_trips_without_a_route_take_the_fastest_one():

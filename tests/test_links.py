@@ -56,6 +56,8 @@ def triangle(length: float = 300.0) -> LinkNetwork:
     light = np.concatenate([green, np.ones(2)]).astype(float)
     return LinkNetwork(
         regions=3,
+        periods=1,
+        period=900.0,
         numbers=np.array([1.0, 1.0, 1.0, 4.7]),
         spacing=SPACING,
         headway=1.0,
@@ -268,6 +270,32 @@ def test_chance_makes_queues_where_streams_have_none():
         spent.append(float(state.spent))
     assert min(spent[1:]) > 1.015 * spent[0]
     assert spent[1] != spent[2]
+
+
+def test_shares_are_those_of_the_period_and_the_draw():
+    """In the second period all drive by way of d; the other draw does so in the first one."""
+    streets = triangle()
+    direct = [1.0, 0.0, 1.0]
+    around = [0.0, 1.0, 1.0]
+    rows = {
+        "origin": np.repeat(streets.origin, 4, axis=0),
+        "ending": np.repeat(streets.ending, 4, axis=0),
+        "cell_share": np.array([direct, around, around, direct]),
+    }
+    demand = demand_of(torch.tensor(0.05, dtype=torch.float64))
+    model = model_of(replace(streets, periods=2, period=2 * STEP_S, **rows))
+    passed = []
+    for seed in (0, 1):
+        state = model.start(1, [seed])
+        gone = []
+        for _ in range(6):
+            state = model.advance(state, demand, Commands())
+            gone.append(float(state.gone[0, 2]))
+        passed.append(gone)
+    assert passed[0][:2] == [0.0, 0.0]
+    assert min(passed[0][3:]) > 4.0
+    assert max(passed[1][:2]) > 2.0
+    assert passed[1][-1] < 0.01
 
 
 def test_a_queue_discharges_at_the_saturation_flow():

@@ -126,7 +126,7 @@ class Counts:
         self.first = defaultdict[int, float](float)
         self.last = defaultdict[int, float](float)
         region_of = streets.city.region_of
-        for route, first, last in drives:
+        for _, route, first, last in drives:
             destination = region_of[route[-1]]
             movements = list(itertools.pairwise(route))
             links = [streets.link_of[movement] for movement in movements]

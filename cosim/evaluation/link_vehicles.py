@@ -27,9 +27,11 @@ PLACES = {"random": 0.5, "random_free": 0.5, "center": 0.5, "max": 1.0}
 class Drive(NamedTuple):
     """A trip on its way.
 
+    depart: when it is due (s)
     first, last: shares of its first and last streets that it drives (-)
     """
 
+    depart: float
     route: Route
     first: float
     last: float
@@ -60,14 +62,15 @@ def drives_of(
     if without:
         ways = _fastest(trips, without, files, city)
     drives = []
-    for element, (edges, driven) in zip(trips.elements, found, strict=True):
+    parts = zip(trips.depart.tolist(), trips.elements, found, strict=True)
+    for depart, element, (edges, driven) in parts:
         route = tuple(edges)
         if not driven:
             route = ways.get(attribute(element, "id"), ())
         if len(route) > 1 and city.number.keys() >= set(route):
             begin = _place(element.get("departPos", "base"), city.length[route[0]])
             end = _place(element.get("arrivalPos", "max"), city.length[route[-1]])
-            drives.append(Drive(route, 1.0 - begin, end))
+            drives.append(Drive(depart, route, 1.0 - begin, end))
     return drives
 
 

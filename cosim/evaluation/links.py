@@ -4,7 +4,8 @@ A link has the lanes of a street that share movements. Shares of turns, origins 
 are counted on the static routes. Lights follow the signal programmes.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+import math
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -20,7 +21,7 @@ from cosim.evaluation.link_streets import (
     link_arrays,
     vehicle_arrays,
 )
-from cosim.evaluation.link_vehicles import draws_of, drives_of, means_of
+from cosim.evaluation.link_vehicles import Drive, draws_of, drives_of, means_of
 from cosim.plant.gates import MIN_GREEN_S, least_times
 from cosim.plant.pressure import Roads
 from cosim.plant.settings import own_files, settings
@@ -41,6 +42,9 @@ from nmfd.runs import shipped
 CAPACITY = {"G": 1.0, "g": 1.0, "o": 1.0, "O": 1.0, "s": 0.5}
 GIVES_WAY = frozenset("gso")  # lights
 MINOR = frozenset("m=so")  # states of connections without a signal that must give way
+
+
+PERIOD_S = 900.0  # in which recorded trips have shares of their own
 
 
 class Lights(NamedTuple):
@@ -97,6 +101,10 @@ def link_network(scenario: Scenario, seeds: Sequence[int] = PLANNING_SEEDS) -> L
         raise InputError(f"{scenario.where}: sumo.routes: no trip leads over two streets for cars")
     streets = Streets(city, connections_of(city), routes, scenario.where)
     counts = Counts(streets, together)
+    periods = 1
+    if chosen.routes:
+        periods = max(math.ceil(scenario.steps * scenario.step / PERIOD_S), 1)
+        by_draw = by_period(together, chosen.begin, periods)
     means = means_of(draws[0], files)
     steered, _ = read_signals(city, files, HELD)
     fixed, _ = read_signals(city, files)
@@ -110,6 +118,8 @@ def link_network(scenario: Scenario, seeds: Sequence[int] = PLANNING_SEEDS) -> L
     links = link_arrays(streets)
     return LinkNetwork(
         regions=city.regions,
+        periods=periods,
+        period=PERIOD_S,
         numbers=np.array(Numbers()),
         spacing=means["length"] + means["minGap"],
         headway=means["tau"],
@@ -123,6 +133,18 @@ def link_network(scenario: Scenario, seeds: Sequence[int] = PLANNING_SEEDS) -> L
         **_stage_arrays(streets, counts, steered),
         **phase_arrays(streets, steered, actuated, cycles, chosen.begin),
     )
+
+
+def by_period(drives: Iterable[Drive], begin: float, periods: int) -> list[list[Drive]]:
+    """Return the trips that are due in each period.
+
+    begin: of the first one (s)
+    """
+    parts: list[list[Drive]] = [[] for _ in range(periods)]
+    for drive in drives:
+        period = int((drive.depart - begin) / PERIOD_S)
+        parts[min(max(period, 0), periods - 1)].append(drive)
+    return parts
 
 
 def _foes(city: City) -> set[tuple[Movement, Movement]]:

@@ -79,7 +79,7 @@ class Drivers:
             self._nominal = flows.values(nominal).reshape(1, -1).clamp(min=LEAST_NOMINAL)
 
     def static(self, draw: Tensor) -> Tensor:
-        """Return the shares without guidance; draw: that of each rollout (B,)."""
+        """Return the shares without guidance; draw: row of each rollout (B,)."""
         return self._draws.index_select(0, draw)
 
     def by_times(

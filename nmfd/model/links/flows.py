@@ -331,7 +331,7 @@ class Flows:
     def ways(self, cells: Tensor, draw: Tensor, chance: Chance | None = None) -> Ways:
         """Return the ways with these cells (-, (B, C)).
 
-        draw: number of the draw of trips of each rollout (B,)
+        draw: row of the shares of each rollout (B,)
         chance: with which vehicles draw their cells; they are divided if None
         """
         ending = self._ending.index_select(0, draw)

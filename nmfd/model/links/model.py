@@ -209,7 +209,8 @@ class LinkModel:
         flows = self.flows
         regions = self.network.regions
         seeds = np.resize(np.array(draws), batch)
-        draw = seeds % len(self.network.origin)
+        periods = self.network.periods
+        draw = seeds % (len(self.network.origin) // periods) * periods
         traffic = flows.start(batch)
         by_chance = None
         if chance:
@@ -241,11 +242,13 @@ class LinkModel:
         programme = self._programmes.read(state.interval * self.step, self._steps)
         # Intervals are alike but for the steps in which signals decide.
         period = 1 if self._signals is None else self._signals.period
-        alike = state._replace(interval=state.interval % period, chance=None)
+        elapsed = int(state.interval * self.step / self.network.period)
+        draw = state.draw + min(elapsed, self.network.periods - 1)
+        alike = state._replace(interval=state.interval % period, draw=draw, chance=None)
         after = run_again(
             self._advance, alike, demand, commands, programme, state.chance, play=self._play
         )
-        after = after._replace(interval=state.interval + 1, chance=state.chance)
+        after = after._replace(interval=state.interval + 1, draw=state.draw, chance=state.chance)
         return after._replace(realised=gates) if opened else after
 
     def _advance(

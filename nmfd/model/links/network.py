@@ -20,9 +20,12 @@ class LinkNetwork:
     A link is a group of lanes of one street that share movements. A movement leads from a link to
     another street, a turn to a link of that street. An entry is a link with a destination region, a
     cell is a turn with one: vehicles are counted by these. All numbers are places in other arrays.
-    Shares are those of D draws of trips: each locks at another demand, and their mean later.
+    Shares are those of D draws of trips: each locks at another demand, and their mean later. As
+    recorded trips begin elsewhere at other times, a draw has shares for each of K periods, the last
+    without an end: row d K + k is draw d in period k.
 
     regions: number of regions
+    periods, period: number K of periods, and their length (s)
     numbers: calibration (flows.Numbers, in their order)
     spacing, headway: of the average vehicle in a queue (m), and the least time it keeps (s)
     dawdling, acceleration: what it drives below the limit (m/s), and as it starts (m/s2)
@@ -37,10 +40,10 @@ class LinkNetwork:
     served, server: pairs of a turn and a lane that leads there (P,)
     first, last: mean share of each link that trips drive which begin, and end there (-, (L,))
     entry_link, destination: of each entry (E,), sorted by free_time
-    ending: share of the vehicles of each entry whose trip ends in the link (D, E)
-    origin: share of the trips from the link's region to the destination that begin here (D, E)
+    ending: share of the vehicles of each entry whose trip ends in the link (D K, E)
+    origin: share of the trips from the link's region to the destination that begin here (D K, E)
     cell_turn, cell_entry, cell_onward: turn of each cell, entry it leaves, entry it enters (C,)
-    cell_share: share of the vehicles of its entry, of those whose trip goes on (D, C)
+    cell_share: share of the vehicles of its entry, of those whose trip goes on (D K, C)
     yielding, foe: pairs of a movement that gives way and the one that it gives way to (F,)
     cycle: length of each movement's programme (s) (M,)
     begin: place of its first second in `light` and `yields` (M,)
@@ -69,6 +72,8 @@ class LinkNetwork:
     """
 
     regions: int
+    periods: int
+    period: float
     numbers: np.ndarray
     spacing: float
     headway: float
@@ -143,6 +148,6 @@ def read_links(path: Path) -> LinkNetwork:
         raise InputError(f"{path}: no such file; {remedy}") from None
     except (OSError, KeyError, ValueError, BadZipFile) as error:
         raise InputError(f"{path}: is no network of links ({error}); {remedy}") from None
-    for name in ("regions", "spacing", "headway", "dawdling", "acceleration"):
+    for name in ("regions", "periods", "period", "spacing", "headway", "dawdling", "acceleration"):
         arrays[name] = arrays[name].item()
     return LinkNetwork(**arrays)
