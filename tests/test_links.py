@@ -626,6 +626,19 @@ def test_signals_that_choose_need_signals():
         LinkPlant(scenario, network=none)
 
 
+def test_trips_may_begin_elsewhere_in_every_period():
+    """No street has trips in both periods, but both have trips."""
+    scenario = api.load_scenario("grid7_peak")
+    network = read_links(links_file(scenario))
+    half = np.arange(len(network.entry_link)) % 2
+    every = network.origin.max(axis=0)
+    origin = np.array([every * (half == 0), every * (half == 1)])
+    rows = {name: getattr(network, name)[:1].repeat(2, axis=0) for name in ("ending", "cell_share")}
+    LinkPlant(scenario, network=replace(network, periods=2, origin=origin, **rows))
+    with pytest.raises(InputError, match="no route leads from region 0 to region 1"):
+        LinkPlant(scenario, network=replace(network, origin=np.zeros_like(network.origin)))
+
+
 def test_a_missing_file_names_the_command():
     failed = nmfd_command("benchmark economic_mpc --plant links --controllers greedy")
     assert "write it with 'cosim links'" in error_line(failed, "nmfd")

@@ -1,7 +1,8 @@
 """Streets of a SUMO network for the link model (nmfd.model.links).
 
 A link has the lanes of a street that share movements. Shares of turns, origins and ends of trips
-are counted on the static routes. Lights follow the signal programmes.
+are counted on the static routes, those of recorded trips by quarter of an hour. Lights follow the
+signal programmes.
 """
 
 import math

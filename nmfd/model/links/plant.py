@@ -170,7 +170,7 @@ def _check_demand(scenario: Scenario, network: LinkNetwork, where: Path) -> None
             f"{where}: has {regions} regions, the scenario {scenario.network.regions}; {remedy}"
         )
     pair = network.region[network.entry_link] * regions + network.destination
-    begin = np.bincount(pair, network.origin.min(axis=0), regions**2).reshape(regions, regions)
+    begin = np.bincount(pair, network.origin.max(axis=0), regions**2).reshape(regions, regions)
     missing = (scenario.demand.sum(axis=0) > 0.0) & (begin == 0.0)
     if missing.any():
         i, j = np.argwhere(missing)[0]
