@@ -43,8 +43,6 @@ from nmfd.runs import shipped
 CAPACITY = {"G": 1.0, "g": 1.0, "o": 1.0, "O": 1.0, "s": 0.5}
 GIVES_WAY = frozenset("gso")  # lights
 MINOR = frozenset("m=so")  # states of connections without a signal that must give way
-
-
 PERIOD_S = 900.0  # in which recorded trips have shares of their own
 
 
