@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from cosim.evaluation.link_vehicles import CAR, Drive, drives_of, means_of
-from cosim.evaluation.links import PERIOD_S, by_period, link_network
+from cosim.evaluation.links import by_quarter, link_network
 from cosim.sumo.net import city_of
 from cosim.sumo.recorded_trips import RecordedTrips
+from cosim.sumo.route_plan import QUARTER_S
 from nmfd import api
 
 TYPES = """
@@ -49,10 +50,10 @@ def test_trips_begin_and_end_along_their_streets(places, first, last):
 
 
 def test_trips_are_parted_by_the_time_they_are_due():
-    """Those before the first period, or after the last one, count in these."""
-    due = [-1.0, 0.0, PERIOD_S - 1.0, PERIOD_S, 5.0 * PERIOD_S]
+    """Those before the first quarter of an hour, or after the last one, count in these."""
+    due = [-1.0, 0.0, QUARTER_S - 1.0, QUARTER_S, 5.0 * QUARTER_S]
     drives = [Drive(100.0 + time, ("a", "b"), 1.0, 1.0) for time in due]
-    parts = by_period(drives, 100.0, 2)
+    parts = by_quarter(drives, 100.0, 2.0 * QUARTER_S)
     assert [len(part) for part in parts] == [3, 2]
     assert parts[1] == drives[3:]
 

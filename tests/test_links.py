@@ -251,7 +251,7 @@ def test_vehicles_turn_by_chance_as_often_as_on_average():
     model = model_of()
     state = model.start(1, [1], chance=True)
     entry = model.flows.places(np.array([0, 0, 2]))
-    choice = model._ways(state, Commands(), state.chance).choice
+    choice = model._ways(state, state.draw, Commands(), state.chance).choice
     taken = [choice.cells(torch.full((1, 3), float(n))).tolist()[0] for n in range(DRAWS)]
     assert sorted(set(np.array(taken).ravel())) == [0.0, 1.0]
     assert np.bincount(entry, taken[0]).tolist() == [1.0, 0.0, 1.0]
@@ -380,7 +380,7 @@ def test_metering_admits_its_rate():
 def test_drivers_head_for_commanded_regions(share):
     model = model_of()
     state = rollout(model, 0.1, intervals=1)[-1]
-    cells = model._ways(state, all_commands(share=share)).cells
+    cells = model._ways(state, state.draw, all_commands(share=share)).cells
     torch.testing.assert_close(cells, torch.tensor([[share, 1.0 - share, 1.0]]).double())
 
 
@@ -388,13 +388,13 @@ def test_drivers_avoid_delay_and_prices():
     model = model_of(guided=True)
     free = rollout(model, 0.01, intervals=2)[-1]
     jammed = rollout(model, 1.2)[-1]
-    before = model._ways(free, Commands()).cells[0]
+    before = model._ways(free, free.draw, Commands()).cells[0]
     delay = torch.zeros_like(jammed.present)
     delay[0, 1] = 9000.0
     delayed = free._replace(present=delay, gone=torch.full_like(delay, 30.0))
     prices = torch.tensor([[0.0, 0.0, 5.0]]).double()
-    priced = model._ways(free, Commands(prices=prices)).cells[0]
-    assert float(model._ways(delayed, Commands()).cells[0, 0]) == pytest.approx(
+    priced = model._ways(free, free.draw, Commands(prices=prices)).cells[0]
+    assert float(model._ways(delayed, delayed.draw, Commands()).cells[0, 0]) == pytest.approx(
         float(before[0]), 0.1
     )
     assert float(priced[1]) < 0.3 * float(before[1])
@@ -403,7 +403,7 @@ def test_drivers_avoid_delay_and_prices():
 def test_partial_compliance_mixes_the_shares():
     model = model_of(compliance=0.25)
     state = rollout(model, 0.1, intervals=1)[-1]
-    cells = model._ways(state, all_commands(share=0.3)).cells
+    cells = model._ways(state, state.draw, all_commands(share=0.3)).cells
     assert float(cells[0, 0]) == pytest.approx(0.7 + 0.25 * (0.3 - 0.7))
 
 

@@ -20,7 +20,7 @@ from cosim.plant.settings import settings
 from cosim.plant.strategy import parse
 from nmfd import closed_loop
 from nmfd.api import loaded
-from nmfd.controllers.strategy import Strategy
+from nmfd.controllers.strategy import ControllerLike, Strategy
 from nmfd.errors import InputError
 from nmfd.model.links.flows import Numbers
 from nmfd.model.links.network import LinkNetwork
@@ -80,9 +80,9 @@ def repeated(
     return runs
 
 
-def strategy_in_links(name: str) -> Strategy:
+def strategy_in_links(controller: ControllerLike) -> Strategy:
     """Return how streets know a strategy in SUMO. Raises InputError."""
-    strategy = parse(name)
+    strategy = parse(controller)
     if strategy.controller.name == GUIDING:
         return parse("+".join([REFERENCE, GUIDED, *strategy.labels]))
     return strategy
@@ -235,5 +235,10 @@ def _row(case: Case, numbers: Numbers, *, fitted: bool) -> dict[str, object]:
 
 def locks(run: Result) -> bool:
     """Return True if many trips are not finished at the end."""
+    return left_share(run) > LOCKED
+
+
+def left_share(run: Result) -> float:
+    """Return the share of the trips that are not finished at the end."""
     left = float(_vehicles(run)[-1].sum())
-    return left > LOCKED * (left + run.completed_trips)
+    return left / max(left + run.completed_trips, 1e-9)

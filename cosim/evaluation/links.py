@@ -29,6 +29,7 @@ from cosim.plant.settings import own_files, settings
 from cosim.plant.stages import stages_of, transition
 from cosim.sumo import recorded_trips as recorded
 from cosim.sumo.net import City, Connection, city_of
+from cosim.sumo.route_plan import QUARTER_S
 from cosim.sumo.signals import HELD, Cycle, Signal, read_cycles, read_signals
 from cosim.sumo.trips import PLANNING_SEEDS
 from cosim.sumo.xml_files import attribute, network_root
@@ -43,7 +44,6 @@ from nmfd.runs import shipped
 CAPACITY = {"G": 1.0, "g": 1.0, "o": 1.0, "O": 1.0, "s": 0.5}
 GIVES_WAY = frozenset("gso")  # lights
 MINOR = frozenset("m=so")  # states of connections without a signal that must give way
-PERIOD_S = 900.0  # in which recorded trips have shares of their own
 
 
 class Lights(NamedTuple):
@@ -100,10 +100,9 @@ def link_network(scenario: Scenario, seeds: Sequence[int] = PLANNING_SEEDS) -> L
         raise InputError(f"{scenario.where}: sumo.routes: no trip leads over two streets for cars")
     streets = Streets(city, connections_of(city), routes, scenario.where)
     counts = Counts(streets, together)
-    periods = 1
-    if chosen.routes:
-        periods = max(math.ceil(scenario.steps * scenario.step / PERIOD_S), 1)
-        by_draw = by_period(together, chosen.begin, periods)
+    rows = by_draw
+    if chosen.routes:  # one draw
+        rows = by_quarter(together, chosen.begin, scenario.steps * scenario.step)
     means = means_of(draws[0], files)
     steered, _ = read_signals(city, files, HELD)
     fixed, _ = read_signals(city, files)
@@ -117,8 +116,8 @@ def link_network(scenario: Scenario, seeds: Sequence[int] = PLANNING_SEEDS) -> L
     links = link_arrays(streets)
     return LinkNetwork(
         regions=city.regions,
-        periods=periods,
-        period=PERIOD_S,
+        periods=len(rows) // len(draws),
+        period=QUARTER_S,
         numbers=np.array(Numbers()),
         spacing=means["length"] + means["minGap"],
         headway=means["tau"],
@@ -127,23 +126,25 @@ def link_network(scenario: Scenario, seeds: Sequence[int] = PLANNING_SEEDS) -> L
         **links,
         **_movement_arrays(streets, cycles, chosen.begin, gated),
         **vehicle_arrays(
-            streets, links["free_time"], counts, [Counts(streets, drives) for drives in by_draw]
+            streets, links["free_time"], counts, [Counts(streets, drives) for drives in rows]
         ),
         **_stage_arrays(streets, counts, steered),
         **phase_arrays(streets, steered, actuated, cycles, chosen.begin),
     )
 
 
-def by_period(drives: Iterable[Drive], begin: float, periods: int) -> list[list[Drive]]:
-    """Return the trips that are due in each period.
+def by_quarter(drives: Iterable[Drive], begin: float, duration: float) -> list[list[Drive]]:
+    """Return the trips that are due in each quarter of an hour.
 
-    begin: of the first one (s)
+    Those before or after these count in the first or the last one.
+
+    begin: of the first quarter; duration: of all of them (s)
     """
-    parts: list[list[Drive]] = [[] for _ in range(periods)]
+    quarters: list[list[Drive]] = [[] for _ in range(math.ceil(duration / QUARTER_S))]
     for drive in drives:
-        period = int((drive.depart - begin) / PERIOD_S)
-        parts[min(max(period, 0), periods - 1)].append(drive)
-    return parts
+        own = int((drive.depart - begin) / QUARTER_S)
+        quarters[min(max(own, 0), len(quarters) - 1)].append(drive)
+    return quarters
 
 
 def _foes(city: City) -> set[tuple[Movement, Movement]]:

@@ -60,7 +60,7 @@ class Drivers:
         target = network.destination[network.cell_entry]
         here = region[network.entry_link[network.cell_entry]]
         onward = region[network.turn_link[network.cell_turn]]
-        self._draws = flows.values(network.cell_share).double()
+        self._shares = flows.values(network.cell_share).double()
         self._target = flows.places(target)
         self._link = flows.places(network.turn_link[network.cell_turn])
         self._region_of_link = flows.places(region)
@@ -78,9 +78,12 @@ class Drivers:
         if nominal is not None:
             self._nominal = flows.values(nominal).reshape(1, -1).clamp(min=LEAST_NOMINAL)
 
-    def static(self, draw: Tensor) -> Tensor:
-        """Return the shares without guidance; draw: row of each rollout (B,)."""
-        return self._draws.index_select(0, draw)
+    def static(self, row: Tensor) -> Tensor:
+        """Return the shares without guidance.
+
+        row: of the network's shares, of each rollout (B,)
+        """
+        return self._shares.index_select(0, row)
 
     def by_times(
         self, share: Tensor, present: Tensor, left: Tensor, prices: PerRegion | None
@@ -114,10 +117,10 @@ class Drivers:
     def _ways(self, ends: np.ndarray) -> _Ways:
         """Return ways that end with some cells (C,)."""
         last = torch.as_tensor(ends, device=self._flows.device)
-        reached = self._home.double().expand(len(self._draws), -1)
+        reached = self._home.double().expand(len(self._shares), -1)
         steps = 0
         while steps < LONGEST_WAY and float(reached.min()) < ARRIVED:
-            reached = self._onward(reached, self._draws, last)[1]
+            reached = self._onward(reached, self._shares, last)[1]
             steps += 1
         return _Ways(last, max(steps, 1))
 

@@ -328,13 +328,13 @@ class Flows:
             had_left=self._backwards.start(empty(self.links)),
         )
 
-    def ways(self, cells: Tensor, draw: Tensor, chance: Chance | None = None) -> Ways:
+    def ways(self, cells: Tensor, row: Tensor, chance: Chance | None = None) -> Ways:
         """Return the ways with these cells (-, (B, C)).
 
-        draw: row of the shares of each rollout (B,)
+        row: of the network's shares, of each rollout (B,)
         chance: with which vehicles draw their cells; they are divided if None
         """
-        ending = self._ending.index_select(0, draw)
+        ending = self._ending.index_select(0, row)
         choice = None
         if chance is not None:
             choice = chance.choice(cells)

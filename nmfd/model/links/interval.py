@@ -15,7 +15,7 @@ class LinkState(NamedTuple):
     """State of B rollouts at the beginning of a control interval.
 
     interval: its number
-    draw: first row of the shares of the draw of trips of each rollout (B,)
+    draw: number of the draw of trips of each rollout (B,)
     used: of the gates' windows; stages: of max-pressure or of actuated signals
     chance: of single vehicles, None without
     asked: trips that were due so far on average, by entry (B, E)

@@ -209,8 +209,7 @@ class LinkModel:
         flows = self.flows
         regions = self.network.regions
         seeds = np.resize(np.array(draws), batch)
-        periods = self.network.periods
-        draw = seeds % (len(self.network.origin) // periods) * periods
+        draw = seeds % (len(self.network.origin) // self.network.periods)
         traffic = flows.start(batch)
         by_chance = None
         if chance:
@@ -242,18 +241,22 @@ class LinkModel:
         programme = self._programmes.read(state.interval * self.step, self._steps)
         # Intervals are alike but for the steps in which signals decide.
         period = 1 if self._signals is None else self._signals.period
-        elapsed = int(state.interval * self.step / self.network.period)
-        draw = state.draw + min(elapsed, self.network.periods - 1)
-        alike = state._replace(interval=state.interval % period, draw=draw, chance=None)
-        after = run_again(
-            self._advance, alike, demand, commands, programme, state.chance, play=self._play
-        )
-        after = after._replace(interval=state.interval + 1, draw=state.draw, chance=state.chance)
+        alike = state._replace(interval=state.interval % period, chance=None)
+        given = (alike, self._row(state), demand, commands, programme, state.chance)
+        after = run_again(self._advance, *given, play=self._play)
+        after = after._replace(interval=state.interval + 1, chance=state.chance)
         return after._replace(realised=gates) if opened else after
+
+    def _row(self, state: LinkState) -> Tensor:
+        """Return the row of the network's shares of each rollout (B,)."""
+        network = self.network
+        elapsed = int(state.interval * self.step / network.period)
+        return state.draw * network.periods + min(elapsed, network.periods - 1)
 
     def _advance(
         self,
         state: LinkState,
+        row: Tensor,
         demand: PerPair,
         commands: Commands,
         programme: tuple[Tensor, Tensor, Tensor],
@@ -261,11 +264,11 @@ class LinkModel:
     ) -> LinkState:
         """Return the state by tensors alone, so that a GPU can record it.
 
-        programme: as of Programmes.read
+        row: as of _row; programme: as of Programmes.read
         """
         flows = self.flows
         dt = flows.dt
-        origin = self._origin.index_select(0, state.draw)
+        origin = self._origin.index_select(0, row)
         due = demand.flatten(1).index_select(1, self._pair_of_entry) * origin * dt
         light, yields, opens = programme
         gates = commands.gates
@@ -275,7 +278,7 @@ class LinkModel:
             shares = torch.where(shares >= OPEN_SHARE, 1.0, shares)
         interval = Interval(
             due=due,
-            ways=self._ways(state, commands, chance),
+            ways=self._ways(state, row, commands, chance),
             chance=chance,
             metering=commands.metering,
             gates=shares,
@@ -306,11 +309,13 @@ class LinkModel:
             realised=realised,
         )
 
-    def _ways(self, state: LinkState, commands: Commands, chance: Chance | None = None) -> Ways:
-        """Return the ways of an interval."""
+    def _ways(
+        self, state: LinkState, row: Tensor, commands: Commands, chance: Chance | None = None
+    ) -> Ways:
+        """Return the ways of an interval; row: as of _row."""
         choices = self._choices
         drivers = self._drivers
-        static = drivers.static(state.draw)
+        static = drivers.static(row)
         compliance = choices.rerouting
         by_splits = commands.splits is not None and commands.prices is None
         if by_splits or choices.guided or commands.prices is not None:
@@ -321,7 +326,7 @@ class LinkModel:
         elif compliance > 0.0:
             cells = drivers.by_times(static, state.present, state.gone, commands.prices)
         cells = static + compliance * (cells - static)
-        return self.flows.ways(cells.to(self.flows.dtype), state.draw, chance)
+        return self.flows.ways(cells.to(self.flows.dtype), row, chance)
 
     def _realised(self, gates: PerPair, share: Tensor) -> PerPair:
         """Return the mean share of green of each boundary.
