@@ -14,9 +14,10 @@ from streets import seen
 from cosim.plant import guidance, routes
 from cosim.plant.guidance import Guide
 from cosim.plant.meter import Event
-from cosim.plant.routes import MOST_NODES, Exits, Moves, Returning, Trees, Ways
+from cosim.plant.routes import MOST_TIMES
 
 EDGES, REGION = 40, np.repeat([0, 1, 2, 3], 10)
+NAMES = [f"{n:02}" for n in range(EDGES)]
 
 
 @pytest.fixture(scope="module")
@@ -30,33 +31,50 @@ def city():
     return first, second, random.uniform(0.0, 3.0, len(pairs)), random.uniform(5.0, 60.0, EDGES)
 
 
-@pytest.fixture(params=[MOST_NODES, 1])
-def ways(city, request, monkeypatch):
-    """Out of region 0, with all searches kept or hardly any."""
-    monkeypatch.setattr(routes, "MOST_NODES", request.param)
-    first, second, turn, time = city
-    inside, outside = (
-        Moves(first, second, allowed=(REGION == 0) ^ outside, reverse=outside)
-        for outside in (False, True)
-    )
-    gates = sorted(
-        {
-            (int(REGION[b]), int(a), int(b), n)
-            for n, (a, b) in enumerate(zip(first, second, strict=True))
-            if REGION[a] == 0 and REGION[b] != 0
-        }
-    )
-    following, gate, entry, move = np.array(gates).T
-    ahead = outside.ahead(outside.number[entry], 0.8 * time, 0.7 * turn)
-    moves = Moves(first, second, allowed=np.full(EDGES, True), reverse=False)
-    everywhere = Trees(moves, time, turn, aims=gate)
-    exits = Exits(np.array([gate, entry, move, following]).T, inside=inside, outside=outside)
-    over = turn[move] + time[entry]
-    there = Trees(inside, time, turn, aims=exits.first_nodes, beyond=over)
-    onward = Trees(outside, time, turn, ahead, aims=exits.second_nodes)
-    returning = Returning(everywhere, over, back_to(gate, entry, city))
-    found = Ways(exits, there=there, onward=onward, ahead=ahead, everywhere=returning)
-    return found, gate, entry
+@pytest.fixture(params=[MOST_TIMES, 1])
+def kept(request, monkeypatch):
+    """All searches are kept, or hardly any, and all drivers see the same times."""
+    monkeypatch.setattr(routes, "MOST_TIMES", request.param)
+    monkeypatch.setattr(guidance, "SPREAD", 0.0)
+
+
+class Crowd:
+    """Drivers in the random city, one after the other.
+
+    Without a `present` route, SUMO says that they are not on the first edge of their route.
+    """
+
+    def __init__(self, city, *, ways_return=False, detour=60.0):
+        first, second, turn, time = city
+        pairs = [(NAMES[a], NAMES[b]) for a, b in zip(first, second, strict=True)]
+        town = streets.city(
+            dict(zip(NAMES, REGION.tolist(), strict=True)),
+            {name: [NAMES[b] for b in second[first == n]] for n, name in enumerate(NAMES)},
+            length=dict(zip(NAMES, time, strict=True)),
+            turn_time=dict(zip(pairs, turn, strict=True)),
+        )
+        self.routes = {}
+        self.here = 0
+        session = streets.session(self.routes, road=lambda vehicle: NAMES[self.here])
+        chosen = {"compliance": 1.0, "random": np.random.default_rng(0)}
+        chosen |= {"ways_return": ways_return, "most_detour": detour}
+        self.guide = Guide(session, town, np.full((4,) * 3, 1 / 3), **chosen)
+
+    def send_by(self, *regions):
+        """Command that all leave for these regions, in equal shares."""
+        theta = np.zeros((4,) * 3)
+        theta[:, regions] = 1.0 / len(regions)
+        self.guide.command(theta, None)
+
+    def sent(self, here, target, present=()):
+        """Return the edges of a driver's route, and those before."""
+        self.here = here
+        before = [NAMES[n] for n in present] or [NAMES[here - 1], NAMES[target]]
+        self.routes["driver"] = tuple(before)
+        region = int(REGION[here])
+        bound = {"destination": int(REGION[target]), "edge": NAMES[target]}
+        self.guide.apply([Event(vehicle="driver", source=None, region=region, **bound)])
+        return [int(name) for name in self.routes["driver"]], [int(name) for name in before]
 
 
 def least(city, allowed):
@@ -79,61 +97,99 @@ def takes(way, city):
     return sum(turns[move] + city[3][move[1]] for move in pairwise(way))
 
 
-def back_to(gate, entry, city):
-    """(G,) [s] from behind the nearest gateway back to each."""
-    return 0.8 * least(city, np.full(EDGES, True))[np.ix_(entry, gate)].min(axis=0)
+def hops(city):
+    """Predecessors on the ways with the fewest moves."""
+    first, second, *_ = city
+    moves = csr_array((np.ones(len(first)), (first, second)), shape=(EDGES,) * 2)
+    _, before = dijkstra(moves, unweighted=True, return_predecessors=True)
+    return before
 
 
-@pytest.mark.parametrize("detour", [0.0, 40.0])
-def test_the_fastest_ways_are_found_up_to_a_limit(city, ways, detour):
-    """By each next region, and those that come back where they are the fastest of all."""
-    found, gate, entry = ways
+def way_by(before, here, target):
+    """The edges from here to target by predecessors, () without a way."""
+    way = [target]
+    while way[-1] != here:
+        if before[here, way[-1]] < 0:
+            return ()
+        way.append(int(before[here, way[-1]]))
+    return way[::-1]
+
+
+@pytest.mark.usefixtures("kept")
+@pytest.mark.parametrize("present", [False, True])
+@pytest.mark.parametrize("detour", [0.0, 40.0, 1e9])
+def test_drivers_get_the_fastest_route_by_the_commanded_region(city, detour, present):
+    """Up to a detour, and if their present route is not as good."""
+    first, second, *_ = city
+    leave = (REGION[first] == 0) & (REGION[second] != 0)
     inside, outside = least(city, REGION == 0), least(city, REGION != 0)
-    fastest_of_all = least(city, np.full(EDGES, True))
-    over = [takes(move, city) for move in zip(gate.tolist(), entry.tolist(), strict=True)]
-    begins = found.exits.begins[:-1]
-    cut = back = 0
-    for longest in (60.0, np.inf, 150.0):  # a wider search may come later, or was made before
-        for here, target in product(range(10), range(10, EDGES)):
-            exact = inside[here, gate] + over + outside[entry, target]
-            by_region = np.minimum.reduceat(exact, begins)
-            choices = found.choices(here, target, longest, detour)
-            assert choices.fastest == choices.times.min()
-            for n, time in enumerate(choices.times):
-                assert choices.exist[n] or by_region[n] == np.inf
-                if time == np.inf:
-                    cut += by_region[n] < np.inf
-                    assert by_region[n] >= longest + detour
-                    continue
-                way = choices.route(n).tolist()
-                assert (way[0], way[-1]) == (here, target)
-                assert takes(way, city) == pytest.approx(time)
-                leaves = max(place for place, edge in enumerate(way) if REGION[edge] == 0)
-                assert REGION[way[leaves + 1]] == found.exits.neighbours[n]
-                if (REGION[way[:leaves]] == 0).all():
-                    assert time > longest + detour or time == pytest.approx(by_region[n])
-                else:
-                    back += 1
-                    assert time > longest or time == pytest.approx(fastest_of_all[here, target])
-            if fastest_of_all[here, target] < longest:
-                assert choices.fastest == pytest.approx(fastest_of_all[here, target])
-    assert cut > 50
+    gates = list(zip(first[leave].tolist(), second[leave].tolist(), strict=True))
+    crowd, before = Crowd(city, detour=detour), hops(city)
+    obeyed = cut = kept = 0
+    for region in (1, 2, 3):
+        crowd.send_by(region)
+        for here, target in product(range(1, 10), range(10, EDGES)):
+            exact = np.full(4, np.inf)
+            for a, b in gates:
+                time = inside[here, a] + takes((a, b), city) + outside[b, target]
+                exact[REGION[b]] = min(exact[REGION[b]], time)
+            way, old = crowd.sent(here, target, way_by(before, here, target) if present else ())
+            if exact[region] == np.inf:
+                assert way == old
+                continue
+            by = region if exact[region] <= exact.min() + detour else int(exact.argmin())
+            obeyed += by == region
+            cut += by != region
+            if way == old:
+                kept += 1
+                assert takes(old, city) <= exact[by] + 1e-6
+                continue
+            leaves = next(n for n, edge in enumerate(way) if REGION[edge] != 0)
+            assert REGION[way[leaves]] == by
+            assert (way[0], way[-1]) == (here, target)
+            assert takes(way, city) == pytest.approx(exact[by])
+    assert obeyed > 100
+    assert (cut > 50) is (detour < 1e9)
+    assert (kept > 50) is present
+
+
+@pytest.mark.usefixtures("kept")
+def test_routes_that_come_back_are_taken_where_they_are_the_fastest(city):
+    best = least(city, np.full(EDGES, True))
+    crowd, before = Crowd(city, ways_return=True, detour=0.0), hops(city)
+    back = 0
+    crowd.send_by(1, 2, 3)
+    for present, here, target in product((False, True), range(1, 10), range(10, EDGES)):
+        way, old = crowd.sent(here, target, way_by(before, here, target) if present else ())
+        if best[here, target] == np.inf:
+            assert way == old
+            continue
+        assert (way[0], way[-1]) == (here, target)
+        assert takes(way, city) == pytest.approx(best[here, target])
+        leaves = max(place for place, edge in enumerate(way) if REGION[edge] == 0)
+        back += bool((REGION[way[:leaves]] != 0).any())
     assert back > 10
 
 
-def test_ways_home_are_the_fastest_up_to_a_limit(city):
-    first, second, turn, time = city
-    exact = least(city, np.full(EDGES, True))
-    moves = Moves(first, second, allowed=np.full(EDGES, True), reverse=True)
-    home = Trees(moves, time, turn)
-    for most, here, target in product((60.0, np.inf), range(EDGES), range(EDGES)):
-        cost, before = home.time(target, here, most)
-        if exact[here, target] > most:
-            assert cost == np.inf
-        elif np.isfinite(exact[here, target]):
-            way = home.back(before, target, here).tolist()
+@pytest.mark.usefixtures("kept")
+@pytest.mark.parametrize("ways_return", [False, True])
+def test_routes_home_are_the_fastest(city, ways_return):
+    """Inside the region of destination, or anywhere where routes may return."""
+    crowd = Crowd(city, ways_return=ways_return)
+    crowd.send_by(0)
+    found = 0
+    for region in range(4):
+        exact = least(city, np.full(EDGES, True) if ways_return else region == REGION)
+        there = np.flatnonzero(region == REGION).tolist()
+        for here, target in product(there, there):
+            way, old = crowd.sent(here, target)
+            if here == target or exact[here, target] == np.inf:
+                assert way == old
+                continue
+            found += 1
             assert (way[0], way[-1]) == (here, target)
-            assert cost == pytest.approx(exact[here, target]) == takes(way, city)
+            assert takes(way, city) == pytest.approx(exact[here, target])
+    assert found > 60
 
 
 DRIVER = Event(vehicle="driver", source=None, region=0, destination=2, edge="t")
@@ -200,50 +256,27 @@ def test_prices_lengthen_the_ways_through_a_region_and_go_when_none_are_commande
         assert "".join(routes["driver"]) == way
 
 
+@pytest.mark.usefixtures("kept")
 @pytest.mark.parametrize("ways_return", [False, True])
-def test_with_prices_no_way_is_a_long_detour_by_the_times_without(city, ways_return, monkeypatch):
-    monkeypatch.setattr(guidance, "SPREAD", 0.0)
-    first, second, _, time = city
-    free, names, even = (
-        (first, second, 0.0 * first, time),
-        [f"{n:02}" for n in range(EDGES)],
-        np.full((4,) * 3, 0.25),
-    )
-    inside, outside, best = (
-        least(free, allowed) for allowed in (REGION == 0, REGION != 0, REGION < 4)
-    )
+def test_with_prices_no_way_is_a_long_detour_by_the_times_without(city, ways_return):
+    first, second, *_ = city
+    free, before = (first, second, 0.0 * first, city[3]), hops(city)
+    inside, outside = least(free, REGION == 0), least(free, REGION != 0)
+    best = least(free, np.full(EDGES, True))
     if not ways_return:
         leave = (REGION[first] == 0) & (REGION[second] != 0)
         a, b = first[leave], second[leave]
-        best = np.min(inside[:, a, None] + time[b, None] + outside[b], axis=1)
-    _, before = dijkstra(
-        csr_array((np.ones(len(first)), (first, second)), shape=(EDGES,) * 2),
-        return_predecessors=True,
-    )
-    after = {name: [names[b] for b in second[first == n]] for n, name in enumerate(names)}
-    length = dict(zip(names, time, strict=True))
+        best = np.min(inside[:, a, None] + city[3][b, None] + outside[b], axis=1)
     longest = {}
     for most in (20.0, 60.0, 1e9):
-        routes, detours, random = {}, [], np.random.default_rng(0)
-        town = streets.city(dict(zip(names, REGION.tolist(), strict=True)), after, length=length)
-        chosen = {
-            "compliance": 1.0,
-            "most_detour": most,
-            "random": random,
-            "ways_return": ways_return,
-        }
-        guide = Guide(streets.session(routes), town, even, **chosen)
-        guide.command(even, None, np.array([0.0, 5.0, 5.0, 0.0]))
+        crowd, detours = Crowd(free, ways_return=ways_return, detour=most), []
+        even = np.full((4,) * 3, 1 / 3)
+        crowd.guide.command(even, None, np.array([0.0, 5.0, 5.0, 0.0]))
         for here, target in product(range(10), range(30, 39)):
-            way = [target]
-            while way[-1] != here and before[here, way[-1]] >= 0:
-                way.append(before[here, way[-1]])
-            if way[-1] == here and best[here, target] < np.inf:
-                routes["driver"] = tuple(names[n] for n in way[::-1])
-                guide.apply([DRIVER._replace(destination=3, edge=names[target])])
-                detours.append(
-                    time[[int(name) for name in routes["driver"][1:]]].sum() - best[here, target]
-                )
+            present = way_by(before, here, target)
+            if present and best[here, target] < np.inf:
+                way, _ = crowd.sent(here, target, present)
+                detours.append(takes(way, free) - best[here, target])
         longest[most] = max(detours)
         assert longest[most] <= most + 1e-6
     assert longest[1e9] > 60.0
@@ -271,7 +304,7 @@ def test_drivers_are_asked_again_where_they_are():
             assert guide.realised.sum() == guide.realised[0, 2, 2] == 1
         # Of the region that he was told before nothing is left, although a control interval has
         # passed.
-        assert guide._shares._given[0][2][2] == pytest.approx(1.0 if asked < 9 else 0.9)
+        assert guide._shares.counts.given[0, 2, 2] == pytest.approx(1.0 if asked < 9 else 0.9)
 
 
 def test_on_a_junction_it_is_too_late_and_who_arrived_is_not_asked():

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from cosim.plant.fastest import assigned, shifted
-from cosim.plant.routes import Choices
+from cosim.plant import fastest
+from cosim.plant.fastest import UNKNOWN
 from cosim.plant.shares import MEMORY, SHARE_PENALTY_S, Shares
 
 HALF = (0.5, 0.5)
@@ -23,7 +23,9 @@ HALF = (0.5, 0.5)
     ids=["as they are", "half of them", "all of them", "freed by how much theta raises"],
 )
 def test_theta_shifts_wishes(wish, own, theta, expected):
-    assert shifted(*map(np.array, (wish, own, theta))) == pytest.approx(np.array(expected))
+    assert fastest.shifted.py_func(*map(np.array, (wish, own, theta))) == pytest.approx(
+        np.array(expected)
+    )
 
 
 @pytest.mark.parametrize(
@@ -49,7 +51,7 @@ def test_theta_shifts_wishes(wish, own, theta, expected):
 )
 def test_the_cheapest_next_region_is_assigned(times, shares, given, expected):
     arrays = map(np.array, (times, shares, given))
-    assert assigned(*arrays, SHARE_PENALTY_S) == expected
+    assert fastest.assigned.py_func(*arrays, SHARE_PENALTY_S) == expected
 
 
 def splits_of(shares):
@@ -67,13 +69,15 @@ def shares_of(theta):
 
 
 def next_region(shares, *times, exists=(True, True), limit=math.inf):
-    choices = Choices(np.array(times), min(times), np.array(exists), route=lambda n: np.zeros(0))
-    return shares.next_region(0, np.array([1, 2]), 3, choices, limit)
+    neighbours = np.array([1, 2])
+    arrays = neighbours, np.array(times), np.array(exists)
+    return fastest.chosen(shares.counts, 0, 3, *arrays, limit)
 
 
 def test_a_region_without_a_route_leaves_its_share_to_others():
     assert next_region(shares_of((0.25, 0.75)), 100.0, math.inf, exists=(True, False)) == 0
-    assert next_region(shares_of(HALF), math.inf, math.inf, exists=(False, False)) is None
+    nowhere = next_region(shares_of(HALF), math.inf, math.inf, exists=(False, False))
+    assert nowhere == UNKNOWN
 
 
 def test_a_region_beyond_the_limit_gets_nobody_although_theta_says_so():
@@ -84,12 +88,12 @@ def test_a_region_beyond_the_limit_gets_nobody_although_theta_says_so():
 def test_a_driver_who_is_assigned_anew_counts_no_more_for_the_region_before():
     theta = (0.25, 0.75)
     shares = shares_of(theta)  # all wish to go by 1, half of them shall
-    shares.assign((0, 1, 3))
-    interval = shares.interval
+    visits = np.array([(0, 3, 0, 0, UNKNOWN, 0)], fastest.VISIT)
+    fastest.assign(shares.counts, visits, 0, 1)
     assert next_region(shares, 100.0, 101.0) == 1
     shares.command(splits_of(theta))
-    assert shares._given[0][3][1] == MEMORY
-    shares.withdraw((0, 1, 3), interval)
-    assert shares._given[0][3][1] == pytest.approx(0.0)
-    assert shares.realised.sum() == 0
+    assert shares.counts.given[0, 3, 1] == MEMORY
+    fastest.assign(shares.counts, visits, 0, 2)
+    assert shares.counts.given[0, 3].tolist() == pytest.approx([0.0, 0.0, 1.0, 0.0])
+    assert shares.counts.realised[0, :, 3].tolist() == [0, 0, 1, 0]
     assert next_region(shares, 100.0, 101.0) == 0

@@ -86,6 +86,7 @@ def simulate(
             planning=planning,
             observer=observer,
             gui=gui,
+            guides=strategy.guides,
         )
         stack.callback(plant.close)
         # Without a command, drivers do what the controller's model takes them to do.

@@ -89,6 +89,7 @@ class SumoPlant:
         gui: bool = False,
         planning: PlanningModel | None = None,
         observer: Observer | None = None,
+        guides: bool = False,
     ):
         """Build the network if need be.
 
@@ -97,11 +98,13 @@ class SumoPlant:
         gui: show the run in sumo-gui
         planning: model of the controller and the estimator, whose nominal split ratios stand for
             drivers without a command; that of the scenario if None
+        guides: get ready for commands to drivers at the reset, instead of at the first one
         Raises InputError for a city that does not fit the scenario's network or the settings.
         """
         self._scenario = scenario
         self._planning = planning or planning_model(scenario)
         self._observer = observer or Observer()
+        self._guides = guides
         settings = settings or settings_of(scenario)
         self._settings = settings
         check_lanes(scenario, settings)
@@ -156,8 +159,10 @@ class SumoPlant:
             )
         self._sampler = StreetSampler(session, city, known if estimated else None)
         self._streets: StreetMeans | None = None
-        self._guide: Guide | _Unguided = _Unguided(city.regions)
         self._seed = seed
+        self._guide: Guide | _Unguided = _Unguided(city.regions)
+        if self._guides:
+            self._guide = self._new_guide()
         flows = self._launch.turning_flows() if settings.signals_from_outside else None
         self.actuation = Actuation(
             session,

@@ -1,4 +1,4 @@
-"""Travel times of streets and junctions, and searches for fastest routes.
+"""Travel times of streets and junctions, and what searches need.
 
 A few vehicles are on one street at a time, so recent minutes count together, the newest most: on a
 street by the mean speed, over a junction by Little's law, vehicles on it over vehicles that get
@@ -7,18 +7,13 @@ interval counts half.
 """
 
 import math
-from collections.abc import Callable
-from functools import cache, cached_property
-from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components, dijkstra
+from jaxtyping import Float
 
 from cosim.plant import fastest
 from cosim.plant.sampling import STANDING_M_S, StreetMeans
-from cosim.sumo.arrays import EdgeMask, MoveEnds, PerEdge, PerGateway, PerMove
+from cosim.sumo.arrays import MoveEnds, PerEdge, PerMove
 from cosim.sumo.net import City
 from nmfd.arrays import PerRegion
 
@@ -27,20 +22,14 @@ WINDOW_S = 300.0  # after which an observation counts a third
 EMPTY_WEIGHT = 0.5  # of earlier observations after a control interval without vehicles
 PRIOR_VEH_S = 3.0  # at the speed limit, which count besides
 FAR_S = 1e9  # longer than any way
-MOST_NODES = 500_000  # of all searches to the same aims that are kept, of 4 bytes each
-PerNode = Float[np.ndarray, " nodes"]  # of a graph of moves
-Nodes = Int[np.ndarray, " nodes"]
-PerNeighbour = Float[np.ndarray, " N"]
-NeighbourMask = Bool[np.ndarray, " N"]
-PerKept = Float[np.ndarray, " kept"]  # moves of a graph
-GatewayNumbers = Int[np.ndarray, " G"]
-Route = Int[np.ndarray, " route"]  # edges
+LEAST_COST_S = 1e-3  # of a move, for searches
+MOST_TIMES = 1_000_000  # to gateways that are kept, of 8 bytes each
 
 
 class TravelTimes:
     """Travel times of one run.
 
-    first, second: numbers of the edges that each move joins (M,)
+    first, second: numbers of the edges that each move joins (M,); onward: the same as a graph
     free, free_turns: in free flow, along edges (s, (E,)) and of moves over junctions (s, (M,))
     edges, turns: the same at present
     """
@@ -48,11 +37,8 @@ class TravelTimes:
     def __init__(self, city: City, *, lanes: bool = True):
         """lanes: False in the mesoscopic model"""
         self._lanes = lanes
-        self.first, self.second = city.move_edges.T
-        self._order = np.lexsort((self.second, self.first))
-        edges = np.arange(len(city.edges) + 1)
-        self._begins = np.searchsorted(self.first[self._order], edges)
-        self._ends = self.second[self._order]
+        self.first, self.second = np.ascontiguousarray(city.move_edges.T, np.int64)
+        self.onward = _graph(self.first, self.second, len(city.edges))
         self._length = np.array([city.length[edge] for edge in city.edges])
         self._limit = np.array([city.speed[edge] for edge in city.edges])
         self.free = city.free_time
@@ -72,10 +58,6 @@ class TravelTimes:
         # The same on internal edges: time [veh s] and vehicles that got over them [veh].
         self._crossing = np.zeros(len(inside))
         self._crossed = np.zeros(len(inside))
-
-    def moves(self, route: Route) -> Route:
-        """Return the moves of a route, UNKNOWN where the city has none."""
-        return fastest.moves_of(route, self._begins, self._ends, self._order)
 
     def learn(self, seen: StreetMeans) -> None:
         """Update the times from the means of a control interval."""
@@ -116,327 +98,13 @@ class TravelTimes:
         self.turns = np.maximum(np.bincount(self._move, over, len(self.turns)), self.free_turns)
 
 
-class Moves:
-    """Moves between allowed edges as a graph whose nodes are these edges.
-
-    number, node: edge -> its node, -1 for edges that are not allowed, as an array (E,) and a list
-    edges: of each node (nodes,); begins, columns: of rows as in csr_array
-    """
-
-    def __init__(self, first: MoveEnds, second: MoveEnds, *, allowed: EdgeMask, reverse: bool):
-        """first, second: numbers of edges (M,)
-        allowed: edges that are nodes (E,)
-        reverse: moves lead from second to first
-        """
-        self.edges = np.flatnonzero(allowed)
-        self.number = np.full(len(allowed), -1)
-        self.number[self.edges] = np.arange(len(self.edges))
-        self.node = self.number.tolist()
-        rows = self.number[second if reverse else first]
-        columns = self.number[first if reverse else second]
-        kept = np.flatnonzero(allowed[first] & allowed[second])
-        kept = kept[np.lexsort((columns[kept], rows[kept]))]
-        nodes = np.arange(len(self.edges) + 1)
-        self._kept = kept
-        self._second = second[kept]
-        self.columns = columns[kept].astype(np.int32)
-        self.begins = np.searchsorted(rows[kept], nodes).astype(np.int32)
-
-    def costs(self, time: PerEdge, turns: PerMove, ahead: PerNode | None = None) -> PerKept:
-        """Return times of moves, and of the edges that they lead to (s).
-
-        time: of edges (s, (E,)); turns: of moves (s, (M,))
-        ahead: lower bound of the time from each node to the nearest aim (s, (nodes,)), for an A*
-            search: edge costs are reduced by the drop in this bound. Distances returned are
-            therefore cost + ahead - ahead[start], and detours come last.
-        """
-        cost = np.maximum(time[self._second] + turns[self._kept], 1e-3)
-        if ahead is not None:
-            cost += ahead[self.columns] - np.repeat(ahead, np.diff(self.begins))
-        return cost
-
-    def leading_to(self, nodes: GatewayNumbers) -> Bool[np.ndarray, "nodes G"]:
-        """Return which nodes lead to each of `nodes` (bool, (all nodes, G))."""
-        moves = self._graph(np.ones(len(self.columns)))
-        # Nodes that lead to each other are reached from the same ones: in most cities nearly all.
-        _, part = connected_components(moves, connection="strong")
-        _, once, which = np.unique(part[nodes], return_index=True, return_inverse=True)
-        steps = dijkstra(moves.T.tocsr(), indices=nodes[once], unweighted=True)
-        return np.isfinite(steps).T[:, which]
-
-    def ahead(self, nodes: GatewayNumbers, time: PerEdge, turns: PerMove) -> PerNode:
-        """Return a lower bound of the time to the nearest of `nodes` (s).
-
-        It is FAR_S for nodes that lead to none.
-
-        time: of edges (s, (E,)); turns: of moves (s, (M,))
-        """
-        moves = self._graph(self.costs(time, turns))
-        least = dijkstra(moves.T.tocsr(), indices=nodes, min_only=True)
-        # Just below the least time, because no move may cost nothing.
-        return np.where(np.isfinite(least), (1.0 - 1e-6) * least, FAR_S)
-
-    def _graph(self, cost: PerKept) -> csr_array:
-        """Return the moves as a graph with these costs."""
-        return csr_array((cost, self.columns, self.begins), shape=(len(self.edges),) * 2)
-
-
-class Tree(NamedTuple):
-    """One search.
-
-    most: its limit (s), infinite if all aims were reached
-    times: to each aim and beyond (s), infinite above the limit; nearest: the least of them
-    before: predecessors (nodes,)
-    """
-
-    most: float
-    times: PerGateway
-    nearest: float
-    before: Nodes
-
-
-class Trees:
-    """Fastest routes by `moves` from single edges to some aims.
-
-    They are searched on demand and no further than needed.
-
-    node: edge -> its node, as in `Moves`
-    """
-
-    def __init__(
-        self,
-        moves: Moves,
-        time: PerEdge,
-        turns: PerMove,
-        ahead: PerNode | None = None,
-        *,
-        aims: Nodes | tuple[()] = (),
-        beyond: PerGateway | float = 0.0,
-    ):
-        """time: of edges (s, (E,)); turns: of moves (s, (M,))
-        ahead: see `Moves.costs` (s, (nodes,))
-        aims: nodes (G,); beyond: time from each aim on (s, (G,))
-        """
-        self.node = moves.node
-        self._moves = moves
-        self._costs = moves.costs(time, turns, ahead)
-        self._searches: dict[int, Tree] = {}
-        self._ahead = ahead
-        self._aims = np.array(aims, dtype=int)
-        self._beyond = beyond
-
-    def tree(self, begin: int, most: float) -> Tree:
-        """Return the search from edge `begin`, at least up to `most` (s)."""
-        node = self.node[begin]
-        tree = self._searches.get(node)
-        if tree is None or tree.most < most:
-            if len(self._searches) * len(self._moves.edges) > MOST_NODES:
-                self._searches.clear()
-            tree = self._search(node, most)
-            self._searches[node] = tree
-        return tree
-
-    def time(self, begin: int, end: int, most: float) -> tuple[float, Nodes]:
-        """Return the time from edge `begin` to `end` (s), and predecessors.
-
-        The time is infinite above `most`. Aims and `ahead` do not count.
-        """
-        aims = np.array([self.node[end]])
-        times, before, _ = self._found(self.node[begin], most, aims)
-        return float(times[0]), before
-
-    def back(self, before: Nodes, begin: int, end: int) -> Route:
-        """Return the edges from `end` back to `begin`, by predecessors."""
-        return fastest.path(before, self._moves.edges, self.node[end], self.node[begin])
-
-    def _search(self, node: int, most: float) -> Tree:
-        """Return a new search from a node up to `most` (s)."""
-        times, before, complete = self._found(node, most, self._aims)
-        if self._ahead is not None:
-            times += self._ahead[node]
-        times += self._beyond
-        nearest = float(times.min(initial=math.inf))
-        return Tree(math.inf if complete else most, times, nearest, before)
-
-    def _found(self, node: int, most: float, aims: Nodes) -> tuple[PerGateway, Nodes, bool]:
-        """Return times, predecessors and completeness of `fastest.search`."""
-        moves = self._moves
-        return fastest.search(moves.begins, moves.columns, self._costs, node, most, aims)
-
-
-class Choices(NamedTuple):
-    """The fastest routes of a driver by each next region.
-
-    times: (s, (N,)), infinite if too long; fastest: the least of them
-    exist: True if there is a route, however long (N,)
-    route: returns the edges of the n-th
-    """
-
-    times: PerNeighbour
-    fastest: float
-    exist: NeighbourMask
-    route: Callable[[int], Route]
-
-
-class Exits:
-    """Gateways out of one region, with the moves that lead there and on.
-
-    Gateway g leads from edge first[g] to second[g]. Gateways from begins[n] up to begins[n + 1]
-    lead into region neighbours[n].
-
-    first, second, move: edges of each gateway, and move from one to the other (G,)
-    inside: moves in the region; outside: reversed moves elsewhere
-    first_nodes, second_nodes: nodes of first[g] in `inside`, and of second[g] in `outside` (G,)
-    """
-
-    def __init__(self, gateways: Int[np.ndarray, "G 4"], *, inside: Moves, outside: Moves):
-        """gateways: first, second, move and next region, which rises"""
-        self.first, self.second, self.move, next_region = gateways.T.copy()
-        self.neighbours, begins = np.unique(next_region, return_index=True)
-        self.begins = np.append(begins, len(next_region))
-        self.inside = inside
-        self.outside = outside
-        self.first_nodes = inside.number[self.first]
-        self.second_nodes = outside.number[self.second]
-
-    @cached_property
-    def leading(self) -> Bool[np.ndarray, "nodes G"]:
-        """Return to which gateways each edge inside leads."""
-        return self.inside.leading_to(self.first_nodes)
-
-    @cached_property
-    def reached(self) -> Bool[np.ndarray, "nodes G"]:
-        """Return from which gateways each edge outside is reached."""
-        return self.outside.leading_to(self.second_nodes)
-
-
-class Returning(NamedTuple):
-    """Fastest routes by all moves, for those that come back into a region.
-
-    trees: to first[g]
-    entering: time from the end of first[g] to that of second[g] (s, (G,))
-    back: no more than the time from behind the nearest gateway back to first[g] (s, (G,))
-    """
-
-    trees: Trees
-    entering: PerGateway
-    back: PerGateway
-
-
-class _Way(NamedTuple):
-    """A fastest route of a driver as far as its last gateway.
-
-    time: of the whole route (s); before: predecessors in `trees` (nodes,)
-    """
-
-    time: float
-    gateway: int
-    trees: Trees
-    before: Nodes
-
-
-class Ways:
-    """Fastest routes out of one region by each of its G gateways.
-
-    Searches start where drivers are and where they go, on demand and no further than needed. A
-    route that comes back into the region before it leaves for good has the same end, from the last
-    gateway on.
-    """
-
-    def __init__(
-        self,
-        exits: Exits,
-        *,
-        there: Trees,
-        onward: Trees,
-        ahead: PerNode,
-        everywhere: Returning | None = None,
-    ):
-        """there: routes by moves `inside` to first[g], and on to second[g]
-        onward: routes by reversed moves `outside` to second[g], with `ahead`
-        ahead: time from the nearest second[g] to nodes of `outside`, not above their times (s)
-        everywhere: for routes that come back; None if none may
-        """
-        self.exits = exits
-        self._there = there
-        self._onward = onward
-        self._ahead = ahead.tolist()
-        self._everywhere = everywhere
-        # Least time from a gateway back to one and over it (s).
-        self._back_soonest = math.inf
-        if everywhere:
-            around = everywhere.back + everywhere.entering
-            self._back_soonest = float(around.min(initial=math.inf))
-
-    def choices(self, here: int, target: int, longest: float, detour: float) -> Choices:
-        """Return the fastest routes from `here` to `target` by each next region.
-
-        longest: no less than the fastest of all takes (s), infinite if unknown
-        detour: beyond this, routes that take longer are left out (s)
-        """
-        exits = self.exits
-        ahead = self._ahead[self._onward.node[target]]
-        most = detour + longest
-        there = self._there.tree(here, max(most - ahead, 0.0))
-        left = 0.0
-        if there.nearest < math.inf:
-            left = max(most - min(there.nearest, most) - ahead, 0.0)
-        onward = self._onward.tree(target, left)
-        times, gateways, exist, soonest = fastest.by_region(
-            there.times,
-            onward.times,
-            exits.begins,
-            exits.leading[self._there.node[here]],
-            exits.reached[self._onward.node[target]],
-        )
-        back = self._returning(here, there, onward, min(soonest, longest), ahead)
-        by_return = None
-        if back is not None and back.time < soonest:
-            by_return = int(np.searchsorted(exits.begins, back.gateway, side="right")) - 1
-            soonest = back.time
-            times[by_return] = soonest
-            exist[by_return] = True
-
-        def route(n: int) -> Route:
-            way = _Way(times[n], gateways[n], self._there, there.before)
-            if back is not None and n == by_return:
-                way = back
-            inside = way.trees.back(way.before, here, exits.first[way.gateway])
-            outside = self._onward.back(onward.before, target, exits.second[way.gateway])
-            return np.concatenate((inside[::-1], outside))
-
-        return Choices(times, soonest, exist, route)
-
-    def _returning(
-        self, here: int, there: Tree, onward: Tree, most: float, ahead: float
-    ) -> _Way | None:
-        """Return the fastest route that comes back; None if it is too long.
-
-        most: time that it has to be below (s)
-        ahead: least time from the nearest second[g] on (s)
-        """
-        everywhere = self._everywhere
-        # It has left, and come back, which alone takes too long for most drivers.
-        if everywhere is None or there.nearest + self._back_soonest + ahead >= most:
-            return None
-        ends, nearest = fastest.ends_of_returns(
-            there.nearest, everywhere.back, everywhere.entering, onward.times, most
-        )
-        if nearest == math.inf:
-            return None
-        tree = everywhere.trees.tree(here, most - nearest)
-        times = tree.times + ends
-        gateway = int(times.argmin())
-        return _Way(float(times[gateway]), gateway, everywhere.trees, tree.before)
-
-
-class RegionRoutes:
-    """Routes within and out of every region, as drivers see them.
+class Searches:
+    """Searches for fastest routes as drivers see them (cosim.plant.fastest).
 
     Classes of drivers see different travel times. Prices lengthen the times through all regions but
-    `free` ones. Searches are kept for one control interval.
+    that of the destination. Searches are kept for one control interval.
 
-    regions: all regions
+    scene: of the present control interval
     """
 
     def __init__(
@@ -445,126 +113,152 @@ class RegionRoutes:
         times: TravelTimes,
         taste: Float[np.ndarray, "classes E"],
         *,
+        most_detour: float,
         ways_return: bool,
         lanes: bool,
     ):
         """taste: factors of the times that every class sees (-, (classes, E))
+        most_detour: that a next region, or a price, may cost a driver (s)
         ways_return: routes may leave a region and come back; lanes: False in the mesoscopic model
         """
-        self.regions = tuple(range(city.regions))
-        self._edge_region = city.edge_region
         self._times = times
         self._taste = taste
-        self._lanes = lanes
-        ends = (times.first, times.second)
-        self._homeward = []
-        self._exits = []
-        for region in self.regions:
-            here = city.edge_region == region
-            self._homeward.append(Moves(*ends, allowed=here, reverse=True))
-            inside = Moves(*ends, allowed=here, reverse=False)
-            outside = Moves(*ends, allowed=~here, reverse=True)
-            rows = []
-            for gateway in city.gateways:
-                if gateway.source == region:
-                    pair = [city.number[gateway.from_edge], city.number[gateway.to_edge]]
-                    (move,) = times.moves(np.array(pair))
-                    rows.append((*pair, move, gateway.target))
-            gateways = np.array(rows, dtype=int).reshape(-1, 4)
-            self._exits.append(Exits(gateways, inside=inside, outside=outside))
-        self._everywhere = None
-        if ways_return:
-            everywhere = np.full(len(city.edges), True)
-            self._everywhere = Moves(*ends, allowed=everywhere, reverse=False)
-            back = Moves(*ends, allowed=everywhere, reverse=True)
-            self._homeward = [back] * city.regions
-        self._ahead = cache(self._ahead_of)
-        # Results of one control interval.
-        self.seen = cache(self._seen_by)
-        self.home = cache(self._home)
-        self.ways = cache(self._ways)
+        self._regions = city.regions
+        edges = len(city.edges)
+        region = city.edge_region.astype(np.int64)
+        inside = region == np.arange(city.regions)[:, None]
+        number = {move: n for n, move in enumerate(city.moves)}
+        rows = []
+        for gateway in city.gateways:
+            move = gateway.from_edge, gateway.to_edge
+            pair = [city.number[edge] for edge in move]
+            rows.append((gateway.source, gateway.target, *pair, number[move]))
+        gateways = np.array(sorted(rows, key=lambda row: row[:2]), np.int64).reshape(-1, 5)
+        source, _, before, behind, over = np.ascontiguousarray(gateways.T)
+        boundaries, first = np.unique(gateways[:, :2], axis=0, return_index=True)
+        all_regions = np.arange(city.regions + 1)
+        self._streets = fastest.Streets(
+            region=region,
+            onward=times.onward,
+            backward=_graph(times.second, times.first, edges),
+            allowed=np.concatenate([inside, ~inside, np.full((1, edges), True)]),
+            free=times.free,
+            free_turns=times.free_turns,
+            gates=np.searchsorted(source, all_regions),
+            boundaries=np.searchsorted(boundaries[:, 0], all_regions),
+            boundary_gates=np.append(first, len(source)),
+            neighbours=np.ascontiguousarray(boundaries[:, 1]),
+            before=before,
+            behind=behind,
+            over=over,
+            leading=np.full((len(source), edges), False),
+            reached=np.full((len(source), edges), False),
+            ahead=np.zeros((city.regions + 1, len(taste), edges)),
+            back=np.zeros((len(source), len(taste))),
+            most_detour=float(most_detour),
+            ways_return=ways_return,
+            lanes=lanes,
+        )
+        self._work = _work(self._streets, len(taste))
+        self._look_ahead()
         self.command(None)
+
+    def _look_ahead(self) -> None:
+        """Note what does not change: which gateways lead where, and least times."""
+        streets = self._streets
+        classes = range(len(self._taste))
+        free = self._seen(streets.free * self._taste, streets.free_turns)
+        scene = fastest.scene_of(fastest.Parts(streets, free, self._work))
+        for region in range(self._regions):
+            inside = streets.allowed[region]
+            outside = streets.allowed[self._regions + region]
+            gates = range(streets.gates[region], streets.gates[region + 1])
+            for gate in gates:
+                before = streets.before[gate]
+                streets.leading[gate] = fastest.connected(streets.backward, before, inside)
+                behind = streets.behind[gate]
+                streets.reached[gate] = fastest.connected(streets.onward, behind, outside)
+            begins = streets.behind[gates.start : gates.stop]
+            ends = streets.before[gates.start : gates.stop]
+            for number in classes:
+                ahead = _just_below(fastest.least_times(scene, number, begins, outside))
+                streets.ahead[region, number] = ahead
+                if streets.ways_return:
+                    least = fastest.least_times(scene, number, begins, streets.allowed[-1])
+                    streets.back[gates.start : gates.stop, number] = _just_below(least)[ends]
 
     def command(self, prices: PerRegion | None) -> None:
         """Begin a control interval with new travel times.
 
         prices: of the regions (-, (R,)); None: no prices
         """
-        self._prices = np.zeros(len(self.regions)) if prices is None else prices
-        self._free = []
-        for destination in self.regions:
-            free = [r for r in self.regions if r == destination or not self._prices[r]]
-            self._free.append(tuple(free))
-        self.seen.cache_clear()
-        self.home.cache_clear()
-        self.ways.cache_clear()
+        times = self._times
+        classes = np.arange(len(self._taste))
+        first_views = {(0.0,) * self._regions: 0}  # prices -> first view
+        views = np.empty((len(classes), self._regions), np.int64)
+        for destination in range(self._regions):
+            told = np.zeros(self._regions) if prices is None else prices.astype(float)
+            told[destination] = 0.0
+            first = first_views.setdefault(tuple(told.tolist()), len(first_views) * len(classes))
+            views[:, destination] = first + classes
+        factors = 1.0 + np.array(list(first_views))[:, self._streets.region]
+        edges = (times.edges * factors)[:, None] * self._taste
+        edges = edges.reshape(-1, len(times.edges))
+        if len(edges) != self._work.rows.shape[1]:
+            self._work = _work(self._streets, len(edges))
+        fastest.forget(self._work)
+        seen = self._seen(edges, times.turns)._replace(views=views)
+        self.scene = fastest.scene_of(fastest.Parts(self._streets, seen, self._work))
 
-    def free(self, destination: int) -> tuple[int, ...]:
-        """Return the regions without a price for drivers to `destination`."""
-        return self._free[destination]
-
-    def _seen_by(self, driver_class: int, free: tuple[int, ...]) -> PerEdge:
-        """Return the times of edges that a class of drivers sees (s, (E,))."""
-        prices = self._prices.copy()
-        prices[list(free)] = 0.0
-        return self._times.edges * (1.0 + prices)[self._edge_region] * self._taste[driver_class]
-
-    def _home(self, region: int, driver_class: int, free: tuple[int, ...]) -> Trees:
-        """Return routes to edges of a region.
-
-        They stay inside it, unless routes may return.
-        """
-        return self._trees(self._homeward[region], driver_class, free)
-
-    def _ways(self, region: int, driver_class: int, free: tuple[int, ...]) -> Ways:
-        """Return routes out of a region to edges of others."""
-        exits = self._exits[region]
-        second = self.seen(driver_class, free)[exits.second]
-        over = self._times.turns[exits.move] + second
-        ahead = self._ahead(exits.outside, region, driver_class)
-        everywhere = None
-        if self._everywhere:
-            nodes = self._everywhere.number[exits.first]
-            trees = self._trees(self._everywhere, driver_class, free, aims=nodes)
-            back = self._ahead(self._homeward[region], region, driver_class)[exits.first]
-            everywhere = Returning(trees, over, back)
-        there = self._trees(
-            exits.inside,
-            driver_class,
-            free,
-            aims=exits.first_nodes,
-            beyond=over if self._lanes else second,
-        )
-        onward = self._trees(
-            exits.outside, driver_class, free, ahead=ahead, aims=exits.second_nodes
-        )
-        return Ways(
-            exits,
-            there=there,
-            onward=onward,
-            ahead=ahead,
-            everywhere=everywhere,
+    def _seen(self, edges: PerEdge, turns: PerMove) -> fastest.Seen:
+        """Return times of edges (s, (V, E)) and moves (s, (M,)) for searches."""
+        streets = self._streets
+        costs = np.maximum(np.take(edges, self._times.second, axis=1) + turns, LEAST_COST_S)
+        return fastest.Seen(
+            edges=edges,
+            turns=turns,
+            onward=np.take(costs, streets.onward.moves, axis=1),
+            backward=np.take(costs, streets.backward.moves, axis=1),
+            views=np.zeros((0, 0), np.int64),
         )
 
-    def _trees(
-        self,
-        moves: Moves,
-        driver_class: int,
-        free: tuple[int, ...],
-        **others: Any,
-    ) -> Trees:
-        """Return routes at the times that a class of drivers sees.
 
-        others: arguments of `Trees`
-        """
-        seen = self.seen(driver_class, free)
-        return Trees(moves, seen, self._times.turns, **others)
+def _graph(first: MoveEnds, second: MoveEnds, edges: int) -> fastest.Graph:
+    """Return the moves from edges `first` to `second` (M,), by `first`.
 
-    def _ahead_of(self, back: Moves, region: int, driver_class: int) -> np.ndarray:
-        """Return the time from behind the nearest gateway (s, (nodes,)).
+    edges: number of all
+    """
+    order = np.lexsort((second, first))
+    begins = np.searchsorted(first[order], np.arange(edges + 1))
+    ends = second[order].astype(np.int32)
+    return fastest.Graph(begins.astype(np.int32), ends, order)
 
-        It is the time in free flow. back: reversed moves
-        """
-        nodes = back.number[self._exits[region].second]
-        free = self._times.free * self._taste[driver_class]
-        return back.ahead(nodes, free, self._times.free_turns)
+
+def _just_below(least: PerEdge) -> PerEdge:
+    """Return least times (s, (E,)), FAR_S without a route.
+
+    They are just below them, because no move may cost nothing.
+    """
+    return np.where(np.isfinite(least), (1.0 - 1e-6) * least, FAR_S)
+
+
+def _work(streets: fastest.Streets, views: int) -> fastest.Work:
+    """Return room for the searches in so many views."""
+    edges = len(streets.region)
+    regions = len(streets.gates) - 1
+    gates = int(np.diff(streets.gates).max(initial=1))
+    rows = max(MOST_TIMES // gates, fastest.ROWS_OF_A_DRIVER)
+    looks = edges + len(streets.onward.ends) + 1
+    return fastest.Work(
+        rows=np.full((3, views, regions, edges), fastest.UNKNOWN, np.int32),
+        limits=np.empty(rows),
+        complete=np.empty(rows, bool),
+        to_gates=np.empty((rows, gates)),
+        used=np.zeros(1, np.int64),
+        latest=np.full(3, fastest.UNKNOWN),
+        times=np.empty(edges),
+        wanted=np.full(edges, False),
+        before=np.empty((7, edges), np.int64),
+        heap_times=np.empty(looks),
+        heap_edges=np.empty(looks, np.int64),
+    )

@@ -155,9 +155,8 @@ class StreetSampler:
 
         A large city has more edges than vehicles, so most of its edges are empty.
         """
-        vehicles = self._session.running()
-        if 2 * len(vehicles) > len(self._city.edges):
+        if 2 * self._session.running_count() > len(self._city.edges):
             return list(range(len(self._city.edges))), list(self._inside)
-        roads = set(map(self._session.road, vehicles))  # some may be closed to cars
+        roads = set(map(self._session.road, self._session.running()))  # some may be closed to cars
         streets = [self._city.number[road] for road in roads & self._city.number.keys()]
         return streets, sorted(roads & self._inside.keys())

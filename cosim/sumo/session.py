@@ -153,9 +153,10 @@ class Session:
         self.arrived = _compiled(simulation.getArrivedIDList)
         self.started_teleport = _compiled(simulation.getStartingTeleportIDList)
         self.ended_teleport = _compiled(simulation.getEndingTeleportIDList)
-        # Vehicles now: on the road, without teleporting ones; all that are loaded and have not
-        # arrived; due to depart.
+        # Vehicles now: on the road, without teleporting ones, and their number; all that are loaded
+        # and have not arrived; due to depart.
         self.running = _compiled(vehicle.getIDList)
+        self.running_count = _compiled(vehicle.getIDCount)
         self.known = _compiled(vehicle.getLoadedIDList)
         self.pending = _compiled(simulation.getPendingVehicles)
         # One vehicle: edge, normal or internal; route; place on it; speed (m/s); time since it
