@@ -79,6 +79,9 @@ def simulate(
         trip_file = stack.enter_context(atomic(job.trip_file)) if job.trip_file else None
         chosen = strategy.settings(scenario)
         planning = strategy.planning(scenario)
+        guides: bool | None = strategy.guides or chosen.guided
+        if not guides and strategy.own:
+            guides = None  # a controller of the user's own may command drivers at any time
         plant = SumoPlant(
             scenario,
             settings=chosen,
@@ -86,7 +89,7 @@ def simulate(
             planning=planning,
             observer=observer,
             gui=gui,
-            guides=strategy.guides,
+            guides=guides,
         )
         stack.callback(plant.close)
         # Without a command, drivers do what the controller's model takes them to do.

@@ -29,9 +29,10 @@ LEAST_SHARE = 1e-3  # a region with a smaller share gets no drivers
 # share of its time.
 SWITCHING_THRESHOLD = 0.6
 MESO_THRESHOLD = 0.3  # in the mesoscopic model: less than this share of the other's own time
-INSIDE = 0  # a kind of search, by the region: from where the driver is to its gateways
-OUTSIDE = 1  # from the target back to behind the gateways
-EVERYWHERE = 2  # from where he is to the gateways by any edges, for routes that come back
+# Kinds of searches: from where the driver is to the gateways of his region; from the target back to
+# behind them; from where he is to them by any edges, for routes that come back. As Python's
+# integers they would be compiled one by one.
+INSIDE, OUTSIDE, EVERYWHERE = np.arange(3)
 ROWS_OF_A_DRIVER = 6  # searches that he needs at most
 VISIT = np.dtype(
     [
@@ -715,10 +716,18 @@ def shifted(wish: np.ndarray, own: np.ndarray, theta: np.ndarray) -> np.ndarray:
     A next region that theta lowers loses the same part of its wishes. The regions that theta raises
     get these in proportion to how much it raises them.
     """
-    kept = np.where(theta < own, wish * (theta / own), wish)
-    raised = np.maximum(theta - own, 0.0)
-    freed = wish.sum() - kept.sum()
-    return kept + freed * raised / max(raised.sum(), 1e-12)
+    shares = wish.copy()
+    raised = 0.0
+    for n in range(len(wish)):
+        if theta[n] < own[n]:
+            shares[n] *= theta[n] / own[n]
+        else:
+            raised += theta[n] - own[n]
+    freed = wish.sum() - shares.sum()
+    for n in range(len(wish)):
+        if theta[n] > own[n]:
+            shares[n] += freed * (theta[n] - own[n]) / max(raised, 1e-12)
+    return shares
 
 
 @inner
@@ -729,11 +738,15 @@ def assigned(times: np.ndarray, shares: np.ndarray, given: np.ndarray, penalty: 
     given: vehicles assigned before (veh, (N,))
     penalty: per vehicle that a region is behind its share (s)
     """
-    allowed = (shares > LEAST_SHARE) & (times < math.inf)
-    if not allowed.any():  # every region with a share is too long a detour
-        allowed = times <= times.min()
-    behind = shares * (given.sum() + 1.0) - given
-    return np.where(allowed, times - penalty * behind, math.inf).argmin()
+    most = given.sum() + 1.0
+    best = times.argmin()  # if every region with a share is too long a detour
+    least = math.inf
+    for n in range(len(times)):
+        cost = times[n] - penalty * (shares[n] * most - given[n])
+        if shares[n] > LEAST_SHARE and cost < least:
+            best = n
+            least = cost
+    return best
 
 
 @compiled
@@ -753,14 +766,15 @@ def chosen(
     times: by each of them (s, (N,)); exist: there is a route (bool, (N,))
     limit: time beyond which a route is too long (s)
     """
-    within = np.where(times <= limit, times, math.inf)
+    within = times.copy()
+    within[times > limit] = math.inf
     wished = counts.wished[region, destination]
     wished[neighbours[within.argmin()]] += 1.0
     wish = wished[neighbours]
     own = counts.own[region, destination][neighbours]
     theta = counts.theta[region, destination][neighbours]
     shares = shifted(wish / wish.sum(), own, theta)
-    shares = np.where(exist, shares, 0.0)
+    shares[~exist] = 0.0
     total = shares.sum()
     if total <= 0.0:
         return UNKNOWN

@@ -89,7 +89,7 @@ class SumoPlant:
         gui: bool = False,
         planning: PlanningModel | None = None,
         observer: Observer | None = None,
-        guides: bool = False,
+        guides: bool | None = None,
     ):
         """Build the network if need be.
 
@@ -98,7 +98,8 @@ class SumoPlant:
         gui: show the run in sumo-gui
         planning: model of the controller and the estimator, whose nominal split ratios stand for
             drivers without a command; that of the scenario if None
-        guides: get ready for commands to drivers at the reset, instead of at the first one
+        guides: True: get ready for commands to drivers at the reset, instead of at the first one;
+            False: there are none, and times over junctions are not measured
         Raises InputError for a city that does not fit the scenario's network or the settings.
         """
         self._scenario = scenario
@@ -157,7 +158,9 @@ class SumoPlant:
             self._estimation = Estimation(
                 session, city, self._layout, meter, self._instruments, self._planning
             )
-        self._sampler = StreetSampler(session, city, known if estimated else None)
+        self._sampler = StreetSampler(
+            session, city, known if estimated else None, turns=self._guides is not False
+        )
         self._streets: StreetMeans | None = None
         self._seed = seed
         self._guide: Guide | _Unguided = _Unguided(city.regions)

@@ -27,7 +27,7 @@ class StreetMeans:
     accumulation: (R,) [veh]; production: (R,) [veh m/s]
     queue, queue_max: (G,) [veh] halting on the edge before a gateway, mean and largest
     crossing: (I,) [veh] on the internal edges of `City.inside`; crossed: (I,) [veh/s] that passed
-        them
+        them; both 0 if turns are not sampled
     """
 
     duration: float
@@ -50,10 +50,19 @@ class StreetSampler:
     longest_queue: (E,) [veh] halting, the most in all samples so far
     """
 
-    def __init__(self, session: Session, city: City, probes: frozenset[str] | None = None):
+    def __init__(
+        self,
+        session: Session,
+        city: City,
+        probes: frozenset[str] | None = None,
+        *,
+        turns: bool = True,
+    ):
+        """turns: vehicles on junctions are sampled, too"""
         self._session = session
         self._city = city
         self._probes = probes
+        self._turns = turns
         self._inside = {edge: n for n, edge in enumerate(city.inside)}
         # Gateways may share the edge before them.
         self._upstream = sorted({gateway.from_edge for gateway in city.gateways})
@@ -94,7 +103,8 @@ class StreetSampler:
         if self._probes is None:
             self._timed = self._timed + counts
             self._routed = self._routed + counts * routing
-            self._sample_turns(crossed)
+            if self._turns:
+                self._sample_turns(crossed)
         else:
             self._sample_probes(self._probes)
         self._queues.append([session.halting(edge) for edge in self._upstream])
