@@ -36,9 +36,9 @@ PICTURE = Path(__file__).with_name("house.svg")
 # together, plans of routes, MFDs of edgeData and trips from counts 6,000, chance, vehicles and a
 # fit in the plant of streets 4,000, its recordings for a GPU 700, and its steps with derivatives in
 # machine code 13,000, loading by more policies and thresholds of each region 350, guidance in
-# machine code 1,650, training from a policy 150, shares by period 200: names and steps were not
+# machine code 1,750, training from a policy 150, shares by period 200: names and steps were not
 # cut.
-TOKENS = 266_650
+TOKENS = 266_750
 TEST_TOKENS = 174_600
 TOKENS_PER_LINE = 9.5
 DECISIONS_IN_EXPRESSIONS = 0.65

@@ -136,8 +136,9 @@ class Work(NamedTuple):
         (3, V, R, E)
     limits: longest time searched (s, (rows,)); complete: all gateways were reached (rows,)
     to_gates: times by gateway (s, (rows, most G))
-    used: number of rows in use (1,)
-    latest: rows whose predecessors are the first in `before`, UNKNOWN without one (3,)
+    numbers: of the search in each row (rows,); latest: of those whose predecessors are in
+        `before` (6,)
+    used: number of rows in use, and of searches so far (2,)
     times, wanted: of edges; before: edges before each in seven searches (7, E)
     heap_times, heap_edges: what a search has to look at next (M + E,)
     """
@@ -146,8 +147,9 @@ class Work(NamedTuple):
     limits: np.ndarray
     complete: np.ndarray
     to_gates: np.ndarray
-    used: np.ndarray
+    numbers: np.ndarray
     latest: np.ndarray
+    used: np.ndarray
     times: np.ndarray
     wanted: np.ndarray
     before: np.ndarray
@@ -377,8 +379,11 @@ def _run(scene: Scene, trip: Trip, kind: int, most: float, before: np.ndarray) -
 
 
 @inner
-def _row(scene: Scene, trip: Trip, kind: int, most: float) -> int:
-    """Return the row of a search for a trip, at least up to `most` (s)."""
+def _row(scene: Scene, trip: Trip, kind: int, most: float, first: int) -> int:
+    """Return the row of a search for a trip, at least up to `most` (s).
+
+    first: row of work.before for predecessors of the first kind
+    """
     streets = scene.streets
     work = scene.work
     start = trip.here
@@ -393,12 +398,14 @@ def _row(scene: Scene, trip: Trip, kind: int, most: float) -> int:
         row = work.used[0]
         work.used[0] += 1
         work.rows[kind, trip.sight, trip.region, start] = row
-    work.latest[kind] = row
+    work.used[1] += 1
+    work.numbers[row] = work.used[1]
+    work.latest[first + kind] = work.used[1]
     work.limits[row] = most
-    work.complete[row] = _run(scene, trip, kind, most, work.before[kind])
-    first = streets.gates[trip.region]
-    for gate in range(first, streets.gates[trip.region + 1]):
-        work.to_gates[row, gate - first] = work.times[ends[gate]]
+    work.complete[row] = _run(scene, trip, kind, most, work.before[first + kind])
+    gates = range(streets.gates[trip.region], streets.gates[trip.region + 1])
+    for gate in gates:
+        work.to_gates[row, gate - gates.start] = work.times[ends[gate]]
     return row
 
 
@@ -434,9 +441,10 @@ def _onward(scene: Scene, trip: Trip, row: int, gate: int) -> float:
 
 
 @inner
-def choices(scene: Scene, trip: Trip, longest: float) -> Choices:
+def choices(scene: Scene, trip: Trip, longest: float, first: int) -> Choices:
     """Return the fastest routes of a trip by each next region.
 
+    first: see `_row`
     longest: no less than the fastest of all takes (s), infinite if unknown. Beyond it and
     `most_detour`, routes are left out
     """
@@ -444,24 +452,24 @@ def choices(scene: Scene, trip: Trip, longest: float) -> Choices:
     region = trip.region
     ahead = streets.ahead[region, trip.driver_class, trip.target]
     most = streets.most_detour + longest
-    inside = _row(scene, trip, INSIDE, max(most - ahead, 0.0))
+    inside = _row(scene, trip, INSIDE, max(most - ahead, 0.0), first)
     nearest = math.inf
     for gate in range(streets.gates[region], streets.gates[region + 1]):
         nearest = min(nearest, _out(scene, trip, inside, gate))
     left = 0.0
     if nearest < math.inf:
         left = max(most - min(nearest, most) - ahead, 0.0)
-    outside = _row(scene, trip, OUTSIDE, left)
-    first = streets.boundaries[region]
-    count = streets.boundaries[region + 1] - first
+    outside = _row(scene, trip, OUTSIDE, left, first)
+    boundaries = range(streets.boundaries[region], streets.boundaries[region + 1])
+    count = len(boundaries)
     times = np.full(count, math.inf)
     gates = np.zeros(count, np.int64)
     exist = np.full(count, False)
     soonest = math.inf
     for n in range(count):
-        begin = streets.boundary_gates[first + n]
-        gates[n] = begin
-        for gate in range(begin, streets.boundary_gates[first + n + 1]):
+        boundary = boundaries.start + n
+        gates[n] = streets.boundary_gates[boundary]
+        for gate in range(gates[n], streets.boundary_gates[boundary + 1]):
             exist[n] |= streets.leading[gate, trip.here] and streets.reached[gate, trip.target]
             time = _out(scene, trip, inside, gate) + _onward(scene, trip, outside, gate)
             if time < times[n]:
@@ -471,11 +479,11 @@ def choices(scene: Scene, trip: Trip, longest: float) -> Choices:
     rows = np.array([inside, outside, UNKNOWN])
     returns = UNKNOWN
     if streets.ways_return:
-        gate, time = _returning(scene, trip, rows, nearest, min(soonest, longest))
+        gate, time = _returning(scene, trip, rows, nearest, min(soonest, longest), first)
         if time < soonest:
             soonest = time
             for n in range(count):
-                if gate >= streets.boundary_gates[first + n]:
+                if gate >= streets.boundary_gates[boundaries.start + n]:
                     returns = n
             times[returns] = time
             gates[returns] = gate
@@ -485,13 +493,14 @@ def choices(scene: Scene, trip: Trip, longest: float) -> Choices:
 
 @inner
 def _returning(
-    scene: Scene, trip: Trip, rows: np.ndarray, nearest: float, most: float
+    scene: Scene, trip: Trip, rows: np.ndarray, nearest: float, most: float, first: int
 ) -> tuple[int, float]:
     """Return the fastest route that comes back into the region.
 
     Returns its last gateway and its time (s). The time is infinite if it is not below `most` (s).
 
-    rows: of searches of each kind (3,); nearest: time over the nearest gateway (s)
+    rows: of searches of each kind (3,); first: see `_row`
+    nearest: time over the nearest gateway (s)
     """
     streets = scene.streets
     gates = range(streets.gates[trip.region], streets.gates[trip.region + 1])
@@ -510,7 +519,7 @@ def _returning(
     # It has left, and come back, which alone takes too long for most drivers.
     if nearest + around + ahead >= most or end == math.inf:
         return best, least
-    rows[EVERYWHERE] = _row(scene, trip, EVERYWHERE, most - end)
+    rows[EVERYWHERE] = _row(scene, trip, EVERYWHERE, most - end, first)
     there = scene.work.to_gates[rows[EVERYWHERE]]
     for gate in gates:
         on = _over(scene, trip.sight, gate) + _onward(scene, trip, rows[OUTSIDE], gate)
@@ -525,7 +534,6 @@ def _returning(
 def forget(work: Work) -> None:
     """Forget all searches."""
     work.rows[:] = UNKNOWN
-    work.latest[:] = UNKNOWN
     work.used[0] = 0
 
 
@@ -539,11 +547,9 @@ def _search_again(scene: Scene, found: Choices, first: int) -> None:
     work = scene.work
     for kind in range(len(found.rows)):
         row = found.rows[kind]
-        if row == UNKNOWN or (first == 0 and work.latest[kind] == row):
-            continue
-        if first == 0:
-            work.latest[kind] = row
-        _run(scene, found.trip, kind, work.limits[row], work.before[first + kind])
+        if row != UNKNOWN and work.latest[first + kind] != work.numbers[row]:
+            work.latest[first + kind] = work.numbers[row]
+            _run(scene, found.trip, kind, work.limits[row], work.before[first + kind])
 
 
 @inner
@@ -575,23 +581,22 @@ def _route(scene: Scene, found: Choices, n: int, first: int) -> np.ndarray:
 
 
 @inner
-def homeward(
-    scene: Scene, region: int, view: int, here: int, target: int, most: float
-) -> tuple[float, np.ndarray]:
+def homeward(scene: Scene, trip: Trip, most: float) -> tuple[float, np.ndarray]:
     """Return time (s) and edges of the fastest route in one region.
 
     It stays inside the region, unless routes may return. The time is infinite above `most`.
     """
     streets = scene.streets
-    allowed = streets.allowed[-1 if streets.ways_return else region]
-    field = Field(streets.backward, scene.seen.backward[view], allowed, streets.ahead[-1, 0])
+    costs = scene.seen.backward[trip.sight]
+    allowed = streets.allowed[-1 if streets.ways_return else trip.region]
+    field = Field(streets.backward, costs, allowed, streets.ahead[-1, 0])
     work = scene.work
     before = work.before[-1]
-    _search(work, field, np.array([target]), np.array([here]), most, before)
-    time = work.times[here]
+    _search(work, field, np.array([trip.target]), np.array([trip.here]), most, before)
+    time = work.times[trip.here]
     if time == math.inf:
         return time, np.zeros(0, np.int64)
-    return time, _path(before, here, target)
+    return time, _path(before, trip.here, trip.target)
 
 
 @inner
@@ -650,14 +655,14 @@ def _leaves_once(route: np.ndarray, region: np.ndarray) -> bool:
 
 
 @inner
-def present_route(scene: Scene, view: int, here: int, route: np.ndarray, known: bool) -> Present:
-    """Return the present route of a driver on edge `here`.
+def present_route(scene: Scene, trip: Trip, route: np.ndarray, known: bool) -> Present:
+    """Return the present route of a driver.
 
     route: the rest of it; known: it is open to cars
     """
-    if not known or route[0] != here:
+    if not known or route[0] != trip.here:
         return Present(known, math.inf, math.inf, math.inf)
-    time, free, found = times_of(scene, view, route)
+    time, free, found = times_of(scene, trip.sight, route)
     longest = math.inf
     if found and (scene.streets.ways_return or _leaves_once(route, scene.streets.region)):
         longest = time + 1.0
@@ -825,11 +830,14 @@ def next_change(
         driver = drivers[n]
         visit = visits[driver.slot]
         edges = routes[driver.begin : driver.end]
+        view = scene.seen.views[visit.driver_class, visit.destination]
+        trip = Trip(visit.region, visit.driver_class, view, driver.here, visit.target)
+        present = present_route(scene, trip, edges, driver.known)
         if visit.region == visit.destination:
             following = UNKNOWN
-            route = _plan_home(scene, visit, driver.here, edges, driver.known)
+            route = _plan_home(scene, trip, edges, present)
         else:
-            following, route = _plan_on(scene, counts, visit, driver.here, edges, driver.known)
+            following, route = _plan_on(scene, counts, trip, visit.destination, edges, present)
         if len(route):
             return n, following, route
         if following != UNKNOWN:
@@ -838,26 +846,26 @@ def next_change(
 
 
 @inner
-def _plan_home(
-    scene: Scene, visit: np.ndarray, here: int, edges: np.ndarray, known: bool
-) -> np.ndarray:
+def _unpriced(trip: Trip) -> Trip:
+    """Return the trip of a driver who does not see prices."""
+    return Trip(trip.region, trip.driver_class, trip.driver_class, trip.here, trip.target)
+
+
+@inner
+def _plan_home(scene: Scene, trip: Trip, edges: np.ndarray, present: Present) -> np.ndarray:
     """Return the fastest route inside the region of destination.
 
     If routes may return, it is the fastest of all. There are no edges if the present one is kept.
     """
     streets = scene.streets
-    plain = visit.driver_class
-    view = scene.seen.views[plain, visit.destination]
-    present = present_route(scene, view, here, edges, known)
-    if here == visit.target:
+    if trip.here == trip.target:
         return np.zeros(0, np.int64)
-    longest = worth(streets, present) + 1.0
-    time, route = homeward(scene, visit.region, view, here, visit.target, longest)
+    time, route = homeward(scene, trip, worth(streets, present) + 1.0)
     if time == math.inf or keeps(streets, present, edges, time, UNKNOWN):
         return np.zeros(0, np.int64)
-    if view != plain:  # prices may have made the route a long detour
-        takes = _time_of(scene, plain, route)
-        time, shortest = homeward(scene, visit.region, plain, here, visit.target, takes)
+    if trip.sight != trip.driver_class:  # prices may have made the route a long detour
+        takes = _time_of(scene, trip.driver_class, route)
+        time, shortest = homeward(scene, _unpriced(trip), takes)
         if time < takes - streets.most_detour:
             return shortest
     return route
@@ -867,30 +875,29 @@ def _plan_home(
 def _plan_on(
     scene: Scene,
     counts: Counts,
-    visit: np.ndarray,
-    here: int,
+    trip: Trip,
+    destination: int,
     edges: np.ndarray,
-    known: bool,
+    present: Present,
 ) -> tuple[int, np.ndarray]:
     """Return the next region of a driver, and the fastest route by it.
 
     There are no edges if the present route is kept, and the region is UNKNOWN if nothing changes.
+
+    destination: region; edges: of the present route
     """
     streets = scene.streets
-    plain = visit.driver_class
-    region = visit.region
-    view = scene.seen.views[plain, visit.destination]
-    present = present_route(scene, view, here, edges, known)
-    trip = Trip(region, plain, view, here, visit.target)
-    found = choices(scene, trip, present.longest)
+    region = trip.region
+    plain = trip.driver_class
+    found = choices(scene, trip, present.longest, 0)
     nothing = np.zeros(0, np.int64)
     if found.fastest == math.inf:
         return UNKNOWN, nothing
     first = streets.boundaries[region]
     neighbours = streets.neighbours[first : streets.boundaries[region + 1]]
-    if view == plain:
+    if trip.sight == plain:
         limit = found.fastest + streets.most_detour
-        n = chosen(counts, region, visit.destination, neighbours, found.times, found.exist, limit)
+        n = chosen(counts, region, destination, neighbours, found.times, found.exist, limit)
         if n == UNKNOWN:
             return UNKNOWN, nothing
         following = neighbours[n]
@@ -899,9 +906,9 @@ def _plan_on(
         _search_again(scene, found, 0)
         return following, _route(scene, found, n, 0)
     # The driver sees prices. By the times without them, no route is a long detour.
-    unpriced = present_route(scene, plain, here, edges, known)
-    trip = Trip(region, plain, plain, here, visit.target)
-    shortest = choices(scene, trip, unpriced.longest)
+    blind = _unpriced(trip)
+    unpriced = present_route(scene, blind, edges, present.known)
+    shortest = choices(scene, blind, unpriced.longest, 3)
     limit = shortest.fastest + streets.most_detour
     _search_again(scene, found, 0)
     _search_again(scene, shortest, 3)
@@ -909,9 +916,9 @@ def _plan_on(
     for n in range(len(neighbours)):
         way = _shortened(scene, found, shortest, n, limit)
         if len(way):
-            times[n] = _time_of(scene, view, way)
+            times[n] = _time_of(scene, trip.sight, way)
     exist = found.exist | shortest.exist
-    n = chosen(counts, region, visit.destination, neighbours, times, exist, math.inf)
+    n = chosen(counts, region, destination, neighbours, times, exist, math.inf)
     if n == UNKNOWN:
         return UNKNOWN, nothing
     following = neighbours[n]

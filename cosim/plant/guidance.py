@@ -14,7 +14,7 @@ where boundaries are ragged). Its next region is the one it enters on its last e
 
 import math
 from collections import defaultdict
-from collections.abc import Container, Sequence
+from collections.abc import Container, Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -97,10 +97,13 @@ class _Visits:
         if visit is not None:
             self._free.append(visit.slot)
 
-    def again(self, visit: _Visit, steps: int) -> None:
-        """Let a driver be guided again after so many simulation steps; 0: never."""
+    def again(self, visits: Iterable[_Visit], steps: int) -> None:
+        """Let drivers be guided again after so many simulation steps.
+
+        steps: 0: never
+        """
         if steps:
-            self._due[self._step + steps].append(visit)
+            self._due[self._step + steps] += visits
 
     def due(self) -> list[_Visit]:
         """Return the drivers to guide again in this step."""
@@ -220,43 +223,53 @@ class Guide:
         If a vehicle is on a junction, has left the region, or can no longer change lanes, try again
         after a few steps.
         """
-        again = []  # who is guided again, after how many steps
+        soon = []
         ready = []
+        present = self._visits.present
         number = self._city.number
         road = self._session.road
-        soon = min(self._period, 1)
         for visit in visits:
-            vehicle = visit.vehicle
-            if self._visits.present.get(vehicle) is not visit:
+            if present.get(visit.vehicle) is not visit:
                 continue  # the vehicle has left the region, or arrived
             try:
-                here = number.get(road(vehicle))
+                here = number.get(road(visit.vehicle))
             except REFUSALS:  # the vehicle was removed, or arrived at once
-                self._visits.end(vehicle)
+                self._visits.end(visit.vehicle)
                 continue
             if here is None or self._region[here] != visit.region:
-                again.append((visit, soon))
-                continue
-            again.append((visit, self._period))
-            way_out = []
-            if self._lanes:
-                way_out = self._lanes.way_out(vehicle, visit.edge)
-            if way_out:
-                self.led_on += self._session.set_route(vehicle, way_out)
+                soon.append(visit)
             else:
                 ready.append((visit, here))
-        late = self._plan(ready)
-        for visit, steps in again:
-            self._visits.again(visit, self._retry if visit.slot in late else steps)
+        late = self._plan(self._led(ready))
+        in_time = [visit for visit, _ in ready if visit not in late]
+        self._visits.again(soon, min(self._period, 1))
+        self._visits.again(in_time, self._period)
+        self._visits.again(late, self._retry)
 
-    def _plan(self, ready: Sequence[tuple[_Visit, int]]) -> set[int]:
-        """Give drivers their routes.
-
-        Returns slots of those who cannot change lanes any more.
+    def _led(self, ready: list[tuple[_Visit, int]]) -> list[tuple[_Visit, int]]:
+        """Lead on drivers at the end of a wrong lane; return the others.
 
         ready: drivers, and numbers of their present edges
         """
-        late: set[int] = set()
+        if self._lanes is None:
+            return ready
+        others = []
+        for visit, here in ready:
+            way_out = self._lanes.way_out(visit.vehicle, visit.edge)
+            if way_out:
+                self.led_on += self._session.set_route(visit.vehicle, way_out)
+            else:
+                others.append((visit, here))
+        return others
+
+    def _plan(self, ready: Sequence[tuple[_Visit, int]]) -> list[_Visit]:
+        """Give drivers their routes.
+
+        Returns those who cannot change lanes any more.
+
+        ready: as in `_led`
+        """
+        late: list[_Visit] = []
         if not ready:
             return late
         rows = []
@@ -284,7 +297,7 @@ class Guide:
             visit, _ = ready[n]
             edges = [self._city.edges[edge] for edge in route.tolist()]
             if self._lanes and self._lanes.too_late(visit.vehicle, edges):
-                late.add(visit.slot)
+                late.append(visit)
             # If SUMO refuses the route, nothing changes.
             elif self._session.set_route(visit.vehicle, edges) and following != UNKNOWN:
                 fastest.assign(counts, visits, visit.slot, following)
