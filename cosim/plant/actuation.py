@@ -96,6 +96,7 @@ class Actuation:
         )
         self._supervisor = Supervisor(network, step) if settings.chain_limit > 0 else None
         self.states: dict[str, list[tuple[float, str]]] = {name: [] for name in session.signals()}
+        self._shown = [""] * len(self.states)
 
     def command(self, perimeter: PerPair, vehicles: PerEdge) -> None:
         """Set u (R, R) [-] of the control interval that begins.
@@ -149,14 +150,16 @@ class Actuation:
 
         waits: is told of every change
         """
-        state_of = self._session.signal_state
         now = self._session.time
-        for signal, states in self.states.items():
-            state = state_of(signal)
-            if not states or state != states[-1][1]:
-                states.append((now, state))
+        shown = list(map(self._session.signal_state, self.states))
+        if shown == self._shown:
+            return
+        for signal, before, state in zip(self.states, self._shown, shown, strict=True):
+            if state != before:
+                self.states[signal].append((now, state))
                 if waits is not None:
                     waits.changed(signal, state, now)
+        self._shown = shown
 
     def green_time(self) -> tuple[PerGateway, PerGateway]:
         """Return two (G,) [s], means of links; NaN where no command arrives.

@@ -1,9 +1,10 @@
 """Fastest routes, and what drivers make of them, in machine code.
 
-Guidance asks for a route per driver and minute. Each answer takes a few microseconds here, and some
-tens by calls from Python. Edges, moves, regions and gateways are numbers; UNKNOWN is an edge closed
-to cars, or a move that the city does not have. All is in one file, because machine code that was
-kept is made again when its own file has changed, not when others have.
+Guidance asks for a route per driver and minute. Each answer takes ten to thirty microseconds here,
+most of them for memory that SUMO has used in between. Edges, moves, regions and gateways are
+numbers; UNKNOWN is an edge closed to cars, or a move that the city does not have. All is in one
+file, because machine code that was kept is made again when its own file has changed, not when
+others have.
 
 A driver in region i bound for edge d takes the fastest route inside i to a gateway, and from there
 to d without coming back to i. Searches start where he is and where he goes, and reach no further
@@ -83,7 +84,7 @@ class Streets(NamedTuple):
     leading: edges inside the region that lead to each gateway (bool, (G, E))
     reached: edges outside that each gateway leads to (bool, (G, E))
     ahead: no more than the time that a class of drivers takes from the nearest gateway out of a
-        region to each edge outside (s, (R, classes, E))
+        region to each edge outside (s, (R + 1, classes, E)); the last is 0
     back: the same to the edge before each gateway, by all edges (s, (G, classes))
     most_detour: that a next region, or a price, may cost a driver (s)
     ways_return: routes may come back into a region; lanes: False in the mesoscopic model
