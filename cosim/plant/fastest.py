@@ -6,10 +6,8 @@ numbers; UNKNOWN is an edge closed to cars, or a move that the city does not hav
 file, because machine code that was kept is made again when its own file has changed, not when
 others have.
 
-A driver in region i bound for edge d takes the fastest route inside i to a gateway, and from there
-to d without coming back to i. Searches start where he is and where he goes, and reach no further
-than needed. With `ways_return`, a route may come back into i before it leaves for good, and has the
-same end, from the last gateway on.
+Searches start where drivers are and where they go, and reach no further than needed. A route that
+comes back into its region has the same end as others, from its last gateway on.
 
 Drivers keep their route unless the gain is large: every reroute invalidates the travel times used
 for others.
@@ -30,11 +28,11 @@ LEAST_SHARE = 1e-3  # a region with a smaller share gets no drivers
 # share of its time.
 SWITCHING_THRESHOLD = 0.6
 MESO_THRESHOLD = 0.3  # in the mesoscopic model: less than this share of the other's own time
-# Kinds of searches: from where the driver is to the gateways of his region; from the target back to
-# behind them; from where he is to them by any edges, for routes that come back. As Python's
-# integers they would be compiled one by one.
+# Kinds of searches: from the driver to the gateways of the region; from the target back to behind
+# them; from the driver to them by any edges, for routes that come back. As Python's integers they
+# would be compiled one by one.
 INSIDE, OUTSIDE, EVERYWHERE = np.arange(3)
-ROWS_OF_A_DRIVER = 6  # searches that he needs at most
+ROWS_OF_A_DRIVER = 6  # the most searches for one driver
 VISIT = np.dtype(
     [
         ("region", np.int64),
@@ -360,22 +358,27 @@ def _search(
 
 
 @inner
+def _ends(streets: Streets, trip: Trip, kind: int) -> tuple[int, np.ndarray]:
+    """Return the start and the aims of a search."""
+    gates = slice(streets.gates[trip.region], streets.gates[trip.region + 1])
+    if kind == OUTSIDE:
+        return trip.target, streets.behind[gates]
+    return trip.here, streets.before[gates]
+
+
+@inner
 def _run(scene: Scene, trip: Trip, kind: int, most: float, before: np.ndarray) -> bool:
     """Search routes of a kind for a trip up to `most` (s)."""
     streets = scene.streets
     costs = scene.seen.onward[trip.sight]
     allowed = streets.allowed[-1 if kind == EVERYWHERE else trip.region]
     field = Field(streets.onward, costs, allowed, streets.ahead[-1, 0])
-    start = trip.here
-    ends = streets.before
     if kind == OUTSIDE:
         costs = scene.seen.backward[trip.sight]
         allowed = streets.allowed[len(streets.gates) - 1 + trip.region]
         ahead = streets.ahead[trip.region, trip.driver_class]
         field = Field(streets.backward, costs, allowed, ahead)
-        start = trip.target
-        ends = streets.behind
-    aims = ends[streets.gates[trip.region] : streets.gates[trip.region + 1]]
+    start, aims = _ends(streets, trip, kind)
     return _search(scene.work, field, np.array([start]), aims, most, before)
 
 
@@ -385,13 +388,8 @@ def _row(scene: Scene, trip: Trip, kind: int, most: float, first: int) -> int:
 
     first: row of work.before for predecessors of the first kind
     """
-    streets = scene.streets
     work = scene.work
-    start = trip.here
-    ends = streets.before
-    if kind == OUTSIDE:
-        start = trip.target
-        ends = streets.behind
+    start, aims = _ends(scene.streets, trip, kind)
     row = work.rows[kind, trip.sight, trip.region, start]
     if row != UNKNOWN and (work.complete[row] or work.limits[row] >= most):
         return row
@@ -404,9 +402,8 @@ def _row(scene: Scene, trip: Trip, kind: int, most: float, first: int) -> int:
     work.latest[first + kind] = work.used[1]
     work.limits[row] = most
     work.complete[row] = _run(scene, trip, kind, most, work.before[first + kind])
-    gates = range(streets.gates[trip.region], streets.gates[trip.region + 1])
-    for gate in gates:
-        work.to_gates[row, gate - gates.start] = work.times[ends[gate]]
+    for n, aim in enumerate(aims):
+        work.to_gates[row, n] = work.times[aim]
     return row
 
 
@@ -818,8 +815,8 @@ def next_change(
 ) -> tuple[int, int, np.ndarray]:
     """Guide drivers from number `begin` on, until one gets another route.
 
-    Returns his number, the next region that the route counts for, and its edges. The number is n,
-    and there are no edges, if nobody gets one. The next region is UNKNOWN in the region of
+    Returns the driver's number, the next region that the route counts for, and its edges. If nobody
+    gets one, the number is n and there are no edges. The next region is UNKNOWN in the region of
     destination.
 
     visits: of all drivers (VISIT, (slots,)); drivers: those to guide (DRIVER, (n,))

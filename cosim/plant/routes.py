@@ -9,7 +9,7 @@ interval counts half.
 import math
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from cosim.plant import fastest
 from cosim.plant.sampling import STANDING_M_S, StreetMeans
@@ -24,6 +24,8 @@ PRIOR_VEH_S = 3.0  # at the speed limit, which count besides
 FAR_S = 1e9  # longer than any way
 LEAST_COST_S = 1e-3  # of a move, for searches
 MOST_TIMES = 1_000_000  # to gateways that are kept, of 8 bytes each
+PerView = Float[np.ndarray, "V E"]
+Views = Int[np.ndarray, "classes R"]
 
 
 class TravelTimes:
@@ -167,7 +169,8 @@ class Searches:
         """Note what does not change: which gateways lead where, and least times."""
         streets = self._streets
         classes = range(len(self._taste))
-        free = self._seen(streets.free * self._taste, streets.free_turns)
+        no_views = np.zeros((0, 0), np.int64)
+        free = self._seen(streets.free * self._taste, streets.free_turns, no_views)
         scene = fastest.scene_of(fastest.Parts(streets, free, self._work))
         for region in range(self._regions):
             inside = streets.allowed[region]
@@ -207,11 +210,14 @@ class Searches:
         if len(edges) != self._work.rows.shape[1]:
             self._work = _work(self._streets, len(edges))
         fastest.forget(self._work)
-        seen = self._seen(edges, times.turns)._replace(views=views)
+        seen = self._seen(edges, times.turns, views)
         self.scene = fastest.scene_of(fastest.Parts(self._streets, seen, self._work))
 
-    def _seen(self, edges: PerEdge, turns: PerMove) -> fastest.Seen:
-        """Return times of edges (s, (V, E)) and moves (s, (M,)) for searches."""
+    def _seen(self, edges: PerView, turns: PerMove, views: Views) -> fastest.Seen:
+        """Return the travel times that searches need.
+
+        Arguments and result: as in `fastest.Seen`
+        """
         streets = self._streets
         costs = np.maximum(np.take(edges, self._times.second, axis=1) + turns, LEAST_COST_S)
         return fastest.Seen(
@@ -219,7 +225,7 @@ class Searches:
             turns=turns,
             onward=np.take(costs, streets.onward.moves, axis=1),
             backward=np.take(costs, streets.backward.moves, axis=1),
-            views=np.zeros((0, 0), np.int64),
+            views=views,
         )
 
 
