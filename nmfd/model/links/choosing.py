@@ -110,32 +110,38 @@ def _wanted(
 
 
 @compiled
-def show(signals: Choosing, programme: Lights, stages: Stages, lights: Lights) -> None:
-    """Set the lights of a step (signals.Lights), and the stages after it.
+def show(signals: Choosing, stages: Stages, lights: Lights) -> None:
+    """Set the lights of K steps, and the stages after them.
 
-    programme: lights of the signals that keep their programmes (signals.Lights)
+    lights: signals.Lights (K, B, M) of the programmes, which some signals keep
     """
     zero = signals.zero
-    one = signals.one
     dt = signals.dt
-    for b in range(len(stages.stage)):
-        for m in range(len(signals.signal)):
-            lights.light[b, m] = programme.light[0, m]
-            lights.yields[b, m] = programme.yields[0, m]
-            if signals.chooses[m]:
-                s = signals.signal[m]
-                stage = stages.stage[b, s]
-                earlier = stages.before[b, s]
-                after = signals.light[m, stage]
-                before = signals.light[m, earlier]
-                # Those who gave way wait on the junction, and go while it clears.
-                kept = max(min(after, before), before * signals.yields[m, earlier])
-                waits = min(stages.clearing[b, s] / dt, one)
-                lights.light[b, m] = waits * kept + (one - waits) * after
-                lights.yields[b, m] = (one - waits) * signals.yields[m, stage]
-        for s in range(len(signals.count)):
-            stages.green[b, s] += max(dt - stages.clearing[b, s], zero)
-            stages.clearing[b, s] = max(stages.clearing[b, s] - dt, zero)
-            for n in range(signals.light.shape[1]):
-                stages.red[b, s, n] += dt
-            stages.red[b, s, stages.stage[b, s]] = zero
+    for k in range(len(lights.light)):
+        for b in range(len(stages.stage)):
+            _show(signals, stages, lights.light[k, b], lights.yields[k, b], b)
+            for s in range(len(signals.count)):
+                stages.green[b, s] += max(dt - stages.clearing[b, s], zero)
+                stages.clearing[b, s] = max(stages.clearing[b, s] - dt, zero)
+                for n in range(signals.light.shape[1]):
+                    stages.red[b, s, n] += dt
+                stages.red[b, s, stages.stage[b, s]] = zero
+
+
+@inner
+def _show(signals: Choosing, stages: Stages, light: np.ndarray, yields: np.ndarray, b: int) -> None:
+    """Set the lights (M,) and duties to give way (M,) of rollout b in a step."""
+    one = signals.one
+    for m in range(len(signals.signal)):
+        if not signals.chooses[m]:
+            continue
+        s = signals.signal[m]
+        stage = stages.stage[b, s]
+        earlier = stages.before[b, s]
+        after = signals.light[m, stage]
+        before = signals.light[m, earlier]
+        # Those who gave way wait on the junction, and go while it clears.
+        kept = max(min(after, before), before * signals.yields[m, earlier])
+        waits = min(stages.clearing[b, s] / signals.dt, one)
+        light[m] = waits * kept + (one - waits) * after
+        yields[m] = (one - waits) * signals.yields[m, stage]

@@ -43,6 +43,7 @@ class City(NamedTuple):
     """Places and numbers of a city, as Flows, Gates and LinkModel name them.
 
     movement, link, whole, taken, cycle: of each gate (G,)
+    cells: in the order of their entries (C,); first_cell: of each entry among these (E + 1,)
     extended: gates are those of actuated signals; chain_limit: as of nmfd.model.links.model.Choices
     gap, smoothing, dt, epsilon, least, zero, one: numbers in the precision of the counts
     """
@@ -50,6 +51,8 @@ class City(NamedTuple):
     link_of_entry: Any
     region_of_entry: Any
     entry_of_cell: Any
+    cells: Any
+    first_cell: Any
     onward: Any
     turn_of_cell: Any
     movement_of_turn: Any
@@ -99,6 +102,8 @@ class Given(NamedTuple):
 
     due: trips of a step, by entry (veh, (B, E))
     cells, goes_on, at_end: as of flows.Ways
+    chosen: 1 for the cells that the next vehicles take, else 0, which machine code sets (B, C);
+        `cells` if streams divide
     low, high, draws: as of chance.Choice; no rows if streams divide
     metering: (veh/s, (B, R)); gates: share of each gate (-, (B, G)); no rows without commands
     light, yields: as of signals.Lights in each step (K, B, M)
@@ -109,6 +114,7 @@ class Given(NamedTuple):
     cells: Any
     goes_on: Any
     at_end: Any
+    chosen: Any
     low: Any
     high: Any
     draws: Any
@@ -122,7 +128,7 @@ class Given(NamedTuple):
 class Counts(NamedTuple):
     """Counts before each step, and after the last one (rows, B, any number).
 
-    With two rows, steps take them in turn.
+    With one row, steps change it.
 
     asked, used: as of interval.LinkState; others: as of flows.Traffic
     """
@@ -172,12 +178,10 @@ class _Work(NamedTuple):
 
     Names are those of the reference.
 
-    number: of the draw of the next vehicle of each entry
     left: share of a gate's green before it is limited to what there is
     free: room on each link before it is limited
     """
 
-    trips: Any
     held: Any
     begin: Any
     waits: Any
@@ -188,9 +192,6 @@ class _Work(NamedTuple):
     opened: Any
     arrived: Any
     up: Any
-    number: Any
-    draw: Any
-    cells: Any
     first: Any
     by_turn: Any
     stood: Any
@@ -230,7 +231,6 @@ def _work_of(city: City, given: Given) -> _Work:
     links = len(city.storage)
     gates = len(city.whole)
     return _Work(
-        trips=np.empty(entries, kind),
         held=np.empty(entries, kind),
         begin=np.empty(entries, kind),
         waits=np.empty(given.metering.shape[1], kind),
@@ -241,9 +241,6 @@ def _work_of(city: City, given: Given) -> _Work:
         opened=np.empty(gates, kind),
         arrived=np.empty(entries, kind),
         up=np.empty(entries, kind),
-        number=np.empty(entries, np.int32),
-        draw=np.empty(entries, np.float32),
-        cells=np.empty(cells, kind),
         first=np.empty(cells, kind),
         by_turn=np.empty(turns, kind),
         stood=np.empty(turns, kind),
@@ -291,15 +288,50 @@ def advance(
 ) -> None:
     """Advance all rollouts from step `begin` of the interval to step `end`."""
     work = _work_of(city, given)
+    work.entered[:] = city.zero
+    work.started[:] = city.zero
     for b in range(len(given.due)):
-        work.number[:] = -1
+        if begin == 0:
+            _choose(city, given, counts, b)
         for k in range(begin, end):
             now = k % len(counts.queue)
-            _flow(city, given, counts, histories, b, now, k, work)
+            sums.begun[b] += _flow(city, given, counts, histories, b, now, k, work)
             _leave(city, counts, b, k, work)
             _count_links(city, counts, histories, given, sums, b, k, work)
             _count_entries(city, counts, histories, given, sums, b, k, work)
             _count_gates(city, counts, given, sums, b, k, work)
+
+
+@inner
+def _choose(city: City, given: Given, counts: Counts, b: int) -> None:
+    """Set which cells the next vehicles of rollout b take."""
+    if len(given.draws) > 0:
+        for e in range(len(city.link_of_entry)):
+            _take(city, given, b, e, counts.moved[0, b, e])
+
+
+@inner
+def _choose_again(city: City, given: Given, counts: Counts, b: int, before: int, now: int) -> None:
+    """Set it where they are others than those of row `before`."""
+    if len(given.draws) > 0:
+        for e in range(len(city.link_of_entry)):
+            moved = counts.moved[now, b, e]
+            if int(moved) != int(counts.moved[before, b, e]):
+                _take(city, given, b, e, moved)
+
+
+@inner
+def _take(city: City, given: Given, b: int, e: int, moved: float) -> None:
+    """Set which cells the next vehicle of entry e takes.
+
+    moved: vehicles that moved up so far
+    """
+    last = given.draws.shape[1] - 1  # all bits are 1
+    draw = given.draws[b, int(moved) & last, e]
+    for n in range(city.first_cell[e], city.first_cell[e + 1]):
+        c = city.cells[n]
+        taken = given.low[b, c] <= draw < given.high[b, c]
+        given.chosen[b, c] = city.one if taken else city.zero
 
 
 @inner
@@ -312,45 +344,54 @@ def _flow(
     now: int,
     k: int,
     work: _Work,
-) -> None:
+) -> float:
     """Compute which vehicles of rollout b move in step k.
 
     now: row of the counts before the step
+    Return the trips that begin.
     """
-    _begin(city, given, counts, b, now, k, work)
+    begun = _begin(city, given, counts, b, now, k, work)
     _gate(city, given, counts, b, now, k, work)
     _arrive(city, given, counts, histories, b, now, k, work)
     _move_up(city, given, counts, histories, b, now, k, work)
     _see_green(city, given, counts, b, now, k, work)
     _receive(city, given, counts, histories, b, now, k, work)
+    return begun
 
 
 @inner
-def _begin(city: City, given: Given, counts: Counts, b: int, now: int, k: int, work: _Work) -> None:
+def _begin(
+    city: City, given: Given, counts: Counts, b: int, now: int, k: int, work: _Work
+) -> float:
     """Trips that may begin."""
     one = city.one
+    then = (k + 1) % len(counts.queue)
     by_chance = len(given.draws) > 0
     metered = len(given.metering) > 0
+    begun = 0.0
     work.waits[:] = city.zero
-    for e in range(len(work.held)):
+    for e in range(len(work.begin)):
         trips = given.due[b, e]
+        asked = counts.asked[now, b, e]
         if by_chance:
-            start = counts.asked[now, b, e] + given.draws[b, 0, e]
-            trips = np.floor(start + given.due[b, e]) - np.floor(start)
-        held = counts.held[now, b, e] + trips
-        work.trips[e] = trips
-        work.held[e] = held
+            start = asked + given.draws[b, 0, e]
+            trips = np.floor(start + trips) - np.floor(start)
+        counts.asked[then, b, e] = asked + given.due[b, e]
+        begun += trips
         # Without metering, trips that were held begin in the first step.
-        work.begin[e] = held if k == 0 else trips
+        if metered or k == 0:
+            trips += counts.held[now, b, e]
+        work.begin[e] = trips
         if metered:
-            work.waits[city.region_of_entry[e]] += held
-    if not metered:
-        return
-    for r in range(len(work.rate)):
-        limit = given.metering[b, r] * city.dt
-        work.rate[r] = min(limit / max(work.waits[r], city.least), one)
-    for e in range(len(work.held)):
-        work.begin[e] = work.held[e] * work.rate[city.region_of_entry[e]]
+            work.held[e] = trips
+            work.waits[city.region_of_entry[e]] += trips
+    if metered:
+        for r in range(len(work.rate)):
+            limit = given.metering[b, r] * city.dt
+            work.rate[r] = min(limit / max(work.waits[r], city.least), one)
+        for e in range(len(work.begin)):
+            work.begin[e] = work.held[e] * work.rate[city.region_of_entry[e]]
+    return begun
 
 
 @inner
@@ -392,8 +433,6 @@ def _arrive(
     work: _Work,
 ) -> None:
     """Vehicles that arrive at the queue."""
-    by_chance = len(given.draws) > 0
-    last = given.draws.shape[1] - 1  # all bits are 1
     entered = _row(histories.entered, given, k)
     started = _row(histories.started, given, k)
     work.queued[:] = city.zero
@@ -408,11 +447,6 @@ def _arrive(
         work.arrived[e] = counts.queue[now, b, e] + arriving
         work.queued[i] += work.arrived[e]
         work.waiting[i] += counts.due[now, b, e] + work.begin[e]
-        if by_chance:
-            number = int(counts.moved[now, b, e]) & last
-            if number != work.number[e]:  # seldom: draws are far apart in memory
-                work.number[e] = number
-                work.draw[e] = given.draws[b, number, e]
 
 
 @inner
@@ -429,7 +463,6 @@ def _move_up(
     """1. The first vehicles."""
     one = city.one
     zero = city.zero
-    by_chance = len(given.draws) > 0
     ending = _row(histories.ending, given, k)
     work.in_lane[:] = zero
     for p in range(len(city.served)):
@@ -445,17 +478,15 @@ def _move_up(
         in_queue = histories.ending[b, ending - city.to_end[i], i] * work.share_in_queue[i]
         work.stopping[i] = counts.stopping[now, b, i] + in_queue
         work.moving_up[i] = min(work.room[i] / max(work.queued[i], city.least), one)
-    for e in range(len(work.up)):
-        work.up[e] = work.arrived[e] * work.moving_up[city.link_of_entry[e]]
     work.by_turn[:] = zero
-    for c in range(len(work.first)):
-        e = city.entry_of_cell[c]
-        taken = given.cells[b, c]
-        if by_chance:
-            taken = one if given.low[b, c] <= work.draw[e] < given.high[b, c] else zero
-        work.cells[c] = taken
-        work.first[c] = counts.first[now, b, c] + work.up[e] * taken
-        work.by_turn[city.turn_of_cell[c]] += work.first[c]
+    for e in range(len(work.up)):
+        up = work.arrived[e] * work.moving_up[city.link_of_entry[e]]
+        work.up[e] = up
+        for n in range(city.first_cell[e], city.first_cell[e + 1]):
+            c = city.cells[n]
+            first = counts.first[now, b, c] + up * given.chosen[b, c]
+            work.first[c] = first
+            work.by_turn[city.turn_of_cell[c]] += first
 
 
 @inner
@@ -521,8 +552,6 @@ def _leave(city: City, counts: Counts, b: int, k: int, work: _Work) -> None:
     """4. Flows from cells and turns."""
     now = k % len(counts.queue)
     then = (k + 1) % len(counts.queue)
-    work.entered[:] = city.zero
-    work.started[:] = city.zero
     for c in range(len(work.first)):
         t = city.turn_of_cell[c]
         leaving = work.first[c] * work.going[t]
@@ -600,6 +629,7 @@ def _count_entries(
     then = (k + 1) % len(counts.queue)
     entered = _row(histories.entered, given, k)
     started = _row(histories.started, given, k)
+    by_chance = len(given.draws) > 0
     metered = len(given.metering) > 0
     for e in range(len(work.entered)):
         i = city.link_of_entry[e]
@@ -608,16 +638,20 @@ def _count_entries(
         ahead = begun * city.ahead[e]
         starting = work.started[e] * given.goes_on[b, e]
         passing = work.entered[e] * given.goes_on[b, e] - starting
+        work.started[e] = city.zero
+        work.entered[e] = city.zero
+        before = counts.moved[now, b, e]
+        moved = before + work.up[e]
+        if by_chance and int(moved) != int(before):
+            _take(city, given, b, e, moved)
         held = work.held[e] - work.begin[e] if metered else city.zero
-        counts.asked[then, b, e] = counts.asked[now, b, e] + given.due[b, e]
         counts.held[then, b, e] = held
+        sums.held[b] += held
         counts.due[then, b, e] = due - begun
         counts.queue[then, b, e] = work.arrived[e] - work.up[e] + ahead
-        counts.moved[then, b, e] = counts.moved[now, b, e] + work.up[e]
+        counts.moved[then, b, e] = moved
         histories.started[b, started, e] = starting
         histories.entered[b, entered, e] = passing + begun - ahead
-        sums.held[b] += held
-        sums.begun[b] += work.trips[e]
 
 
 @inner
@@ -658,8 +692,8 @@ def derive(
     work = _work_of(city, given)
     d = _work_of(city, given)  # derivatives by what has these names
     for b in range(len(given.due)):
-        work.number[:] = -1
         for k in range(len(given.light) - 1, -1, -1):
+            _choose_again(city, given, counts, b, k + 1, k)
             _flow(city, given, counts, histories, b, k, k, work)
             _leave_back(city, given, counts, d_counts, d_histories, d_sums, b, k, work, d)
             _receive_back(city, given, d_counts, d_histories, d_sums, b, k, work, d)
@@ -882,7 +916,7 @@ def _move_up_back(
         d_cell = d.first[c] + d.by_turn[city.turn_of_cell[c]]
         d_counts.first[b, c] = d_cell
         d_given.cells[b, c] += d_cell * work.up[e]
-        d.up[e] += d_cell * work.cells[c]
+        d.up[e] += d_cell * given.chosen[b, c]
     d.moving_up[:] = zero
     for e in range(len(d.up)):
         d.moving_up[city.link_of_entry[e]] += d.up[e] * work.arrived[e]

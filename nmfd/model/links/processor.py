@@ -113,19 +113,16 @@ class CompiledMaxPressure(MaxPressure):
             one=kind(1.0),
         )
 
-    def step(
-        self, number: int, stages: Stages, traffic: Traffic, programme: Lights
-    ) -> tuple[Stages, Lights]:
-        """Return the state and the lights of a step, as MaxPressure."""
-        stages = Stages(*(part.clone() for part in stages))
-        own = Stages(*_arrays(stages))
+    def play(self, number: int, stages: Stages, inside: np.ndarray, lights: Lights) -> None:
+        """Set the lights of steps (K, B, M), and the state after them, of arrays.
+
+        number: of the first step; there is no decision in the others
+        inside: vehicles on each link (veh, (B, L))
+        lights: of the programmes, which some signals keep
+        """
         if number % self.period == 0:
-            (inside,) = _arrays([traffic.inside])
-            choose(self._numbers, inside, own)
-        light = self._light.new_empty(len(stages.stage), len(self._signal))
-        lights = Lights(light, torch.empty_like(light))
-        show(self._numbers, Lights(*_arrays(programme)), own, Lights(*_arrays(lights)))
-        return stages, lights
+            choose(self._numbers, inside, stages)
+        show(self._numbers, stages, lights)
 
 
 class CompiledSteps(Steps):
@@ -143,7 +140,7 @@ class CompiledSteps(Steps):
         run = _Run(self, state, interval)
         if torch.is_grad_enabled():
             return run.passed(_Differentiable.apply(run, *run.varied))
-        return run.passed(run.advanced(rows=2))
+        return run.passed(run.advanced(rows=1))
 
     def _numbers(self) -> City:
         """Return the numbers of the city."""
@@ -153,6 +150,9 @@ class CompiledSteps(Steps):
         tensors = {name.lstrip("_"): getattr(flows, name) for name in FLOWS}
         tensors |= {name: getattr(flows, name).ages for name in DELAYS}
         tensors |= {name: getattr(gates, name) for name in GATES}
+        tensors["cells"] = torch.argsort(flows.entry_of_cell, stable=True)
+        cells = torch.bincount(flows.entry_of_cell, minlength=flows.entries)
+        tensors["first_cell"] = torch.nn.functional.pad(torch.cumsum(cells, 0), (1, 0))
         arrays = {}
         for name, tensor in tensors.items():
             array = tensor.numpy()
@@ -195,7 +195,7 @@ class _Run:
         self._steps = steps
         self._state = state
         self._interval = interval
-        self._stages = state.stages
+        self._stages: Any = state.stages
         self._given = self._read()
 
     def advanced(self, rows: int) -> tuple[Tensor, ...]:
@@ -288,9 +288,10 @@ class _Run:
         interval = self._interval
         ways = interval.ways
         batch = len(interval.due)
-        draws = [torch.empty(0, 0), torch.empty(0, 0), torch.empty(0, 0, 0)]
+        draws = [ways.cells, torch.empty(0, 0), torch.empty(0, 0), torch.empty(0, 0, 0)]
         if ways.choice is not None:
-            draws = [ways.choice.low, ways.choice.high, ways.choice.draws]
+            chosen = torch.empty_like(ways.cells)
+            draws = [chosen, ways.choice.low, ways.choice.high, ways.choice.draws]
         lights = []
         for programme in (interval.light, interval.yields):
             lights.append(programme.unsqueeze(1).repeat(1, batch, 1))
@@ -307,23 +308,31 @@ class _Run:
         count = self.count
         if signals is None:
             return count
+        first = self._state.interval * count
+        then = min(now + signals.period - (first + now) % signals.period, count)
+        lights = Lights(self._given.light[now:then], self._given.yields[now:then])
+        if isinstance(signals, CompiledMaxPressure):
+            if now == 0:
+                self._stages = Stages(*(part.clone() for part in self._stages))
+            inside = self._counts.inside[now % rows]
+            signals.play(first + now, Stages(*_arrays(self._stages)), inside, lights)
+            return then
+        programme = Lights(self._interval.light[now:then], self._interval.yields[now:then])
+        with torch.no_grad():
+            traffic = self._traffic(now, rows)
+            self._stages, shown = signals.step(first + now, self._stages, traffic, programme)
+        lights.light[:] = shown.light
+        lights.yields[:] = shown.yields
+        return then
+
+    def _traffic(self, now: int, rows: int) -> Traffic:
+        """Return the state before step `now`."""
         counts = {}
         for name in OF_TRAFFIC:
             counts[name] = torch.from_numpy(getattr(self._counts, name)[now % rows])
         for name, values in self._histories._asdict().items():
-            counts[name] = torch.from_numpy(values[:, now : values.shape[1] - count + now])
-        traffic = Traffic(**counts, outside=self._state.traffic.outside)
-        interval = self._interval
-        first = self._state.interval * count
-        with torch.no_grad():
-            while True:
-                programme = Lights(interval.light[now : now + 1], interval.yields[now : now + 1])
-                self._stages, lights = signals.step(first + now, self._stages, traffic, programme)
-                self._given.light[now] = lights.light
-                self._given.yields[now] = lights.yields
-                now += 1
-                if now == count or (first + now) % signals.period == 0:
-                    return now
+            counts[name] = torch.from_numpy(values[:, now : values.shape[1] - self.count + now])
+        return Traffic(**counts, outside=self._state.traffic.outside)
 
 
 class _Differentiable(torch.autograd.Function):

@@ -21,6 +21,8 @@ as cosim.plant.gates does. Under max-pressure the window is the cycle. At actuat
 are those of a cycle of the programme.
 """
 
+import math
+from functools import lru_cache
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -37,6 +39,7 @@ CALLED_VEH = 0.2  # vehicles that call a stage
 FIXED = "fixed"
 MAX_PRESSURE = "max-pressure"
 ACTUATED = "actuated"
+KEPT = 8  # intervals whose programmes are kept: with equal cycles, one is enough
 GAP_S = 3.0  # SUMO's time without a vehicle on the detectors that ends a green
 
 
@@ -174,15 +177,20 @@ class Programmes:
         """opens: of the gates"""
         self._flows = flows
         self._opens = opens
+        self._period = math.lcm(*flows.network.cycle.tolist())
+        self._read = lru_cache(maxsize=KEPT)(self._read_in_period)
 
     def read(self, begin: float, steps: int) -> tuple[Tensor, Tensor, Tensor]:
         """Return lights, duties to give way and openings (steps, M).
 
         begin: time of the first step (s)
         """
+        return self._read(round(begin) % self._period, steps)
+
+    def _read_in_period(self, begin: int, steps: int) -> tuple[Tensor, Tensor, Tensor]:
         network = self._flows.network
         seconds = round(self._flows.dt)
-        clock = round(begin) + np.arange(steps * seconds)[:, None]
+        clock = begin + np.arange(steps * seconds)[:, None]
         place = network.begin + clock % network.cycle
 
         def by_step(values: np.ndarray) -> np.ndarray:
