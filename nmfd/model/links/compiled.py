@@ -1,9 +1,9 @@
 """Steps of the link model, and their derivatives, in machine code.
 
-The equations are those of `flows.Flows.step`, `signals.Gates.limit` and `interval.Steps`, which say
-what they mean, are the reference, and run on a GPU. On a processor, a step is a hundred operations
-on arrays of a few thousand counts, and each goes through memory; here all steps of one rollout
-follow each other in the cache. All counts are arrays of one precision.
+The equations are those of `flows.Flows.step`, `signals.Gates.limit`, `signals.MaxPressure` and
+`interval.Steps`, which say what they mean, are the reference, and run on a GPU. On a processor, a
+step is a hundred operations on arrays of a few thousand counts, and each goes through memory; here
+all steps of one rollout follow each other in the cache. All counts are arrays of one precision.
 
 `derive` has the equations of `advance` in reverse order, with derivatives d_x, by x, of what the
 rollout is judged by. As in torch, a limit that binds passes none. All is in one file, because
@@ -16,6 +16,8 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numba import njit
+
+from nmfd.model.links.signals import Stages
 
 F = TypeVar("F", bound=Callable)
 
@@ -93,6 +95,38 @@ class City(NamedTuple):
     dt: Any
     epsilon: Any
     least: Any
+    zero: Any
+    one: Any
+
+
+class Choosing(NamedTuple):
+    """Places and numbers of signals.MaxPressure, the reference, with its names.
+
+    called, decision_period, longest_green, longest_red: constants of nmfd.model.links.signals
+    dt, zero, one: as of City
+    """
+
+    chooses: Any
+    signal: Any
+    light: Any
+    yields: Any
+    loss: Any
+    least: Any
+    count: Any
+    link: Any
+    pressed: Any
+    presses: Any
+    weight: Any
+    gain_stage: Any
+    gain_movement: Any
+    gain: Any
+    called: Any
+    decision_period: Any
+    longest_green: Any
+    longest_red: Any
+    lookahead: Any
+    period: int
+    dt: Any
     zero: Any
     one: Any
 
@@ -283,10 +317,17 @@ def advance(
     counts: Counts,
     histories: Histories,
     sums: Sums,
+    signals: Choosing | None,
+    stages: Any,
+    first: int,
     begin: int,
     end: int,
 ) -> None:
-    """Advance all rollouts from step `begin` of the interval to step `end`."""
+    """Advance all rollouts from step `begin` of the interval to step `end`.
+
+    signals, stages: under max-pressure, and their state (signals.Stages), which it changes
+    first: number of the first step of the interval
+    """
     work = _work_of(city, given)
     work.entered[:] = city.zero
     work.started[:] = city.zero
@@ -295,6 +336,10 @@ def advance(
             _choose(city, given, counts, b)
         for k in range(begin, end):
             now = k % len(counts.queue)
+            if signals is not None:
+                if (first + k) % signals.period == 0:
+                    _decide(signals, counts.inside[now, b], stages, b)
+                _show(signals, stages, given.light[k, b], given.yields[k, b], b)
             sums.begun[b] += _flow(city, given, counts, histories, b, now, k, work)
             _leave(city, counts, b, k, work)
             _count_links(city, counts, histories, given, sums, b, k, work)
@@ -332,6 +377,100 @@ def _take(city: City, given: Given, b: int, e: int, moved: float) -> None:
         c = city.cells[n]
         taken = given.low[b, c] <= draw < given.high[b, c]
         given.chosen[b, c] = city.one if taken else city.zero
+
+
+@inner
+def _decide(signals: Choosing, inside: np.ndarray, stages: Stages, b: int) -> None:
+    """Change stages of rollout b to those that signals want now.
+
+    inside: vehicles on each link (veh, (L,))
+    """
+    zero = signals.zero
+    most = signals.light.shape[1]
+    pressure = np.zeros(signals.least.size, inside.dtype)
+    waiting = np.zeros(signals.least.shape, inside.dtype)
+    weight = np.zeros(len(signals.signal), inside.dtype)
+    for n in range(len(signals.pressed)):
+        weight[signals.pressed[n]] += inside[signals.presses[n]] * signals.weight[n]
+    for n in range(len(signals.gain)):
+        gained = max(weight[signals.gain_movement[n]], zero) * signals.gain[n]
+        pressure[signals.gain_stage[n]] += gained
+    for m in range(len(weight)):
+        for n in range(most):
+            present = signals.light[m, n] * inside[signals.link[m]]
+            waiting[signals.signal[m], n] += present
+    for s in range(len(waiting)):
+        own = stages.stage[b, s]
+        wanted = _wanted(signals, stages, b, s, waiting[s], pressure[s * most : (s + 1) * most])
+        may = stages.clearing[b, s] == zero and stages.green[b, s] >= signals.least[s, own]
+        if may and wanted != own:
+            stages.stage[b, s] = wanted
+            stages.before[b, s] = own
+            stages.clearing[b, s] = signals.loss[s, own, wanted]
+            stages.green[b, s] = zero
+
+
+@inner
+def _wanted(
+    signals: Choosing,
+    stages: Stages,
+    b: int,
+    s: int,
+    waiting: np.ndarray,
+    pressure: np.ndarray,
+) -> int:
+    """Return the stage that signal s wants.
+
+    waiting: vehicles for each stage (veh, (n,)); pressure: of each stage (n,)
+    """
+    own = stages.stage[b, s]
+    best = own
+    overdue = own
+    ahead = signals.zero
+    longest = signals.zero
+    for n in range(signals.count[s]):
+        if n == own or waiting[n] < signals.called:
+            continue
+        kept = signals.lookahead / (signals.lookahead + signals.loss[s, own, n])
+        if best == own or pressure[n] * kept > ahead:
+            ahead = pressure[n] * kept
+            best = n
+        red = stages.red[b, s, n]
+        if red >= signals.longest_red and red > longest:
+            longest = red
+            overdue = n
+    if overdue != own:
+        return overdue
+    too_long = stages.green[b, s] + signals.decision_period > signals.longest_green
+    return best if too_long or ahead > pressure[own] else own
+
+
+@inner
+def _show(signals: Choosing, stages: Stages, light: np.ndarray, yields: np.ndarray, b: int) -> None:
+    """Set the lights of rollout b in a step, and the stages after it.
+
+    light, yields: as of signals.Lights (M,); those of the programmes, which some signals keep
+    """
+    one = signals.one
+    for m in range(len(signals.signal)):
+        if not signals.chooses[m]:
+            continue
+        s = signals.signal[m]
+        stage = stages.stage[b, s]
+        earlier = stages.before[b, s]
+        after = signals.light[m, stage]
+        before = signals.light[m, earlier]
+        # Those who gave way wait on the junction, and go while it clears.
+        kept = max(min(after, before), before * signals.yields[m, earlier])
+        waits = min(stages.clearing[b, s] / signals.dt, one)
+        light[m] = waits * kept + (one - waits) * after
+        yields[m] = (one - waits) * signals.yields[m, stage]
+    for s in range(len(signals.count)):
+        stages.green[b, s] += max(signals.dt - stages.clearing[b, s], signals.zero)
+        stages.clearing[b, s] = max(stages.clearing[b, s] - signals.dt, signals.zero)
+        for n in range(signals.light.shape[1]):
+            stages.red[b, s, n] += signals.dt
+        stages.red[b, s, stages.stage[b, s]] = signals.zero
 
 
 @inner

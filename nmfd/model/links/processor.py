@@ -7,8 +7,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nmfd.model.links.choosing import Choosing, choose, show
-from nmfd.model.links.compiled import City, Counts, Given, Histories, Sums, advance, derive
+from nmfd.model.links.compiled import (
+    Choosing,
+    City,
+    Counts,
+    Given,
+    Histories,
+    Sums,
+    advance,
+    derive,
+)
 from nmfd.model.links.flows import EPSILON, LEAST, Delay, Flows, Traffic
 from nmfd.model.links.interval import Interval, LinkState, Passed, Steps
 from nmfd.model.links.signals import (
@@ -16,6 +24,7 @@ from nmfd.model.links.signals import (
     DECISION_PERIOD_S,
     LONGEST_GREEN_S,
     LONGEST_RED_S,
+    Actuated,
     Lights,
     MaxPressure,
     Stages,
@@ -101,28 +110,18 @@ class CompiledMaxPressure(MaxPressure):
         super().__init__(flows, lookahead)
         kind = flows.storage.numpy().dtype.type
         arrays = {name: getattr(self, f"_{name}").numpy() for name in CHOOSING}
-        self._numbers = Choosing(
+        self.numbers = Choosing(
             **arrays,
             called=kind(CALLED_VEH),
             decision_period=kind(DECISION_PERIOD_S),
             longest_green=kind(LONGEST_GREEN_S),
             longest_red=kind(LONGEST_RED_S),
             lookahead=kind(lookahead),
+            period=self.period,
             dt=kind(flows.dt),
             zero=kind(0.0),
             one=kind(1.0),
         )
-
-    def play(self, number: int, stages: Stages, inside: np.ndarray, lights: Lights) -> None:
-        """Set the lights of steps (K, B, M), and the state after them, of arrays.
-
-        number: of the first step; there is no decision in the others
-        inside: vehicles on each link (veh, (B, L))
-        lights: of the programmes, which some signals keep
-        """
-        if number % self.period == 0:
-            choose(self._numbers, inside, stages)
-        show(self._numbers, stages, lights)
 
 
 class CompiledSteps(Steps):
@@ -223,11 +222,19 @@ class _Run:
         inside = self._counts.inside[0]
         numbers = [np.zeros(len(used)) for _ in range(3)]  # sums of many: in float64
         sums = Sums(*numbers, *(np.zeros_like(values) for values in (inside, inside, used)))
+        signals = self._steps.signals
+        choosing = None
+        stages = None
+        if isinstance(signals, CompiledMaxPressure):
+            choosing = signals.numbers
+            self._stages = Stages(*(part.clone() for part in self._stages))
+            stages = Stages(*_arrays(self._stages))
+        first = self._state.interval * count
+        rollouts = (self._steps.city, self._given, self._counts, self._histories, sums)
         now = 0
         while now < count:
             then = self._show(now, rows)
-            city = self._steps.city
-            advance(city, self._given, self._counts, self._histories, sums, now, then)
+            advance(*rollouts, choosing, stages, first, now, then)
             now = then
         after = [values[count % rows].copy() for values in counts]
         after += [values[:, count:].copy() for values in histories]
@@ -300,30 +307,22 @@ class _Run:
         return Given(*_arrays([*fields, interval.opens]))
 
     def _show(self, now: int, rows: int) -> int:
-        """Set the lights from step `now` on to the next decision of signals.
+        """Set the lights of actuated signals in step `now`.
 
-        Return the step of that decision.
+        Return the step up to which all lights are known.
         """
         signals = self._steps.signals
-        count = self.count
-        if signals is None:
-            return count
-        first = self._state.interval * count
-        then = min(now + signals.period - (first + now) % signals.period, count)
-        lights = Lights(self._given.light[now:then], self._given.yields[now:then])
-        if isinstance(signals, CompiledMaxPressure):
-            if now == 0:
-                self._stages = Stages(*(part.clone() for part in self._stages))
-            inside = self._counts.inside[now % rows]
-            signals.play(first + now, Stages(*_arrays(self._stages)), inside, lights)
-            return then
-        programme = Lights(self._interval.light[now:then], self._interval.yields[now:then])
+        if not isinstance(signals, Actuated):
+            return self.count
+        interval = self._interval
+        first = self._state.interval * self.count
+        programme = Lights(interval.light[now : now + 1], interval.yields[now : now + 1])
         with torch.no_grad():
             traffic = self._traffic(now, rows)
             self._stages, shown = signals.step(first + now, self._stages, traffic, programme)
-        lights.light[:] = shown.light
-        lights.yields[:] = shown.yields
-        return then
+        self._given.light[now] = shown.light
+        self._given.yields[now] = shown.yields
+        return now + 1
 
     def _traffic(self, now: int, rows: int) -> Traffic:
         """Return the state before step `now`."""
