@@ -100,7 +100,7 @@ class City(NamedTuple):
 
 
 class Choosing(NamedTuple):
-    """Places and numbers of signals.MaxPressure, the reference, with its names.
+    """Places and numbers of signals.MaxPressure, with its names.
 
     called, decision_period, longest_green, longest_red: constants of nmfd.model.links.signals
     dt, zero, one: as of City
