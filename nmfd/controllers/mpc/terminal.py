@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.special import erf
 
 from nmfd.controllers.mpc.edge_model import PerCell
 from nmfd.errors import InputError
@@ -82,6 +81,8 @@ def _gelu(a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     It is a times the normal distribution function.
     """
+    from scipy.special import erf  # slow to import
+
     below = 0.5 * (1.0 + erf(a / math.sqrt(2.0)))
     return a * below, below + a * np.exp(-0.5 * a * a) / math.sqrt(2.0 * math.pi)
 

@@ -12,12 +12,13 @@ machine code that was kept is made again when its own file has changed, not when
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 from numba import njit
 
-from nmfd.model.links.signals import Stages
+if TYPE_CHECKING:  # guidance in SUMO takes `compiled` from here, without torch
+    from nmfd.model.links.signals import Stages
 
 F = TypeVar("F", bound=Callable)
 
@@ -380,7 +381,7 @@ def _take(city: City, given: Given, b: int, e: int, moved: float) -> None:
 
 
 @inner
-def _decide(signals: Choosing, inside: np.ndarray, stages: Stages, b: int) -> None:
+def _decide(signals: Choosing, inside: np.ndarray, stages: "Stages", b: int) -> None:
     """Change stages of rollout b to those that signals want now.
 
     inside: vehicles on each link (veh, (L,))
@@ -413,7 +414,7 @@ def _decide(signals: Choosing, inside: np.ndarray, stages: Stages, b: int) -> No
 @inner
 def _wanted(
     signals: Choosing,
-    stages: Stages,
+    stages: "Stages",
     b: int,
     s: int,
     waiting: np.ndarray,
@@ -446,7 +447,9 @@ def _wanted(
 
 
 @inner
-def _show(signals: Choosing, stages: Stages, light: np.ndarray, yields: np.ndarray, b: int) -> None:
+def _show(
+    signals: Choosing, stages: "Stages", light: np.ndarray, yields: np.ndarray, b: int
+) -> None:
     """Set the lights of rollout b in a step, and the stages after it.
 
     light, yields: as of signals.Lights (M,); those of the programmes, which some signals keep
