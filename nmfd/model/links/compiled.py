@@ -358,7 +358,7 @@ def _choose(city: City, given: Given, counts: Counts, b: int) -> None:
 
 @inner
 def _choose_again(city: City, given: Given, counts: Counts, b: int, before: int, now: int) -> None:
-    """Set it where they are others than those of row `before`."""
+    """Set them where the next vehicles are not those of row `before`."""
     if len(given.draws) > 0:
         for e in range(len(city.link_of_entry)):
             moved = counts.moved[now, b, e]

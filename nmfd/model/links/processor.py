@@ -291,7 +291,7 @@ class _Run:
         )
 
     def _read(self) -> Given:
-        """Return commands and shares; responsive signals have no lights yet."""
+        """Return commands, shares and the lights of the programmes."""
         interval = self._interval
         ways = interval.ways
         batch = len(interval.due)
