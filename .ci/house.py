@@ -38,7 +38,7 @@ PICTURE = Path(__file__).with_name("house.svg")
 # machine code 13,000, loading by more policies and thresholds of each region 350, guidance in
 # machine code 1,750, training from a policy 150, shares by period 200: names and steps were not
 # cut.
-TOKENS = 267_200
+TOKENS = 267_300
 TEST_TOKENS = 174_600
 TOKENS_PER_LINE = 9.5
 DECISIONS_IN_EXPRESSIONS = 0.65

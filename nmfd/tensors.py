@@ -9,6 +9,7 @@ from contextlib import contextmanager
 import torch
 from jaxtyping import Float
 
+THREADS = torch.get_num_threads()  # outside of `one_thread`: one per core, or OMP_NUM_THREADS
 PerRollout = Float[torch.Tensor, "*#B"]
 PerRegion = Float[torch.Tensor, "*#B R"]
 PerPair = Float[torch.Tensor, "*#B R R"]

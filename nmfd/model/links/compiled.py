@@ -323,16 +323,18 @@ def advance(
     first: int,
     begin: int,
     end: int,
+    rollouts: tuple[int, int],
 ) -> None:
-    """Advance all rollouts from step `begin` of the interval to step `end`.
+    """Advance rollouts from step `begin` of the interval to step `end`.
 
     signals, stages: under max-pressure, and their state (signals.Stages), which it changes
     first: number of the first step of the interval
+    rollouts: number of the first one, and of the one after the last
     """
     work = _work_of(city, given)
     work.entered[:] = city.zero
     work.started[:] = city.zero
-    for b in range(len(given.due)):
+    for b in range(*rollouts):
         if begin == 0:
             _choose(city, given, counts, b)
         for k in range(begin, end):
@@ -823,6 +825,7 @@ def derive(
     d_counts: Counts,
     d_histories: Histories,
     d_sums: Sums,
+    rollouts: tuple[int, int],
 ) -> None:
     """Compute the derivatives by what an interval begins with.
 
@@ -830,10 +833,11 @@ def derive(
     d_given: by due, cells, metering and gates, which are added up
     d_counts, d_histories: by those after the interval (B, n); then by those before
     d_sums: by the sums
+    rollouts: as of `advance`
     """
     work = _work_of(city, given)
     d = _work_of(city, given)  # derivatives by what has these names
-    for b in range(len(given.due)):
+    for b in range(*rollouts):
         for k in range(len(given.light) - 1, -1, -1):
             _choose_again(city, given, counts, b, k + 1, k)
             _flow(city, given, counts, histories, b, k, k, work)

@@ -1,6 +1,8 @@
 """The steps of a control interval on a processor, by machine code."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -29,6 +31,7 @@ from nmfd.model.links.signals import (
     MaxPressure,
     Stages,
 )
+from nmfd.tensors import THREADS
 
 # Numbers of a city by the attributes of its Flows.
 FLOWS = (
@@ -230,11 +233,11 @@ class _Run:
             self._stages = Stages(*(part.clone() for part in self._stages))
             stages = Stages(*_arrays(self._stages))
         first = self._state.interval * count
-        rollouts = (self._steps.city, self._given, self._counts, self._histories, sums)
+        city = (self._steps.city, self._given, self._counts, self._histories, sums)
         now = 0
         while now < count:
             then = self._show(now, rows)
-            advance(*rollouts, choosing, stages, first, now, then)
+            _in_threads(advance, len(used), *city, choosing, stages, first, now, then)
             now = then
         after = [values[count % rows].copy() for values in counts]
         after += [values[:, count:].copy() for values in histories]
@@ -257,7 +260,9 @@ class _Run:
             histories.append(found)
         sums = Sums(*by[-len(Sums._fields) :])
         given = [np.zeros_like(getattr(self._given, name)) for name in OF_GIVEN]
-        derive(
+        _in_threads(
+            derive,
+            len(given[0]),
             self._steps.city,
             self._given,
             self._counts,
@@ -343,6 +348,19 @@ class _Differentiable(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *weights: Tensor) -> tuple[Tensor | None, ...]:
         return (None, *ctx.run.derived(weights))
+
+
+def _in_threads(function: Callable, batch: int, *arguments: Any) -> None:
+    """Call machine code for B rollouts, in a thread per core."""
+    threads = min(THREADS, batch)
+    bounds = [number * batch // threads for number in range(threads + 1)]
+    parts = list(pairwise(bounds))
+    if threads == 1:
+        function(*arguments, parts[0])
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        for done in [pool.submit(function, *arguments, part) for part in parts]:
+            done.result()
 
 
 def _rows(command: Tensor | None, due: Tensor, columns: int) -> Tensor:
