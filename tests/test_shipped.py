@@ -18,6 +18,7 @@ from nmfd.api import load_scenario
 from nmfd.api import run as nmfd_run
 from nmfd.controllers.strategy import CONTROLLERS
 from nmfd.errors import InputError
+from nmfd.model.links.network import read_links
 from nmfd.model.regional_model import load_network
 from nmfd.runs import shipped
 
@@ -155,3 +156,8 @@ def test_what_is_listed(installed):
     assert all(len(line) < 170 for line in text.splitlines())
     assert good(nmfd("--version")).endswith(f"version {__version__}\n")
     assert good(nmfd("--cite")).startswith("cff-version: 1.2.0\n")
+
+
+@pytest.mark.parametrize("name", ["grid7_peak", "bologna_lanes"])
+def test_shipped_streets_can_be_read(name):
+    assert len(read_links(ROOT / "scenarios" / name / "links.npz").length) > 100
