@@ -36,8 +36,8 @@ PICTURE = Path(__file__).with_name("house.svg")
 # together, plans of routes, MFDs of edgeData and trips from counts 6,000, chance, vehicles and a
 # fit in the plant of streets 4,000, its recordings for a GPU 700, and its steps with derivatives in
 # machine code 13,000, loading by more policies and thresholds of each region 350, guidance in
-# machine code 1,750, training from a policy 150, shares by period 200: names and steps were not
-# cut.
+# machine code 1,750, training from a policy 150, shares by period 200, cells of next vehicles and
+# threads 500: names and steps were not cut.
 TOKENS = 267_300
 TEST_TOKENS = 174_700
 TOKENS_PER_LINE = 9.5

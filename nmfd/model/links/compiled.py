@@ -332,6 +332,7 @@ def advance(
     rollouts: number of the first one, and of the one after the last
     """
     work = _work_of(city, given)
+    # Each step adds to them, and `_count_entries` leaves 0.
     work.entered[:] = city.zero
     work.started[:] = city.zero
     for b in range(*rollouts):

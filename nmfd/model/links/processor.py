@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -198,6 +199,7 @@ class _Run:
         self._state = state
         self._interval = interval
         self._stages: Any = state.stages
+        self._first = state.interval * steps.steps  # number of the first step
         self._given = self._read()
 
     def advanced(self, rows: int) -> tuple[Tensor, ...]:
@@ -232,12 +234,12 @@ class _Run:
             choosing = signals.numbers
             self._stages = Stages(*(part.clone() for part in self._stages))
             stages = Stages(*_arrays(self._stages))
-        first = self._state.interval * count
-        city = (self._steps.city, self._given, self._counts, self._histories, sums)
+        city = self._steps.city
+        arguments = (city, self._given, self._counts, self._histories, sums, choosing, stages)
         now = 0
         while now < count:
             then = self._show(now, rows)
-            _in_threads(advance, len(used), *city, choosing, stages, first, now, then)
+            _in_threads(advance, len(used), *arguments, self._first, now, then)
             now = then
         after = [values[count % rows].copy() for values in counts]
         after += [values[:, count:].copy() for values in histories]
@@ -247,7 +249,7 @@ class _Run:
     def derived(self, weights: Sequence[Tensor]) -> list[Tensor]:
         """Return the derivatives by the varied tensors.
 
-        Call it after `advanced` with a row for each step.
+        Call it once, after `advanced` with a row for each step.
 
         weights: derivatives by its results
         """
@@ -300,15 +302,15 @@ class _Run:
         interval = self._interval
         ways = interval.ways
         batch = len(interval.due)
-        draws = [ways.cells, torch.empty(0, 0), torch.empty(0, 0), torch.empty(0, 0, 0)]
+        choice = [ways.cells, torch.empty(0, 0), torch.empty(0, 0), torch.empty(0, 0, 0)]
         if ways.choice is not None:
             chosen = torch.empty_like(ways.cells)
-            draws = [chosen, ways.choice.low, ways.choice.high, ways.choice.draws]
+            choice = [chosen, ways.choice.low, ways.choice.high, ways.choice.draws]
         lights = []
         for programme in (interval.light, interval.yields):
             lights.append(programme.unsqueeze(1).repeat(1, batch, 1))
         due, cells, metering, gates = self.varied[: len(OF_GIVEN)]
-        fields = [due, cells, ways.goes_on, ways.ends, *draws, metering, gates, *lights]
+        fields = [due, cells, ways.goes_on, ways.ends, *choice, metering, gates, *lights]
         return Given(*_arrays([*fields, interval.opens]))
 
     def _show(self, now: int, rows: int) -> int:
@@ -320,11 +322,11 @@ class _Run:
         if not isinstance(signals, Actuated):
             return self.count
         interval = self._interval
-        first = self._state.interval * self.count
+        number = self._first + now
         programme = Lights(interval.light[now : now + 1], interval.yields[now : now + 1])
         with torch.no_grad():
             traffic = self._traffic(now, rows)
-            self._stages, shown = signals.step(first + now, self._stages, traffic, programme)
+            self._stages, shown = signals.step(number, self._stages, traffic, programme)
         self._given.light[now] = shown.light
         self._given.yields[now] = shown.yields
         return now + 1
@@ -359,8 +361,7 @@ def _in_threads(function: Callable, batch: int, *arguments: Any) -> None:
         function(*arguments, parts[0])
         return
     with ThreadPoolExecutor(threads) as pool:
-        for done in [pool.submit(function, *arguments, part) for part in parts]:
-            done.result()
+        list(pool.map(partial(function, *arguments), parts))  # raises the first error
 
 
 def _rows(command: Tensor | None, due: Tensor, columns: int) -> Tensor:
