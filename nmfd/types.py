@@ -1,5 +1,6 @@
 """Types that plants, controllers and the closed loop exchange."""
 
+import json
 import os
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -346,15 +347,18 @@ class Result:
             with uninterrupted():
                 if only is None:
                     data = xarray.load_dataset(
-                        path, engine="netcdf4", decode_times=False, mask_and_scale=False
+                        path, engine="scipy", decode_times=False, mask_and_scale=False, mmap=False
                     )
                 else:
                     data = _some_arrays(path, only)
+                data = _with_empty(data, only)
         except FileNotFoundError:
             raise InputError(f"{path}: no such run") from None
         except Exception as error:
             reason = str(error).partition("\n")[0]
-            raise InputError(f"{path}: is no run ({reason}); delete it and run again") from None
+            raise InputError(
+                f"{path}: is no run of this version ({reason}); delete it and run again"
+            ) from None
         for name, value in data.attrs.items():
             if isinstance(value, np.generic):
                 data.attrs[name] = value.item()
@@ -366,20 +370,23 @@ class Result:
         for name, value in data.attrs.items():
             if isinstance(value, bool):  # netCDF has no such type
                 data.attrs[name] = int(value)
-        encoding = {}
+        empty = {}
         for name, variable in data.variables.items():
+            if variable.size == 0:  # scipy cannot read it back
+                empty[name] = variable.dims, variable.shape, variable.dtype.str, variable.attrs
             if variable.dtype == np.float16:  # nor this one
                 data[name] = variable.astype(np.float32)
-            if variable.dtype.kind in "fiu":
-                encoding[name] = {"zlib": True, "_FillValue": None}
+        data = data.drop_vars(empty)
+        data.attrs["empty"] = json.dumps(empty)
+        encoding = {name: {"_FillValue": None} for name in data.variables}
         path = Path(path)
         temporary = path.with_name(f".{path.stem}-{os.getpid()}.tmp")
         try:
             with uninterrupted():  # xarray would keep its lock for ever
-                data.to_netcdf(temporary, engine="netcdf4", encoding=encoding)
+                data.to_netcdf(temporary, engine="scipy", format="NETCDF3_64BIT", encoding=encoding)
                 os.replace(temporary, path)
-        except RuntimeError as error:  # netCDF hides the reason of the system
-            raise InputError(f"{path}: cannot be written ({error}); is the disk full?") from None
+        except OSError as error:  # which does not name the file
+            raise InputError(f"{path}: cannot be written ({error})") from None
         finally:
             temporary.unlink(missing_ok=True)
 
@@ -469,14 +476,23 @@ class Result:
 
 def _some_arrays(path: Path | str, names: Collection[str]) -> "xarray.Dataset":
     """Return arrays of numbers of a netCDF file, and its attributes."""
-    import netCDF4
-    import xarray
+    from xarray import Dataset
+    from xarray.backends import ScipyDataStore
 
-    with netCDF4.Dataset(path) as file:
-        file.set_auto_maskandscale(False)
-        arrays = {}
-        for name in names:
-            if name in file.variables:
-                variable = file.variables[name]
-                arrays[name] = variable.dimensions, variable[:]
-        return xarray.Dataset(arrays, attrs={name: file.getncattr(name) for name in file.ncattrs()})
+    with ScipyDataStore(str(path), mmap=False) as store:
+        there = store.ds.variables
+        arrays = {
+            name: store.open_store_variable(name, there[name]).load()
+            for name in names
+            if name in there
+        }
+        return Dataset(arrays, attrs=store.get_attrs())
+
+
+def _with_empty(data: "xarray.Dataset", only: Collection[str] | None) -> "xarray.Dataset":
+    """Return the Dataset with its arrays of length 0, which are kept in an attribute."""
+    empty = json.loads(data.attrs.pop("empty", "{}"))
+    for name, (dimensions, shape, dtype, attrs) in empty.items():
+        if only is None or name in only:
+            data[name] = dimensions, np.zeros(shape, dtype), attrs
+    return data

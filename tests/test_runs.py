@@ -51,6 +51,18 @@ def test_a_result_is_read_as_it_was_written(tmp_path):
         _ = back.nothing
 
 
+def test_arrays_without_entries_are_read_as_they_were_written(tmp_path):
+    data = trajectory().data.assign(
+        queue=(("time", "gateway"), np.zeros((5, 0), np.int32), {"units": "veh"})
+    )
+    Result(data.assign_coords(gateway=np.array([], object))).write(tmp_path / "a.nc")
+    again = Result.read(tmp_path / "a.nc")
+    assert again.queue.shape == (5, 0)
+    assert again.queue.units == "veh"
+    assert list(again.gateway.values) == []
+    assert Result.read(tmp_path / "a.nc", only=["queue"]).sizes == {"time": 5, "gateway": 0}
+
+
 def test_the_same_run_is_the_same_but_for_times():
     one = trajectory()
     other = one.assign(decision_time=2.0 * one.decision_time, wall_time=7.0)
@@ -133,7 +145,7 @@ def test_what_is_no_run_is_one_line(tmp_path, damage):
         file.write_bytes(
             {"cut off": whole[: len(whole) // 2], "empty": b"", "a table": b"a,b\n1,2\n"}[damage]
         )
-    assert re.search(r"a\.nc: (no such run|is no run)", problem(Result.read, file))
+    assert re.search(r"a\.nc: (no such run|is no run of this version)", problem(Result.read, file))
 
 
 def test_atomic_write_leaves_the_old_file_when_interrupted(tmp_path):
