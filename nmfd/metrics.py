@@ -99,7 +99,7 @@ def summary(result: Result) -> dict[str, float | int | str]:
     >>> round(summary(nmfd.run("economic_mpc", "no-control", steps=20))["max_accumulation_veh"])
     12558
     """
-    facts = {name: value for name, value in result.data.attrs.items() if name not in NO_COLUMNS}
+    facts = {name: value for name, value in result.attrs.items() if name not in NO_COLUMNS}
     if "accumulation" not in result:
         return facts
     inside = result["accumulation"].sum(axis=(1, 2))

@@ -5,13 +5,14 @@ import os
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Flag
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
 from nmfd.arrays import PerPair, PerRegion, PerTurn
-from nmfd.errors import InputError, uninterrupted
+from nmfd.errors import InputError
 
 if TYPE_CHECKING:
     import xarray
@@ -165,6 +166,17 @@ class Controller(Protocol):
         """
 
 
+class Variable(NamedTuple):
+    """Array of a Result, as xarray.Dataset takes it.
+
+    attributes: long_name, and units but of texts
+    """
+
+    dimensions: tuple[str, ...]
+    values: np.ndarray
+    attributes: dict[str, str]
+
+
 class Quantity(NamedTuple):
     """Named axes, unit ("" of texts) and meaning of a variable of a Result."""
 
@@ -172,15 +184,15 @@ class Quantity(NamedTuple):
     unit: str
     text: str
 
-    def variable(self, values: Any) -> tuple:
-        """Return dimensions, array and attributes, as xarray.Dataset takes them."""
+    def variable(self, values: Any) -> Variable:
+        """Return an array with these axes."""
         array = np.asarray(values)
         if array.dtype.kind == "U":
             array = array.astype(object)  # as netCDF returns texts
         attributes = {"long_name": self.text}
         if self.unit:
             attributes["units"] = self.unit
-        return self.dimensions, array, attributes
+        return Variable(self.dimensions, array, attributes)
 
 
 _PAIRS = ("time", "region", "destination")
@@ -219,24 +231,35 @@ EXPECTED = {
 }
 SHOWN_FACTS = 30  # in the representation of a result
 SHOWN_CHARACTERS = 60  # of a fact
+NAMES = ("region_name",)  # of entries of a dimension with numbers
 # These differ between two runs of the same seed.
 HOST_TIMES = ("decision_time", "wall_time", "sumo_time_s", "setup_time_s", "overhead_share")
 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """One closed-loop run of T control intervals, as a Dataset.
+    """One closed-loop run of T control intervals.
 
-    data: variables over time (T+1 states), interval (T decisions), region, next_region and
-        destination; in SUMO over gateway and edge, too. Attributes: controller, plant, seed, step
-        (s), estimated (0 or 1), wall_time (s), scenario, version, settings (JSON), and all scalar
-        facts of the run
+    variables: arrays over time (T+1 states), interval (T decisions), region, next_region and
+        destination; in SUMO over gateway and edge, too
+    attrs: controller, plant, seed, step (s), estimated (0 or 1), wall_time (s), scenario, version,
+        settings (JSON), and all scalar facts of the run
 
     `result.accumulation` is the labelled array of that variable, `result["accumulation"]` its
     values, `result.seed` the attribute of that name; `dir(result)` lists them.
     """
 
-    data: "xarray.Dataset"
+    variables: Mapping[str, Variable]
+    attrs: Mapping[str, Any]
+
+    @cached_property
+    def data(self) -> "xarray.Dataset":
+        """All variables and attributes as a Dataset with coordinates."""
+        import xarray  # half a second, which few commands need
+
+        return xarray.Dataset(self.variables, attrs=self.attrs).set_coords(
+            [name for name in NAMES if name in self]
+        )
 
     @property
     def accumulation(self) -> "xarray.DataArray":
@@ -276,22 +299,25 @@ class Result:
     @property
     def controller(self) -> str:
         """Name of the controller."""
-        return self.data.attrs["controller"]
+        return self.attrs["controller"]
 
     @property
     def seed(self) -> int:
         """Seed of the run."""
-        return self.data.attrs["seed"]
+        return self.attrs["seed"]
 
     @property
     def step(self) -> float:
         """Control interval (s)."""
-        return self.data.attrs["step"]
+        return self.attrs["step"]
 
     @property
     def sizes(self) -> Mapping[str, int]:
         """Length of every dimension."""
-        return {str(name): size for name, size in self.data.sizes.items()}
+        sizes: dict[str, int] = {}
+        for variable in self.variables.values():
+            sizes |= zip(variable.dimensions, variable.values.shape, strict=True)
+        return sizes
 
     @property
     def total_time_spent(self) -> float:
@@ -304,7 +330,7 @@ class Result:
     @property
     def completed_trips(self) -> float:
         """Trips that reached their end (veh)."""
-        return float(self.data.attrs.get("completed_veh", self["completed"][-1]))
+        return float(self.attrs.get("completed_veh", self["completed"][-1]))
 
     @classmethod
     def make(
@@ -315,10 +341,8 @@ class Result:
         attrs: facts of the run
         arrays: those of VARIABLES
         """
-        import xarray  # half a second, which few commands need
-
         times = attrs["step"] * np.arange(len(arrays["accumulation"]))
-        coordinates: dict[str, tuple] = {
+        variables = {
             "time": Quantity(("time",), "s", "time since the start").variable(times),
             "interval": Quantity(("interval",), "s", "beginning of the interval").variable(
                 times[:-1]
@@ -326,32 +350,23 @@ class Result:
         }
         for name in ("region", "next_region", "destination"):
             numbers = np.arange(arrays["accumulation"].shape[1])
-            coordinates[name] = Quantity((name,), "1", "number of the region").variable(numbers)
+            variables[name] = Quantity((name,), "1", "number of the region").variable(numbers)
         if len(region_names):
             names = Quantity(("region",), "", "name of the region").variable(region_names)
-            coordinates["region_name"] = names
-        variables = {name: about.variable(arrays[name]) for name, about in VARIABLES.items()}
-        return cls(xarray.Dataset(variables, coordinates, dict(attrs)))
+            variables["region_name"] = names
+        for name, about in VARIABLES.items():
+            variables[name] = about.variable(arrays[name])
+        return cls(variables, dict(attrs))
 
     @classmethod
     def read(cls, path: Path | str, only: Collection[str] | None = None) -> "Result":
         """Return the result in the netCDF file `path`.
 
-        only: arrays to read, of those that the file has, without coordinates; all if None, which
-            takes three times as long
+        only: variables to read, of those that the file has; all if None
         Raises: InputError if the file is missing, or damaged
         """
-        import xarray
-
         try:
-            with uninterrupted():
-                if only is None:
-                    data = xarray.load_dataset(
-                        path, engine="scipy", decode_times=False, mask_and_scale=False, mmap=False
-                    )
-                else:
-                    data = _some_arrays(path, only)
-                data = _with_empty(data, only)
+            return cls(*_read(path, only))
         except FileNotFoundError:
             raise InputError(f"{path}: no such run") from None
         except Exception as error:
@@ -359,54 +374,35 @@ class Result:
             raise InputError(
                 f"{path}: is no run of this version ({reason}); delete it and run again"
             ) from None
-        for name, value in data.attrs.items():
-            if isinstance(value, np.generic):
-                data.attrs[name] = value.item()
-        return cls(data)
 
     def write(self, path: Path | str) -> None:
-        """Write the Dataset to the netCDF file `path`, whole or not at all."""
-        data = self.data.copy()
-        for name, value in data.attrs.items():
-            if isinstance(value, bool):  # netCDF has no such type
-                data.attrs[name] = int(value)
-        empty = {}
-        for name, variable in data.variables.items():
-            if variable.size == 0:  # scipy cannot read it back
-                empty[name] = variable.dims, variable.shape, variable.dtype.str, variable.attrs
-            if variable.dtype == np.float16:  # nor this one
-                data[name] = variable.astype(np.float32)
-        data = data.drop_vars(empty)
-        data.attrs["empty"] = json.dumps(empty)
-        encoding = {name: {"_FillValue": None} for name in data.variables}
+        """Write a netCDF file, whole or not at all."""
         path = Path(path)
         temporary = path.with_name(f".{path.stem}-{os.getpid()}.tmp")
         try:
-            with uninterrupted():  # xarray would keep its lock for ever
-                data.to_netcdf(temporary, engine="scipy", format="NETCDF3_64BIT", encoding=encoding)
-                os.replace(temporary, path)
+            _write(temporary, self.variables, self.attrs)
+            os.replace(temporary, path)
         except OSError as error:  # which does not name the file
             raise InputError(f"{path}: cannot be written ({error})") from None
         finally:
             temporary.unlink(missing_ok=True)
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("__") or name == "data":
+        if name.startswith("__") or name in ("variables", "attrs"):
             raise AttributeError(name)
-        if name in self.data.variables:
+        if name in self.variables:
             return self.data[name]
-        if name in self.data.attrs:
-            return self.data.attrs[name]
+        if name in self.attrs:
+            return self.attrs[name]
         raise AttributeError(f"result without variable or attribute {name!r}")
 
     def __dir__(self) -> list[str]:
-        names = {*super().__dir__(), *map(str, self.data.variables), *map(str, self.data.attrs)}
-        return sorted(names)
+        return sorted({*super().__dir__(), *self.variables, *self.attrs})
 
     def __repr__(self) -> str:
         lengths = ", ".join(f"{name} {size}" for name, size in self.sizes.items())
         facts = "\n".join(f"    {name}: {value}" for name, value in self._shown().items())
-        return f"Result of {self.data.attrs.get('controller', '?')} over {lengths}\n{facts}"
+        return f"Result of {self.attrs.get('controller', '?')} over {lengths}\n{facts}"
 
     def _shown(self) -> dict[str, str]:
         """Return facts for a screen: total time spent, and short attributes."""
@@ -414,27 +410,28 @@ class Result:
         if "accumulation" in self:
             shown["total_time_spent"] = f"{self.total_time_spent:.6g} veh s"
             shown["completed_trips"] = f"{self.completed_trips:,.0f}"
-        for name, value in self.data.attrs.items():
+        for name, value in self.attrs.items():
             if len(shown) < SHOWN_FACTS and len(str(value)) <= SHOWN_CHARACTERS:
                 text = f"{value:g}" if isinstance(value, float) else str(value)
-                shown.setdefault(str(name), text)
+                shown.setdefault(name, text)
         return shown
 
     def __getitem__(self, name: str) -> np.ndarray:
-        return self.data.variables[name].values
+        return self.variables[name].values
 
     def __contains__(self, name: str) -> bool:
-        return name in self.data.variables
+        return name in self.variables
 
     def assign(self, **values: Any) -> "Result":
         """Return the result with other arrays or other attributes."""
-        data = self.data.copy()
+        variables = dict(self.variables)
+        attrs = dict(self.attrs)
         for name, value in values.items():
-            if name in data.variables:
-                data[name] = (data[name].dims, np.asarray(value), data[name].attrs)
+            if name in variables:
+                variables[name] = variables[name]._replace(values=np.asarray(value))
             else:
-                data.attrs[name] = value
-        return Result(data)
+                attrs[name] = value
+        return Result(variables, attrs)
 
     def add(
         self, attrs: Mapping[str, Any], about: Mapping[str, Quantity] = {}, **arrays: np.ndarray
@@ -443,22 +440,19 @@ class Result:
 
         about: name of an array -> its axes, unit and meaning
         """
-        variables = {}
+        variables = dict(self.variables)
         for name, quantity in about.items():
             if name in arrays:
                 variables[name] = quantity.variable(arrays[name])
-        return Result(self.data.assign(variables).assign_attrs(attrs))
+        return Result(variables, {**self.attrs, **attrs})
 
     def label(self, **names: Sequence[str]) -> "Result":
         """Return the result with names of the entries of some dimensions.
 
         names: `gateway` or `edge` -> names
         """
-        coordinates = {}
-        for dimension, values in names.items():
-            about = Quantity((dimension,), "", f"name of the {dimension}")
-            coordinates[dimension] = about.variable(values)
-        return Result(self.data.assign_coords(coordinates))
+        about = {name: Quantity((name,), "", f"name of the {name}") for name in names}
+        return self.add({}, about, **names)
 
     def without_times(self) -> "xarray.Dataset":
         """Return the Dataset without wall times and key.
@@ -474,25 +468,80 @@ class Result:
         return self.data._repr_html_()
 
 
-def _some_arrays(path: Path | str, names: Collection[str]) -> "xarray.Dataset":
-    """Return arrays of numbers of a netCDF file, and its attributes."""
-    from xarray import Dataset
-    from xarray.backends import ScipyDataStore
+def _write(path: Path, variables: Mapping[str, Variable], attrs: Mapping[str, Any]) -> None:
+    """Write a netCDF file that xarray reads as `Result.data`.
 
-    with ScipyDataStore(str(path), mmap=False) as store:
-        there = store.ds.variables
-        arrays = {
-            name: store.open_store_variable(name, there[name]).load()
-            for name in names
-            if name in there
-        }
-        return Dataset(arrays, attrs=store.get_attrs())
+    Arrays without entries, which scipy cannot read back, are an attribute.
+    """
+    from scipy.io import netcdf_file
+
+    empty = {}
+    with netcdf_file(path, "w", version=2) as file:
+        for name, variable in variables.items():
+            dimensions, values, about = variable
+            if not values.size:
+                empty[name] = dimensions, values.shape, values.dtype.str, about
+                continue
+            if values.dtype == object:
+                texts = np.char.encode(values.astype(str), "utf-8")
+                values = texts.view("S1").reshape(*texts.shape, -1)
+                dimensions = *dimensions, f"string{values.shape[-1]}"
+                about = {**about, "_Encoding": "utf-8"}
+            elif values.dtype.kind in "biu":
+                values = values.astype(np.int32)
+            elif values.dtype == np.float16:
+                values = values.astype(np.float32)
+            for dimension, size in zip(dimensions, values.shape, strict=True):
+                if dimension not in file.dimensions:
+                    file.createDimension(dimension, size)
+            stored = file.createVariable(name, values.dtype, dimensions)
+            stored[:] = values
+            for key, text in about.items():
+                setattr(stored, key, text.encode())
+        names = " ".join(name for name in NAMES if name in variables)
+        texts_too = {"coordinates": names, "empty": json.dumps(empty)}
+        for name, value in {**attrs, **texts_too}.items():
+            setattr(file, name, _packed(value))
 
 
-def _with_empty(data: "xarray.Dataset", only: Collection[str] | None) -> "xarray.Dataset":
-    """Return the Dataset with its arrays of length 0, which are kept in an attribute."""
-    empty = json.loads(data.attrs.pop("empty", "{}"))
-    for name, (dimensions, shape, dtype, attrs) in empty.items():
+def _packed(value: Any) -> Any:
+    """Return an attribute as netCDF takes it."""
+    if isinstance(value, str):
+        return value.encode()
+    whole = isinstance(value, bool | int | np.integer) and abs(value) < 2**31
+    return np.int32(value) if whole else np.float64(value)
+
+
+def _read(
+    path: Path | str, only: Collection[str] | None
+) -> tuple[dict[str, Variable], dict[str, Any]]:
+    """Return variables and attributes of a netCDF file."""
+    from scipy.io import netcdf_file
+
+    variables = {}
+    with netcdf_file(path, mmap=False) as file:
+        attrs = _attributes(file)
+        for name, stored in file.variables.items():
+            if only is not None and name not in only:
+                continue
+            values = stored.data.astype(stored.data.dtype.newbyteorder("="))
+            about = _attributes(stored)
+            dimensions = stored.dimensions
+            if about.pop("_Encoding", None):
+                texts = values.view(f"S{values.shape[-1]}")[..., 0]
+                values = np.char.decode(texts, "utf-8").astype(object)
+                dimensions = dimensions[:-1]
+            variables[name] = Variable(dimensions, values, about)
+    for name, (dimensions, shape, dtype, about) in json.loads(attrs.pop("empty", "{}")).items():
         if only is None or name in only:
-            data[name] = dimensions, np.zeros(shape, dtype), attrs
-    return data
+            variables[name] = Variable(tuple(dimensions), np.zeros(shape, dtype), about)
+    attrs.pop("coordinates", None)
+    return variables, attrs
+
+
+def _attributes(owner: Any) -> dict[str, Any]:
+    """Return the attributes of a netCDF file, or of a variable in it."""
+    return {
+        name: value.decode() if isinstance(value, bytes) else value.item()
+        for name, value in owner._attributes.items()  # noqa: SLF001 - scipy has no other way
+    }

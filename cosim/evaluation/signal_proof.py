@@ -14,16 +14,19 @@ timetable changes.
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 from xml.etree.ElementTree import Element
 
 import numpy as np
-import pandas as pd
 
-from cosim.sumo.xml_files import attribute, read_xml, seconds_of
+from cosim.sumo.xml_files import attribute, read_xml, seconds_of, xml_text
 from nmfd.types import Quantity, Result
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 KINDS = ("static", "actuated", "delay_based")
+NAMES = ("id", "programID", "offset")  # by which programmes with the same rules differ
 MIN_GREEN_S = 5.0
 YELLOW_S = 3.0
 SHEET = {  # variable of a result, column of signals.csv
@@ -84,14 +87,17 @@ def proof_sheet(
                 indices = (link.get("linkIndex"), link.get("linkIndex2"))
                 crossings[signal].update(int(index) for index in indices if index)
         timetabled.update(attribute(switch, "junctionID") for switch in root.iter("wautJunction"))
+    made: dict[tuple, Rules] = {}
     rows: dict[str, dict[str, float]] = {}
     for signal in sorted((states.keys() & programmes.keys()) - timetabled):
         if any(logic.get("type") not in KINDS for logic in programmes[signal]):
             continue
         judged = []
         for logic in programmes[signal]:
-            rules = Rules(logic, crossings[signal], step)
-            judged.append(rules.judge(states[signal], end))
+            alike = xml_text(logic, dict.fromkeys(NAMES, "")), *sorted(crossings[signal])
+            if alike not in made:
+                made[alike] = Rules(logic, crossings[signal], step)
+            judged.append(made[alike].judge(states[signal], end))
         rows[signal] = min(judged, key=violations)
         rows[signal]["longest_wait"] = waits.get(signal, np.nan)
     sheet = {"signal": np.array(list(rows), dtype=str)}
@@ -105,17 +111,18 @@ def violations(row: Mapping[str, float]) -> int:
     return int(sum(row[name] for name in VIOLATIONS))
 
 
-def sheets(results: Iterable[Result]) -> pd.DataFrame:
+def sheets(results: Iterable[Result]) -> "pd.DataFrame":
     """Return the table signals.csv: one row per run and signal."""
-    parts = [
-        result.data[list(SHEET)[1:]]
-        .to_dataframe()
-        .reset_index()
-        .assign(controller=result.controller, seed=result.seed)
-        for result in results
-    ]
+    import pandas as pd  # a third of a second, which runs do not need
+
+    parts = []
+    for result in results:
+        columns = {name: result[name] for name in SHEET}
+        parts.append(
+            pd.DataFrame({"controller": result.controller, "seed": result.seed, **columns})
+        )
     units = {name: f"{name}_s" for name, quantity in SHEET.items() if quantity.unit == "s"}
-    return pd.concat(parts)[["controller", "seed", *SHEET]].rename(columns=units)
+    return pd.concat(parts).rename(columns=units)
 
 
 class _Programme(NamedTuple):

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
@@ -32,6 +31,7 @@ from nmfd.types import Result
 
 # Share of an edge's room: a queue that reaches its upstream end leaves gaps that move backwards.
 FULL_SHARE = 0.8
+TRIPS = [(name, "U9" if kind is str else kind) for name, kind in Trip.__annotations__.items()]
 # Attribute of a result, column of runs.csv -> meaning.
 FACTS = config.read(Path(__file__).with_name("columns.toml"))["runs"] | PRESSURE_FACTS
 
@@ -169,35 +169,43 @@ def trip_measures(trips: Sequence[Trip], regions: int) -> tuple[dict[str, float]
     Measures are of private vehicles, and apart of others; the mean time (s, (R,)) of private ones
     by region of origin is NaN without any.
     """
-    table = pd.DataFrame(trips, columns=Trip._fields).astype(Trip.__annotations__)
-    private = table[table["private"]]
-    other = table[~table["private"]]
-    count = Counter(private["outcome"])
-    entered = table[table["outcome"].isin((COMPLETED, REMOVED, UNDER_WAY))]
-    public = entered[entered["public"]]
-    entered = entered[entered["private"]]
+    table = np.rec.fromrecords([tuple(trip) for trip in trips], dtype=TRIPS)
+    private = table[table.private]
+    other = table[~table.private]
+    count = Counter(private.outcome)
+    entered = table[np.isin(table.outcome, (COMPLETED, REMOVED, UNDER_WAY))]
     row = {
         "trips": len(private),
-        "departed_veh": len(entered),
+        "departed_veh": np.count_nonzero(entered.private),
         "completed_veh": count[COMPLETED],
         "final_backlog_veh": count[WAITING],
-        "total_backlog_veh_s": private["departure_delay"].sum(),
+        "total_backlog_veh_s": float(private.departure_delay.sum()),
         "removed_veh": count[REMOVED] + count[GIVEN_UP],
         "removed_waiting_veh": count[GIVEN_UP],
-        "mean_trip_time_s": private["time"].mean(),
-        "mean_finished_trip_time_s": private.loc[private["outcome"] == COMPLETED, "time"].mean(),
-        "median_trip_time_s": private["time"].median(),
-        "p95_trip_time_s": private["time"].quantile(0.95),
-        "mean_departure_delay_s": private["departure_delay"].mean(),
-        "mean_time_loss_s": entered["time_loss"].mean(),
-        "public_transport_trips": int(table["public"].sum()),
-        "public_transport_delay_s": public["time_loss"].mean(),
+        "mean_trip_time_s": _mean(private.time),
+        "mean_finished_trip_time_s": _mean(private.time[private.outcome == COMPLETED]),
+        "median_trip_time_s": _quantile(private.time, 0.5),
+        "p95_trip_time_s": _quantile(private.time, 0.95),
+        "mean_departure_delay_s": _mean(private.departure_delay),
+        "mean_time_loss_s": _mean(entered.time_loss[entered.private]),
+        "public_transport_trips": np.count_nonzero(table.public),
+        "public_transport_delay_s": _mean(entered.time_loss[entered.public]),
         "other_trips": len(other),
-        "other_time_spent_veh_s": other["time"].sum(),
-        "other_departure_delay_veh_s": other["departure_delay"].sum(),
+        "other_time_spent_veh_s": float(other.time.sum()),
+        "other_departure_delay_veh_s": float(other.departure_delay.sum()),
     }
-    by_origin = private.groupby("origin")["time"].mean().reindex(range(regions))
-    return row, by_origin.to_numpy()
+    by_origin = [_mean(private.time[private.origin == region]) for region in range(regions)]
+    return row, np.array(by_origin)
+
+
+def _mean(values: np.ndarray) -> float:
+    """Return the mean of those that are known, NaN without any."""
+    known = values[~np.isnan(values)]
+    return float(known.mean()) if known.size else math.nan
+
+
+def _quantile(values: np.ndarray, share: float) -> float:
+    return float(np.quantile(values, share)) if values.size else math.nan
 
 
 def queue_facts(result: Result, city: City) -> dict[str, float]:

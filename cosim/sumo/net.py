@@ -5,7 +5,7 @@ import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
 from cosim.sumo.arrays import PerEdge, PerMove, Points
-from cosim.sumo.xml_files import attribute, network_root
+from cosim.sumo.xml_files import attribute, changed, network_root
 from nmfd.errors import InputError
 from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import config
@@ -245,7 +245,8 @@ def load_city(
     Raises: InputError for a broken file, an unknown edge, an edge without a region, or a region
         without edges
     """
-    net = _read_net(Path(net_file), opened)
+    net_file = Path(net_file)
+    net = _read(net_file, opened)
     given = read_regions(Path(regions_csv), regions)
     edges = tuple(sorted(edge for edge, lanes in net.lanes_of.items() if lanes))
     for edge in given:
@@ -266,7 +267,7 @@ def load_city(
             f"{regions_csv}: region {min(empty)} has no edges; "
             f"every region from 0 to {regions - 1} needs one"
         )
-    return _derived(Path(net_file), net, edges, given, regions)
+    return _derived(net_file, net, edges, given, regions)
 
 
 def _derived(
@@ -371,8 +372,17 @@ def points_along(shape: Points, marks: Callable[[float], ArrayLike]) -> Float[np
     return np.stack([np.interp(at, along, axis) for axis in shape.T], axis=-1)
 
 
-def _read_net(path: Path, opened: Collection[str] = ()) -> _Net:
+def _read(path: Path, opened: Collection[str] = ()) -> _Net:
     """Read a SUMO network; opened: as of `load_city`. Raises InputError."""
+    return _read_net(path, frozenset(opened), changed(path))
+
+
+@lru_cache(maxsize=2)  # a large city takes seconds
+def _read_net(path: Path, opened: Collection[str], _: int) -> _Net:
+    """Read a SUMO network.
+
+    The last argument is the time of its last change, for the cache.
+    """
     lanes_of: dict[str, list[_Lane]] = {}
     internal: dict[str, _Crossing] = {}
     connections = []
@@ -479,7 +489,7 @@ def connections_for_cars(net_file: Path, opened: Collection[str] = ()) -> list[C
     opened: as of `load_city`
     Raises: InputError
     """
-    return _links_for_cars(_read_net(net_file, opened))
+    return _links_for_cars(_read(net_file, opened))
 
 
 def _links_for_cars(net: _Net) -> list[Connection]:

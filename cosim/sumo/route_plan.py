@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-import pandas as pd
 
 from cosim.sumo.arrays import PerTrip
 from cosim.sumo.net import City
@@ -88,6 +87,8 @@ class RoutePlan:
 
     def write(self, path: Path) -> None:
         """Write the plan, by quarter of an hour."""
+        import pandas as pd  # slow to import
+
         rows = []
         for quarters in self._drivers.values():
             for quarter, routes in quarters.items():
@@ -104,6 +105,8 @@ def read_plan(paths: Iterable[Path], city: City) -> RoutePlan:
 
     Raises: InputError for a file that is none, or for a route on edges that are not in the city
     """
+    import pandas as pd
+
     plan = RoutePlan()
     for path in paths:
         with stream_of(path, "a plan of routes", "make it with cosim plan") as stream:

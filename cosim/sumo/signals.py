@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from cosim.sumo.net import City, Gateway
 from cosim.sumo.session import Phase, Programme
-from cosim.sumo.xml_files import attribute, is_true, read_xml, seconds_of
+from cosim.sumo.xml_files import attribute, changed, is_true, read_xml, seconds_of
 from nmfd.errors import InputError
 
 GREEN = frozenset("Gg")
@@ -252,8 +252,7 @@ def read_files(net: Path, additional: Iterable[Path] = ()) -> SignalFile:
 
     Raises: InputError
     """
-    stamp = net.stat().st_mtime_ns if net.is_file() else 0
-    network = _network(net, stamp)
+    network = _network(net, changed(net))
     programmes = dict(network.programmes)
     switched = set(network.timetabled)
     for path in additional:
@@ -264,10 +263,10 @@ def read_files(net: Path, additional: Iterable[Path] = ()) -> SignalFile:
 
 
 @lru_cache(maxsize=2)  # a large city takes seconds, and a run asks several times
-def _network(net: Path, stamp: int) -> SignalFile:
-    """Return the signals of a network file.
+def _network(net: Path, _: int) -> SignalFile:
+    """Return the signals of a network.
 
-    stamp: time of its last change, for the cache
+    The last argument is the time of its last change, for the cache.
     """
     return _file(read_xml(net))
 

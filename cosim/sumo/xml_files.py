@@ -3,6 +3,7 @@
 import gzip
 import io
 import math
+import re
 import xml.etree.ElementTree as ElementTree
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,6 +18,7 @@ from nmfd.runs.files import check_file, check_name
 BROKEN = (OSError, EOFError, zlib.error, ElementTree.ParseError, LookupError, TypeError, ValueError)
 UNITS_S = (1.0, 60.0, 3600.0, 86400.0)  # of the parts of a time, the last one first
 IN_ATTRIBUTES = {'"': "&quot;", "\r": "&#13;", "\n": "&#10;", "\t": "&#09;"}
+ESCAPED = re.compile('[&<>"\r\n\t]')
 MAX_INCLUDE_DEPTH = 20  # of files that include each other
 
 
@@ -100,13 +102,19 @@ def xml_text(element: ElementTree.Element, own: Mapping[str, str] = {}) -> str:
     """
     attributes = ""
     for key, value in {**element.attrib, **own}.items():
-        attributes += f' {key}="{escape(value, IN_ATTRIBUTES)}"'
+        text = escape(value, IN_ATTRIBUTES) if ESCAPED.search(value) else value
+        attributes += f' {key}="{text}"'
     content = escape(element.text or "")
     for part in element:
         content += xml_text(part) + escape(part.tail or "")
     if not content:
         return f"<{element.tag}{attributes} />"
     return f"<{element.tag}{attributes}>{content}</{element.tag}>"
+
+
+def changed(path: Path) -> int:
+    """Return the time of a file's last change (ns), 0 if there is none."""
+    return path.stat().st_mtime_ns if path.is_file() else 0
 
 
 @contextmanager

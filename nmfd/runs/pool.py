@@ -2,7 +2,7 @@
 
 Where the system can, processes are forked from a server that has imported the modules of the first
 job, which saves seconds for each. They do not import the user's script, which would do everything
-again.
+again. The server is a fork of this process where that loses no thread, a new one elsewhere.
 """
 
 import math
@@ -16,8 +16,8 @@ import time
 import traceback
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from contextlib import contextmanager
-from multiprocessing import context, forkserver, resource_tracker
+from contextlib import contextmanager, suppress
+from multiprocessing import context, forkserver, resource_tracker, util
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -31,8 +31,7 @@ Job = Callable[[], Any]
 NEVER_ANSWERED = 124  # exit status of a process whose controller does not answer
 WATCH_S = 1.0  # between two looks at a decision
 POLL_S = 0.2  # longest wait without a look at Ctrl-C, which Windows needs
-# If dask is installed, xarray imports it with the first Dataset of a process.
-PRELOADED = ("xarray", "dask.array")
+PRELOADED = ("scipy.io",)  # which writes results
 ALSO_THERE = ("torch", "casadi")  # preloaded if this process has them, as its jobs then need them
 NAME = "run"  # of the processes
 STARTING = threading.Lock()  # held while a process starts
@@ -169,11 +168,38 @@ def _start_server() -> None:
     """
     resource_tracker.ensure_running()  # first, as it lets Ctrl-C through
     blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    new_process = util.spawnv_passfds
+    heavy = any(name in sys.modules for name in ALSO_THERE)
+    if sys.platform == "linux" and threading.active_count() == 1 and not heavy:
+        util.spawnv_passfds = _fork  # type: ignore[assignment]
     try:
         with _environment({"PYTHONSAFEPATH": "1", "PYTHONPATH": os.pathsep.join(sys.path)}):
             forkserver.ensure_running()
     finally:
+        util.spawnv_passfds = new_process
         signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+
+
+def _fork(_: Any, command: Sequence[Any], kept: Collection[int]) -> int:
+    """Run the server in a fork of this process.
+
+    It has the modules that this process has imported, and no other file open.
+
+    command: its code is the last argument; kept: open files of the server
+    """
+    sys.stdout.flush()  # or every process would print what waits there
+    sys.stderr.flush()
+    process = os.fork()  # noqa: TID251
+    if process:
+        return process
+    try:
+        for number in map(int, os.listdir("/proc/self/fd")):
+            if number > 2 and number not in kept:
+                with suppress(OSError):  # the list was one of them
+                    os.close(number)
+        exec(command[-1], {})
+    finally:
+        os._exit(0)
 
 
 @contextmanager

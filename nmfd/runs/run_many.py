@@ -453,7 +453,7 @@ def _kept(path: Path, name: str, known: Kept | None) -> Kept | None:
         return known
     try:
         result = Result.read(path)
-        key = json.loads(result.data.attrs["key"])
+        key = json.loads(result.attrs["key"])
         found = result.controller, result.seed
     except (InputError, KeyError, ValueError):  # cut off, or not of this package
         return None

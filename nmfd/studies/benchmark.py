@@ -14,8 +14,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from scipy.special import stdtrit
-
 from nmfd import closed_loop, faults
 from nmfd.controllers import open_loop
 from nmfd.controllers.strategy import Strategy
@@ -393,6 +391,8 @@ def interval(values: Sequence[float]) -> float:
     count = len(values)
     if count < 2 or any(map(math.isnan, values)):
         return math.nan
+    from scipy.special import stdtrit  # slow to import
+
     return float(stdtrit(count - 1, 0.975)) * statistics.stdev(values) / math.sqrt(count)
 
 
@@ -404,13 +404,11 @@ def run_perturbed(
     seed: number of the draw of the perturbation and of the noise on measurements
     sigma, kind: see `perturbed`
     """
-    import xarray
-
     actual = perturbed(scenario, sigma, seed, kind)
     result = closed_loop_of(strategy, seed, scenario=scenario, plant=PERTURBED_PLANT, actual=actual)
     row = summary(result)
     facts = {"kind": kind, "sigma": sigma, "trips_veh": scenario.step * float(actual.demand.sum())}
-    return Result(xarray.Dataset(attrs=facts | {column: row[column] for column in KEPT}))
+    return Result({}, facts | {column: row[column] for column in KEPT})
 
 
 def improvements(rows: "pd.DataFrame", controller: str) -> dict[float, tuple[float, float]]:

@@ -105,10 +105,8 @@ def panels(count: int) -> tuple[Figure, list[Axes]]:
     if count == 1:
         size = (6.8, 4.6)
     drawing = figure(*size)
-    grid = np.ravel(drawing.subplots(rows, columns))
-    for ax in grid[count:]:
-        ax.remove()
-    return drawing, list(grid[:count])
+    grid = drawing.add_gridspec(rows, columns)
+    return drawing, [drawing.add_subplot(grid[n]) for n in range(count)]
 
 
 def legend_below(drawing: Figure, axes: Sequence[Axes], columns: int = 4) -> None:
