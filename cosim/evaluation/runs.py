@@ -20,6 +20,7 @@ from nmfd.model.scenario import Scenario, with_demand
 from nmfd.runs.files import file_hash, run_name
 from nmfd.runs.run_many import Run
 
+GUIDANCE = ("cosim.plant.guidance",)  # which few runs need and imports its compiler
 SECONDS_PER_TRIP = 0.006  # wall time, in the committed results of grid7 and cities
 
 
@@ -63,7 +64,8 @@ def runs_of(
         for strategy in strategies:
             name = strategy.name
             job = Simulation(scenario, strategy, seed, demand, policies.get(name))
-            runs.append(Run(run_name(name, seed), keys[name], job, folder, expected))
+            modules = GUIDANCE if strategy.guides else ()
+            runs.append(Run(run_name(name, seed), keys[name], job, folder, expected, modules))
     return runs
 
 

@@ -99,7 +99,6 @@ class Meter:
         teleports, streets closed to cars, vehicles moved by another program, or too fast to be seen
         in between
     redirected (R, R, R) [i, j, l], in i, bound for j and from now on for l
-    time_inside (R, R) [i, j], time that vehicles bound for j spent in i [veh s]
     teleports; entry_flow, (source region, first edge behind the boundary) -> vehicles
     """
 
@@ -151,7 +150,7 @@ class Meter:
         self.crossings, self.jumps, self.redirected = np.zeros(
             (3, regions, regions, regions), dtype=int
         )
-        self.time_inside = np.zeros((regions, regions))
+        self._steps_inside = np.zeros((regions, regions), dtype=int)
         self.teleports = 0
         self.entry_flow: Counter[tuple[int, str]] = Counter()
         # Several movements may lead from one region to one edge: they share its flow.
@@ -180,6 +179,11 @@ class Meter:
             entry = gateway.source, gateway.to_edge
             flows.append(self.entry_flow[entry] / self._alike[entry])
         return np.array(flows)
+
+    @property
+    def time_inside(self) -> PerPair:
+        """Time that vehicles bound for j spent in i [veh s, (R, R)]."""
+        return self._steps_inside * self._session.step_length
 
     def observe(self) -> list[Event]:
         """Account for the last simulation step; return departures, then entries."""
@@ -210,7 +214,7 @@ class Meter:
             events += self._entered()
         for vehicle in arrived:
             self._leave(vehicle)
-        self.time_inside += self._running * session.step_length
+        self._steps_inside += self._running
         # The order of a set is not reproducible.
         events.sort(key=lambda event: (event.source is not None, event.vehicle))
         return events

@@ -221,10 +221,11 @@ class Roads:
 
     def _shares(self, edge: str, targets: Sequence[str]) -> dict[str, float]:
         """Return turning shares among `targets`, equal ones without flow."""
-        flows = np.array([self._flows.get((edge, target), 0.0) for target in targets])
-        total = flows.sum()
-        shares = flows / total if total else flows + 1.0 / max(len(targets), 1)
-        return dict(zip(targets, shares, strict=True))
+        flows = {target: self._flows.get((edge, target), 0.0) for target in targets}
+        total = sum(flows.values())
+        if not total:
+            return dict.fromkeys(targets, 1.0 / max(len(targets), 1))
+        return {target: flow / total for target, flow in flows.items()}
 
     def _upstream(self, edge: str) -> str | None:
         """Return the edge before if the road only gets turn lanes here."""
