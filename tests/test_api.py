@@ -49,9 +49,15 @@ def test_importing_the_packages_imports_nothing_heavy():
     assert json.loads(subprocess.check_output([sys.executable, "-c", code], text=True)) == []
 
 
-def test_runs_without_policies_load_neither_torch_nor_figures():
-    modules = "nmfd.api, cosim.api, cosim.evaluation.simulate, cosim.plant.fastest"
-    heavy = ("torch", "casadi", "matplotlib", "bokeh", "optuna", "sklearn", "distributed")
+@pytest.mark.parametrize(
+    ("modules", "tables"),
+    [
+        ("nmfd.api, cosim.api", ()),
+        ("cosim.evaluation.simulate, cosim.plant.guidance", ("pandas", "xarray")),
+    ],
+)
+def test_runs_without_policies_load_neither_torch_nor_figures(modules, tables):
+    heavy = ("torch", "casadi", "matplotlib", "bokeh", "optuna", "sklearn", "distributed", *tables)
     code = f"import sys, {modules}; print(*(name for name in {heavy} if name in sys.modules))"
     assert subprocess.check_output([sys.executable, "-c", code], text=True) == "\n"
 

@@ -269,3 +269,9 @@ def _work(streets: fastest.Streets, views: int) -> fastest.Work:
         heap_times=np.empty(looks),
         heap_edges=np.empty(looks, np.int64),
     )
+
+
+# The first machine code of a process loads parts of Numba for a third of a second. A server that
+# imports this module does it once for all runs.
+_NO_MOVES = np.zeros(0, int)
+fastest.connected(_graph(_NO_MOVES, _NO_MOVES, 1), 0, np.ones(1, bool))
