@@ -478,30 +478,51 @@ def _write(path: Path, variables: Mapping[str, Variable], attrs: Mapping[str, An
     empty = {}
     with netcdf_file(path, "w", version=2) as file:
         for name, variable in variables.items():
-            dimensions, values, about = variable
+            values = variable.values
             if not values.size:
-                empty[name] = dimensions, values.shape, values.dtype.str, about
+                about = variable.attributes
+                empty[name] = variable.dimensions, values.shape, values.dtype.str, about
                 continue
-            if values.dtype == object:
-                texts = np.char.encode(values.astype(str), "utf-8")
-                values = texts.view("S1").reshape(*texts.shape, -1)
-                dimensions = *dimensions, f"string{values.shape[-1]}"
-                about = {**about, "_Encoding": "utf-8"}
-            elif values.dtype.kind in "biu":
-                values = values.astype(np.int32)
-            elif values.dtype == np.float16:
-                values = values.astype(np.float32)
-            for dimension, size in zip(dimensions, values.shape, strict=True):
+            encoded = _encoded(variable)
+            for dimension, size in zip(encoded.dimensions, encoded.values.shape, strict=True):
                 if dimension not in file.dimensions:
                     file.createDimension(dimension, size)
-            stored = file.createVariable(name, values.dtype, dimensions)
-            stored[:] = values
-            for key, text in about.items():
+            stored = file.createVariable(name, encoded.values.dtype, encoded.dimensions)
+            stored[:] = encoded.values
+            for key, text in encoded.attributes.items():
                 setattr(stored, key, text.encode())
         names = " ".join(name for name in NAMES if name in variables)
-        texts_too = {"coordinates": names, "empty": json.dumps(empty)}
-        for name, value in {**attrs, **texts_too}.items():
+        of_file = {**attrs, "coordinates": names, "empty": json.dumps(empty)}
+        for name, value in of_file.items():
             setattr(file, name, _packed(value))
+
+
+def _encoded(variable: Variable) -> Variable:
+    """Return an array of types that netCDF has.
+
+    Texts are characters along another dimension.
+    """
+    values = variable.values
+    if values.dtype == object:
+        texts = np.char.encode(values.astype(str), "utf-8")
+        values = texts.view("S1").reshape(*texts.shape, -1)
+        dimensions = *variable.dimensions, f"string{values.shape[-1]}"
+        return Variable(dimensions, values, {**variable.attributes, "_Encoding": "utf-8"})
+    if values.dtype.kind in "biu":
+        values = values.astype(np.int32)
+    elif values.dtype == np.float16:
+        values = values.astype(np.float32)
+    return variable._replace(values=values)
+
+
+def _decoded(stored: Any) -> Variable:
+    """Return an array that `_encoded` prepared, from a variable of a file."""
+    attributes = _attributes(stored)
+    values = stored.data.astype(stored.data.dtype.newbyteorder("="))
+    if attributes.pop("_Encoding", None) is None:
+        return Variable(stored.dimensions, values, attributes)
+    texts = np.char.decode(values.view(f"S{values.shape[-1]}")[..., 0], "utf-8")
+    return Variable(stored.dimensions[:-1], texts.astype(object), attributes)
 
 
 def _packed(value: Any) -> Any:
@@ -518,20 +539,13 @@ def _read(
     """Return variables and attributes of a netCDF file."""
     from scipy.io import netcdf_file
 
-    variables = {}
     with netcdf_file(path, mmap=False) as file:
         attrs = _attributes(file)
-        for name, stored in file.variables.items():
-            if only is not None and name not in only:
-                continue
-            values = stored.data.astype(stored.data.dtype.newbyteorder("="))
-            about = _attributes(stored)
-            dimensions = stored.dimensions
-            if about.pop("_Encoding", None):
-                texts = values.view(f"S{values.shape[-1]}")[..., 0]
-                values = np.char.decode(texts, "utf-8").astype(object)
-                dimensions = dimensions[:-1]
-            variables[name] = Variable(dimensions, values, about)
+        there = dict(file.variables)
+    variables = {}
+    for name, stored in there.items():
+        if only is None or name in only:
+            variables[name] = _decoded(stored)
     for name, (dimensions, shape, dtype, about) in json.loads(attrs.pop("empty", "{}")).items():
         if only is None or name in only:
             variables[name] = Variable(tuple(dimensions), np.zeros(shape, dtype), about)
