@@ -136,9 +136,11 @@ def _drawn(city: City, demand: PairsOverTime, step: float, seed: int) -> _Drawn:
     positions = rng.random(len(depart))
     noise = perception(len(city.edges), rng)
     first, last = np.empty((2, len(depart)), dtype=int)
-    for n, (i, j) in enumerate(zip(origin, destination, strict=True)):
-        first[n] = city.number[_draw(starts[i], draws[n, 0])]
-        last[n] = city.number[_draw(goals[j], draws[n, 1])]
+    for region in range(city.regions):
+        begins = origin == region
+        first[begins] = _draw(city, starts[region], draws[begins, 0])
+        ends = destination == region
+        last[ends] = _draw(city, goals[region], draws[ends, 1])
     for n in np.flatnonzero(first == last):  # to the next edge instead
         edges = goals[destination[n]].edges
         place = edges.index(city.edges[first[n]])
@@ -224,9 +226,11 @@ def _is_pocket(city: City, edge: str) -> bool:
     return city.lanes[edge] > city.lanes[road] and city.successors[road] == (edge,)
 
 
-def _draw(ends: _Ends, uniform: float) -> str:
-    n = int(np.searchsorted(ends.weights, uniform, side="right"))
-    return ends.edges[min(n, len(ends.edges) - 1)]
+def _draw(city: City, ends: _Ends, uniforms: PerTrip) -> TripNumbers:
+    """Return an edge (N,) for every random number from 0 to 1 (N,)."""
+    numbers = np.array([city.number[edge] for edge in ends.edges])
+    places = np.searchsorted(ends.weights, uniforms, side="right")
+    return numbers[np.minimum(places, len(numbers) - 1)]
 
 
 def perception(edges: int, rng: np.random.Generator) -> Noise:
@@ -280,9 +284,9 @@ def fastest_routes(
             if not len(chunk):
                 continue
             _, before = dijkstra(graph, indices=chunk, return_predecessors=True)
-            for n in members[np.isin(first[members], chunk)]:
-                tree = before[np.searchsorted(chunk, first[n])]
-                routes[n] = _walk(tree, int(first[n]), int(last[n]))
+            here = members[np.isin(first[members], chunk)]
+            for n, row in zip(here, np.searchsorted(chunk, first[here]), strict=True):
+                routes[n] = _walk(before[row], int(first[n]), int(last[n]))
     return routes
 
 
