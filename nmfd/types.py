@@ -169,7 +169,7 @@ class Controller(Protocol):
 class Variable(NamedTuple):
     """Array of a Result, as xarray.Dataset takes it.
 
-    attributes: long_name, and units but of texts
+    attributes: long_name and, unless the values are texts, units
     """
 
     dimensions: tuple[str, ...]
@@ -231,7 +231,7 @@ EXPECTED = {
 }
 SHOWN_FACTS = 30  # in the representation of a result
 SHOWN_CHARACTERS = 60  # of a fact
-NAMES = ("region_name",)  # of entries of a dimension with numbers
+COORDINATES = ("region_name",)  # besides those that are named like their dimension
 # These differ between two runs of the same seed.
 HOST_TIMES = ("decision_time", "wall_time", "sumo_time_s", "setup_time_s", "overhead_share")
 
@@ -258,7 +258,7 @@ class Result:
         import xarray  # half a second, which few commands need
 
         return xarray.Dataset(self.variables, attrs=self.attrs).set_coords(
-            [name for name in NAMES if name in self]
+            [name for name in COORDINATES if name in self]
         )
 
     @property
@@ -491,8 +491,8 @@ def _write(path: Path, variables: Mapping[str, Variable], attrs: Mapping[str, An
             stored[:] = encoded.values
             for key, text in encoded.attributes.items():
                 setattr(stored, key, text.encode())
-        names = " ".join(name for name in NAMES if name in variables)
-        of_file = {**attrs, "coordinates": names, "empty": json.dumps(empty)}
+        coordinates = " ".join(name for name in COORDINATES if name in variables)
+        of_file = {**attrs, "coordinates": coordinates, "empty": json.dumps(empty)}
         for name, value in of_file.items():
             setattr(file, name, _packed(value))
 

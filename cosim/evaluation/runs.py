@@ -20,7 +20,7 @@ from nmfd.model.scenario import Scenario, with_demand
 from nmfd.runs.files import file_hash, run_name
 from nmfd.runs.run_many import Run
 
-GUIDANCE = ("cosim.plant.guidance",)  # which few runs need and imports its compiler
+GUIDANCE = ("cosim.plant.guidance",)  # loads a compiler, so only for guided runs
 SECONDS_PER_TRIP = 0.006  # wall time, in the committed results of grid7 and cities
 
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 KINDS = ("static", "actuated", "delay_based")
-NAMES = ("id", "programID", "offset")  # by which programmes with the same rules differ
+NO_RULES = ("id", "programID", "offset")  # attributes of a programme without effect on its rules
 MIN_GREEN_S = 5.0
 YELLOW_S = 3.0
 SHEET = {  # variable of a result, column of signals.csv
@@ -87,17 +87,18 @@ def proof_sheet(
                 indices = (link.get("linkIndex"), link.get("linkIndex2"))
                 crossings[signal].update(int(index) for index in indices if index)
         timetabled.update(attribute(switch, "junctionID") for switch in root.iter("wautJunction"))
-    made: dict[tuple, Rules] = {}
+    known: dict[tuple, Rules] = {}  # by programme and crossings
     rows: dict[str, dict[str, float]] = {}
     for signal in sorted((states.keys() & programmes.keys()) - timetabled):
         if any(logic.get("type") not in KINDS for logic in programmes[signal]):
             continue
         judged = []
         for logic in programmes[signal]:
-            alike = xml_text(logic, dict.fromkeys(NAMES, "")), *sorted(crossings[signal])
-            if alike not in made:
-                made[alike] = Rules(logic, crossings[signal], step)
-            judged.append(made[alike].judge(states[signal], end))
+            programme = xml_text(logic, dict.fromkeys(NO_RULES, ""))
+            key = (programme, *sorted(crossings[signal]))
+            if key not in known:
+                known[key] = Rules(logic, crossings[signal], step)
+            judged.append(known[key].judge(states[signal], end))
         rows[signal] = min(judged, key=violations)
         rows[signal]["longest_wait"] = waits.get(signal, np.nan)
     sheet = {"signal": np.array(list(rows), dtype=str)}

@@ -31,6 +31,7 @@ from nmfd.types import Result
 
 # Share of an edge's room: a queue that reaches its upstream end leaves gaps that move backwards.
 FULL_SHARE = 0.8
+# Columns of a table of trips; no outcome has more than nine characters.
 TRIPS = [(name, "U9" if kind is str else kind) for name, kind in Trip.__annotations__.items()]
 # Attribute of a result, column of runs.csv -> meaning.
 FACTS = config.read(Path(__file__).with_name("columns.toml"))["runs"] | PRESSURE_FACTS

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
 from cosim.sumo.arrays import PerEdge, PerMove, Points
-from cosim.sumo.xml_files import attribute, changed, network_root
+from cosim.sumo.xml_files import attribute, last_change, network_root
 from nmfd.errors import InputError
 from nmfd.model.regional_model import RegionalModel
 from nmfd.runs import config
@@ -246,7 +246,7 @@ def load_city(
         without edges
     """
     net_file = Path(net_file)
-    net = _read(net_file, opened)
+    net = _net(net_file, opened)
     given = read_regions(Path(regions_csv), regions)
     edges = tuple(sorted(edge for edge, lanes in net.lanes_of.items() if lanes))
     for edge in given:
@@ -372,16 +372,20 @@ def points_along(shape: Points, marks: Callable[[float], ArrayLike]) -> Float[np
     return np.stack([np.interp(at, along, axis) for axis in shape.T], axis=-1)
 
 
-def _read(path: Path, opened: Collection[str] = ()) -> _Net:
-    """Read a SUMO network; opened: as of `load_city`. Raises InputError."""
-    return _read_net(path, frozenset(opened), changed(path))
+def _net(path: Path, opened: Collection[str] = ()) -> _Net:
+    """Return a SUMO network, read anew only if its file has changed.
+
+    opened: as of `load_city`
+    Raises: InputError
+    """
+    return _read_net(path, frozenset(opened), last_change(path))
 
 
 @lru_cache(maxsize=2)  # a large city takes seconds
 def _read_net(path: Path, opened: Collection[str], _: int) -> _Net:
     """Read a SUMO network.
 
-    The last argument is the time of its last change, for the cache.
+    The last argument is the time of its file's last change, for the cache.
     """
     lanes_of: dict[str, list[_Lane]] = {}
     internal: dict[str, _Crossing] = {}
@@ -489,7 +493,7 @@ def connections_for_cars(net_file: Path, opened: Collection[str] = ()) -> list[C
     opened: as of `load_city`
     Raises: InputError
     """
-    return _links_for_cars(_read(net_file, opened))
+    return _links_for_cars(_net(net_file, opened))
 
 
 def _links_for_cars(net: _Net) -> list[Connection]:

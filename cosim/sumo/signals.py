@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from cosim.sumo.net import City, Gateway
 from cosim.sumo.session import Phase, Programme
-from cosim.sumo.xml_files import attribute, changed, is_true, read_xml, seconds_of
+from cosim.sumo.xml_files import attribute, is_true, last_change, read_xml, seconds_of
 from nmfd.errors import InputError
 
 GREEN = frozenset("Gg")
@@ -252,7 +252,7 @@ def read_files(net: Path, additional: Iterable[Path] = ()) -> SignalFile:
 
     Raises: InputError
     """
-    network = _network(net, changed(net))
+    network = _network(net, last_change(net))
     programmes = dict(network.programmes)
     switched = set(network.timetabled)
     for path in additional:

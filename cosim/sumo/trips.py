@@ -227,7 +227,7 @@ def _is_pocket(city: City, edge: str) -> bool:
 
 
 def _draw(city: City, ends: _Ends, uniforms: PerTrip) -> TripNumbers:
-    """Return an edge (N,) for every random number from 0 to 1 (N,)."""
+    """Return the edges that random numbers from 0 to 1 (N,) draw."""
     numbers = np.array([city.number[edge] for edge in ends.edges])
     places = np.searchsorted(ends.weights, uniforms, side="right")
     return numbers[np.minimum(places, len(numbers) - 1)]

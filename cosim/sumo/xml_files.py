@@ -112,7 +112,7 @@ def xml_text(element: ElementTree.Element, own: Mapping[str, str] = {}) -> str:
     return f"<{element.tag}{attributes}>{content}</{element.tag}>"
 
 
-def changed(path: Path) -> int:
+def last_change(path: Path) -> int:
     """Return the time of a file's last change (ns), 0 if there is none."""
     return path.stat().st_mtime_ns if path.is_file() else 0
 

@@ -169,8 +169,8 @@ def _start_server() -> None:
     resource_tracker.ensure_running()  # first, as it lets Ctrl-C through
     blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     new_process = util.spawnv_passfds
-    heavy = any(name in sys.modules for name in ALSO_THERE)
-    if sys.platform == "linux" and threading.active_count() == 1 and not heavy:
+    with_threads = any(name in sys.modules for name in ALSO_THERE) or threading.active_count() > 1
+    if sys.platform == "linux" and not with_threads:
         util.spawnv_passfds = _fork  # type: ignore[assignment]
     try:
         with _environment({"PYTHONSAFEPATH": "1", "PYTHONPATH": os.pathsep.join(sys.path)}):
@@ -198,6 +198,8 @@ def _fork(_: Any, command: Sequence[Any], kept: Collection[int]) -> int:
                 with suppress(OSError):  # the list was one of them
                     os.close(number)
         exec(command[-1], {})
+    except Exception:
+        traceback.print_exc()
     finally:
         os._exit(0)
 

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 with warnings.catch_warnings(action="ignore"):  # a notebook without ipywidgets gets no bar
     from tqdm.auto import tqdm
 
-tqdm.monitor_interval = 0  # it needs no thread to watch it, beside which no process may fork
+tqdm.monitor_interval = 0  # no thread watches bars: nmfd.runs.pool forks only without threads
 Show = Callable[..., None] | None  # takes done, all and perhaps a note
 Progress = Show | bool
 MEASURED_S = 2.0  # of the first steps, from which the time of all others follows
