@@ -121,12 +121,12 @@ class Choosing(NamedTuple):
     gain_stage: Any
     gain_movement: Any
     gain: Any
+    lost: Any
     called: Any
     decision_period: Any
     longest_green: Any
     longest_red: Any
     lookahead: Any
-    period: int
     dt: Any
     zero: Any
     one: Any
@@ -341,7 +341,7 @@ def advance(
         for k in range(begin, end):
             now = k % len(counts.queue)
             if signals is not None:
-                if (first + k) % signals.period == 0:
+                if (first + k) * signals.dt % signals.decision_period < signals.dt:
                     _decide(signals, counts.inside[now, b], stages, b)
                 _show(signals, stages, given.light[k, b], given.yields[k, b], b)
             sums.begun[b] += _flow(city, given, counts, histories, b, now, k, work)
@@ -393,6 +393,7 @@ def _decide(signals: Choosing, inside: np.ndarray, stages: "Stages", b: int) -> 
     most = signals.light.shape[1]
     pressure = np.zeros(signals.least.size, inside.dtype)
     waiting = np.zeros(signals.least.shape, inside.dtype)
+    overdue = np.zeros_like(waiting)
     weight = np.zeros(len(signals.signal), inside.dtype)
     for n in range(len(signals.pressed)):
         weight[signals.pressed[n]] += inside[signals.presses[n]] * signals.weight[n]
@@ -400,12 +401,19 @@ def _decide(signals: Choosing, inside: np.ndarray, stages: "Stages", b: int) -> 
         gained = max(weight[signals.gain_movement[n]], zero) * signals.gain[n]
         pressure[signals.gain_stage[n]] += gained
     for m in range(len(weight)):
+        present = inside[signals.link[m]]
+        red = stages.red[b, m]
+        if red < signals.longest_red or present < signals.called:
+            red = zero
         for n in range(most):
-            present = signals.light[m, n] * inside[signals.link[m]]
-            waiting[signals.signal[m], n] += present
+            light = signals.light[m, n]
+            waiting[signals.signal[m], n] += light * present
+            if light > zero:
+                overdue[signals.signal[m], n] += red
     for s in range(len(waiting)):
         own = stages.stage[b, s]
-        wanted = _wanted(signals, stages, b, s, waiting[s], pressure[s * most : (s + 1) * most])
+        pressures = pressure[s * most : (s + 1) * most]
+        wanted = _wanted(signals, stages, b, s, waiting[s], overdue[s], pressures)
         may = stages.clearing[b, s] == zero and stages.green[b, s] >= signals.least[s, own]
         if may and wanted != own:
             stages.stage[b, s] = wanted
@@ -421,15 +429,17 @@ def _wanted(
     b: int,
     s: int,
     waiting: np.ndarray,
+    overdue: np.ndarray,
     pressure: np.ndarray,
 ) -> int:
     """Return the stage that signal s wants.
 
-    waiting: vehicles for each stage (veh, (n,)); pressure: of each stage (n,)
+    waiting: vehicles for each stage (veh, (n,))
+    overdue: red of movements that wait too long for it (s, (n,)); pressure: of each stage (n,)
     """
     own = stages.stage[b, s]
     best = own
-    overdue = own
+    latest = own
     ahead = signals.zero
     longest = signals.zero
     for n in range(signals.count[s]):
@@ -439,12 +449,12 @@ def _wanted(
         if best == own or pressure[n] * kept > ahead:
             ahead = pressure[n] * kept
             best = n
-        red = stages.red[b, s, n]
-        if red >= signals.longest_red and red > longest:
-            longest = red
-            overdue = n
-    if overdue != own:
-        return overdue
+    for n in range(signals.count[s]):
+        if overdue[n] > longest:
+            longest = overdue[n]
+            latest = n
+    if best != own and latest != own:
+        return latest
     too_long = stages.green[b, s] + signals.decision_period > signals.longest_green
     return best if too_long or ahead > pressure[own] else own
 
@@ -467,16 +477,18 @@ def _show(
         after = signals.light[m, stage]
         before = signals.light[m, earlier]
         # Those who gave way wait on the junction, and go while it clears.
-        kept = max(min(after, before), before * signals.yields[m, earlier])
+        both = min(after, before)
+        kept = max(both, before * signals.yields[m, earlier])
+        lost = max(signals.lost[m] - stages.green[b, s], signals.zero)
         waits = min(stages.clearing[b, s] / signals.dt, one)
-        light[m] = waits * kept + (one - waits) * after
+        starts = min((stages.clearing[b, s] + lost) / signals.dt, one)
+        light[m] = waits * kept + (starts - waits) * both + (one - starts) * after
         yields[m] = (one - waits) * signals.yields[m, stage]
+        red = stages.red[b, m] + signals.dt
+        stages.red[b, m] = signals.zero if after > signals.zero else red
     for s in range(len(signals.count)):
         stages.green[b, s] += max(signals.dt - stages.clearing[b, s], signals.zero)
         stages.clearing[b, s] = max(stages.clearing[b, s] - signals.dt, signals.zero)
-        for n in range(signals.light.shape[1]):
-            stages.red[b, s, n] += signals.dt
-        stages.red[b, s, stages.stage[b, s]] = signals.zero
 
 
 @inner

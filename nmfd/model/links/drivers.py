@@ -8,8 +8,8 @@ drivers weigh the ways onward:
 z(c) is that of the entry that c leads to. This is a recursive logit (Fosgerau, Frejinger and
 Karlstroem, 2013) whose prior are the static shares: only ways that static routes use are taken.
 
-- By times, to the region of destination: w_c = exp(-(d + price T) / SPREAD_S), with the time T and
-  the delay d on the link that c enters; a price counts where another region is the destination.
+- By times, to the region of destination: w_c = exp(-(d + price T) / DISPERSION_S), with the time T
+  and the delay d on the link that c enters; a price counts where another region is the destination.
 - By commanded splits, to the next region: w_c = theta_ihj / nominal theta_ihj over the boundary, so
   that nominal splits change nothing.
 
@@ -24,10 +24,10 @@ from torch import Tensor
 
 from nmfd.arrays import PerTurn
 from nmfd.model.links.flows import Flows
+from nmfd.model.regional_model import DISPERSION_S
 from nmfd.tensors import PerRegion
 from nmfd.tensors import PerTurn as Turns
 
-SPREAD_S = 30.0  # of the times that drivers tell apart; not fitted
 LONGEST_DELAY_S = 300.0  # on one link; keeps weights within the range of numbers
 LEAST_NOMINAL = 0.02  # nominal share by which a command is divided
 ARRIVED = 0.999  # share of the static ways that the recursion follows to their end
@@ -100,7 +100,7 @@ class Drivers:
         if prices is not None:
             priced = time * prices.index_select(1, self._region_of_link)
             cost = cost + torch.where(self._enters_home, 0.0, priced.index_select(1, self._link))
-        weight = torch.exp(-cost.double() / SPREAD_S)
+        weight = torch.exp(-cost.double() / DISPERSION_S)
         return self._weighed(share, weight, self._to_destination)
 
     def by_splits(self, share: Tensor, splits: Turns) -> Tensor:

@@ -22,8 +22,9 @@ shares, if green lasts long enough: first in, first out, and no flow could be la
 lead to some turns only, vehicles that all want one turn still move up in all lanes.
 A movement that gives way to a flow f has exp(-gap f) of its green, which is the chance that no
 vehicle comes within the critical gap. A vehicle that stood at the stop line takes longer along the
-next link: 1.6 s until it drives, and v / 2a as it accelerates. Trips begin and end where they do on
-average along a street; one that ends in the queue moves up there.
+next link: START_S until it drives, and v / 2a as it accelerates, less what each green loses of its
+capacity at the beginning (`Flows.lost`). Trips begin and end where they do on average along a
+street; one that ends in the queue moves up there.
 
 Every vehicle that leaves one count enters another one: mass and its derivative are conserved.
 """
@@ -42,9 +43,11 @@ EPSILON = 1e-3  # veh
 LEAST = 0.1  # veh: smaller counts do not divide a room, which bounds the gradient
 INFLOW = 0.6  # veh/s in each lane, the most that can enter a link
 # SUMO's cars leave a queue with a headway of REACTION * tau + (spacing + BETWEEN_M) / v.
-REACTION = 0.9
+REACTION = 1.04
 BETWEEN_M = 4.8
 START_S = 1.6  # after which the first vehicle of a queue drives
+ACCELERATING = 0.85  # of a vehicle's acceleration, as drivers dawdle
+BRAKING = 4.5  # m/s2, of SUMO's cars that stop at yellow
 
 
 class Numbers(NamedTuple):
@@ -52,7 +55,7 @@ class Numbers(NamedTuple):
 
     time_factor: of the free-flow times (-)
     spacing: of the length of lane that a standing vehicle takes (-)
-    saturation: of the flow of a lane at green, which is 1 / (0.9 tau + (spacing + 4.8 m) / v) with
+    saturation: of the flow of a lane at green, which is 1 / (1.04 tau + (spacing + 4.8 m) / v) with
         the speed v on the junction (-)
     gap: critical gap of vehicles that give way (s)
     """
@@ -243,9 +246,9 @@ class Flows:
         wave = flow / (1.0 / self.spacing - flow / speed)
         self.wave = wave
         # A queue discharges at its flow, although its first vehicle is late on the next link.
-        late = np.minimum(START_S + speed / (2.0 * network.acceleration), network.length / wave)
-        # The newest count is that of now. Between two steps counts change evenly.
-        wave_steps = (network.length / wave - late) / self.dt + 1.0
+        late = np.minimum(self._starting(speed) - self.lost(speed), network.length / wave)
+        # The newest count is that of now, and a step is long. Between steps counts change evenly.
+        wave_steps = np.maximum((network.length / wave - late) / self.dt, 1.0)
         backwards = np.floor(wave_steps).astype(int)
         self._earlier = self.values(wave_steps - backwards)
         self._along = self.delay(along[network.entry_link], self.device)
@@ -261,6 +264,22 @@ class Flows:
         network = self.network
         headway = REACTION * network.headway + (network.spacing + BETWEEN_M) / speed
         return self.numbers.saturation / headway
+
+    def lost(self, speed: np.ndarray) -> np.ndarray:
+        """Return the time lost in each green of a lane that has a queue (s).
+
+        Of a queue, vehicle k crosses the stop line START_S + v / 2a + k / s after the light, the
+        first one START_S after it. Those that cannot stop any more cross at yellow.
+
+        speed: on the junction (m/s)
+        """
+        yellow = speed / (2.0 * BRAKING)
+        headway = 1.0 / self._saturation(speed)
+        return np.maximum(self._starting(speed) - headway - yellow, 0.0)
+
+    def _starting(self, speed: np.ndarray) -> np.ndarray:
+        """Return what a vehicle loses that stands when the light changes (s)."""
+        return START_S + speed / (2.0 * ACCELERATING * self.network.acceleration)
 
     def _limit(self) -> None:
         """Set the storage of links, and the most vehicles that move in a step."""

@@ -121,7 +121,6 @@ class CompiledMaxPressure(MaxPressure):
             longest_green=kind(LONGEST_GREEN_S),
             longest_red=kind(LONGEST_RED_S),
             lookahead=kind(lookahead),
-            period=self.period,
             dt=kind(flows.dt),
             zero=kind(0.0),
             one=kind(1.0),

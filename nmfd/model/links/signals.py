@@ -32,9 +32,9 @@ from torch import Tensor
 from nmfd.model.links.flows import EPSILON, LEAST, Flows, Traffic
 
 LEAST_GREEN_S = 5.0  # of a gated movement in each window of green
-DECISION_PERIOD_S = 5.0
+DECISION_PERIOD_S = 5  # at the first step from then on
 LONGEST_GREEN_S = 50.0  # under max-pressure while others wait
-LONGEST_RED_S = 120.0  # then a stage with vehicles comes first
+LONGEST_RED_S = 120.0  # of a movement with vehicles; then a stage that serves it comes first
 CALLED_VEH = 0.2  # vehicles that call a stage
 FIXED = "fixed"
 MAX_PRESSURE = "max-pressure"
@@ -60,7 +60,7 @@ class Stages(NamedTuple):
     stage, before: present or coming stage, and the one before it (B, S)
     clearing: time until the present stage begins (s, (B, S))
     green: time since then (s, (B, S))
-    red: time since each stage was last green (s, (B, S, n))
+    red: time since each movement was last green (s, (B, M))
     """
 
     stage: Tensor
@@ -89,7 +89,7 @@ class Phases(NamedTuple):
 class Responsive(Protocol):
     """Signals that follow the traffic; their state is Stages or Phases.
 
-    period: steps between their decisions
+    period: steps after which their decisions fall on the same ones again
     """
 
     period: int
@@ -126,13 +126,14 @@ class Gates:
         self.opens = np.zeros(len(network.light))
         whole = np.ones(len(self.movements))
         taken = np.ones(len(self.movements))
+        lost = flows.lost(network.speed)
         for number, movement in enumerate(self.movements):
             begin = network.begin[movement]
             cycle = network.cycle[movement]
             light = network.light[begin : begin + cycle]
             opens = (light > 0.0) & (np.roll(light, 1) == 0.0)
-            capacity = light.sum()
             green = (light == 1.0).sum()
+            capacity = _late(light, lost[movement]).sum()
             if by_cycle:
                 opens[:] = False
             if not of_programme:
@@ -177,7 +178,14 @@ class Programmes:
         """opens: of the gates"""
         self._flows = flows
         self._opens = opens
-        self._period = math.lcm(*flows.network.cycle.tolist())
+        network = flows.network
+        self._light = network.light.copy()
+        for begin, cycle, lost in zip(
+            network.begin, network.cycle, flows.lost(network.speed), strict=True
+        ):
+            own = slice(begin, begin + cycle)
+            self._light[own] = _late(network.light[own], lost)
+        self._period = math.lcm(*network.cycle.tolist())
         self._read = lru_cache(maxsize=KEPT)(self._read_in_period)
 
     def read(self, begin: float, steps: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -196,12 +204,31 @@ class Programmes:
         def by_step(values: np.ndarray) -> np.ndarray:
             return values[place].reshape(steps, seconds, -1)
 
-        light = by_step(network.light).mean(axis=1)
-        yielding = by_step(network.light * network.yields).mean(axis=1)
+        light = by_step(self._light).mean(axis=1)
+        yielding = by_step(self._light * network.yields).mean(axis=1)
         yields = yielding / np.maximum(light, 1e-9)
         opens = by_step(self._opens).max(axis=1)
         values = self._flows.values
         return values(light), values(yields), values(opens)
+
+
+def _late(light: np.ndarray, lost: float) -> np.ndarray:
+    """Return the light of a movement without the time lost in each green.
+
+    A light that always shows stays as it is.
+
+    light: in each second of its cycle (-, (cycle,)); lost: (s)
+    """
+    late = light.copy()
+    for opens in np.flatnonzero((light > 0.0) & (np.roll(light, 1) == 0.0)):
+        left = lost
+        for second in range(opens, opens + len(light)):
+            place = second % len(light)
+            if left <= 0.0 or light[place] == 0.0:
+                break
+            late[place] -= min(light[place], left)
+            left -= light[place]
+    return late
 
 
 def _shown(table: Tensor, stage: Tensor, signal: Tensor) -> Tensor:
@@ -224,8 +251,10 @@ class MaxPressure:
         self._chooses = torch.as_tensor(network.signal >= 0, device=flows.device)
         self._signal = flows.places(np.maximum(network.signal, 0))
         self._light = flows.values(network.stage_light)
+        self._serves = flows.values(network.stage_light > 0.0)
         self._yields = flows.values(network.stage_yields)
         self._loss = flows.values(network.stage_loss)
+        self._lost = flows.values(flows.lost(network.speed))
         self._least = flows.values(network.stage_least)
         self._count = flows.places(network.stages)
         self._link = flows.places(network.movement_link)
@@ -235,37 +264,41 @@ class MaxPressure:
         self._gain_stage = flows.places(network.gain_stage)
         self._gain_movement = flows.places(network.gain_movement)
         self._gain = flows.values(network.gain)
-        self.period = max(round(DECISION_PERIOD_S / flows.dt), 1)
+        self.period = DECISION_PERIOD_S // math.gcd(DECISION_PERIOD_S, round(flows.dt))
 
     def start(self, batch: int) -> Stages:
         """Return the state at first: all signals in their first stage."""
-        signals, most = self._least.shape
+        signals = len(self._least)
         stage = torch.zeros(batch, signals, dtype=torch.long, device=self._flows.device)
         zeros = self._least.new_zeros(batch, signals)
-        return Stages(stage, stage, zeros, zeros, self._least.new_zeros(batch, signals, most))
+        red = zeros.new_zeros(batch, len(self._light))
+        return Stages(stage, stage, zeros, zeros, red)
 
     def step(
         self, number: int, stages: Stages, traffic: Traffic, programme: Lights
     ) -> tuple[Stages, Lights]:
         """Return the state and the lights of a step, as `Responsive`."""
-        if number % self.period == 0:
+        dt = self._flows.dt
+        if number * dt % DECISION_PERIOD_S < dt:
             with torch.no_grad():
                 stages = self._decide(stages, traffic.inside)
-        dt = self._flows.dt
         after = _shown(self._light, stages.stage, self._signal)
         before = _shown(self._light, stages.before, self._signal)
         # Those who gave way wait on the junction, and go while it clears.
         last = before * _shown(self._yields, stages.before, self._signal)
-        kept = torch.maximum(torch.minimum(after, before), last)
-        waits = (stages.clearing / dt).clamp(max=1.0).index_select(1, self._signal)
-        light = waits * kept + (1.0 - waits) * after
+        clearing = stages.clearing.index_select(1, self._signal)
+        lost = (self._lost - stages.green.index_select(1, self._signal)).clamp(min=0.0)
+        waits = (clearing / dt).clamp(max=1.0)
+        starts = ((clearing + lost) / dt).clamp(max=1.0)
+        both = torch.minimum(after, before)
+        kept = torch.maximum(both, last)
+        light = waits * kept + (starts - waits) * both + (1.0 - starts) * after
         yields = (1.0 - waits) * _shown(self._yields, stages.stage, self._signal)
         begun = (dt - stages.clearing).clamp(min=0.0)
-        running = torch.nn.functional.one_hot(stages.stage, self._least.shape[1])
         stages = stages._replace(
             clearing=(stages.clearing - dt).clamp(min=0.0),
             green=stages.green + begun,
-            red=(stages.red + dt) * (1 - running),
+            red=torch.where(after > 0.0, 0.0, stages.red + dt),
         )
         light = torch.where(self._chooses, light, programme.light)
         return stages, Lights(light, torch.where(self._chooses, yields, programme.yields))
@@ -288,7 +321,9 @@ class MaxPressure:
         pressure = self._pressure(inside)
         worth = pressure * self._lookahead / (self._lookahead + loss)
         worth = torch.where(called, worth, -torch.inf)
-        overdue = torch.where(called & (stages.red >= LONGEST_RED_S), stages.red, 0.0)
+        too_late = (stages.red >= LONGEST_RED_S) & (present.squeeze(2) >= CALLED_VEH)
+        red = torch.where(too_late, stages.red, 0.0).unsqueeze(2)
+        overdue = torch.zeros_like(waiting).index_add(1, self._signal, self._serves * red)
         late = overdue.amax(2) > 0.0
         best = torch.where(late, overdue.argmax(2), worth.argmax(2))
         ahead = worth.amax(2) > pressure.gather(2, own).squeeze(2)
@@ -333,6 +368,10 @@ class Actuated:
         self._signal = flows.places(signal)
         self._light = flows.values(network.light[place])
         self._yielding = flows.values(network.light[place] * network.yields[place])
+        before = np.tile(np.arange(second.shape[1]) - 1, (len(signal), 1))
+        before[:, 0] = network.phases[signal] - 1
+        red_before = np.take_along_axis(network.light[place], before, axis=1) == 0.0
+        self._lost = flows.values(flows.lost(network.speed)[:, None] * red_before)
         self._count = flows.places(network.phases)
         self._least = flows.values(network.phase_least)
         self._most = flows.values(network.phase_most)
@@ -370,8 +409,10 @@ class Actuated:
         yielding = torch.zeros_like(light)
         for second in range(seconds):
             phases = self._next(phases, gap + second)
-            light = light + _shown(self._light, phases.phase, self._signal) / seconds
-            yielding = yielding + _shown(self._yielding, phases.phase, self._signal) / seconds
+            lost = _shown(self._lost, phases.phase, self._signal)
+            begun = (phases.since.index_select(1, self._signal) - lost).clamp(0.0, 1.0) / seconds
+            light = light + begun * _shown(self._light, phases.phase, self._signal)
+            yielding = yielding + begun * _shown(self._yielding, phases.phase, self._signal)
         yields = yielding / light.clamp(min=1e-9)
         light = torch.where(self._chooses, light, programme.light)
         return phases, Lights(light, torch.where(self._chooses, yields, programme.yields))
