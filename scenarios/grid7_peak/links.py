@@ -90,13 +90,17 @@ def main(folder: Path, again: Path | None) -> None:
         scenario = loaded(nmfd.load_scenario(row["city"]), demand=row["demand"])
         links = in_links(scenario, row["control"], row["seed"])
         regions = in_regions(scenario, row["control"])
-        spent = np.mean([one.total_time_spent for one in links]) / 1e6
+        spent = np.array([one.total_time_spent for one in links]) / 1e6
+        lock = np.array([locks(one) for one in links])
+        like = not row["SUMO locks"] and not lock.all()
+        flowing = spent[~lock].mean() if like else np.nan
         seen.append(
             {
-                "links": spent,
-                "links lock": np.mean([locks(one) for one in links]),
+                "links": spent.mean(),
+                "links lock": lock.mean(),
                 "links left": np.mean([left_share(one) for one in links]),
-                "difference %": 100 * (spent / row["SUMO"] - 1),
+                "difference %": 100 * (spent.mean() / row["SUMO"] - 1),
+                "flowing %": 100 * (flowing / row["SUMO"] - 1),
                 "regions": regions.total_time_spent / 1e6,
                 "regions left": left_share(regions),
             }
@@ -105,12 +109,13 @@ def main(folder: Path, again: Path | None) -> None:
     table = pd.concat([table, pd.DataFrame(seen)], axis=1).round(3)
     table.to_csv(folder / "links.csv", index=False)
     click.echo(table.to_markdown(index=False))
-    off = table.loc[~table["SUMO locks"], "difference %"].abs()
-    near = (off <= WITHIN).sum()
-    click.echo(
-        f"{len(off)} runs flow in SUMO: {off.median():.1f} % off in the median, {near} within "
-        f"{WITHIN:g} %; area under the curve of {len(table)} runs:"
-    )
+    for name, draws in (("difference %", "all draws"), ("flowing %", "draws that flow")):
+        off = table.loc[~table["SUMO locks"], name].abs()
+        click.echo(
+            f"{len(off)} runs flow in SUMO: {off.median():.1f} % off in the median, "
+            f"{(off <= WITHIN).sum()} within {WITHIN:g} % ({draws})"
+        )
+    click.echo(f"area under the curve of {len(table)} runs:")
     for name in ("links lock", "links left", "regions left"):
         area = roc_auc_score(table["SUMO locks"], table[name])
         click.echo(f"{name} {area:.3f}")
