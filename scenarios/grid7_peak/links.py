@@ -92,8 +92,8 @@ def main(folder: Path, again: Path | None) -> None:
         regions = in_regions(scenario, row["control"])
         spent = np.array([one.total_time_spent for one in links]) / 1e6
         lock = np.array([locks(one) for one in links])
-        like = not row["SUMO locks"] and not lock.all()
-        flowing = spent[~lock].mean() if like else np.nan
+        both_flow = not row["SUMO locks"] and not lock.all()
+        flowing = spent[~lock].mean() if both_flow else np.nan
         seen.append(
             {
                 "links": spent.mean(),

@@ -341,7 +341,8 @@ def advance(
         for k in range(begin, end):
             now = k % len(counts.queue)
             if signals is not None:
-                if (first + k) * signals.dt % signals.decision_period < signals.dt:
+                since = (first + k) * signals.dt % signals.decision_period
+                if since < signals.dt:
                     _decide(signals, counts.inside[now, b], stages, b)
                 _show(signals, stages, given.light[k, b], given.yields[k, b], b)
             sums.begun[b] += _flow(city, given, counts, histories, b, now, k, work)
@@ -435,13 +436,12 @@ def _wanted(
     """Return the stage that signal s wants.
 
     waiting: vehicles for each stage (veh, (n,))
-    overdue: red of movements that wait too long for it (s, (n,)); pressure: of each stage (n,)
+    overdue: sum of the red of movements that wait too long for each stage (s, (n,))
+    pressure: of each stage (n,)
     """
     own = stages.stage[b, s]
     best = own
-    latest = own
     ahead = signals.zero
-    longest = signals.zero
     for n in range(signals.count[s]):
         if n == own or waiting[n] < signals.called:
             continue
@@ -449,12 +449,9 @@ def _wanted(
         if best == own or pressure[n] * kept > ahead:
             ahead = pressure[n] * kept
             best = n
-    for n in range(signals.count[s]):
-        if overdue[n] > longest:
-            longest = overdue[n]
-            latest = n
-    if best != own and latest != own:
-        return latest
+    late = np.argmax(overdue)
+    if best != own and overdue[late] > signals.zero:
+        return late
     too_long = stages.green[b, s] + signals.decision_period > signals.longest_green
     return best if too_long or ahead > pressure[own] else own
 

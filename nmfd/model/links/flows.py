@@ -22,8 +22,8 @@ shares, if green lasts long enough: first in, first out, and no flow could be la
 lead to some turns only, vehicles that all want one turn still move up in all lanes.
 A movement that gives way to a flow f has exp(-gap f) of its green, which is the chance that no
 vehicle comes within the critical gap. A vehicle that stood at the stop line takes longer along the
-next link: START_S until it drives, and v / 2a as it accelerates, less what each green loses of its
-capacity at the beginning (`Flows.lost`). Trips begin and end where they do on average along a
+next link: START_S until it drives, and v / 2a as it accelerates by a, less what each green loses of
+its capacity at the beginning (`Flows.lost`). Trips begin and end where they do on average along a
 street; one that ends in the queue moves up there.
 
 Every vehicle that leaves one count enters another one: mass and its derivative are conserved.
@@ -247,7 +247,7 @@ class Flows:
         self.wave = wave
         # A queue discharges at its flow, although its first vehicle is late on the next link.
         late = np.minimum(self._starting(speed) - self.lost(speed), network.length / wave)
-        # The newest count is that of now, and a step is long. Between steps counts change evenly.
+        # Room counts at the end of a step. Between steps counts change evenly.
         wave_steps = np.maximum((network.length / wave - late) / self.dt, 1.0)
         backwards = np.floor(wave_steps).astype(int)
         self._earlier = self.values(wave_steps - backwards)
@@ -268,8 +268,9 @@ class Flows:
     def lost(self, speed: np.ndarray) -> np.ndarray:
         """Return the time lost in each green of a lane that has a queue (s).
 
-        Of a queue, vehicle k crosses the stop line START_S + v / 2a + k / s after the light, the
-        first one START_S after it. Those that cannot stop any more cross at yellow.
+        Vehicle k of a queue crosses the stop line START_S + v / 2a + k / s after the light changes,
+        but the first one START_S after it. Those that cannot stop any more cross at yellow. The
+        constants are those of SUMO at one signal (tests/test_link_capacity.py).
 
         speed: on the junction (m/s)
         """
@@ -278,7 +279,7 @@ class Flows:
         return np.maximum(self._starting(speed) - headway - yellow, 0.0)
 
     def _starting(self, speed: np.ndarray) -> np.ndarray:
-        """Return what a vehicle loses that stands when the light changes (s)."""
+        """Return the time that a standing vehicle loses as it starts (s)."""
         return START_S + speed / (2.0 * ACCELERATING * self.network.acceleration)
 
     def _limit(self) -> None:

@@ -32,7 +32,7 @@ from torch import Tensor
 from nmfd.model.links.flows import EPSILON, LEAST, Flows, Traffic
 
 LEAST_GREEN_S = 5.0  # of a gated movement in each window of green
-DECISION_PERIOD_S = 5  # at the first step from then on
+DECISION_PERIOD_S = 5
 LONGEST_GREEN_S = 50.0  # under max-pressure while others wait
 LONGEST_RED_S = 120.0  # of a movement with vehicles; then a stage that serves it comes first
 CALLED_VEH = 0.2  # vehicles that call a stage
@@ -279,7 +279,8 @@ class MaxPressure:
     ) -> tuple[Stages, Lights]:
         """Return the state and the lights of a step, as `Responsive`."""
         dt = self._flows.dt
-        if number * dt % DECISION_PERIOD_S < dt:
+        since = number * dt % DECISION_PERIOD_S  # the last decision was due
+        if since < dt:
             with torch.no_grad():
                 stages = self._decide(stages, traffic.inside)
         after = _shown(self._light, stages.stage, self._signal)
@@ -308,9 +309,9 @@ class MaxPressure:
         own = stages.stage.unsqueeze(2)
         batch = len(own)
         signals, most = self._least.shape
-        present = inside.index_select(1, self._link).unsqueeze(2)
+        present = inside.index_select(1, self._link)
         waiting = inside.new_zeros(batch, signals, most)
-        waiting = waiting.index_add(1, self._signal, self._light * present)
+        waiting = waiting.index_add(1, self._signal, self._light * present.unsqueeze(2))
         number = torch.arange(most, device=inside.device)
         exists = number < self._count.unsqueeze(1)
         called = (waiting >= CALLED_VEH) & exists & (number != own)
@@ -321,7 +322,7 @@ class MaxPressure:
         pressure = self._pressure(inside)
         worth = pressure * self._lookahead / (self._lookahead + loss)
         worth = torch.where(called, worth, -torch.inf)
-        too_late = (stages.red >= LONGEST_RED_S) & (present.squeeze(2) >= CALLED_VEH)
+        too_late = (stages.red >= LONGEST_RED_S) & (present >= CALLED_VEH)
         red = torch.where(too_late, stages.red, 0.0).unsqueeze(2)
         overdue = torch.zeros_like(waiting).index_add(1, self._signal, self._serves * red)
         late = overdue.amax(2) > 0.0
