@@ -153,13 +153,19 @@ def vehicles(model, state) -> torch.Tensor:
     return model.accumulation(state).sum() + outside + state.traffic.completed.sum()
 
 
-def first_green(model, traffic_of, steps=40):
-    """Length of the first green of a -> b (s); `traffic_of`: the traffic of a step."""
-    stages = model.start(1).stages
+def signals_shown(model, traffic_of, steps):
+    """State and lights in each step; `traffic_of`: the traffic by step and state before it."""
+    state = model.start(1).stages
     programme = Lights(torch.ones(1, 3).double(), torch.zeros(1, 3).double())
-    green = 0.0
     for n in range(steps):
-        stages, lights = model._signals.step(n, stages, traffic_of(n), programme)
+        state, lights = model._signals.step(n, state, traffic_of(n, state), programme)
+        yield state, lights
+
+
+def first_green(model, traffic_of, steps=40):
+    """Length of the first green of a -> b (s)."""
+    green = 0.0
+    for _, lights in signals_shown(model, traffic_of, steps):
         if float(lights.light[0, 0]) == 0.0:
             break
         green += 2.0 * float(lights.light[0, 0])
@@ -339,7 +345,7 @@ def test_an_actuated_green_lasts_until_no_vehicle_passes_for_three_seconds():
     empty = model.start(1).traffic
     for last, green in ((0, LEAST_S), (10, np.ceil(19.5 + GAP_S)), (30, LONGEST_S)):
         found = first_green(
-            model, lambda n, last=last: empty._replace(left=empty.left + min(n, last))
+            model, lambda n, _, last=last: empty._replace(left=empty.left + min(n, last))
         )
         assert found == pytest.approx(green - LOST_S)
 
@@ -350,7 +356,7 @@ def test_vehicles_between_the_detector_and_the_stop_line_extend_no_green():
     empty = model.start(1).traffic
     for vehicles, green in ((2.0, LEAST_S), (3.0, LONGEST_S)):
         queue = torch.tensor([[vehicles, 0.0, 0.0]]).double()
-        found = first_green(model, lambda _, queue=queue: empty._replace(queue=queue))
+        found = first_green(model, lambda *_, queue=queue: empty._replace(queue=queue))
         assert found == pytest.approx(green - LOST_S)
 
 
@@ -379,15 +385,12 @@ def three_stages(*, beside: bool) -> LinkNetwork:
 
 def stages_shown(model, inside_of, seconds):
     """Stage of the signal in each step of 2 s; `inside_of`: vehicles by link while it shows one."""
-    state = model._signals.start(1)
     empty = model.start(1).traffic
-    programme = Lights(torch.ones(1, 3).double(), torch.zeros(1, 3).double())
-    shown = []
-    for n in range(seconds // 2):
-        traffic = empty._replace(inside=torch.tensor([inside_of(int(state.stage))]).double())
-        state, _ = model._signals.step(n, state, traffic, programme)
-        shown.append(int(state.stage))
-    return shown
+
+    def traffic_of(_, state):
+        return empty._replace(inside=torch.tensor([inside_of(int(state.stage))]).double())
+
+    return [int(state.stage) for state, _ in signals_shown(model, traffic_of, seconds // 2)]
 
 
 @pytest.mark.parametrize("beside", [True, False])
