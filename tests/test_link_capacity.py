@@ -1,4 +1,4 @@
-"""Vehicles that leave a queue in each green: the link model beside SUMO, at one signal."""
+"""Vehicles that leave a queue at a signal, or where they merge: the link model beside SUMO."""
 
 from dataclasses import replace
 from xml.etree import ElementTree
@@ -6,12 +6,18 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import tiny_city
-from test_links import ONE_LANE, STEP_S, model_of, rollout, triangle
+import torch
+from test_links import CYCLE_S, ONE_LANE, STEP_S, demand_of, model_of, rollout, triangle
+
+from nmfd.model.links.flows import ACCELERATING, Numbers
+from nmfd.model.links.model import Commands
 
 RED_S = 43  # with yellow
 FIRST, LAST = 10, 70  # cycles that count
+STRAIGHT = (600, 0)  # where the next street ends (m)
+RIGHT = (0, -600)
 NODES = """<nodes><node id="a" x="-900" y="0"/><node id="c" x="0" y="0" type="traffic_light"/>
-<node id="b" x="600" y="0"/></nodes>"""
+<node id="b" x="{x}" y="{y}"/></nodes>"""
 EDGES = """<edges><edge id="ac" from="a" to="c" speed="{speed}"/>
 <edge id="cb" from="c" to="b" speed="{speed}"/></edges>"""
 CITY = """<additional><tlLogic id="c" type="static" programID="own" offset="0">
@@ -21,28 +27,48 @@ CITY = """<additional><tlLogic id="c" type="static" programID="own" offset="0">
 <edgeData id="e" file="seen.xml" begin="{begin}" end="{end}"/></additional>"""
 
 
+CASES = [
+    (13.89, 7, STRAIGHT),
+    (13.89, 10, STRAIGHT),
+    (13.89, 30, STRAIGHT),
+    (8.33, 10, STRAIGHT),
+    (13.89, 10, RIGHT),
+    (13.89, 40, RIGHT),
+    (8.33, 40, RIGHT),
+]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("speed, green", [(13.89, 7), (13.89, 10), (13.89, 30), (8.33, 10)])
-def test_a_green_serves_as_many_vehicles_as_in_sumo(tmp_path, speed, green):
-    assert served(speed, green) == pytest.approx(served_in_sumo(tmp_path, speed, green), rel=0.05)
+@pytest.mark.parametrize("speed, green, end", CASES)
+def test_a_green_serves_as_many_vehicles_as_in_sumo(tmp_path, speed, green, end):
+    expected, on_junction = served_in_sumo(tmp_path, speed, green, end)
+    assert served(speed, green, on_junction) == pytest.approx(expected, rel=0.05)
 
 
-def served_in_sumo(folder, speed, green):
-    """Vehicles in each green; speed: limit (m/s); green: (s)"""
+def served_in_sumo(folder, speed, green, end):
+    """Vehicles in each green, and their speed on the junction.
+
+    speed: limit (m/s); green: (s); end: place where the next street ends (m)
+    """
     cycle = green + RED_S
-    about = {"speed": speed, "green": green, "begin": FIRST * cycle, "end": LAST * cycle}
+    begin, stop = FIRST * cycle, LAST * cycle
+    about = {"speed": speed, "green": green, "begin": begin, "end": stop, "x": end[0], "y": end[1]}
     for name, text in (("n.xml", NODES), ("e.xml", EDGES), ("add.xml", CITY)):
         (folder / name).write_text(text.format(**about))
     net = folder / "net.xml"
     files = ("-n", folder / "n.xml", "-e", folder / "e.xml", "-o", net, "--no-turnarounds")
     tiny_city.run("netconvert", *files)
-    tiny_city.run("sumo", "-n", net, "-a", folder / "add.xml", "-e", LAST * cycle, "--seed", 1)
+    tiny_city.run("sumo", "-n", net, "-a", folder / "add.xml", "-e", stop, "--seed", 1)
     street = ElementTree.parse(folder / "seen.xml").find(".//edge[@id='ac']")
-    return float(street.get("left")) / (LAST - FIRST)
+    over = ElementTree.parse(net).find(".//edge[@function='internal']/lane")
+    return float(street.get("left")) / (LAST - FIRST), float(over.get("speed"))
 
 
-def served(speed, green):
-    """The same in the link model, with SUMO's default vehicles."""
+def served(speed, green, on_junction):
+    """Vehicles in each green of the link model, with SUMO's default ones.
+
+    on_junction: their speed there (m/s)
+    """
     cycle = green + RED_S
     network = replace(
         triangle(),
@@ -51,7 +77,8 @@ def served(speed, green):
         begin=np.array([0, cycle, cycle + 1]),
         light=np.concatenate([np.ones(green), np.zeros(RED_S), np.ones(2)]),
         yields=np.concatenate([np.zeros(cycle + 1), np.ones(1)]),
-        speed=np.full(3, speed),
+        speed=np.full(3, on_junction),
+        limit=np.full(3, speed),
         free_time=np.full(3, 300.0 / speed),
         acceleration=2.6,
         **ONE_LANE,
@@ -59,3 +86,63 @@ def served(speed, green):
     states = rollout(model_of(network), 1.0, intervals=48)
     left = float((states[-1].traffic.left - states[8].traffic.left)[0, 0])
     return left * cycle / (40 * STEP_S)
+
+
+MERGE = """<nodes><node id="w" x="-500" y="0"/><node id="e" x="500" y="0"/>
+<node id="s" x="0" y="-500"/><node id="c" x="0" y="0" type="priority"/></nodes>"""
+INTO = """<edges><edge id="wc" from="w" to="c" priority="2" speed="{speed}"/>
+<edge id="ce" from="c" to="e" priority="2" speed="{speed}"/>
+<edge id="sc" from="s" to="c" priority="1" speed="{speed}"/></edges>"""
+FLOWS = """<additional><route id="m" edges="wc ce"/><route id="r" edges="sc ce"/>
+<flow id="m" route="m" begin="0" end="9999" probability="{flow}"/>
+<flow id="r" route="r" begin="0" end="9999" period="1"/>
+<edgeData id="e" file="seen.xml" begin="600" end="7800"/></additional>"""
+
+
+@pytest.mark.parametrize("flow", [0.1, 0.2])
+def test_a_queue_merges_by_the_chance_of_a_gap(flow):
+    gap = Numbers().gap + 13.89 / (2 * ACCELERATING * 2.6)
+    share = merged(13.89, flow) / merged(13.89, 0.0)
+    assert share == pytest.approx(np.exp(-gap * flow), rel=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("speed, flow", [(13.89, 0.2), (13.89, 0.3), (8.33, 0.1), (8.33, 0.2)])
+def test_a_queue_merges_as_in_sumo(tmp_path, speed, flow):
+    """Share of what the same queue serves without a flow to give way to."""
+    few, many = (merged_in_sumo(tmp_path, speed, rate) for rate in (flow, 0.001))
+    share = merged(speed, flow) / merged(speed, 0.0)
+    assert share == pytest.approx(few / many, abs=0.05)
+
+
+def merged_in_sumo(folder, speed, flow):
+    """Vehicles that leave a queue to merge with `flow` (veh/s)."""
+    for name, text in (("n.xml", MERGE), ("e.xml", INTO), ("add.xml", FLOWS)):
+        (folder / name).write_text(text.format(speed=speed, flow=flow))
+    net = folder / "net.xml"
+    tiny_city.run("netconvert", "-n", folder / "n.xml", "-e", folder / "e.xml", "-o", net)
+    tiny_city.run("sumo", "-n", net, "-a", folder / "add.xml", "-e", 7800, "--seed", 1)
+    street = ElementTree.parse(folder / "seen.xml").find(".//edge[@id='sc']")
+    return float(street.get("left"))
+
+
+def merged(speed, flow):
+    """Vehicles that leave the same queue in the link model, from d to b."""
+    network = replace(
+        triangle(),
+        cell_share=np.array([[1.0, 0.0, 1.0]]),
+        origin=np.array([[1.0, 0.0, 1.0]]),
+        light=np.ones(CYCLE_S + 2),
+        speed=np.full(3, speed),
+        limit=np.full(3, speed),
+        free_time=np.full(3, 300.0 / speed),
+        acceleration=2.6,
+        **ONE_LANE,
+    )
+    model = model_of(network)
+    demand = demand_of(torch.tensor(flow, dtype=torch.float64))
+    demand[0, 2, 1] = 1.0
+    states = [model.start(1)]
+    for _ in range(24):
+        states.append(model.advance(states[-1], demand, Commands()))
+    return float((states[-1].traffic.left - states[8].traffic.left)[0, 2])

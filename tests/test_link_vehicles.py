@@ -6,7 +6,14 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from cosim.evaluation.link_vehicles import CAR, Drive, drives_of, means_of
+from cosim.evaluation.link_vehicles import (
+    CAR,
+    STOPPING_S,
+    Drive,
+    blocked,
+    drives_of,
+    means_of,
+)
 from cosim.evaluation.links import by_quarter, link_network
 from cosim.sumo.net import city_of
 from cosim.sumo.recorded_trips import RecordedTrips
@@ -82,6 +89,24 @@ def test_the_average_vehicle(tmp_path):
     assert means["length"] == pytest.approx(np.mean([8.0, 4.0, 3.0, CAR["length"]]))
     assert means["minGap"] == pytest.approx(np.mean([2.5, 1.25, 1.0, 2.5]))
     assert means["accel"] == CAR["accel"]
+
+
+def test_buses_that_stop_block_their_lane(tmp_path):
+    """A stop of a time that is not known counts nothing."""
+    buses = tmp_path / "buses.xml"
+    stops = tmp_path / "stops.xml"
+    stops.write_text('<additional><busStop id="s" lane="a_0"/></additional>')
+    buses.write_text(
+        """<routes><vehicle id="v" depart="triggered"><stop busStop="s" duration="20"/>
+        <stop lane="b_1" duration="0:00:40"/><stop lane="b_1" until="600"/></vehicle>
+        <trip id="w" depart="1800"><stop busStop="s" duration="24"/></trip></routes>"""
+    )
+    shares = blocked([buses], [stops], 1800.0)
+    assert shares == {
+        "a_0": pytest.approx((20.0 + 24.0 + 2 * STOPPING_S) / 1800.0),
+        "b_1": pytest.approx((40.0 + STOPPING_S) / 1800.0),
+    }
+    assert blocked([], [stops], 1800.0) == {}
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ from nmfd.controllers.dpc.street_rollout import MOST_DELAYED, Bound
 from nmfd.errors import InputError
 from nmfd.model.links.chance import DRAWS
 from nmfd.model.links.compiled import compiled
-from nmfd.model.links.flows import ACCELERATING, BETWEEN_M, BRAKING, REACTION, START_S
+from nmfd.model.links.flows import ACCELERATING, BETWEEN_M, BRAKING, REACTION, START_S, TURNING
 from nmfd.model.links.model import Choices, Commands, LinkModel, choices_of
 from nmfd.model.links.network import LinkNetwork, read_links
 from nmfd.model.links.plant import LinkPlant, links_file
@@ -70,6 +70,8 @@ def triangle(length: float = 300.0) -> LinkNetwork:
         street=np.array(["a", "b", "d"]),
         length=np.full(3, length),
         behind=np.zeros(3),
+        limit=np.full(3, SPEED),
+        stopped=np.zeros(3),
         free_time=np.full(3, length / 15.0),
         region=np.array([0, 1, 2]),
         lane_link=np.array([0, 0, 1, 2]),
@@ -262,10 +264,21 @@ def test_vehicles_turn_by_chance_as_often_as_on_average():
     state = model.start(1, [1], chance=True)
     entry = model.flows.places(np.array([0, 0, 2]))
     choice = model._ways(state, state.draw, Commands(), state.chance).choice
-    taken = [choice.cells(torch.full((1, 3), float(n))).tolist()[0] for n in range(DRAWS)]
+    one = torch.ones(1, 3).double()
+    taken = [choice.cells(n * one, one, 1).tolist()[0] for n in range(DRAWS)]
     assert sorted(set(np.array(taken).ravel())) == [0.0, 1.0]
     assert np.bincount(entry, taken[0]).tolist() == [1.0, 0.0, 1.0]
     assert np.mean(taken, axis=0) == pytest.approx([0.7, 0.3, 1.0], abs=0.1)
+
+
+def test_each_vehicle_of_a_step_turns_by_itself():
+    model = model_of()
+    state = model.start(1, [1], chance=True)
+    choice = model._ways(state, state.draw, Commands(), state.chance).choice
+    one = torch.ones(1, 3).double()
+    single = [choice.cells(n * one, one, 1) for n in range(4)]
+    expected = (0.5 * single[0] + single[1] + single[2] + 0.25 * single[3]) / 2.75
+    torch.testing.assert_close(choice.cells(0.5 * one, 2.75 * one, 3), expected)
 
 
 def test_chance_makes_queues_where_streams_have_none():
@@ -315,6 +328,36 @@ def test_a_queue_discharges_at_the_saturation_flow():
     states = rollout(model, 1.0, intervals=16)
     flow = (states[-1].traffic.left - states[7].traffic.left)[0, 0] / (9 * STEP_S)
     assert float(flow) == pytest.approx(SATURATION * (GREEN_S - LOST_S) / CYCLE_S, rel=0.05)
+
+
+def test_a_slow_turn_limits_the_flow():
+    network = replace(
+        triangle(),
+        cell_share=np.array([[1.0, 0.0, 1.0]]),
+        speed=np.full(3, 5.0),
+        light=np.ones(CYCLE_S + 2),
+        **ONE_LANE,
+    )
+    states = rollout(model_of(network), 1.0, intervals=8)
+    flow = (states[-1].traffic.left - states[3].traffic.left)[0, 0] / (5 * STEP_S)
+    assert float(flow) == pytest.approx(1.0 / (TURNING + SPACING / 5.0), rel=0.02)
+
+
+@pytest.mark.parametrize("length", [0.2, 10.0, 40.0])
+def test_a_short_street_passes_the_full_flow(length):
+    """All drive by way of d, over a junction of 30 m, without a red light."""
+    network = replace(
+        triangle(),
+        length=np.array([300.0, 300.0, length]),
+        behind=np.array([0.0, 0.0, 30.0]),
+        free_time=np.array([20.0, 20.0, (length + 30.0) / 15.0]),
+        cell_share=np.array([[0.0, 1.0, 1.0]]),
+        light=np.ones(CYCLE_S + 2),
+        yields=np.zeros(CYCLE_S + 2),
+    )
+    states = rollout(model_of(network), 1.0, intervals=8)
+    flow = (states[-1].traffic.left - states[3].traffic.left)[0, 2] / (5 * STEP_S)
+    assert float(flow) == pytest.approx(SATURATION, rel=0.05)
 
 
 def test_a_blocked_turn_blocks_its_link_and_the_trips_that_begin():

@@ -144,8 +144,11 @@ class Counts:
                 self.last[link] += share * last
 
 
-def link_arrays(streets: Streets) -> Arrays:
-    """Return the arrays of links and lanes."""
+def link_arrays(streets: Streets, blocked: Mapping[str, float]) -> Arrays:
+    """Return the arrays of links and lanes.
+
+    blocked: lane -> share of the time in which a stopping vehicle blocks it
+    """
     city = streets.city
     names = [street for street, _ in streets.links]
     behind = defaultdict[int, list[tuple[float, float]]](list)  # time and length over the junction
@@ -154,11 +157,17 @@ def link_arrays(streets: Streets) -> Arrays:
         behind[link].append((city.turn_time[movement], length))
     over = np.array([np.mean(behind.get(link, [(0.0, 0.0)]), axis=0) for link in range(len(names))])
     length = np.array([city.length[street] for street in names])
+    limit = np.array([city.speed[street] for street in names])
+    stopped = []
+    for street, lanes in streets.links:
+        stopped.append(np.mean([blocked.get(f"{street}_{lane}", 0.0) for lane in lanes]))
     return {
         "street": np.array(names),
         "length": length,
         "behind": over[:, 1],
-        "free_time": length / [city.speed[street] for street in names] + over[:, 0],
+        "limit": limit,
+        "stopped": np.array(stopped),
+        "free_time": length / limit + over[:, 0],
         "region": np.array([city.region_of[street] for street in names]),
         "lane_link": np.repeat(np.arange(len(names)), [len(lanes) for _, lanes in streets.links]),
     }

@@ -1,5 +1,6 @@
 """Vehicles of the link model: routes, and the average vehicle."""
 
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
@@ -13,13 +14,15 @@ from cosim.sumo.net import City
 from cosim.sumo.programs import run_sumo
 from cosim.sumo.recorded_trips import RecordedTrips
 from cosim.sumo.trips import make_trips
-from cosim.sumo.xml_files import attribute, child, file_list, read_xml
+from cosim.sumo.xml_files import attribute, child, file_list, read_xml, seconds_of
 from nmfd.model.scenario import Scenario
 from nmfd.runs.files import temporary_folder
 
 Route: TypeAlias = tuple[str, ...]
 # Attributes of a vType, and what SUMO's cars have without them.
 CAR = {"length": 5.0, "minGap": 2.5, "tau": 1.0, "sigma": 0.5, "accel": 2.6}
+MOST_BLOCKED = 0.9  # share of the time
+STOPPING_S = 6.0  # that a vehicle loses as it brakes for a stop and starts again
 # Word for a position -> share of the length of the street; others mean its beginning.
 PLACES = {"random": 0.5, "random_free": 0.5, "center": 0.5, "max": 1.0}
 
@@ -117,6 +120,31 @@ def means_of(trips: RecordedTrips, files: Sequence[Path]) -> dict[str, float]:
     usual = _values([])
     own = [known.get(element.get("type", ""), usual) for element in trips.elements]
     return dict(zip(CAR, np.mean(own, axis=0).tolist(), strict=True))
+
+
+def blocked(
+    background: Sequence[Path], additional: Sequence[Path], period: float
+) -> dict[str, float]:
+    """Return the share of the time in which stopping vehicles block a lane.
+
+    The result has one entry for each lane with stops; those of flows are left out.
+
+    background: files with them, such as buses; additional: files with bus stops
+    period: in which they drive (s)
+    """
+    lane_of = {}
+    for path in (*background, *additional):
+        for stop in read_xml(path).iter("busStop"):
+            lane_of[attribute(stop, "id")] = attribute(stop, "lane")
+    stood: dict[str, float] = defaultdict(float)
+    for path in background:
+        for vehicle in (*read_xml(path).iter("vehicle"), *read_xml(path).iter("trip")):
+            for stop in vehicle.iter("stop"):
+                lane = stop.get("lane", lane_of.get(stop.get("busStop", "")))
+                duration = seconds_of(stop.get("duration", "0"))
+                if lane is not None and duration > 0.0:
+                    stood[lane] += duration + STOPPING_S
+    return {lane: min(seconds / period, MOST_BLOCKED) for lane, seconds in stood.items()}
 
 
 def _values(types: Iterable[Element]) -> np.ndarray:

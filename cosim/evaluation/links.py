@@ -22,7 +22,7 @@ from cosim.evaluation.link_streets import (
     link_arrays,
     vehicle_arrays,
 )
-from cosim.evaluation.link_vehicles import Drive, draws_of, drives_of, means_of
+from cosim.evaluation.link_vehicles import Drive, blocked, draws_of, drives_of, means_of
 from cosim.plant.gates import MIN_GREEN_S, least_times
 from cosim.plant.pressure import Roads
 from cosim.plant.settings import own_files, settings
@@ -113,7 +113,9 @@ def link_network(scenario: Scenario, seeds: Sequence[int] = PLANNING_SEEDS) -> L
             gated.add((gateway.from_edge, gateway.to_edge))
     actuated = {signal.id for signal in fixed if signal.id in obeying}
     cycles = read_cycles(city.net_file, files)
-    links = link_arrays(streets)
+    departing = max(float(np.ptp([drive.depart for drive in together])), QUARTER_S)
+    stopping = blocked(own_files(scenario, chosen.background), files, departing)
+    links = link_arrays(streets, stopping)
     return LinkNetwork(
         regions=city.regions,
         periods=len(rows) // len(draws),

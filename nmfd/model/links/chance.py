@@ -3,7 +3,7 @@
 Without chance, a junction at 95 % of its capacity has no queue left over at the end of green; with
 it, trips take longer where traffic is dense. The trips of an entry begin as whole vehicles, one
 after the other, the first at a random time. Each vehicle that moves up draws its cell by the shares
-p_c; the draw stays until a whole vehicle has passed. Derivatives are those of the shares.
+p_c, also where several move up in one step, or a part of one. Derivatives are those of the shares.
 """
 
 from collections.abc import Sequence
@@ -30,14 +30,27 @@ class Choice(NamedTuple):
     draws: Tensor
     entry: Tensor
 
-    def cells(self, moved: Tensor) -> Tensor:
-        """Return 1 for the cells that the next vehicles take, else 0 (B, C).
+    def cells(self, before: Tensor, moved: Tensor, most: int) -> Tensor:
+        """Return the shares of the cells that a step's vehicles draw (-, (B, C)).
 
-        moved: vehicles that moved up so far, by entry (veh, (B, E))
+        before: vehicles that moved up so far, by entry (veh, (B, E))
+        moved: those of the step (veh, (B, E)); most: no more of an entry than this
         """
-        number = moved.detach().long() % DRAWS
-        draw = self.draws.gather(1, number.unsqueeze(1)).squeeze(1).index_select(1, self.entry)
-        taken = ((draw >= self.low) & (draw < self.high)).to(self.shares.dtype)
+        begin = before.detach()
+        end = begin + moved.detach()
+        none = (end == begin).to(end.dtype)  # the next vehicle counts
+        first = begin.floor()
+        taken = torch.zeros_like(self.shares)
+        for n in range(most + 1):
+            number = first + n
+            part = (torch.minimum(end, number + 1.0) - torch.maximum(begin, number)).clamp(min=0.0)
+            if n == 0:
+                part = part + none
+            share = part / (end - begin + none)
+            row = (number.long() % DRAWS).unsqueeze(1)
+            draw = self.draws.gather(1, row).squeeze(1).index_select(1, self.entry)
+            drawn = (draw >= self.low) & (draw < self.high)
+            taken = taken + drawn * share.index_select(1, self.entry)
         return taken + (self.shares - self.shares.detach())
 
 

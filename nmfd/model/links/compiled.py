@@ -66,6 +66,7 @@ class City(NamedTuple):
     link_of_lane: Any
     yielding: Any
     foe: Any
+    gaps: Any
     home: Any
     home_link: Any
     ahead: Any
@@ -91,7 +92,6 @@ class City(NamedTuple):
     cycle: Any
     extended: bool
     chain_limit: Any
-    gap: Any
     smoothing: Any
     dt: Any
     epsilon: Any
@@ -137,7 +137,7 @@ class Given(NamedTuple):
 
     due: trips of a step, by entry (veh, (B, E))
     cells, goes_on, at_end: as of flows.Ways
-    chosen: 1 for the cells that the next vehicles take, else 0, which machine code sets (B, C);
+    chosen: share of the vehicles that move up now, by cell, which machine code sets (B, C);
         `cells` if streams divide
     low, high, draws: as of chance.Choice; no rows if streams divide
     metering: (veh/s, (B, R)); gates: share of each gate (-, (B, G)); no rows without commands
@@ -385,6 +385,29 @@ def _take(city: City, given: Given, b: int, e: int, moved: float) -> None:
 
 
 @inner
+def _take_each(city: City, given: Given, b: int, e: int, before: float, up: float) -> None:
+    """Set the shares of cells that a step's vehicles of entry e take.
+
+    before: vehicles that moved up before; up: those that do in this step
+    """
+    last = given.draws.shape[1] - 1
+    after = before + up
+    first = city.first_cell[e]
+    end = city.first_cell[e + 1]
+    for n in range(first, end):
+        given.chosen[b, city.cells[n]] = city.zero
+    number = int(before)
+    while number < after:
+        part = (min(after, number + city.one) - max(before, city.one * number)) / (after - before)
+        draw = given.draws[b, number & last, e]
+        for n in range(first, end):
+            c = city.cells[n]
+            if given.low[b, c] <= draw < given.high[b, c]:
+                given.chosen[b, c] += part
+        number += 1
+
+
+@inner
 def _decide(signals: Choosing, inside: np.ndarray, stages: "Stages", b: int) -> None:
     """Change stages of rollout b to those that signals want now.
 
@@ -618,6 +641,7 @@ def _move_up(
     one = city.one
     zero = city.zero
     ending = _row(histories.ending, given, k)
+    by_chance = len(given.draws) > 0
     work.in_lane[:] = zero
     for p in range(len(city.served)):
         standing = counts.standing[now, b, city.served[p]]
@@ -636,6 +660,9 @@ def _move_up(
     for e in range(len(work.up)):
         up = work.arrived[e] * work.moving_up[city.link_of_entry[e]]
         work.up[e] = up
+        before = counts.moved[now, b, e]
+        if by_chance and int(before + up) != int(before):
+            _take_each(city, given, b, e, before, up)
         for n in range(city.first_cell[e], city.first_cell[e + 1]):
             c = city.cells[n]
             first = counts.first[now, b, c] + up * given.chosen[b, c]
@@ -651,9 +678,9 @@ def _see_green(
     one = city.one
     work.gap[:] = city.zero
     for f in range(len(city.foe)):
-        work.gap[city.yielding[f]] += counts.recent[now, b, city.foe[f]]
+        work.gap[city.yielding[f]] += city.gaps[f] * counts.recent[now, b, city.foe[f]]
     for m in range(len(work.gap)):
-        work.gap[m] = math.exp(-city.gap * work.gap[m])
+        work.gap[m] = math.exp(-work.gap[m])
         kept = one - given.yields[k, b, m] * (one - work.gap[m])
         work.open_share[m] = work.light[m] * kept
     work.wanted[:] = city.zero
@@ -667,7 +694,8 @@ def _see_green(
         work.stood[t] = stood
         work.arriving[t] = arriving
         work.leader[t] = leader
-        work.green[t] = arriving + (leader - arriving) * stood
+        green = arriving + (leader - arriving) * stood
+        work.green[t] = min(green, most / max(work.by_turn[t], city.least))
         work.wanted[city.link_entered[t]] += work.by_turn[t] * work.green[t]
 
 
@@ -860,6 +888,7 @@ def derive(
             )
             _arrive_back(city, given, d_counts, d_histories, b, k, work, d)
             _begin_back(city, given, d_given, d_counts, d_sums, b, k, work, d)
+            _choose_again(city, given, counts, b, k + 1, k)  # as `_flow` takes each vehicle
 
 
 @inner
@@ -987,12 +1016,18 @@ def _see_green_back(
         standing = counts.standing[k, b, t]
         stood = work.stood[t]
         d_green = d.going[t] * work.rho[i] + d.wanted[i] * work.by_turn[t]
-        d_leader = d_green * stood
         d.by_turn[t] += d.wanted[i] * work.green[t]
+        most = city.per_step[m] * work.open_share[m] * city.lanes_of_turn[t]
+        together = max(work.by_turn[t], least)
+        if work.arriving[t] + (work.leader[t] - work.arriving[t]) * stood > most / together:
+            d.open_share[m] += d_green / together * city.per_step[m] * city.lanes_of_turn[t]
+            if work.by_turn[t] >= least:
+                d.by_turn[t] -= d_green * work.green[t] / together
+            d_green = city.zero
+        d_leader = d_green * stood
         d.stood[t] += d_green * (work.leader[t] - work.arriving[t])
         d.open_share[m] += d_green * (one - stood) * city.pace[m]
         below = max(standing, least)
-        most = city.per_step[m] * work.open_share[m] * city.lanes_of_turn[t]
         ratio = most / below
         d_standing = d.stood[t] / max(work.by_turn[t], city.epsilon)
         if ratio <= one:
@@ -1006,9 +1041,9 @@ def _see_green_back(
         gap = work.gap[m]
         yields = given.yields[k, b, m]
         d.light[m] = d.open_share[m] * (one - yields * (one - gap))
-        d.open_share[m] *= -city.gap * gap * work.light[m] * yields  # by the flow of its foes
+        d.open_share[m] *= -gap * work.light[m] * yields  # by the flow of its foes
     for f in range(len(city.foe)):
-        d_counts.recent[b, city.foe[f]] += d.open_share[city.yielding[f]]
+        d_counts.recent[b, city.foe[f]] += city.gaps[f] * d.open_share[city.yielding[f]]
 
 
 @inner

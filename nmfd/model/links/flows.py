@@ -21,10 +21,11 @@ Cattrysse and Immers, "A generic class of first order node models" (2011), with 
 shares, if green lasts long enough: first in, first out, and no flow could be larger. Where lanes
 lead to some turns only, vehicles that all want one turn still move up in all lanes.
 A movement that gives way to a flow f has exp(-gap f) of its green, which is the chance that no
-vehicle comes within the critical gap. A vehicle that stood at the stop line takes longer along the
-next link: START_S until it drives, and v / 2a as it accelerates by a, less what each green loses of
-its capacity at the beginning (`Flows.lost`). Trips begin and end where they do on average along a
-street; one that ends in the queue moves up there.
+vehicle comes within the critical gap; to merge with a flow of the speed v it needs v / 2a more. A
+vehicle that stood at the stop line takes longer along the next link: START_S until it drives, and
+v / 2a as it accelerates by a, less what each green loses of its capacity at the beginning
+(`Flows.lost`). Trips begin and end where they do on average along a street; one that ends in the
+queue moves up there.
 
 Every vehicle that leaves one count enters another one: mass and its derivative are conserved.
 """
@@ -42,9 +43,11 @@ from nmfd.model.links.network import LinkNetwork
 EPSILON = 1e-3  # veh
 LEAST = 0.1  # veh: smaller counts do not divide a room, which bounds the gradient
 INFLOW = 0.6  # veh/s in each lane, the most that can enter a link
-# SUMO's cars leave a queue with a headway of REACTION * tau + (spacing + BETWEEN_M) / v.
+# SUMO's cars leave a queue with headways of REACTION * tau + (spacing + BETWEEN_M) / limit, and at
+# least TURNING * tau + spacing / v, at the speed v on the junction.
 REACTION = 1.04
 BETWEEN_M = 4.8
+TURNING = 1.4
 START_S = 1.6  # after which the first vehicle of a queue drives
 ACCELERATING = 0.85  # of a vehicle's acceleration, as drivers dawdle
 BRAKING = 4.5  # m/s2, of SUMO's cars that stop at yellow
@@ -55,9 +58,9 @@ class Numbers(NamedTuple):
 
     time_factor: of the free-flow times (-)
     spacing: of the length of lane that a standing vehicle takes (-)
-    saturation: of the flow of a lane at green, which is 1 / (1.04 tau + (spacing + 4.8 m) / v) with
-        the speed v on the junction (-)
-    gap: critical gap of vehicles that give way (s)
+    saturation: of the flow of a lane at green, which is 1 / (1.04 tau + (spacing + 4.8 m) / limit),
+        and at most 1 / (1.4 tau + spacing / v) with the speed v on the junction (-)
+    gap: critical gap of vehicles that cross a flow (s)
     """
 
     time_factor: float = 1.0
@@ -203,6 +206,19 @@ class Flows:
         self._number()
         self._delay()
         self._limit()
+        self._give_way()
+
+    def _give_way(self) -> None:
+        """Set who gives way to which flow, and the gap needed in it."""
+        network = self.network
+        street = np.zeros(self.movements, dtype=network.street.dtype)
+        street[network.turn_movement] = network.street[network.turn_link]
+        merges = street[network.yielding] == street[network.foe]
+        # A car that merges falls behind the flow while it accelerates to the same speed.
+        behind = network.speed[network.foe] / (2.0 * ACCELERATING * network.acceleration)
+        self._gaps = self.values(self.numbers.gap + np.where(merges, behind, 0.0))
+        self._yielding = self.places(network.yielding)
+        self._foe = self.places(network.foe)
 
     def _number(self) -> None:
         """Set which count belongs to which other one."""
@@ -219,8 +235,6 @@ class Flows:
         self._served = self.places(network.served)
         self._server = self.places(network.server)
         self._link_of_lane = self.places(network.lane_link)
-        self._yielding = self.places(network.yielding)
-        self._foe = self.places(network.foe)
         at_home = np.flatnonzero(network.ending.max(axis=0) > 0.0)
         self._home = self.places(at_home)
         self._home_link = self.places(network.entry_link[at_home])
@@ -241,14 +255,17 @@ class Flows:
         free_steps = self.free_time / self.dt
         along = np.maximum(np.floor(free_steps), 1).astype(int)
         to_end = np.maximum(np.round(network.last * free_steps), 1).astype(int)
-        flow = self._saturation(speed)
+        flow = self._saturation(speed, speed)
         self.speed = speed
         wave = flow / (1.0 / self.spacing - flow / speed)
         self.wave = wave
         # A queue discharges at its flow, although its first vehicle is late on the next link.
-        late = np.minimum(self._starting(speed) - self.lost(speed), network.length / wave)
+        late = self._starting(speed) - self._losing(speed, flow)
+        late = np.minimum(late, network.length / wave)
         # Room counts at the end of a step. Between steps counts change evenly.
         wave_steps = np.maximum((network.length / wave - late) / self.dt, 1.0)
+        # Vehicles and holes under way in a lane while its full flow enters (veh).
+        self._flowing = flow * self.dt * (np.maximum(free_steps, 1.0) + wave_steps + 1.0)
         backwards = np.floor(wave_steps).astype(int)
         self._earlier = self.values(wave_steps - backwards)
         self._along = self.delay(along[network.entry_link], self.device)
@@ -259,24 +276,27 @@ class Flows:
         self._to_end = self.delay(to_end, self.device)
         self._backwards = self.delay(backwards, self.device)
 
-    def _saturation(self, speed: np.ndarray) -> np.ndarray:
-        """Return the flow of a lane at green (veh/s); speed: of cars (m/s)."""
+    def _saturation(self, speed: np.ndarray, limit: np.ndarray) -> np.ndarray:
+        """Return the flow of a lane at green (veh/s).
+
+        speed: of cars (m/s); limit: of the street that they come from (m/s)
+        """
         network = self.network
-        headway = REACTION * network.headway + (network.spacing + BETWEEN_M) / speed
+        before = REACTION * network.headway + (network.spacing + BETWEEN_M) / limit
+        headway = np.maximum(before, TURNING * network.headway + network.spacing / speed)
         return self.numbers.saturation / headway
 
-    def lost(self, speed: np.ndarray) -> np.ndarray:
+    def _losing(self, speed: np.ndarray, saturation: np.ndarray) -> np.ndarray:
         """Return the time lost in each green of a lane that has a queue (s).
 
         Vehicle k of a queue crosses the stop line START_S + v / 2a + k / s after the light changes,
         but the first one START_S after it. Those that cannot stop any more cross at yellow. The
         constants are those of SUMO at one signal (tests/test_link_capacity.py).
 
-        speed: on the junction (m/s)
+        speed: on the junction (m/s); saturation: s (veh/s)
         """
         yellow = speed / (2.0 * BRAKING)
-        headway = 1.0 / self._saturation(speed)
-        return np.maximum(self._starting(speed) - headway - yellow, 0.0)
+        return np.maximum(self._starting(speed) - 1.0 / saturation - yellow, 0.0)
 
     def _starting(self, speed: np.ndarray) -> np.ndarray:
         """Return the time that a standing vehicle loses as it starts (s)."""
@@ -286,17 +306,21 @@ class Flows:
         """Set the storage of links, and the most vehicles that move in a step."""
         network = self.network
         lanes = np.bincount(network.lane_link, minlength=self.links)
-        most_in = INFLOW * self.dt * lanes
-        # A shorter link would hold up the flow that its lanes can take within a step.
-        storage = np.maximum(lanes * network.length / self.spacing, 2.0 * most_in)
+        # On a short link more vehicles drive, and holes come back, than can stand there.
+        storage = lanes * np.maximum(network.length / self.spacing, self._flowing)
         self.storage = self.values(storage)
-        self._most_in = self.values(most_in)
-        saturation = self._saturation(network.speed) * self.dt
+        self._most_in = self.values(INFLOW * self.dt * lanes)
+        limit = network.limit[network.movement_link]
+        saturation = self._saturation(network.speed, limit)
+        self.lost = self._losing(network.speed, saturation)
+        saturation *= (1.0 - network.stopped[network.movement_link]) * self.dt
         movement = network.turn_movement[network.served]
         fastest = np.zeros(len(network.lane_link))
         np.maximum.at(fastest, network.server, saturation[movement])
         fastest[fastest == 0.0] = saturation.max()  # lanes on which trips end
         self._first_of_lane = self.values(fastest)
+        of_link = np.bincount(network.lane_link, fastest, self.links)
+        self._most_moved = int(np.ceil(of_link.max()))
         of_movement = np.zeros(self.movements)
         np.maximum.at(of_movement, movement, fastest[network.server])
         lanes_of_turn = np.bincount(network.served)
@@ -386,13 +410,13 @@ class Flows:
         stopped = stopping * (self._pace_to_end * moving_up).clamp(max=1.0)
         cells = ways.cells
         if ways.choice is not None:
-            cells = ways.choice.cells(traffic.moved)
+            cells = ways.choice.cells(traffic.moved, moved, self._most_moved)
         first = traffic.first + moved.index_select(1, self.entry_of_cell) * cells
         by_turn = self.sums(first, self._turn_of_cell, len(self._link_entered))
 
         # 2. Those that can go, and the trips that can begin.
         stood = traffic.standing / by_turn.clamp(min=EPSILON)
-        green = self._green(traffic, stood, light, yields)
+        green = self._green(traffic, by_turn, stood, light, yields)
         due = traffic.due + begin
         waiting = self.by_link(due)
         put = (self._most_in / waiting.clamp(min=LEAST)).clamp(max=1.0)
@@ -455,22 +479,26 @@ class Flows:
         arriving = self.by_link(self._arriving(traffic))
         return self.by_link(traffic.queue) + first + share * arriving
 
-    def _green(self, traffic: Traffic, stood: Tensor, light: Tensor, yields: Tensor) -> Tensor:
+    def _green(
+        self, traffic: Traffic, by_turn: Tensor, stood: Tensor, light: Tensor, yields: Tensor
+    ) -> Tensor:
         """Return the share phi of first vehicles that can go (-, (B, T)).
 
         A vehicle that stood in front goes first, at the headway of its movement; those that arrive
-        go at the pace of their lane.
+        go at the pace of their lane, as long as all keep that headway.
 
-        stood: share of the first vehicles that stood in front (-, (B, T))
+        by_turn: the first vehicles (veh, (B, T)); stood: share that stood in front (-, (B, T))
         """
-        foes = traffic.recent.index_select(1, self._foe)
-        gap = torch.exp(-self.numbers.gap * self.sums(foes, self._yielding, self.movements))
+        foes = self._gaps * traffic.recent.index_select(1, self._foe)
+        gap = torch.exp(-self.sums(foes, self._yielding, self.movements))
         open_share = light * (1.0 - yields * (1.0 - gap))
         arriving = (self._pace * open_share).index_select(1, self._movement_of_turn)
         most = (self._per_step * open_share).index_select(1, self._movement_of_turn)
         most = most * self._lanes_of_turn
         leader = (most / traffic.standing.clamp(min=LEAST)).clamp(max=1.0)
-        return arriving + (leader - arriving) * stood
+        green = arriving + (leader - arriving) * stood
+        limit = most / by_turn.clamp(min=LEAST)
+        return torch.where(green > limit, limit, green)
 
     def _room(self, traffic: Traffic) -> Tensor:
         """Return the vehicles R that each link can receive (veh, (B, L))."""

@@ -31,6 +31,8 @@ class LinkNetwork:
     dawdling, acceleration: what it drives below the limit (m/s), and as it starts (m/s2)
     street: names of the links' streets (L,)
     length, behind: of each link, and of the ways over the junction behind it (m, (L,))
+    limit: speed limit of each link (m/s, (L,))
+    stopped: share of the time in which a bus that stops blocks a lane of each link (-, (L,))
     free_time: in free flow over both (s, (L,))
     region: of each link (L,)
     lane_link: link of each lane (N,)
@@ -82,6 +84,8 @@ class LinkNetwork:
     street: np.ndarray
     length: np.ndarray
     behind: np.ndarray
+    limit: np.ndarray
+    stopped: np.ndarray
     free_time: np.ndarray
     region: np.ndarray
     lane_link: np.ndarray

@@ -126,14 +126,13 @@ class Gates:
         self.opens = np.zeros(len(network.light))
         whole = np.ones(len(self.movements))
         taken = np.ones(len(self.movements))
-        lost = flows.lost(network.speed)
         for number, movement in enumerate(self.movements):
             begin = network.begin[movement]
             cycle = network.cycle[movement]
             light = network.light[begin : begin + cycle]
             opens = (light > 0.0) & (np.roll(light, 1) == 0.0)
             green = (light == 1.0).sum()
-            capacity = _late(light, lost[movement]).sum()
+            capacity = _late(light, flows.lost[movement]).sum()
             if by_cycle:
                 opens[:] = False
             if not of_programme:
@@ -180,9 +179,7 @@ class Programmes:
         self._opens = opens
         network = flows.network
         self._light = network.light.copy()
-        for begin, cycle, lost in zip(
-            network.begin, network.cycle, flows.lost(network.speed), strict=True
-        ):
+        for begin, cycle, lost in zip(network.begin, network.cycle, flows.lost, strict=True):
             own = slice(begin, begin + cycle)
             self._light[own] = _late(network.light[own], lost)
         self._period = math.lcm(*network.cycle.tolist())
@@ -254,7 +251,7 @@ class MaxPressure:
         self._serves = flows.values(network.stage_light > 0.0)
         self._yields = flows.values(network.stage_yields)
         self._loss = flows.values(network.stage_loss)
-        self._lost = flows.values(flows.lost(network.speed))
+        self._lost = flows.values(flows.lost)
         self._least = flows.values(network.stage_least)
         self._count = flows.places(network.stages)
         self._link = flows.places(network.movement_link)
@@ -372,7 +369,7 @@ class Actuated:
         before = np.tile(np.arange(second.shape[1]) - 1, (len(signal), 1))
         before[:, 0] = network.phases[signal] - 1
         red_before = np.take_along_axis(network.light[place], before, axis=1) == 0.0
-        self._lost = flows.values(flows.lost(network.speed)[:, None] * red_before)
+        self._lost = flows.values(flows.lost[:, None] * red_before)
         self._count = flows.places(network.phases)
         self._least = flows.values(network.phase_least)
         self._most = flows.values(network.phase_most)
