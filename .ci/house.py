@@ -38,7 +38,8 @@ PICTURE = Path(__file__).with_name("house.svg")
 # machine code 13,000, loading by more policies and thresholds of each region 350, guidance in
 # machine code 1,750, training from a policy 150, shares by period 200, cells of next vehicles and
 # threads 500, files of results without xarray and pandas 700, a server that is a fork 300, time
-# that streets lose in each green 700: names and steps were not cut.
+# that streets lose in each green 700, capacities of turns, merging, short streets and lanes with
+# buses 1,500 and tests of them 1,000: names and steps were not cut.
 TOKENS = 270_500
 TEST_TOKENS = 177_300
 TOKENS_PER_LINE = 9.5

@@ -6,11 +6,9 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import tiny_city
-import torch
-from test_links import CYCLE_S, ONE_LANE, STEP_S, demand_of, model_of, rollout, triangle
+from test_links import CYCLE_S, ONE_LANE, STEP_S, model_of, rollout, triangle
 
 from nmfd.model.links.flows import ACCELERATING, Numbers
-from nmfd.model.links.model import Commands
 
 RED_S = 43  # with yellow
 FIRST, LAST = 10, 70  # cycles that count
@@ -25,8 +23,15 @@ CITY = """<additional><tlLogic id="c" type="static" programID="own" offset="0">
 <phase duration="40" state="r"/></tlLogic>
 <route id="r" edges="ac cb"/><flow id="f" route="r" begin="0" end="9999" period="1"/>
 <edgeData id="e" file="seen.xml" begin="{begin}" end="{end}"/></additional>"""
-
-
+MERGE = """<nodes><node id="w" x="-500" y="0"/><node id="e" x="500" y="0"/>
+<node id="s" x="0" y="-500"/><node id="c" x="0" y="0" type="priority"/></nodes>"""
+INTO = """<edges><edge id="wc" from="w" to="c" priority="2" speed="{speed}"/>
+<edge id="ce" from="c" to="e" priority="2" speed="{speed}"/>
+<edge id="sc" from="s" to="c" priority="1" speed="{speed}"/></edges>"""
+FLOWS = """<additional><route id="m" edges="wc ce"/><route id="r" edges="sc ce"/>
+<flow id="m" route="m" begin="0" end="9999" probability="{flow}"/>
+<flow id="r" route="r" begin="0" end="9999" period="1"/>
+<edgeData id="e" file="seen.xml" begin="600" end="7800"/></additional>"""
 CASES = [
     (13.89, 7, STRAIGHT),
     (13.89, 10, STRAIGHT),
@@ -53,15 +58,20 @@ def served_in_sumo(folder, speed, green, end):
     cycle = green + RED_S
     begin, stop = FIRST * cycle, LAST * cycle
     about = {"speed": speed, "green": green, "begin": begin, "end": stop, "x": end[0], "y": end[1]}
-    for name, text in (("n.xml", NODES), ("e.xml", EDGES), ("add.xml", CITY)):
-        (folder / name).write_text(text.format(**about))
-    net = folder / "net.xml"
-    files = ("-n", folder / "n.xml", "-e", folder / "e.xml", "-o", net, "--no-turnarounds")
-    tiny_city.run("netconvert", *files)
-    tiny_city.run("sumo", "-n", net, "-a", folder / "add.xml", "-e", stop, "--seed", 1)
-    street = ElementTree.parse(folder / "seen.xml").find(".//edge[@id='ac']")
-    over = ElementTree.parse(net).find(".//edge[@function='internal']/lane")
-    return float(street.get("left")) / (LAST - FIRST), float(over.get("speed"))
+    left = left_in_sumo(folder, "ac", stop, (NODES, EDGES, CITY), about)
+    over = ElementTree.parse(folder / "net.xml").find(".//edge[@function='internal']/lane")
+    return left / (LAST - FIRST), float(over.get("speed"))
+
+
+def left_in_sumo(folder, street, stop, texts, about):
+    """Vehicles that leave a street; texts: of nodes, edges and traffic, with numbers `about`."""
+    nodes, edges, traffic, net = (folder / f"{name}.xml" for name in ("n", "e", "add", "net"))
+    for path, text in zip((nodes, edges, traffic), texts, strict=True):
+        path.write_text(text.format(**about))
+    tiny_city.run("netconvert", "-n", nodes, "-e", edges, "-o", net, "--no-turnarounds")
+    tiny_city.run("sumo", "-n", net, "-a", traffic, "-e", stop, "--seed", 1)
+    seen = ElementTree.parse(folder / "seen.xml").find(f".//edge[@id='{street}']")
+    return float(seen.get("left"))
 
 
 def served(speed, green, on_junction):
@@ -88,17 +98,6 @@ def served(speed, green, on_junction):
     return left * cycle / (40 * STEP_S)
 
 
-MERGE = """<nodes><node id="w" x="-500" y="0"/><node id="e" x="500" y="0"/>
-<node id="s" x="0" y="-500"/><node id="c" x="0" y="0" type="priority"/></nodes>"""
-INTO = """<edges><edge id="wc" from="w" to="c" priority="2" speed="{speed}"/>
-<edge id="ce" from="c" to="e" priority="2" speed="{speed}"/>
-<edge id="sc" from="s" to="c" priority="1" speed="{speed}"/></edges>"""
-FLOWS = """<additional><route id="m" edges="wc ce"/><route id="r" edges="sc ce"/>
-<flow id="m" route="m" begin="0" end="9999" probability="{flow}"/>
-<flow id="r" route="r" begin="0" end="9999" period="1"/>
-<edgeData id="e" file="seen.xml" begin="600" end="7800"/></additional>"""
-
-
 @pytest.mark.parametrize("flow", [0.1, 0.2])
 def test_a_queue_merges_by_the_chance_of_a_gap(flow):
     gap = Numbers().gap + 13.89 / (2 * ACCELERATING * 2.6)
@@ -117,13 +116,8 @@ def test_a_queue_merges_as_in_sumo(tmp_path, speed, flow):
 
 def merged_in_sumo(folder, speed, flow):
     """Vehicles that leave a queue to merge with `flow` (veh/s)."""
-    for name, text in (("n.xml", MERGE), ("e.xml", INTO), ("add.xml", FLOWS)):
-        (folder / name).write_text(text.format(speed=speed, flow=flow))
-    net = folder / "net.xml"
-    tiny_city.run("netconvert", "-n", folder / "n.xml", "-e", folder / "e.xml", "-o", net)
-    tiny_city.run("sumo", "-n", net, "-a", folder / "add.xml", "-e", 7800, "--seed", 1)
-    street = ElementTree.parse(folder / "seen.xml").find(".//edge[@id='sc']")
-    return float(street.get("left"))
+    about = {"speed": speed, "flow": flow}
+    return left_in_sumo(folder, "sc", 7800, (MERGE, INTO, FLOWS), about)
 
 
 def merged(speed, flow):
@@ -139,10 +133,5 @@ def merged(speed, flow):
         acceleration=2.6,
         **ONE_LANE,
     )
-    model = model_of(network)
-    demand = demand_of(torch.tensor(flow, dtype=torch.float64))
-    demand[0, 2, 1] = 1.0
-    states = [model.start(1)]
-    for _ in range(24):
-        states.append(model.advance(states[-1], demand, Commands()))
+    states = rollout(model_of(network), flow, intervals=24, from_d=1.0)
     return float((states[-1].traffic.left - states[8].traffic.left)[0, 2])

@@ -139,12 +139,16 @@ def demand_of(rate) -> torch.Tensor:
     return demand.index_put((torch.tensor(0), torch.tensor(0), torch.tensor(1)), rate)
 
 
-def rollout(model, rate, commands=None, intervals=6):
-    """All states; `rate`: of the trips from a to b (veh/s), or its function of the interval."""
+def rollout(model, rate, commands=None, intervals=6, from_d=0.0):
+    """All states; `rate`: of the trips from a to b (veh/s), or its function of the interval.
+
+    from_d: rate of those from d to b (veh/s)
+    """
     states = [model.start(1)]
     for k in range(intervals):
         now = rate(k) if callable(rate) else rate
         demand = demand_of(torch.as_tensor(now, dtype=torch.float64))
+        demand[0, 2, 1] = from_d
         states.append(model.advance(states[-1], demand, commands or Commands()))
     return states
 

@@ -132,13 +132,14 @@ def blocked(
     background: files with them, such as buses; additional: files with bus stops
     period: in which they drive (s)
     """
+    driving = [read_xml(path) for path in background]
     lane_of = {}
-    for path in (*background, *additional):
-        for stop in read_xml(path).iter("busStop"):
+    for root in (*driving, *map(read_xml, additional)):
+        for stop in root.iter("busStop"):
             lane_of[attribute(stop, "id")] = attribute(stop, "lane")
     stood: dict[str, float] = defaultdict(float)
-    for path in background:
-        for vehicle in (*read_xml(path).iter("vehicle"), *read_xml(path).iter("trip")):
+    for root in driving:
+        for vehicle in (*root.iter("vehicle"), *root.iter("trip")):
             for stop in vehicle.iter("stop"):
                 lane = stop.get("lane", lane_of.get(stop.get("busStop", "")))
                 duration = seconds_of(stop.get("duration", "0"))

@@ -113,9 +113,8 @@ def link_network(scenario: Scenario, seeds: Sequence[int] = PLANNING_SEEDS) -> L
             gated.add((gateway.from_edge, gateway.to_edge))
     actuated = {signal.id for signal in fixed if signal.id in obeying}
     cycles = read_cycles(city.net_file, files)
-    departing = max(float(np.ptp([drive.depart for drive in together])), QUARTER_S)
-    stopping = blocked(own_files(scenario, chosen.background), files, departing)
-    links = link_arrays(streets, stopping)
+    period = max(float(np.ptp([drive.depart for drive in together])), QUARTER_S)
+    links = link_arrays(streets, blocked(own_files(scenario, chosen.background), files, period))
     return LinkNetwork(
         regions=city.regions,
         periods=len(rows) // len(draws),

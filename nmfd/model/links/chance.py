@@ -38,15 +38,15 @@ class Choice(NamedTuple):
         """
         begin = before.detach()
         end = begin + moved.detach()
-        none = (end == begin).to(end.dtype)  # the next vehicle counts
+        still = (end == begin).to(end.dtype)  # none moves up: the next vehicle counts
         first = begin.floor()
         taken = torch.zeros_like(self.shares)
         for n in range(most + 1):
             number = first + n
             part = (torch.minimum(end, number + 1.0) - torch.maximum(begin, number)).clamp(min=0.0)
             if n == 0:
-                part = part + none
-            share = part / (end - begin + none)
+                part = part + still
+            share = part / (end - begin + still)
             row = (number.long() % DRAWS).unsqueeze(1)
             draw = self.draws.gather(1, row).squeeze(1).index_select(1, self.entry)
             drawn = (draw >= self.low) & (draw < self.high)

@@ -1018,11 +1018,12 @@ def _see_green_back(
         d_green = d.going[t] * work.rho[i] + d.wanted[i] * work.by_turn[t]
         d.by_turn[t] += d.wanted[i] * work.green[t]
         most = city.per_step[m] * work.open_share[m] * city.lanes_of_turn[t]
-        together = max(work.by_turn[t], least)
-        if work.arriving[t] + (work.leader[t] - work.arriving[t]) * stood > most / together:
-            d.open_share[m] += d_green / together * city.per_step[m] * city.lanes_of_turn[t]
+        first = max(work.by_turn[t], least)
+        green = work.arriving[t] + (work.leader[t] - work.arriving[t]) * stood
+        if green > most / first:
+            d.open_share[m] += d_green / first * city.per_step[m] * city.lanes_of_turn[t]
             if work.by_turn[t] >= least:
-                d.by_turn[t] -= d_green * work.green[t] / together
+                d.by_turn[t] -= d_green * work.green[t] / first
             d_green = city.zero
         d_leader = d_green * stood
         d.stood[t] += d_green * (work.leader[t] - work.arriving[t])

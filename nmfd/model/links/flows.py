@@ -182,7 +182,10 @@ class Delay:
 
 
 class Flows:
-    """Equations of one city; `step` advances B rollouts by `dt` seconds."""
+    """Equations of one city; `step` advances B rollouts by `dt` seconds.
+
+    lost: time lost in each green that a queue has, by movement (s, (M,))
+    """
 
     delay = Delay  # kind of the histories
 
@@ -282,9 +285,9 @@ class Flows:
         speed: of cars (m/s); limit: of the street that they come from (m/s)
         """
         network = self.network
-        before = REACTION * network.headway + (network.spacing + BETWEEN_M) / limit
-        headway = np.maximum(before, TURNING * network.headway + network.spacing / speed)
-        return self.numbers.saturation / headway
+        straight = REACTION * network.headway + (network.spacing + BETWEEN_M) / limit
+        turning = TURNING * network.headway + network.spacing / speed
+        return self.numbers.saturation / np.maximum(straight, turning)
 
     def _losing(self, speed: np.ndarray, saturation: np.ndarray) -> np.ndarray:
         """Return the time lost in each green of a lane that has a queue (s).
@@ -497,8 +500,8 @@ class Flows:
         most = most * self._lanes_of_turn
         leader = (most / traffic.standing.clamp(min=LEAST)).clamp(max=1.0)
         green = arriving + (leader - arriving) * stood
-        limit = most / by_turn.clamp(min=LEAST)
-        return torch.where(green > limit, limit, green)
+        allowed = most / by_turn.clamp(min=LEAST)
+        return torch.where(green > allowed, allowed, green)
 
     def _room(self, traffic: Traffic) -> Tensor:
         """Return the vehicles R that each link can receive (veh, (B, L))."""
