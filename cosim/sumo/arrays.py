@@ -6,7 +6,7 @@ tests/conftest.py checks this.
 """
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Real
+from jaxtyping import Bool, Float, Int
 
 from nmfd.arrays import Points as Points  # as there
 
@@ -20,4 +20,3 @@ PerGateway = Float[np.ndarray, " G"]
 GatewayMask = Bool[np.ndarray, " G"]
 PerTrip = Float[np.ndarray, " N"]
 TripNumbers = Int[np.ndarray, " N"]
-RegionCounts = Real[np.ndarray, "T R"]

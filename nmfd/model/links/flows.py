@@ -14,6 +14,7 @@ in the order of arrival; s is the saturation flow. In each step of dt seconds
        the cells: a vehicle that cannot go on stays in front, and holds up those behind it;
     2. of the first vehicles of turn t, phi_t can go: its light, less where it gives way;
     3. they share the room of the next link in proportion: rho_h = min(1, R_h / sum_t phi_t y_t);
+       those who give way to others that enter it get what these leave, but for PUSHING of them;
     4. phi_t rho_h y_c leave the cell.
 
 Where all lanes of a link lead to all turns, steps 1 to 4 are the node model of Tampere, Corthout,
@@ -30,6 +31,7 @@ queue moves up there.
 Every vehicle that leaves one count enters another one: mass and its derivative are conserved.
 """
 
+from collections import defaultdict
 from collections.abc import Sequence
 from typing import NamedTuple, TypeAlias
 
@@ -51,6 +53,7 @@ TURNING = 1.4
 START_S = 1.6  # after which the first vehicle of a queue drives
 ACCELERATING = 0.85  # of a vehicle's acceleration, as drivers dawdle
 BRAKING = 4.5  # m/s2, of SUMO's cars that stop at yellow
+PUSHING = 0.25  # share of those who give way that finds room as the others do
 
 
 class Numbers(NamedTuple):
@@ -222,6 +225,13 @@ class Flows:
         self._gaps = self.values(self.numbers.gap + np.where(merges, behind, 0.0))
         self._yielding = self.places(network.yielding)
         self._foe = self.places(network.foe)
+        foes = defaultdict[int, list[int]](list)
+        for movement, foe in zip(network.yielding, network.foe, strict=True):
+            foes[movement].append(foe)
+        turns = list(zip(network.turn_movement, network.turn_link, strict=True))
+        known = set(turns)
+        taken = [any((foe, link) in known for foe in foes[movement]) for movement, link in turns]
+        self._behind = self.values((1.0 - PUSHING) * np.array(taken))
 
     def _number(self) -> None:
         """Set which count belongs to which other one."""
@@ -423,11 +433,10 @@ class Flows:
         due = traffic.due + begin
         waiting = self.by_link(due)
         put = (self._most_in / waiting.clamp(min=LEAST)).clamp(max=1.0)
-        wanted = self.sums(by_turn * green, self._link_entered, self.links) + waiting * put
 
         # 3. and 4. Room on the next link, and flows.
-        rho = (self._room(traffic) / wanted.clamp(min=LEAST)).clamp(max=1.0)
-        going = green * rho.index_select(1, self._link_entered)
+        rho, entering = self._entering(traffic, by_turn * green, waiting * put, yields)
+        going = green * entering
         leaving = first * going.index_select(1, self._turn_of_cell)
         flow = by_turn * going
         entered = self.sums(leaving, self.onward, self.entries)
@@ -502,6 +511,26 @@ class Flows:
         green = arriving + (leader - arriving) * stood
         allowed = most / by_turn.clamp(min=LEAST)
         return torch.where(green > allowed, allowed, green)
+
+    def _entering(
+        self, traffic: Traffic, able: Tensor, beginning: Tensor, yields: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return the shares rho that find room on the next link.
+
+        They are those of the trips that begin (-, (B, L)) and of the vehicles (-, (B, T)).
+
+        able: vehicles that can go (veh, (B, T)); beginning: trips that can begin (veh, (B, L))
+        """
+        behind = self._behind * yields.index_select(1, self._movement_of_turn)
+        wanted = self.sums(able - able * behind, self._link_entered, self.links) + beginning
+        wanted_behind = self.sums(able * behind, self._link_entered, self.links)
+        room = self._room(traffic)
+        rho = (room / wanted.clamp(min=LEAST)).clamp(max=1.0)
+        left = room - rho * wanted
+        rho_behind = (left / wanted_behind.clamp(min=LEAST)).clamp(max=1.0)
+        first = rho.index_select(1, self._link_entered)
+        last = rho_behind.index_select(1, self._link_entered)
+        return rho, first + behind * (last - first)
 
     def _room(self, traffic: Traffic) -> Tensor:
         """Return the vehicles R that each link can receive (veh, (B, L))."""
