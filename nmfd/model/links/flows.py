@@ -188,6 +188,7 @@ class Flows:
     """Equations of one city; `step` advances B rollouts by `dt` seconds.
 
     lost: time lost in each green that a queue has, by movement (s, (M,))
+    light: of the programmes without it, as network.light
     """
 
     delay = Delay  # kind of the histories
@@ -215,7 +216,7 @@ class Flows:
         self._give_way()
 
     def _give_way(self) -> None:
-        """Set who gives way to which flow, and the gap needed in it."""
+        """Set who gives way to which flow, the gap needed in it, and who gets room last."""
         network = self.network
         street = np.zeros(self.movements, dtype=network.street.dtype)
         street[network.turn_movement] = network.street[network.turn_link]
@@ -326,6 +327,10 @@ class Flows:
         limit = network.limit[network.movement_link]
         saturation = self._saturation(network.speed, limit)
         self.lost = self._losing(network.speed, saturation)
+        self.light = network.light.copy()
+        for begin, cycle, lost in zip(network.begin, network.cycle, self.lost, strict=True):
+            own = slice(begin, begin + cycle)
+            self.light[own] = _late(network.light[own], lost)
         saturation *= (1.0 - network.stopped[network.movement_link]) * self.dt
         movement = network.turn_movement[network.served]
         fastest = np.zeros(len(network.lane_link))
@@ -553,3 +558,22 @@ class Flows:
         ends = traffic.stopping + self._to_end.younger(traffic.ending)
         place = np.arange(self.links) * regions + self.network.region
         return total.index_add(1, self.places(place), ends).view(-1, self.links, regions)
+
+
+def _late(light: np.ndarray, lost: float) -> np.ndarray:
+    """Return the light of a movement without the time lost in each green.
+
+    A light that always shows stays as it is.
+
+    light: in each second of its cycle (-, (cycle,)); lost: (s)
+    """
+    late = light.copy()
+    for opens in np.flatnonzero((light > 0.0) & (np.roll(light, 1) == 0.0)):
+        left = lost
+        for second in range(opens, opens + len(light)):
+            place = second % len(light)
+            if left <= 0.0 or light[place] == 0.0:
+                break
+            late[place] -= min(light[place], left)
+            left -= light[place]
+    return late

@@ -132,7 +132,7 @@ class Gates:
             light = network.light[begin : begin + cycle]
             opens = (light > 0.0) & (np.roll(light, 1) == 0.0)
             green = (light == 1.0).sum()
-            capacity = _late(light, flows.lost[movement]).sum()
+            capacity = flows.light[begin : begin + cycle].sum()
             if by_cycle:
                 opens[:] = False
             if not of_programme:
@@ -177,12 +177,7 @@ class Programmes:
         """opens: of the gates"""
         self._flows = flows
         self._opens = opens
-        network = flows.network
-        self._light = network.light.copy()
-        for begin, cycle, lost in zip(network.begin, network.cycle, flows.lost, strict=True):
-            own = slice(begin, begin + cycle)
-            self._light[own] = _late(network.light[own], lost)
-        self._period = math.lcm(*network.cycle.tolist())
+        self._period = math.lcm(*flows.network.cycle.tolist())
         self._read = lru_cache(maxsize=KEPT)(self._read_in_period)
 
     def read(self, begin: float, steps: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -201,31 +196,12 @@ class Programmes:
         def by_step(values: np.ndarray) -> np.ndarray:
             return values[place].reshape(steps, seconds, -1)
 
-        light = by_step(self._light).mean(axis=1)
-        yielding = by_step(self._light * network.yields).mean(axis=1)
+        light = by_step(self._flows.light).mean(axis=1)
+        yielding = by_step(self._flows.light * network.yields).mean(axis=1)
         yields = yielding / np.maximum(light, 1e-9)
         opens = by_step(self._opens).max(axis=1)
         values = self._flows.values
         return values(light), values(yields), values(opens)
-
-
-def _late(light: np.ndarray, lost: float) -> np.ndarray:
-    """Return the light of a movement without the time lost in each green.
-
-    A light that always shows stays as it is.
-
-    light: in each second of its cycle (-, (cycle,)); lost: (s)
-    """
-    late = light.copy()
-    for opens in np.flatnonzero((light > 0.0) & (np.roll(light, 1) == 0.0)):
-        left = lost
-        for second in range(opens, opens + len(light)):
-            place = second % len(light)
-            if left <= 0.0 or light[place] == 0.0:
-                break
-            late[place] -= min(light[place], left)
-            left -= light[place]
-    return late
 
 
 def _shown(table: Tensor, stage: Tensor, signal: Tensor) -> Tensor:
