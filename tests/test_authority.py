@@ -50,7 +50,7 @@ def judged(network, boundaries, most, started, waiting=0.0, slowness=1.3):
             (),
             3,
         ),
-        (1.9, 10, 0.0, "No: no gateway has a signal", (), 2),
+        (1.9, 10, 0.0, "No: no gateway has a signal", (), 1),
         (1.9, 600, 1.0, "It may: region 1 becomes critical, and gateways could hold 50%", (1,), 0),
         (
             1.9,

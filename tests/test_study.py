@@ -66,7 +66,7 @@ def test_from_a_scenario_to_a_page(ran, out):
     assert verdicts["max-pressure signals"].startswith("gains")
     assert verdicts["guidance"].startswith("gains")
     assert verdicts["actuated signals"].startswith("harms")
-    assert "guidance: leaves 30 trips more unserved; not recommended" in text
+    assert "guidance: leaves 30 of 600 trips more unserved; not recommended" in text
     assert "metering: not judged; a run failed, for the reason in runs.csv" in text
     assert "Yes: max-pressure signals would save" in text
     broken = "breaks at demand times 1.3, where fewer trips are completed than at the demand before"

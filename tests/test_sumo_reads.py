@@ -395,6 +395,20 @@ def test_vehicles_of_another_network_are_named(tmp_path):
         imported(config)
 
 
+def test_a_vehicle_may_have_the_id_of_a_flow(tmp_path):
+    """The flow is a bus line, the vehicle a car."""
+    line = '<flow id="f" begin="0" end="600" period="60" route="r" line="7"/>'
+    traffic = read(given(tmp_path, line + '<vehicle id="f" depart="3" route="r"/>'))
+    assert [vehicle.attrib.keys() & {"line"} for vehicle in traffic.vehicles] == [set()]
+    assert len(traffic.background) == 10
+
+
+def test_vehicles_before_the_beginning_are_counted(tmp_path):
+    config = given(tmp_path, TRIP.format("t", 3) + ENDS + "/>")
+    with pytest.raises(InputError, match="before the simulation begins: 1; it begins at 60 s"):
+        imported(config, begin="60")
+
+
 def test_another_traffic_is_told_with_a_reason(tmp_path):
     slow = '<flow id="s" begin="0" end="90" number="9" route="r" departSpeed="1.0"/>'
     config = given(tmp_path, slow)

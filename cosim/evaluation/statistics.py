@@ -405,10 +405,11 @@ def by_region(
     columns: dict[tuple[str, str], list[str]] = {("", "region"): [*region_names, "all"]}
     for n, heading in enumerate(("trip from here [s]", "CO2 [kg]")):
         for name, values in zip(names, means, strict=True):
-            columns[heading, name] = [f"{value:,.0f}" for value in values[n]]
+            columns[heading, name] = [_or_dash(value, ",.0f") for value in values[n]]
         if len(names) > 1:
-            changes = 100.0 * (means[-1][n] / means[0][n] - 1.0)
-            columns[heading, "change"] = [f"{change:+.1f} %" for change in changes]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                changes = 100.0 * (means[-1][n] / means[0][n] - 1.0)
+            columns[heading, "change"] = [_or_dash(change, "+.1f", " %") for change in changes]
     inside = [np.flatnonzero(region == r) for r in range(regions)]
     inside.append(np.arange(len(region)))
     for name, of in zip(names, runs, strict=True):
@@ -418,6 +419,11 @@ def by_region(
             f"{queue[edge]}, {city.edges[edge]}" for edge in longest
         ]
     return pd.DataFrame(columns)
+
+
+def _or_dash(value: float, form: str, unit: str = "") -> str:
+    """Return a number as text; a dash where no trip begins."""
+    return f"{value:{form}}{unit}" if np.isfinite(value) else "–"
 
 
 def _numbers(run: Result, region: np.ndarray, regions: int) -> np.ndarray:

@@ -41,6 +41,7 @@ BUSES = "public transport and other classes left alone"
 ALONE = "persons, containers and vehicles left alone, in all"
 NOWHERE = "vehicles on edges that the network has not, left out"
 NO_ROUTE = "vehicles without a route that SUMO could drive, left out"
+EARLY = "vehicles that depart before the simulation begins"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +57,7 @@ class Traffic:
     remarks: examples of what was left out, and SUMO's own words about the files
     left_out: shares of SUMO's vehicles, and of the distance that they would drive [-], that are not
         taken over
-    given: ids of all vehicles and flows of the files
+    given: all vehicles and flows of the files, by `_key`
     end: later vehicles were not read [s]
     """
 
@@ -83,7 +84,7 @@ class Traffic:
 
     @cached_property
     def _beside(self) -> set[str]:
-        return {element.get("id", "").strip() for element in self.background}
+        return set(map(_key, self.background))
 
 
 class _Trip(NamedTuple):
@@ -119,7 +120,7 @@ class Reading:
         self._streets = streets
         # What the files hold.
         self._files: list[Element] = []  # for SUMO to read
-        self._given: dict[str, Element] = {}  # id -> vehicle, trip or flow
+        self._given: dict[str, Element] = {}  # vehicles, trips and flows by `_key`
         self._astray: dict[str, str] = {}  # of these, those on an edge that does not exist
         self._background: list[Element] = []
         self._shared: list[Element] = []
@@ -155,7 +156,7 @@ class Reading:
 
     def _driver(self, element: Element) -> Element:
         """Take a vehicle, trip or flow; return what SUMO shall read for it."""
-        name = element.get("id", "").strip()
+        name = _key(element)
         self._given[name] = element
         if _waits(element):
             self._background.append(element)
@@ -283,6 +284,9 @@ class Reading:
         """Return all that was taken."""
         trips = sorted(self._trips, key=lambda trip: trip.depart)
         self._notes[NO_ROUTE] = len(self._routeless)
+        if not trips:
+            single = [element for element in self._given.values() if element.tag != "flow"]
+            self._notes[EARLY] = sum(departure(one) < self._case.begin for one in single)
         self._notes[ALONE] = len(self._background)
         return Traffic(
             vehicles=tuple(trip.element for trip in trips),
@@ -317,7 +321,8 @@ class Reading:
         remarks = []
         if self._astray:
             name, edge = next(iter(self._astray.items()))
-            what = f"edge {edge} of {self._given[name].tag} {name} is not in {self._case.net.name}"
+            tag = self._given[name].tag
+            what = f"edge {edge} of {tag} {name.rstrip('.')} is not in {self._case.net.name}"
             remarks.append(what + _in_all(self._notes[NOWHERE]))
         if self._routeless:
             what = f"vehicle {self._routeless[0]} has no route that SUMO could drive"
@@ -393,6 +398,12 @@ def _single(vehicle: Departure, source: Element, routes: Container[str]) -> Elem
             SubElement(single, "route", {"edges": " ".join(vehicle.edges)})
     single.extend(parts)
     return single
+
+
+def _key(element: Element) -> str:
+    """Return an id for `original`: a vehicle and a flow may have the same."""
+    name = element.get("id", "").strip()
+    return f"{name}." if element.tag == "flow" else name
 
 
 def departure(element: Element) -> float:

@@ -184,7 +184,7 @@ def import_city(
         _move(network_folder, request.out)
         _move(scenario_folder, request.scenario)
     written = f"Written to {out} (see map.png, quality.csv, gateways.csv) and {request.scenario}"
-    return "\n".join([*lines, f"{written}; next: cosim identify {out}"])
+    return "\n".join([*lines, written])
 
 
 def _check_new(folder: Path) -> None:
@@ -470,7 +470,7 @@ def _report(
     lines = [
         report.summary(city.case, city.streets, traffic, clock),
         report.table(tables),
-        report.outcome(city.baseline),
+        report.outcome(city.baseline, clock),
     ]
     if city.same:
         lines.append(report.comparison(city.same, city.case, traffic, clock))

@@ -1,6 +1,5 @@
 """Tables of regions and gateways, and the verdict on their control."""
 
-import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
@@ -135,7 +134,7 @@ def short_demand(depart: PerTrip, begin: float, step: float) -> list[str]:
 
     depart: (N,) [s]; begin, step: of the control intervals [s]
     """
-    intervals = math.ceil((float(depart[-1]) - begin) / step) if len(depart) else 0
+    intervals = int((float(depart[-1]) - begin) / step) + 1 if len(depart) else 0
     if intervals >= FEWEST_INTERVALS:
         return []
     return [

@@ -5,7 +5,7 @@ from cosim.importing.assignment import GAP, Assigned
 from cosim.importing.baseline import Baseline
 from cosim.importing.case import SumoInput
 from cosim.importing.comparison import Comparison
-from cosim.importing.demand import FAST, FROM_FLOWS, NO_ROUTE, NOWHERE, ON_ROAD, Traffic
+from cosim.importing.demand import EARLY, FAST, FROM_FLOWS, NO_ROUTE, NOWHERE, ON_ROAD, Traffic
 from cosim.importing.quality import Tables
 from cosim.importing.streets import Streets
 from nmfd.runs.tables import text_table
@@ -22,9 +22,12 @@ CAPTION = (
 def no_vehicles(case: SumoInput, traffic: Traffic) -> str:
     """Return the error of a case without private vehicles."""
     remarks = "".join(f"; {remark}" for remark in traffic.remarks)
+    remedy = "give a sumocfg with route-files, or add --routes FILE, --counts FILE or --demand peak"
+    if EARLY in traffic.notes:
+        remedy = f"it begins at {case.begin:g} s; give another --begin"
     return (
         f"{case.source}: names no vehicles for the streets of cars{_notes(traffic)}{remarks}; "
-        "give a sumocfg with route-files, or add --routes FILE, --counts FILE or --demand peak"
+        f"{remedy}"
     )
 
 
@@ -44,7 +47,7 @@ def table(tables: Tables) -> str:
     return text_table(tables.quality, CAPTION)
 
 
-def outcome(baseline: Baseline) -> str:
+def outcome(baseline: Baseline, clock: model.Clock) -> str:
     """Return how the run without control ended, for private trips."""
     line = (
         f"without control: {baseline.teleports} teleports; at the end {baseline.running} vehicles "
@@ -53,6 +56,11 @@ def outcome(baseline: Baseline) -> str:
     )
     if baseline.removed:
         line += f"; {baseline.removed:,} removed on their way"
+    if baseline.running + baseline.waiting:
+        line += (
+            f"; runs end at {clock.end:g} s, {model.RECOVERY_S / 60.0:g} minutes after the last "
+            f"departure: for longer ones raise steps = {clock.steps} in scenario.toml"
+        )
     return line
 
 

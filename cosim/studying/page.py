@@ -187,8 +187,9 @@ def details(level: Level) -> list[str]:
         if one.answer is Answer.UNKNOWN:
             lines.append(f"{one.label}: {open_verdict(one)}")
         if not one.serves:
-            more = one.more_left * one.means["trips"]
-            lines.append(f"{one.label}: leaves {more:,.0f} trips more unserved; not recommended")
+            trips = one.means["trips"]
+            more = f"{one.more_left * trips:,.0f} of {trips:,.0f} trips more unserved"
+            lines.append(f"{one.label}: leaves {more}; not recommended")
     skipped: dict[str, list[str]] = {}
     for name, label in LABELS.items():
         if name in level.skipped:
@@ -260,7 +261,10 @@ def broken(load: Loading) -> str:
     level = load.under if load.broken is None else load.broken
     left = f"{load.left[level]:.1%} of its trips are left at the end"
     if load.broken is None:
-        return f"Without control the city does not break up to demand times {level:g}: {left}."
+        return (
+            "Without control more demand still completes more trips, up to demand times "
+            f"{level:g}, where {left}."
+        )
     return (
         f"Without control the city breaks at demand times {level:g}, where fewer trips are "
         f"completed than at the demand before: {left}."

@@ -129,13 +129,15 @@ def _read(
 
 
 def original(name: str, given: Container[str]) -> str:
-    """Return the id of the element that a vehicle comes from.
+    """Return the id in `given` of the element that a vehicle comes from.
 
     It is its own, or that of a flow or of a multiplied vehicle. It is "" for the vehicles of
-    calibrators and persons.
+    calibrators and persons. Flows may have a dot behind their id: vehicles may have the same one.
     """
     while name and name not in given:
         name = name.rpartition(".")[0]
+        if f"{name}." in given:
+            return f"{name}."
     return name
 
 

@@ -24,8 +24,8 @@ WAITING_SHARE = 0.02
 SLOW = 2.5
 FILE = "verdict.txt"
 NO_GATEWAY = (
-    "no gateway has a signal that perimeter control can use; other regions may have "
-    "(cosim import --regions)"
+    "no gateway has a signal that perimeter control can use (gateways.csv says why); if there are "
+    "such signals elsewhere, other regions may have some (cosim import --regions)"
 )
 Counts = Real[np.ndarray, "R R"]
 
@@ -292,7 +292,7 @@ def _remedies(answer: Answer, scenario: str) -> list[str]:
     if answer is Answer.GUESSED:
         return [f"the model of the city: {identify}"]
     if answer is Answer.NO_SIGNAL:
-        return [f"guidance: {guidance}", partition]
+        return [f"guidance: {guidance}"]
     remedies = [f"guidance and other signals: {pressure}", partition]
     if answer is Answer.CROWDED:
         remedies.insert(0, f"other demand shows more: {identify} --levels 0.8,1,1.3")

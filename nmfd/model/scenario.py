@@ -230,15 +230,17 @@ class Scenario(Horizon):
 def with_demand(scenario: Scenario, *, steps: int | None = None, factor: float = 1.0) -> Scenario:
     """Return the beginning of a scenario, with another demand.
 
-    steps: most control intervals; all if None
+    steps: control intervals; all if None
     factor: of the demand
     Raises: InputError
     """
     if steps is None:
         steps = scenario.steps
-    if steps < 1:
-        raise InputError(f"steps: expected 1 or more control intervals, got {steps} instead")
-    steps = min(steps, scenario.steps)
+    if not 1 <= steps <= scenario.steps:
+        raise InputError(
+            f"steps: expected 1 to {scenario.steps} control intervals, got {steps} instead; for "
+            f"more, change steps in {scenario.where}, or --set steps=N"
+        )
     return replace(
         scenario,
         steps=steps,

@@ -216,7 +216,7 @@ class Flows:
         self._give_way()
 
     def _give_way(self) -> None:
-        """Set who gives way to which flow, the gap needed in it, and who gets room last."""
+        """Set who gives way to whom, and the gap needed in a flow."""
         network = self.network
         street = np.zeros(self.movements, dtype=network.street.dtype)
         street[network.turn_movement] = network.street[network.turn_link]
