@@ -69,9 +69,9 @@ def tables(
                 "flow_veh": moves[move],
             }
         )
-    approaches = pd.Series(
-        {edge: regions[streets.number[edge]] for edge in city.signals}, dtype=int
-    )
+    # A railway crossing is no signal here: it has no programme.
+    with_signal = [edge for edge, signal in city.signals.items() if signal in streets.logics]
+    approaches = pd.Series({edge: regions[streets.number[edge]] for edge in with_signal}, dtype=int)
     main_region = approaches.groupby(city.signals).agg(lambda part: part.mode()[0])
 
     def row(region: str, name: str, members: EdgeMask, own: Sequence[Mapping]) -> dict:

@@ -297,7 +297,7 @@ def row(one: Outcome) -> dict[str, str]:
         "min": f"{means['mean_trip_time_s'] / 60.0:.1f}",
         "served": f"{means['completed_veh']:,.0f}",
         "left": f"{one.left:,.0f}",
-        "teleports": f"{means['teleports']:.0f}",
+        "teleports": f"{means['teleports']:.1f}".removesuffix(".0"),
     }
 
 

@@ -160,7 +160,10 @@ def run_many(
         minutes = sum(run.expected for run in todo) / max(workers, 1) / 60.0
         said = minutes > 0.5 and scheduler is None
         if said:
-            _say(f"{len(todo)} runs take about {minutes:.0f} min, {workers} at a time")
+            _say(
+                f"{len(todo)} runs take about {minutes:.0f} min, {workers} at a time, and longer "
+                "where streets fill up"
+            )
         try:
             with (
                 watched("runs", progress, said=said) as show,
