@@ -165,7 +165,7 @@ def share_of_minor(green):
     """Share of d of those who enter b, where a has right of way, and a signal stops them."""
     network = triangle()
     of_links = ("length", "behind", "limit", "stopped", "free_time", "first", "last", "detector")
-    fourth = {name: np.append(values := getattr(network, name), values[0]) for name in of_links}
+    fourth = {name: np.pad(getattr(network, name), (0, 1), "edge") for name in of_links}
     network = replace(
         network,
         **fourth,

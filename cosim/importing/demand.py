@@ -321,8 +321,8 @@ class Reading:
         remarks = []
         if self._astray:
             name, edge = next(iter(self._astray.items()))
-            tag = self._given[name].tag
-            what = f"edge {edge} of {tag} {name.rstrip('.')} is not in {self._case.net.name}"
+            given = self._given[name]
+            what = f"edge {edge} of {given.tag} {given.get('id')} is not in {self._case.net.name}"
             remarks.append(what + _in_all(self._notes[NOWHERE]))
         if self._routeless:
             what = f"vehicle {self._routeless[0]} has no route that SUMO could drive"
@@ -401,7 +401,7 @@ def _single(vehicle: Departure, source: Element, routes: Container[str]) -> Elem
 
 
 def _key(element: Element) -> str:
-    """Return an id for `original`: a vehicle and a flow may have the same."""
+    """Return an id, of a flow with a dot: a vehicle may have the same one."""
     name = element.get("id", "").strip()
     return f"{name}." if element.tag == "flow" else name
 

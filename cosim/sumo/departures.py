@@ -132,7 +132,8 @@ def original(name: str, given: Container[str]) -> str:
     """Return the id in `given` of the element that a vehicle comes from.
 
     It is its own, or that of a flow or of a multiplied vehicle. It is "" for the vehicles of
-    calibrators and persons. Flows may have a dot behind their id: vehicles may have the same one.
+    calibrators and persons. In `given` the id of a flow may end with a dot, as a vehicle may have
+    the same id.
     """
     while name and name not in given:
         name = name.rpartition(".")[0]

@@ -24,8 +24,8 @@ WAITING_SHARE = 0.02
 SLOW = 2.5
 FILE = "verdict.txt"
 NO_GATEWAY = (
-    "no gateway has a signal that perimeter control can use (gateways.csv says why); if there are "
-    "such signals elsewhere, other regions may have some (cosim import --regions)"
+    "no gateway has a signal that perimeter control can use (gateways.csv says why); where the "
+    "city has such signals, other regions may have one (cosim import --regions)"
 )
 Counts = Real[np.ndarray, "R R"]
 

@@ -67,7 +67,7 @@ class City(NamedTuple):
     yielding: Any
     foe: Any
     gaps: Any
-    behind: Any
+    minor: Any
     home: Any
     home_link: Any
     ahead: Any
@@ -246,9 +246,9 @@ class _Work(NamedTuple):
     waiting: Any
     put: Any
     wanted: Any
-    behind: Any
-    wanted_behind: Any
-    rho_behind: Any
+    minor: Any
+    wanted_minor: Any
+    rho_minor: Any
     entering: Any
     free: Any
     receives: Any
@@ -299,9 +299,9 @@ def _work_of(city: City, given: Given) -> _Work:
         waiting=np.empty(links, kind),
         put=np.empty(links, kind),
         wanted=np.empty(links, kind),
-        behind=np.empty(turns, kind),
-        wanted_behind=np.empty(links, kind),
-        rho_behind=np.empty(links, kind),
+        minor=np.empty(turns, kind),
+        wanted_minor=np.empty(links, kind),
+        rho_minor=np.empty(links, kind),
         entering=np.empty(turns, kind),
         free=np.empty(links, kind),
         receives=np.empty(links, kind),
@@ -693,7 +693,7 @@ def _see_green(
         kept = one - given.yields[k, b, m] * (one - work.gap[m])
         work.open_share[m] = work.light[m] * kept
     work.wanted[:] = city.zero
-    work.wanted_behind[:] = city.zero
+    work.wanted_minor[:] = city.zero
     for t in range(len(work.by_turn)):
         m = city.movement_of_turn[t]
         standing = counts.standing[now, b, t]
@@ -707,10 +707,10 @@ def _see_green(
         green = arriving + (leader - arriving) * stood
         work.green[t] = min(green, most / max(work.by_turn[t], city.least))
         able = work.by_turn[t] * work.green[t]
-        behind = city.behind[t] * given.yields[k, b, m]
-        work.behind[t] = behind
-        work.wanted[city.link_entered[t]] += able - able * behind
-        work.wanted_behind[city.link_entered[t]] += able * behind
+        minor = city.minor[t] * given.yields[k, b, m]
+        work.minor[t] = minor
+        work.wanted[city.link_entered[t]] += able - able * minor
+        work.wanted_minor[city.link_entered[t]] += able * minor
 
 
 @inner
@@ -740,11 +740,11 @@ def _receive(
         work.wanted[i] += work.waiting[i] * put
         work.rho[i] = min(work.receives[i] / max(work.wanted[i], city.least), one)
         left = work.receives[i] - work.rho[i] * work.wanted[i]
-        work.rho_behind[i] = min(left / max(work.wanted_behind[i], city.least), one)
+        work.rho_minor[i] = min(left / max(work.wanted_minor[i], city.least), one)
     for t in range(len(work.going)):
         i = city.link_entered[t]
         rho = work.rho[i]
-        work.entering[t] = rho + work.behind[t] * (work.rho_behind[i] - rho)
+        work.entering[t] = rho + work.minor[t] * (work.rho_minor[i] - rho)
         work.going[t] = work.green[t] * work.entering[t]
 
 
@@ -985,21 +985,21 @@ def _receive_back(
     least = city.least
     had_left = _row(d_histories.had_left, given, k)
     d.rho[:] = city.zero
-    d.rho_behind[:] = city.zero
+    d.rho_minor[:] = city.zero
     for t in range(len(d.going)):
         d_entering = d.going[t] * work.green[t]
-        d.rho[city.link_entered[t]] += d_entering * (one - work.behind[t])
-        d.rho_behind[city.link_entered[t]] += d_entering * work.behind[t]
+        d.rho[city.link_entered[t]] += d_entering * (one - work.minor[t])
+        d.rho_minor[city.link_entered[t]] += d_entering * work.minor[t]
     for i in range(len(d.rho)):
         waiting = work.waiting[i]
         put = work.put[i]
         rho = work.rho[i]
         d_coming = d.coming[i] - d_sums.outside[b]
         d_both = d.put[i] + d_coming * waiting
-        below = max(work.wanted_behind[i], least)
+        below = max(work.wanted_minor[i], least)
         ratio = (work.receives[i] - rho * work.wanted[i]) / below
-        d_left = d.rho_behind[i] / below if ratio <= one else city.zero
-        d.wanted_behind[i] = -d_left * ratio if work.wanted_behind[i] >= least else city.zero
+        d_left = d.rho_minor[i] / below if ratio <= one else city.zero
+        d.wanted_minor[i] = -d_left * ratio if work.wanted_minor[i] >= least else city.zero
         d_rho = d.rho[i] + d_both * put - d_left * work.wanted[i]
         d_waiting = d_sums.outside[b] + d_coming * (put * rho)
         below = max(work.wanted[i], least)
@@ -1043,7 +1043,7 @@ def _see_green_back(
         m = city.movement_of_turn[t]
         standing = counts.standing[k, b, t]
         stood = work.stood[t]
-        d_able = d.wanted[i] + (d.wanted_behind[i] - d.wanted[i]) * work.behind[t]
+        d_able = d.wanted[i] + (d.wanted_minor[i] - d.wanted[i]) * work.minor[t]
         d_green = d.going[t] * work.entering[t] + d_able * work.by_turn[t]
         d.by_turn[t] += d_able * work.green[t]
         most = city.per_step[m] * work.open_share[m] * city.lanes_of_turn[t]

@@ -14,7 +14,7 @@ in the order of arrival; s is the saturation flow. In each step of dt seconds
        the cells: a vehicle that cannot go on stays in front, and holds up those behind it;
     2. of the first vehicles of turn t, phi_t can go: its light, less where it gives way;
     3. they share the room of the next link in proportion: rho_h = min(1, R_h / sum_t phi_t y_t);
-       those who give way to others that enter it get what these leave, but for PUSHING of them;
+       of those who give way to others that enter it, all but PUSHING share what these leave;
     4. phi_t rho_h y_c leave the cell.
 
 Where all lanes of a link lead to all turns, steps 1 to 4 are the node model of Tampere, Corthout,
@@ -53,7 +53,7 @@ TURNING = 1.4
 START_S = 1.6  # after which the first vehicle of a queue drives
 ACCELERATING = 0.85  # of a vehicle's acceleration, as drivers dawdle
 BRAKING = 4.5  # m/s2, of SUMO's cars that stop at yellow
-PUSHING = 0.25  # share of those who give way that finds room as the others do
+PUSHING = 0.25  # of those who give way, the share that finds room as the others do, as in SUMO
 
 
 class Numbers(NamedTuple):
@@ -214,25 +214,31 @@ class Flows:
         self._delay()
         self._limit()
         self._give_way()
+        self._rank()
+        self._light()
 
     def _give_way(self) -> None:
-        """Set who gives way to whom, and the gap needed in a flow."""
+        """Set who gives way to which flow, and the gap needed in it."""
         network = self.network
         street = np.zeros(self.movements, dtype=network.street.dtype)
         street[network.turn_movement] = network.street[network.turn_link]
         merges = street[network.yielding] == street[network.foe]
         # A car that merges falls behind the flow while it accelerates to the same speed.
-        behind = network.speed[network.foe] / (2.0 * ACCELERATING * network.acceleration)
-        self._gaps = self.values(self.numbers.gap + np.where(merges, behind, 0.0))
+        lost = network.speed[network.foe] / (2.0 * ACCELERATING * network.acceleration)
+        self._gaps = self.values(self.numbers.gap + np.where(merges, lost, 0.0))
         self._yielding = self.places(network.yielding)
         self._foe = self.places(network.foe)
+
+    def _rank(self) -> None:
+        """Set which turns are minor: others with right of way enter their link."""
+        network = self.network
         foes = defaultdict[int, list[int]](list)
         for movement, foe in zip(network.yielding, network.foe, strict=True):
             foes[movement].append(foe)
         turns = list(zip(network.turn_movement, network.turn_link, strict=True))
         known = set(turns)
-        taken = [any((foe, link) in known for foe in foes[movement]) for movement, link in turns]
-        self._behind = self.values((1.0 - PUSHING) * np.array(taken))
+        minor = [any((foe, link) in known for foe in foes[movement]) for movement, link in turns]
+        self._minor = self.values((1.0 - PUSHING) * np.array(minor))
 
     def _number(self) -> None:
         """Set which count belongs to which other one."""
@@ -327,10 +333,6 @@ class Flows:
         limit = network.limit[network.movement_link]
         saturation = self._saturation(network.speed, limit)
         self.lost = self._losing(network.speed, saturation)
-        self.light = network.light.copy()
-        for begin, cycle, lost in zip(network.begin, network.cycle, self.lost, strict=True):
-            own = slice(begin, begin + cycle)
-            self.light[own] = _late(network.light[own], lost)
         saturation *= (1.0 - network.stopped[network.movement_link]) * self.dt
         movement = network.turn_movement[network.served]
         fastest = np.zeros(len(network.lane_link))
@@ -347,6 +349,14 @@ class Flows:
         self._pace = self.values(saturation / of_movement)
         self._per_step = self.values(saturation)
         self.smoothing = min(self.dt / self.numbers.gap, 1.0)
+
+    def _light(self) -> None:
+        """Set the light of the programmes without the time lost in each green."""
+        network = self.network
+        self.light = network.light.copy()
+        for begin, cycle, lost in zip(network.begin, network.cycle, self.lost, strict=True):
+            own = slice(begin, begin + cycle)
+            self.light[own] = _late(network.light[own], lost)
 
     def values(self, numbers: np.ndarray) -> Tensor:
         """Return an array of numbers as a tensor of this model."""
@@ -526,16 +536,17 @@ class Flows:
 
         able: vehicles that can go (veh, (B, T)); beginning: trips that can begin (veh, (B, L))
         """
-        behind = self._behind * yields.index_select(1, self._movement_of_turn)
-        wanted = self.sums(able - able * behind, self._link_entered, self.links) + beginning
-        wanted_behind = self.sums(able * behind, self._link_entered, self.links)
+        minor = self._minor * yields.index_select(1, self._movement_of_turn)
+        last = able * minor
+        wanted = self.sums(able - last, self._link_entered, self.links) + beginning
+        wanted_minor = self.sums(last, self._link_entered, self.links)
         room = self._room(traffic)
         rho = (room / wanted.clamp(min=LEAST)).clamp(max=1.0)
         left = room - rho * wanted
-        rho_behind = (left / wanted_behind.clamp(min=LEAST)).clamp(max=1.0)
-        first = rho.index_select(1, self._link_entered)
-        last = rho_behind.index_select(1, self._link_entered)
-        return rho, first + behind * (last - first)
+        rho_minor = (left / wanted_minor.clamp(min=LEAST)).clamp(max=1.0)
+        of_major = rho.index_select(1, self._link_entered)
+        of_minor = rho_minor.index_select(1, self._link_entered)
+        return rho, of_major + minor * (of_minor - of_major)
 
     def _room(self, traffic: Traffic) -> Tensor:
         """Return the vehicles R that each link can receive (veh, (B, L))."""

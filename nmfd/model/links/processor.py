@@ -50,7 +50,7 @@ FLOWS = (
     "_yielding",
     "_foe",
     "_gaps",
-    "_behind",
+    "_minor",
     "_home",
     "_home_link",
     "_ahead",
