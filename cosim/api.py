@@ -244,7 +244,8 @@ def evaluate(
 
     The column `failure` is "" of a finished run, else its reason. Raises InputError.
 
-        >>> table = cosim.evaluate("demo", ["no-control", nmfd.PiGating(kp=0.4)], seeds=3)
+        >>> controllers = ["no-control", nmfd.PiGating(kp=0.4)]
+        >>> table = cosim.evaluate("demo", controllers, seeds=3, steps=16, workers=2)
         >>> means = table.groupby("controller")["total_time_spent_veh_s"].mean()
         >>> bool(means["pi-gating(kp=0.4)"] < means["no-control"])
         True

@@ -21,7 +21,7 @@ import nmfd
 from nmfd.studies.benchmark import summary_table
 
 
-@pytest.mark.parametrize("package", ["nmfd", "cosim"])
+@pytest.mark.parametrize("package", ["nmfd", pytest.param("cosim", marks=pytest.mark.slow)])
 def test_the_python_of_the_readmes(package, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     blocks = [
@@ -90,6 +90,7 @@ HALF = tiny.Acting(
 )
 
 
+@pytest.mark.slow
 def test_figures_are_drawn_again_if_a_run_is_new(tmp_path, out):
     scenario = tiny.write(tmp_path)
 

@@ -59,6 +59,7 @@ def fork(tmp_path_factory):
     ]
 
 
+@pytest.mark.slow
 def test_routes_spread_until_nobody_gains(fork):
     """The fork: the gap falls to what was asked for, in both of SUMO's models; the seed tells
     all."""
@@ -92,6 +93,7 @@ def test_an_assignment_that_sumo_refuses(fork):
         assign(net, broken, begin=0.0, end=600.0, seed=0, iterations=1)
 
 
+@pytest.mark.slow
 def test_an_import_assigns_its_peak(tmp_path):
     """The gap is in the report, the routes in the scenario."""
     net = tiny_city.network(tmp_path, "--tls.set B1,C2", name="tiny.net.xml")

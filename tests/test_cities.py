@@ -52,11 +52,11 @@ def check(folder: Path, name: str, intervals: int) -> None:
 @pytest.mark.parametrize(
     "name, expected",
     [
-        ("cross", None),
+        pytest.param("cross", None, marks=pytest.mark.slow),
         pytest.param("grid6", None, marks=pytest.mark.slow),
         pytest.param("corridor", None, marks=pytest.mark.slow),
         ("DRT", "names no vehicles for the streets of cars"),
-        ("ramp", "no two regions can be made"),
+        pytest.param("ramp", "no two regions can be made", marks=pytest.mark.slow),
         ("rail", "has no edge that cars may use"),
     ],
 )

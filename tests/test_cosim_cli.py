@@ -38,6 +38,7 @@ def small(tmp_path_factory):
     return scenario.folder
 
 
+@pytest.mark.slow
 def test_controllers_with_a_model_run(small, tmp_path):
     out, names = tmp_path / "run", ("mpc-pcrg", "dpc-pcrg")
     both = f"--controller {names[0]} --against {names[1]} --steps 2 --out"

@@ -29,7 +29,7 @@ from nmfd.runs.config import Problem
 from nmfd.types import Controls
 
 SCHEME = {"step": 30.0, "substeps": 1, "integrator": "euler"}
-STEPS = 160
+STEPS = 120
 LANE_KM = np.full(7, 100.0)  # jam: 8,000 veh
 WORSE = HeldOut(ahead=900.0, flowing=Errors(2.0, 5.0), congested=Errors(7.0, 6.0))
 

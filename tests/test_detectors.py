@@ -86,6 +86,7 @@ def test_probes_are_a_share_of_the_vehicles():
     assert probes(names, 1.0, seed=4) == set(names)
 
 
+@pytest.mark.slow
 def test_all_links_and_all_probes_see_everything(scenario):
     """Loops on every link come close to the accumulations; probes are all vehicles."""
     plant = SumoPlant(

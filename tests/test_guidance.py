@@ -93,8 +93,11 @@ def least(city, allowed):
 
 def takes(way, city):
     """The time [s] from the end of the first edge of a way to that of its last."""
-    turns = {(int(a), int(b)): extra for a, b, extra in zip(*city[:3], strict=True)}
-    return sum(turns[move] + city[3][move[1]] for move in pairwise(way))
+    first, second, turn, time = city
+    total = 0.0
+    for a, b in pairwise(way):
+        total += turn[(first == a) & (second == b)].item() + time[b]
+    return total
 
 
 def hops(city):

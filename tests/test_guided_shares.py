@@ -217,6 +217,7 @@ def test_in_the_mesoscopic_model_another_way_must_save_a_share_of_its_own_time(a
     assert town.home("t", "t2", "v") == ("t", "u" if best else "t2", "v")
 
 
+@pytest.mark.slow
 def test_guided_is_guidance_by_travel_times_wherever_the_controller_says_nothing():
     """The bytes are those of a controller that commands the nominal split ratios; without it no
     driver is guided."""

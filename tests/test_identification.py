@@ -58,6 +58,7 @@ def test_the_true_model_predicts_without_error(scenario, runs):
     assert error(scenario.network, runs, 10) < 0.05  # single precision
 
 
+@pytest.mark.slow
 def test_the_fit_predicts_a_run_that_it_has_not_seen(scenario, runs):
     line = (Cubic(a=0.0, b=-2e-7, c=0.004, jam=9000.0),) * 7
     start = replace(scenario.network, exit_rates=None, capacity=None, storage=None, mfds=line)

@@ -43,7 +43,7 @@ def stopped(program, *arguments, out, by, after="[!.]*.nc", wait=0.0):
     [
         pytest.param("*", 0.15, marks=pytest.mark.slow),
         pytest.param(".lock", 0.0, marks=pytest.mark.slow),
-        ("manifest.json", 0.3),
+        pytest.param("manifest.json", 0.3, marks=pytest.mark.slow),
     ],
 )
 def test_ctrl_c_at_any_moment_is_one_line(tmp_path, out, after, wait):

@@ -164,7 +164,13 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(case, marks=pytest.mark.slow) if case in ("programmes", "off option") else case
+        for case in CASES
+    ],
+)
 def test_one_word_for_every_gateway(made, case):
     """Table, verdict, map and run agree on which gateways a command can hold."""
     given, expected = CASES[case]

@@ -588,7 +588,7 @@ def spent_and_slope(model, chance):
     rate = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
     commands = [part.to(device) for part in all_commands(price=2.0)]
     state = model.start(2, [3, 4], chance=chance)
-    for _ in range(4):
+    for _ in range(2):
         demand = torch.cat([demand_of(rate), demand_of(rate)]).to(device)
         state = model.advance(state, demand, Commands(*commands))
     spent = state.spent.sum()
@@ -773,6 +773,7 @@ def test_a_file_of_another_kind_is_refused(tmp_path):
         read_links(path)
 
 
+@pytest.mark.slow
 def test_the_benchmark_takes_streets(tmp_path):
     out = tmp_path / "runs"
     words = "--plant links --controllers no-control --steps 1 --out"

@@ -133,6 +133,7 @@ def test_a_network_and_mfd_serve_plants_rules_and_mpc(controller):
     assert not result["completed"][:10].any()  # no trip ends before its length is driven
 
 
+@pytest.mark.slow
 def test_a_policy_cost_constraint_and_days():
     """Training saves fuel; with the constraint most vehicles go round region B."""
     scenario, most = ring(), {}

@@ -170,6 +170,7 @@ PERSONS = "".join(
 )
 
 
+@pytest.mark.slow
 def test_private_trips_are_those_of_the_demand(city):
     """Vehicles that calibrators and persons make are none, whether they drive or not."""
     bus = '<vehicle id="b" line="1" depart="1"><route edges="A1B1 B1C1"/></vehicle>'
@@ -442,6 +443,7 @@ def test_speeds_and_coordinates(city):
     assert traffic.notes == {"fixed speeds at the departure, made the highest safe ones": 1}
 
 
+@pytest.mark.slow
 def test_a_generated_peak_beside_types_of_the_city(city):
     config = city("", '<vType id="car" vClass="passenger" sigma="0.9"/>')
     text, _ = imported(config, demand="peak", level=0.1, iterations=1, mesoscopic=True)

@@ -133,6 +133,7 @@ def test_the_card_has_the_figures_of_the_best_strategy(evaluation):
     )
 
 
+@pytest.mark.slow
 def test_names_are_escaped_and_several_folders_fit_on_a_page(evaluation, tmp_path, monkeypatch):
     monkeypatch.setattr(html, "_pictures", lambda *_: [])
     run = results.read(evaluation)

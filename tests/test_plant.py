@@ -129,6 +129,7 @@ def test_the_samples_are_those_of_every_edge(plant_of):
     assert max(crossing) > 10
 
 
+@pytest.mark.slow
 def test_teleporting_vehicles_stay_in_the_ledger(scenario, plant_of):
     plant = plant_of(time_to_teleport=20.0)
     measurements, record = drive(plant, with_demand(scenario, steps=3), seed=2)

@@ -119,6 +119,7 @@ def test_the_legend_fits_the_figure(scenario, width):
     )
 
 
+@pytest.mark.slow
 def test_names_with_dollars_are_text_in_every_figure(scenario, tmp_path):
     network = replace(scenario.network, region_names=(DOLLARS,) * 7)
     named = replace(scenario, name=DOLLARS, network=network)

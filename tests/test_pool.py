@@ -28,7 +28,9 @@ print(len(commands))
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the server is a new process")
-@pytest.mark.parametrize(("first", "commands"), [("", "1"), ("import torch", "2")])
+@pytest.mark.parametrize(
+    ("first", "commands"), [("", "1"), pytest.param("import torch", "2", marks=pytest.mark.slow)]
+)
 def test_the_server_is_a_fork_only_of_a_process_without_threads(first, commands):
     script = f"print('begun'); {first}\n{SCRIPT}"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)

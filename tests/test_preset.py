@@ -22,6 +22,7 @@ def published(tmp_path, *without):
     return nmfd.load_scenario(tiny.write(tmp_path), settings)
 
 
+@pytest.mark.slow
 def test_the_published_preset_trains_loads_and_drives(tmp_path, monkeypatch):
     """All its parts act: the rates, the noise, the turns of the decoders, and the network in the
     file."""

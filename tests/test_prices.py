@@ -70,6 +70,7 @@ def test_the_lower_bound_without_metering_is_not_that_of_a_policy_that_meters():
     assert np.isnan(lower_bound(metered, strategy, "nmfd"))
 
 
+@pytest.mark.slow
 def test_mpc_of_grid7_has_the_outputs_of_the_policy():
     """The script prices the filling centre most, and meters by the room that every region has
     left."""

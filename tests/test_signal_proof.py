@@ -136,6 +136,7 @@ def imported(tmp_path_factory):
     return made
 
 
+@pytest.mark.slow
 def test_a_run_says_that_signals_break_rules(imported, tmp_path):
     """Signals that stop and start to obey cut greens short; without such faults nothing is said."""
     scenario, faults = imported("static"), ["signal:B1@1-2", "signal:B2@3-5"]

@@ -108,6 +108,7 @@ def test_actuated_signals(plant_of, gateways_fixed):
     assert static == (gateways if gateways_fixed else set())
 
 
+@pytest.mark.slow
 def test_webster_in_sumo(scenario, plant_of):
     """SUMO runs the plan with its offsets; open gateways show it unchanged."""
     plant = plant_of(signals="webster")

@@ -242,8 +242,8 @@ DEVICES = """<device.rerouting.probability v="0.5"/><device.rerouting.period v="
     "routes, options",
     [
         (SECONDS + HOURLY + TRIPS, ""),
-        (SECONDS + TRIPS, '<step-length v="0.5"/>'),
-        (HOURLY + TRIPS, DEVICES),
+        pytest.param(SECONDS + TRIPS, '<step-length v="0.5"/>', marks=pytest.mark.slow),
+        pytest.param(HOURLY + TRIPS, DEVICES, marks=pytest.mark.slow),
         pytest.param(
             TRIPS,
             '<device.rerouting.probability v="0.5"/><device.emissions.probability v="1"/>',
@@ -282,6 +282,7 @@ def drive_and_compare(config, ended):
     assert f"same city: {len(private)} of {len(private)} trips, time spent +0.0 %" in report
 
 
+@pytest.mark.slow
 def test_vehicles_of_a_loaded_state_begin_where_they_are(tmp_path):
     config = city(tmp_path, ["trip", "via", "period", "later"])
     state = tmp_path / "state.xml"
@@ -409,6 +410,7 @@ def test_vehicles_before_the_beginning_are_counted(tmp_path):
         imported(config, begin="60")
 
 
+@pytest.mark.slow
 def test_another_traffic_is_told_with_a_reason(tmp_path):
     slow = '<flow id="s" begin="0" end="90" number="9" route="r" departSpeed="1.0"/>'
     config = given(tmp_path, slow)

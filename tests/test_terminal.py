@@ -89,6 +89,7 @@ def test_the_plan_descends_on_both_sums(scenario, learned):
     assert slope[7].any(), "the last controls matter"
 
 
+@pytest.mark.slow
 def test_mpc_looks_beyond_its_horizon(scenario, learned):
     """Even with what little was learned here."""
     planning = parse(NAME).own_planning(scenario)

@@ -68,6 +68,7 @@ def test_nobody_waits_on_an_empty_lane_or_for_another_turn():
     assert waited(street(route=("a", "c")), *moments) == 18.0
 
 
+@pytest.mark.slow
 def test_the_sheet_of_a_run(tmp_path, out):
     """Cars of one street only: max-pressure leaves the other links red, but nobody waits there."""
     net = tiny_city.network(tmp_path, "--tls.set B1,B2,C1,C2")
