@@ -133,6 +133,16 @@ def test_the_card_has_the_figures_of_the_best_strategy(evaluation):
     )
 
 
+@pytest.mark.parametrize(
+    "after, change", [(600.0, "no change"), (598.2, "0.3 % less"), (630.0, "5 % more")]
+)
+def test_a_small_change_of_one_seed_is_not_zero(evaluation, after, change):
+    rows = results.read(evaluation).level(1.0).rows
+    rows = rows[rows["seed"] == 2000].assign(mean_trip_time_s=600.0)
+    rows.loc[rows["controller"] == "dpc-pcrg", "mean_trip_time_s"] = after
+    assert html.card(rows)[1][2].change == change
+
+
 @pytest.mark.slow
 def test_names_are_escaped_and_several_folders_fit_on_a_page(evaluation, tmp_path, monkeypatch):
     monkeypatch.setattr(html, "_pictures", lambda *_: [])

@@ -223,11 +223,13 @@ def _judged(pair: statistics.Paired, good: int) -> tuple[str, str, bool | None]:
     good: sign of an improvement
     """
     one_seed = pair.seeds == 1
-    digits = 0 if one_seed or pair.percent_half >= 1.0 else 1
-    spread = "" if one_seed else f" ± {max(pair.percent_half, 0.1):.{digits}f}"
+    half = 0.0 if one_seed else pair.percent_half
+    smallest = abs(pair.percent) if one_seed else half
+    digits = 0 if smallest >= 1.0 else 1
+    spread = "" if one_seed else f" ± {max(half, 0.1):.{digits}f}"
     direction = "more" if pair.percent > 0 else "less"
     change = f"{abs(pair.percent):.{digits}f}{spread} % {direction}"
-    if not pair.percent and not pair.percent_half:
+    if not round(pair.percent, 1) and not half:
         change = "no change"
     if pair.significant:
         return change, "significant", pair.percent * good > 0
