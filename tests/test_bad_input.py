@@ -280,15 +280,14 @@ IN_WRONG_FOLDERS = [
     "command, name, expected",
     [
         pytest.param(
-            *(command, NOT_UTF_8, "the name is not UTF-8"),
+            *(command, name, expected),
             marks=pytest.mark.slow if command.startswith("watch") else (),
         )
-        for command in IN_ODD_FOLDERS + IN_WRONG_FOLDERS
-    ]
-    + [
-        (command, REPLACED, "SUMO puts variables")
-        for command in IN_ODD_FOLDERS
-        if not command.startswith("watch")
+        for commands, name, expected in (
+            (IN_ODD_FOLDERS + IN_WRONG_FOLDERS, NOT_UTF_8, "the name is not UTF-8"),
+            (IN_ODD_FOLDERS, REPLACED, "SUMO puts variables"),
+        )
+        for command in commands
     ],
 )
 def test_folders_that_sumo_cannot_open(city, tmp_path, command, name, expected):
