@@ -280,7 +280,9 @@ IN_WRONG_FOLDERS = [
     "command, name, expected",
     [
         pytest.param(
-            *(command, name, expected),
+            command,
+            name,
+            expected,
             marks=pytest.mark.slow if command.startswith("watch") else (),
         )
         for commands, name, expected in (

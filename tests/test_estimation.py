@@ -24,6 +24,7 @@ SCENARIO = replace(
 )
 NETWORK = SCENARIO.network
 REGIONS = NETWORK.regions
+STEPS = 40
 OPEN = Controls(perimeter=NETWORK.open_perimeter)
 
 
@@ -121,7 +122,7 @@ class Crowd:
         )
 
 
-def watch(seed, known, *, steps=40, changed=lambda observation: observation, wrong=1.0):
+def watch(seed, known, *, steps=STEPS, changed=lambda observation: observation, wrong=1.0):
     """Truth and estimate (steps, R, R), and what the detectors said (steps, R)."""
     crowd = Crowd(seed, known, wrong=wrong)
     estimator = Estimator(planning_model(SCENARIO), known)
@@ -142,7 +143,7 @@ def runs():
     """Truth, estimates and detectors of six cities, and estimates without the readings."""
     known = equipped()
     blind = Estimator(planning_model(SCENARIO), known)
-    open_loop = np.array([blind.step(OPEN, nothing()) for _ in range(40)])
+    open_loop = np.array([blind.step(OPEN, nothing()) for _ in range(STEPS)])
     return [(*watch(seed, known), open_loop) for seed in range(6)]
 
 

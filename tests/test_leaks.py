@@ -162,14 +162,12 @@ CASES = {
         {(signal, "mesoscopic model without junction control") for signal in SIGNALS},
     ),
 }
+SLOW_CASES = ("programmes", "off option")
 
 
 @pytest.mark.parametrize(
     "case",
-    [
-        pytest.param(case, marks=pytest.mark.slow) if case in ("programmes", "off option") else case
-        for case in CASES
-    ],
+    [pytest.param(case, marks=pytest.mark.slow) if case in SLOW_CASES else case for case in CASES],
 )
 def test_one_word_for_every_gateway(made, case):
     """Table, verdict, map and run agree on which gateways a command can hold."""

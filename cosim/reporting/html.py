@@ -223,9 +223,12 @@ def _judged(pair: statistics.Paired, good: int) -> tuple[str, str, bool | None]:
     good: sign of an improvement
     """
     one_seed = pair.seeds == 1
-    half = 0.0 if one_seed else pair.percent_half
-    smallest = abs(pair.percent) if one_seed else half
-    digits = 0 if smallest >= 1.0 else 1
+    half = 0.0
+    scale = abs(pair.percent)
+    if not one_seed:
+        half = pair.percent_half
+        scale = half
+    digits = 0 if scale >= 1.0 else 1
     spread = "" if one_seed else f" ± {max(half, 0.1):.{digits}f}"
     direction = "more" if pair.percent > 0 else "less"
     change = f"{abs(pair.percent):.{digits}f}{spread} % {direction}"

@@ -120,12 +120,12 @@ def main(folder: Path, again: Path | None) -> None:
     table.to_csv(folder / "links.csv", index=False)
     click.echo(table.to_markdown(index=False))
     flowing_runs = table[~table["SUMO locks"]]
-    repeated_runs = flowing_runs[flowing_runs["other seeds %"].notna()]
+    with_other_seeds = flowing_runs.dropna(subset="other seeds %")
     for rows, name, what in (
         (flowing_runs, "difference %", "all draws"),
         (flowing_runs, "flowing %", "draws that flow"),
-        (repeated_runs, "difference %", "all draws, where SUMO has other seeds"),
-        (repeated_runs, "other seeds %", "SUMO with other seeds"),
+        (with_other_seeds, "difference %", "all draws, where SUMO has other seeds"),
+        (with_other_seeds, "other seeds %", "SUMO with other seeds"),
     ):
         off = rows[name].abs()
         click.echo(
